@@ -1,0 +1,83 @@
+# The commands of the project. A fresh machine needs `make` and Python 3.11 or newer; the rest goes into .venv.
+.DEFAULT_GOAL := help
+.NOTPARALLEL:
+.DELETE_ON_ERROR:
+
+PYTHONS := python3 python3.14 python3.13 python3.12 python3.11
+VENV := .venv
+BIN := $(VENV)/bin
+RESULT := results/pendulum_delay
+PYTEST_ARGS ?= --numprocesses logical --maxprocesses 4
+
+.PHONY: help demo test coverage check bench fmus clean
+
+help: ## show this list
+	@sed -n 's/^\([a-z]*\):[^#]*## \(.*\)/  make \1	\2/p' Makefile
+
+demo: $(VENV)/.installed-plot ## the main job: two FMUs in two processes under a master, with result and plot
+	@$(BIN)/fmu-mesh launch configs/pendulum_delay.yaml --plot $(RESULT).png
+	@echo "Result: $(RESULT).csv"
+	@echo "Plot:   $(RESULT).png"
+
+test: $(VENV)/.installed-test ## all tests; PYTEST_ARGS='-k name' replaces the arguments
+	@$(BIN)/python -m pytest $(PYTEST_ARGS)
+
+coverage: $(VENV)/.installed-test ## all tests, nodes and masters measured too, and the lines they leave out
+	@$(BIN)/python -m coverage erase
+	@$(BIN)/python -m coverage run -m pytest $(PYTEST_ARGS)
+	@$(BIN)/python -m coverage combine --quiet
+	@$(BIN)/python -m coverage report
+
+# Every tool runs, so that one look shows all there is to mend.
+check: $(VENV)/.installed-check $(VENV)/.installed-test ## lint, format, types, import layers, spelling
+	@failed=; \
+	run() { echo "== $$*"; "$(BIN)/$$@" || failed="$$failed\n  $$*"; }; \
+	run ruff check; \
+	run ruff format --check; \
+	run mypy; \
+	run lint-imports --no-logo; \
+	run codespell; \
+	if [ -n "$$failed" ]; then printf "\nmake check failed:$$failed\n" >&2; exit 1; fi; \
+	echo "make check: all clean"
+
+bench: $(VENV)/.installed-test ## all benchmarks
+	@for script in $(sort $(wildcard benchmarks/*.py)); do \
+	  echo "== $$script"; $(BIN)/python $$script || exit 1; \
+	done
+
+fmus: $(VENV)/.installed-plot ## rebuild the example FMUs from fmus/src (needs a C compiler)
+	@$(BIN)/python fmus/build.py
+
+clean: ## remove results, builds and caches, but not .venv
+	rm -rf results build dist .coverage .coverage.* .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	find . -name __pycache__ -type d -not -path './$(VENV)/*' -prune -exec rm -rf {} +
+
+# A new dependency list installs anew, and so does a new environment.
+$(VENV)/.installed-%: pyproject.toml $(VENV)/.created
+	@echo "Installing fmu-mesh[$*] into $(VENV) ..."
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[$*]'
+	@touch $@
+
+# A name on PATH proves nothing (it may be a stand-in of a version manager), so each candidate has to run.
+# An environment that works is kept, whoever made it.
+$(VENV)/.created:
+	@usable='import sys; sys.exit(sys.version_info < (3, 11))'; \
+	if ! { $(BIN)/python -c "$$usable" && $(BIN)/python -m pip --version; } >/dev/null 2>&1; then \
+	  python=; without_venv=; \
+	  for candidate in $(PYTHONS); do \
+	    $$candidate -c "$$usable" >/dev/null 2>&1 || continue; \
+	    if $$candidate -c 'import ensurepip, venv' >/dev/null 2>&1; then python=$$candidate; break; fi; \
+	    without_venv=$$candidate; \
+	  done; \
+	  if [ -z "$$python" ]; then \
+	    if [ -n "$$without_venv" ]; then \
+	      echo "$$without_venv has no module venv. On Debian and Ubuntu: apt install $$without_venv-venv" >&2; \
+	    else \
+	      echo "No Python 3.11 or newer on PATH (looked for: $(PYTHONS))." >&2; \
+	    fi; \
+	    exit 1; \
+	  fi; \
+	  echo "Creating $(VENV) with $$($$python --version) ..."; \
+	  $$python -m venv --clear $(VENV) || exit 1; \
+	fi; \
+	touch $@
