@@ -1,0 +1,65 @@
+"""Finds and builds the FMUs that tests use.
+
+The sources of the FMUs that only tests use are in ``tests/fmus/src``; a built file of theirs is never kept in
+the repository. Without a C compiler, a test that needs one of them is skipped with that reason.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import fmpy
+import pytest
+
+from fmus.build import BuildError, build, find_compiler
+
+__all__ = ["FMUS", "KEPT_FMUS", "NO_COMPILER", "TEST_FMUS", "build_test_fmu", "extracted_fmu", "find_fmu"]
+
+FMUS = Path(__file__).resolve().parents[2] / "fmus"
+SOURCES = Path(__file__).resolve().parent / "src"
+
+KEPT_FMUS = tuple(sorted(path.stem for path in FMUS.glob("*.fmu")))
+TEST_FMUS = tuple(sorted(path.parent.name for path in SOURCES.glob("*/modelDescription.xml")))
+
+
+def build_test_fmu(name: str, folder: Path) -> Path:
+    """Build a test-only FMU into ``folder`` and return its path; a file that is already there is used again.
+
+    Args:
+        name: ``Faulty`` or ``AllTypes``.
+        folder: a folder of this test session, made if missing.
+
+    Raises:
+        BuildError: there is no C compiler, or the sources do not compile.
+    """
+    built = folder / f"{name}.fmu"
+    return built if built.is_file() else build(SOURCES / name, folder)
+
+
+def find_fmu(name: str, folder: Path) -> Path:
+    """Return the kept FMU, or the test-only FMU built into ``folder``."""
+    if name in KEPT_FMUS:
+        return FMUS / f"{name}.fmu"
+    if NO_COMPILER is not None:
+        pytest.skip(NO_COMPILER)
+    return build_test_fmu(name, folder)
+
+
+def extracted_fmu(name: str, folder: Path) -> Path:
+    """Return the folder of an extracted FMU below ``folder``; it is extracted once."""
+    target = folder / f"{name}_extracted"
+    if not target.is_dir():
+        fmpy.extract(str(find_fmu(name, folder)), unzipdir=str(target))
+    return target
+
+
+def _why_no_compiler() -> str | None:
+    try:
+        find_compiler()
+    except BuildError as error:
+        return str(error)
+    return None
+
+
+NO_COMPILER = _why_no_compiler()
+"""Why nothing can be built here, or None."""
