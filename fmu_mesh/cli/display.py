@@ -1,0 +1,105 @@
+"""What a person sees during a run: one progress line, log messages above it, and a summary at the end."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import BarColumn, Progress, TextColumn
+
+from ..launch.events import End, Event, Log, Ready, Status
+from ..model.plan import Plan
+from ..wire.views import LogLine, MeshStatus
+
+__all__ = ["Display", "summary"]
+
+_STYLES = {"ok": "dim", "warning": "yellow", "discard": "yellow", "error": "red", "fatal": "red"}
+
+
+class Display:
+    """Shows events of a run on standard error.
+
+    Args:
+        plan: what runs.
+        show_progress: whether to draw the bar; never drawn where standard error is no terminal.
+    """
+
+    def __init__(self, plan: Plan, *, show_progress: bool) -> None:
+        self._plan = plan
+        self._console = Console(stderr=True, highlight=False)
+        self._progress = Progress(
+            TextColumn("[bold]{task.description}"),
+            BarColumn(bar_width=None),
+            TextColumn("{task.fields[text]}"),
+            console=self._console,
+            disable=not show_progress or not self._console.is_terminal,
+            transient=True,
+        )
+        self._task = self._progress.add_task(plan.system.config.mesh, total=plan.grid.last_point, text="starting")
+
+    def __enter__(self) -> Self:
+        self._progress.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._progress.stop()
+
+    def event(self, event: Event) -> None:
+        """Show one event of the master."""
+        match event:
+            case Ready(endpoints):
+                if endpoints:
+                    self._console.print(f"mesh '{self._plan.system.config.mesh}' at {', '.join(endpoints)}")
+            case Status(status):
+                self._status(status)
+            case Log(line):
+                self.log(line)
+            case End():
+                pass
+
+    def progress(self, point: int) -> None:
+        """Show the point of a run in this process."""
+        self._progress.update(self._task, completed=point, text=f"t = {self._plan.grid.time(point):.6g} s")
+
+    def log(self, line: LogLine) -> None:
+        """Show one log message of an FMU."""
+        style = _STYLES.get(line.status, "dim")
+        where = f"{line.instance} at point {line.point}"
+        self._console.print(f"[{style}]{escape(where)}: {escape(line.message)}[/]")
+
+    def output(self, name: str, text: str) -> None:
+        """Show a line that a process wrote by itself."""
+        if text:
+            self._console.print(f"[dim]{escape(name)} |[/] {escape(text)}")
+
+    def _status(self, status: MeshStatus) -> None:
+        text = status.state
+        if status.state in ("running", "paused", "stopping"):
+            text = (
+                f"t = {status.time:.6g} s  {status.points_per_second:,.0f} points/s  "
+                f"real-time factor {status.real_time_factor:.3g}" + ("  paused" if status.state == "paused" else "")
+            )
+        self._progress.update(self._task, completed=status.point, text=text)
+
+
+def summary(plan: Plan, *, point: int, seconds: float, rows: int, result_file: str | None) -> list[str]:
+    """The closing lines of a run; the last one is `20000 points in 1.234 s: 16207 points/s, real-time factor 32.4`."""
+    lines = []
+    if result_file is not None:
+        lines.append(f"result: {_short(Path(result_file))} ({rows} rows)")
+    rate = point / seconds if seconds > 0 else 0.0
+    factor = rate * plan.grid.step_size
+    lines.append(f"{point} points in {seconds:.3f} s: {rate:.0f} points/s, real-time factor {factor:.3g}")
+    return lines
+
+
+def _short(path: Path) -> str:
+    try:
+        return str(path.relative_to(Path.cwd()))
+    except ValueError:
+        return str(path)

@@ -1,0 +1,61 @@
+"""The command `fmu-mesh`: finds the command's module, runs it, and turns errors into one paragraph and an exit code."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import os
+import sys
+from collections.abc import Callable, Sequence
+
+from .. import __version__
+from ..errors import ConfigurationError, FmuMeshError, Interrupted
+from . import checking, looking, plotting, running
+
+__all__ = ["main"]
+
+Command = Callable[[argparse.Namespace], int]
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command; returns the exit code (design, section 7)."""
+    parser = _parser()
+    options = parser.parse_args(arguments)
+    if options.command is None:
+        parser.print_help()
+        return ConfigurationError.exit_code
+    logging.basicConfig(
+        level=os.environ.get("FMU_MESH_LOG", "WARNING").upper(), format="%(name)s: %(levelname)s: %(message)s"
+    )
+    run: Command = options.run_command
+    try:
+        return run(options)
+    except FmuMeshError as error:
+        if options.debug:
+            raise
+        print(f"fmu-mesh: {error}", file=sys.stderr)
+        return error.exit_code
+    except KeyboardInterrupt:
+        print("fmu-mesh: interrupted", file=sys.stderr)
+        return Interrupted.exit_code
+    except BrokenPipeError:
+        # The reader of our output is gone, as in `fmu-mesh watch … | head`.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="fmu-mesh",
+        description="A service mesh for co-simulation: FMUs as Zenoh nodes under one master.",
+        epilog="Exit codes: 0 done, 1 internal error, 2 wrong usage or configuration, 3 an FMU failed, "
+        "4 a node or the master was lost, 130 interrupted.",
+    )
+    parser.add_argument("--version", action="version", version=f"fmu-mesh {__version__}")
+    common = argparse.ArgumentParser(add_help=False)
+    common.add_argument("--debug", action="store_true", help="show the traceback of an error")
+    parser.set_defaults(debug=False)
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND")
+    for module in (running, checking, looking, plotting):
+        module.add_commands(commands, common)
+    return parser

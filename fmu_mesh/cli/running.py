@@ -1,0 +1,169 @@
+"""`launch`, `node`, `master` and `router`: the commands that run something."""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import sys
+import threading
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+from ..errors import FmuMeshError
+from ..fmu import LogMessage
+from ..launch.events import End, Event, EventWriter
+from ..launch.launcher import Launcher
+from ..launch.local import LocalMesh
+from ..launch.preparing import Options, prepare
+from ..launch.process import ended_by_signals
+from ..launch.roles import BY_HAND, run_master, run_node
+from ..model.plan import Plan
+from ..wire.router import run_router
+from ..wire.views import LogLine
+from .display import Display, summary
+from .plotting import plot_results, require_matplotlib
+
+__all__ = ["add_commands"]
+
+
+def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.ArgumentParser) -> None:
+    """Add the commands of this module."""
+    launch = commands.add_parser("launch", parents=[common], help="run a mesh: one process per node, and the master")
+    _add_config(launch)
+    launch.add_argument("--local", action="store_true", help="run everything in this one process")
+    launch.add_argument("--plot", type=Path, metavar="FILE.png", help="plot the result when done")
+    launch.add_argument("--no-progress", action="store_true", help="no progress line")
+    launch.set_defaults(run_command=_launch)
+
+    node = commands.add_parser("node", parents=[common], help="run one node by hand")
+    _add_config(node)
+    node.add_argument("node", metavar="INSTANCE", help="name of the instance, or of its group")
+    node.add_argument("--plan", type=Path, help=argparse.SUPPRESS)
+    node.add_argument("--run", default=BY_HAND, help=argparse.SUPPRESS)
+    node.set_defaults(run_command=_node)
+
+    master = commands.add_parser("master", parents=[common], help="run the master and the recorder by hand")
+    _add_config(master)
+    master.add_argument("--plot", type=Path, metavar="FILE.png", help="plot the result when done")
+    master.add_argument("--no-progress", action="store_true", help="no progress line")
+    master.add_argument("--events", action="store_true", help=argparse.SUPPRESS)
+    master.add_argument("--run", default=BY_HAND, help=argparse.SUPPRESS)
+    master.set_defaults(run_command=_master)
+
+    router = commands.add_parser("router", parents=[common], help="run a Zenoh router")
+    router.add_argument("--listen", action="append", metavar="ENDPOINT", help="default: tcp/127.0.0.1:7447")
+    router.set_defaults(run_command=_router)
+
+
+def _add_config(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("config", type=Path, metavar="CONFIG", help="the configuration file")
+    parser.add_argument("--window", type=int, metavar="N", help="how many points a node may run ahead; 1 is lockstep")
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="INSTANCE.VARIABLE=VALUE", help="another start value; repeatable"
+    )
+    parser.add_argument("--output", type=Path, metavar="FILE.csv", help="another result file")
+    parser.add_argument(
+        "--connect", action="append", default=[], metavar="ENDPOINT", help="connect there instead; repeatable"
+    )
+
+
+def _options(arguments: argparse.Namespace) -> Options:
+    return Options(
+        start_values=tuple(arguments.set),
+        window=arguments.window,
+        output=arguments.output,
+        connect=tuple(arguments.connect),
+    )
+
+
+def _launch(arguments: argparse.Namespace) -> int:
+    if arguments.plot is not None:
+        require_matplotlib()
+    options = _options(arguments)
+    plan = prepare(arguments.config, options)
+    with Display(plan, show_progress=not arguments.no_progress) as display:
+        if arguments.local:
+            point, seconds, rows = _run_local(plan, display)
+        else:
+            launcher = Launcher(plan, arguments.config, options, display.event, display.output)
+            end = _run_launcher(launcher)
+            point, seconds, rows = end.status.point, end.seconds, end.rows
+    _close(plan, point, seconds, rows, arguments.plot)
+    return 0
+
+
+def _run_launcher(launcher: Launcher) -> End:
+    """Run it; Ctrl-C and SIGTERM end the run instead of this process."""
+
+    def interrupt(_number: int, _frame: FrameType | None) -> None:
+        launcher.interrupt()
+
+    before = {number: signal.signal(number, interrupt) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        return launcher.run()
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _run_local(plan: Plan, display: Display) -> tuple[int, float, int]:
+    def log(message: LogMessage) -> None:
+        line = LogLine(message.instance, message.status, message.category, message.message, mesh.point)
+        display.log(line)
+
+    mesh = LocalMesh(plan, log, display.progress)
+    with ended_by_signals(mesh.interrupt, lambda: None, watch_stdin=False):
+        mesh.run()
+    return mesh.point, mesh.seconds, mesh.rows
+
+
+def _close(plan: Plan, point: int, seconds: float, rows: int, plot: Path | None) -> None:
+    """Plot if wanted, and print the summary."""
+    result = plan.system.result_file
+    if plot is not None and result is not None:
+        plot_results(Path(result), plot, plan)
+        print(f"plot: {plot}")
+    for line in summary(plan, point=point, seconds=seconds, rows=rows, result_file=result):
+        print(line)
+
+
+def _node(arguments: argparse.Namespace) -> int:
+    run_node(
+        arguments.config, arguments.node, _options(arguments), plan_file=arguments.plan, run=arguments.run
+    )
+    return 0
+
+
+def _master(arguments: argparse.Namespace) -> int:
+    options = _options(arguments)
+    if arguments.events:
+        try:
+            run_master(arguments.config, options, EventWriter(), run=arguments.run)
+        except FmuMeshError as error:
+            return error.exit_code  # the launcher has the event, and tells
+        return 0
+    if arguments.plot is not None:
+        require_matplotlib()
+    plan = prepare(arguments.config, options)
+    ends: list[End] = []
+
+    def show(event: Event) -> None:
+        display.event(event)
+        if isinstance(event, End):
+            ends.append(event)
+
+    with Display(plan, show_progress=not arguments.no_progress) as display:
+        run_master(arguments.config, options, show, plan=plan)
+    _close(plan, ends[0].status.point, ends[0].seconds, ends[0].rows, arguments.plot)
+    return 0
+
+
+def _router(arguments: argparse.Namespace) -> int:
+    stop = threading.Event()
+    endpoints = arguments.listen or ["tcp/127.0.0.1:7447"]
+    with ended_by_signals(lambda _reason: stop.set(), lambda: None, watch_stdin=False), run_router(endpoints) as where:
+        print(f"router at {', '.join(where)}", flush=True)
+        stop.wait()
+    sys.stdout.flush()
+    return 0

@@ -1,0 +1,175 @@
+"""Reading the model description of an FMU into the mesh's own Structs, without extracting or loading it.
+
+Owns the judgement what can run (FMI 2.0 co-simulation with a binary for this platform) and what is only odd: problems
+that a strict validator finds are kept in `ModelDescription.problems`, and the FMU runs.
+"""
+
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path
+from typing import cast
+
+import fmpy
+from fmpy.model_description import ModelDescription as FmpyDescription
+from fmpy.model_description import ModelVariable, read_model_description
+from fmpy.model_description import ValidationError as FmpyValidationError
+
+from ..errors import LoadFailed
+from ..model.description import DefaultExperiment, ModelDescription, Value, Variable, VariableType
+
+__all__ = ["read_description"]
+
+_MAX_DESCRIPTION_SIZE = 64 * 2**20
+_TYPES: tuple[VariableType, ...] = ("Real", "Integer", "Boolean", "String", "Enumeration")
+
+
+def read_description(path: Path) -> ModelDescription:
+    """Read the model description of the FMU at ``path``.
+
+    Raises:
+        LoadFailed: it is no FMU, or one that cannot run here; the message says which and what would help.
+    """
+    names = _archive_names(path)
+    if "modelDescription.xml" not in names:
+        raise LoadFailed(
+            f"'{path}' is a ZIP archive, but has no modelDescription.xml at its root, so it is no FMU.",
+            hint="An FMU that was zipped inside a folder of its own must be zipped again without that folder.",
+        )
+    source, problems = _parse(path)
+    if source.fmiVersion is None or not source.fmiVersion.startswith("2."):
+        raise LoadFailed(f"'{path}' is an FMI {source.fmiVersion} FMU; FMI 2.0 co-simulation is what can run today.")
+    if source.coSimulation is None:
+        raise LoadFailed(f"'{path}' is for model exchange only; export it for co-simulation.")
+    platforms = tuple(fmpy.supported_platforms(str(path)))
+    if fmpy.platform not in platforms:
+        there = ", ".join(platforms) or "no platform at all"
+        raise LoadFailed(
+            f"'{path}' has no binary for this platform ({fmpy.platform}); it has: {there}.",
+            hint="Export it for this platform, or compile its sources into it if it has some.",
+        )
+    library = f"binaries/{fmpy.platform}/{source.coSimulation.modelIdentifier}{fmpy.sharedLibraryExtension}"
+    if library not in names:
+        raise LoadFailed(
+            f"'{path}' has no '{library}', although its model identifier is "
+            f"'{source.coSimulation.modelIdentifier}' (FMI 2.0, 2.3: the library must have that name)."
+        )
+    return _convert(source, platforms, problems)
+
+
+def _archive_names(path: Path) -> frozenset[str]:
+    """Names of all files in the archive."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            for entry in archive.infolist():
+                if entry.filename == "modelDescription.xml" and entry.file_size > _MAX_DESCRIPTION_SIZE:
+                    raise LoadFailed(
+                        f"the modelDescription.xml of '{path}' has {entry.file_size} bytes; "
+                        f"the limit is {_MAX_DESCRIPTION_SIZE}."
+                    )
+            return frozenset(archive.namelist())
+    except FileNotFoundError as error:
+        raise LoadFailed(f"'{path}' does not exist.") from error
+    except zipfile.BadZipFile as error:
+        raise LoadFailed(f"'{path}' is no ZIP archive, so it is no FMU.") from error
+    except OSError as error:
+        raise LoadFailed(f"'{path}' cannot be read: {error.strerror}.") from error
+
+
+def _parse(path: Path) -> tuple[FmpyDescription, tuple[str, ...]]:
+    """FMPy's model description, and what a strict validation of it finds."""
+    try:
+        return read_model_description(str(path), validate=True), ()
+    except FmpyValidationError as error:
+        problems = tuple(str(problem) for problem in error.problems)
+    except Exception as error:  # noqa: BLE001 FMPy and lxml raise whatever the XML provokes in them
+        problems = (str(error),)
+    try:
+        return read_model_description(str(path), validate=False), problems
+    except Exception as error:
+        raise LoadFailed(f"the modelDescription.xml of '{path}' cannot be read: {error}") from error
+
+
+def _convert(source: FmpyDescription, platforms: tuple[str, ...], problems: tuple[str, ...]) -> ModelDescription:
+    co_simulation = source.coSimulation
+    experiment = source.defaultExperiment
+    dependencies = {
+        unknown.variable.name: None
+        if unknown.dependencies is None
+        else tuple(variable.name for variable in unknown.dependencies)
+        for unknown in source.initialUnknowns
+        if unknown.variable is not None
+    }
+    return ModelDescription(
+        model_name=source.modelName or "",
+        model_identifier=co_simulation.modelIdentifier,
+        fmi_version=source.fmiVersion or "",
+        kind="co_simulation",
+        guid=source.guid or "",
+        variables=tuple(
+            _variable(variable, dependencies) for variable in source.modelVariables if variable.type in _TYPES
+        ),
+        description=source.description,
+        generation_tool=source.generationTool,
+        default_experiment=DefaultExperiment(
+            start_time=_number(getattr(experiment, "startTime", None)),
+            stop_time=_number(getattr(experiment, "stopTime", None)),
+            step_size=_number(getattr(experiment, "stepSize", None)),
+            tolerance=_number(getattr(experiment, "tolerance", None)),
+        ),
+        can_handle_variable_step_size=bool(co_simulation.canHandleVariableCommunicationStepSize),
+        can_get_and_set_state=bool(co_simulation.canGetAndSetFMUstate),
+        can_serialize_state=bool(co_simulation.canSerializeFMUstate),
+        only_once_per_process=bool(co_simulation.canBeInstantiatedOnlyOncePerProcess),
+        needs_execution_tool=bool(co_simulation.needsExecutionTool),
+        platforms=platforms,
+        problems=problems,
+    )
+
+
+def _variable(source: ModelVariable, dependencies: dict[str, tuple[str, ...] | None]) -> Variable:
+    type_ = cast("VariableType", source.type)
+    declared = source.declaredType
+    items = tuple((item.name, int(item.value)) for item in declared.items) if declared and declared.items else ()
+    return Variable(
+        name=source.name,
+        value_reference=int(source.valueReference),
+        type=type_,
+        causality=source.causality or "local",
+        variability=source.variability or ("continuous" if type_ == "Real" else "discrete"),
+        initial=source.initial,
+        start=_start(type_, source.start),
+        unit=source.unit or (declared.unit if declared is not None else None),
+        description=source.description,
+        minimum=_number(source.min),
+        maximum=_number(source.max),
+        dependencies=dependencies.get(source.name, ()),
+        items=items,
+    )
+
+
+def _number(text: str | float | None) -> float | None:
+    if text is None:
+        return None
+    try:
+        return float(text)
+    except ValueError:
+        return None
+
+
+def _start(type_: VariableType, text: str | None) -> Value | None:
+    """The start value as a Python value, or None if there is none or it is not of the type."""
+    if text is None:
+        return None
+    try:
+        match type_:
+            case "Real":
+                return float(text)
+            case "Integer" | "Enumeration":
+                return int(text)
+            case "Boolean":
+                return text in ("true", "1")
+            case "String":
+                return text
+    except ValueError:
+        return None

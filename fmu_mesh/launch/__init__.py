@@ -1,0 +1,1 @@
+"""Launching: from a configuration to running processes, and their supervision."""

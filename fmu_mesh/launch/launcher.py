@@ -1,0 +1,287 @@
+"""The launcher: one process per node and one for the master, watched until the last of them has ended.
+
+Desired is that every process runs until the master has said how the run ended. What happens otherwise: a process that
+dies ends the run with `MeshLost` and its name; a request to end goes to the master, which tells the nodes. At the end
+no process and no file of the run is left, whatever became of them.
+"""
+
+from __future__ import annotations
+
+import os
+import queue
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import IO
+
+import msgspec
+
+from ..errors import FmuMeshError, MeshLost, from_report
+from ..model.plan import RECORDER, Plan
+from ..wire.runtime import MeshNote, remove_run_folder, run_folder, write_note
+from .events import End, Event, Ready, Status, decode_event
+from .preparing import Options
+
+__all__ = ["Launcher", "Output"]
+
+_MASTER = "the master"
+_REPORT_S = 1.5
+_KILL_S = 1.0
+
+Output = Callable[[str, str], None]
+"""Called with the name of a process and a line that it wrote to its standard output or error."""
+
+
+class Launcher:
+    """Runs a plan as processes of this host.
+
+    Args:
+        config_file: the configuration file.
+        options: what the command line changed; handed on.
+        on_event: called with every event of the master, on the thread that calls `run`.
+        on_output: called with every line that a process writes, likewise.
+    """
+
+    def __init__(
+        self, plan: Plan, config_file: Path, options: Options, on_event: Callable[[Event], None], on_output: Output
+    ) -> None:
+        self._plan = plan
+        self._config_file = config_file
+        self._options = options
+        self._on_event = on_event
+        self._on_output = on_output
+        self._happened: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
+        self._processes: dict[str, _Process] = {}
+        self._lost: list[tuple[str, str, float]] = []
+        self._end: End | None = None
+        self._point = 0
+        self._interrupted_at: float | None = None
+
+    def run(self) -> End:
+        """Start everything, wait for the end, clean up.
+
+        Raises:
+            FmuMeshError: the run ended early, and why.
+        """
+        run = str(os.getpid())
+        folder = run_folder(self._plan.system.config.mesh, run)
+        try:
+            self._spawn_all(folder, run)
+            while not self._over():
+                self._turn()
+        finally:
+            self._end_all()
+            remove_run_folder(folder)
+        return self._outcome()
+
+    def interrupt(self) -> None:
+        """From any thread or signal handler: end the run; a second call does not wait for anybody."""
+        self._happened.put(self._interrupt)
+
+    # --- start
+
+    def _spawn_all(self, folder: Path, run: str) -> None:
+        config_file = str(self._config_file)
+        common = ["--run", run]
+        for endpoint in self._options.connect:
+            common += ["--connect", endpoint]
+        changes = [f"--set={change}" for change in self._options.start_values]
+        if self._options.window is not None:
+            changes.append(f"--window={self._options.window}")
+        if self._options.output is not None:
+            changes.append(f"--output={self._options.output}")
+        self._spawn(_MASTER, ["master", config_file, *common, *changes, "--events"], folder)
+        for number, (node, plan) in enumerate(self._plan.nodes.items()):
+            if node == RECORDER:
+                continue
+            plan_file = folder / f"{number}.json"
+            plan_file.write_bytes(msgspec.json.encode(plan))
+            self._spawn(node, ["node", config_file, node, *common, "--plan", str(plan_file)], folder)
+
+    def _spawn(self, name: str, arguments: Sequence[str], folder: Path) -> None:
+        process = _Process(name, [sys.executable, "-m", "fmu_mesh", *arguments], self._happened.put)
+        self._processes[name] = process
+        if name == _MASTER:
+            process.start(lambda line: self._take_event(line, folder), self._take_output, self._take_exit)
+        else:
+            process.start(lambda line: self._take_output(name, line), self._take_output, self._take_exit)
+
+    # --- what happens; all on the thread that called `run`
+
+    def _turn(self) -> None:
+        try:
+            self._happened.get(timeout=0.25)()
+        except queue.Empty:
+            return
+
+    def _take_event(self, line: bytes, folder: Path) -> None:
+        try:
+            event = decode_event(line)
+        except msgspec.DecodeError:
+            self._take_output(_MASTER, line)
+            return
+        if isinstance(event, Ready):
+            config = self._plan.system.config
+            note = MeshNote(
+                config.mesh, config.zenoh.key_prefix, event.endpoints, os.getpid(), str(self._config_file.absolute())
+            )
+            write_note(folder, note)
+        elif isinstance(event, Status):
+            self._point = event.status.point
+        elif isinstance(event, End):
+            self._end = event
+        self._on_event(event)
+
+    def _take_output(self, name: str, line: bytes) -> None:
+        self._on_output(name, line.decode(errors="replace").rstrip())
+
+    def _take_exit(self, name: str, code: int) -> None:
+        if self._end is None and (code != 0 or name == _MASTER):
+            self._lost.append((name, _how_it_ended(code), time.monotonic()))
+
+    def _interrupt(self) -> None:
+        master = self._processes.get(_MASTER)
+        if self._interrupted_at is None and master is not None and master.running:
+            self._interrupted_at = time.monotonic()
+            master.signal(signal.SIGTERM)
+        else:
+            self._interrupted_at = 0.0
+
+    def _over(self) -> bool:
+        """Whether there is nothing left to wait for."""
+        now = time.monotonic()
+        if self._end is not None and not self._processes[_MASTER].running:
+            return True
+        if any(name == _MASTER for name, _, _ in self._lost):
+            return True
+        # A node is gone: the master sees it within milliseconds and says so; if it does not, we do.
+        if self._lost and now - self._lost[0][2] > _REPORT_S:
+            return True
+        return self._interrupted_at is not None and now - self._interrupted_at > _REPORT_S
+
+    # --- the end
+
+    def _end_all(self) -> None:
+        """Wait for those that end by themselves, then ask, then kill."""
+        patience = _KILL_S if self._end is not None else 0.1
+        for step in (None, signal.SIGTERM, signal.SIGKILL):
+            running = [process for process in self._processes.values() if process.running]
+            if not running:
+                break
+            if step is not None:
+                for process in running:
+                    process.signal(step)
+            deadline = time.monotonic() + (patience if step is None else _KILL_S)
+            while any(process.running for process in running) and time.monotonic() < deadline:
+                try:
+                    self._happened.get(timeout=0.05)()
+                except queue.Empty:
+                    continue
+        for process in self._processes.values():
+            process.close()
+        while not self._happened.empty():
+            self._happened.get()()
+
+    def _outcome(self) -> End:
+        if self._end is not None:
+            if self._end.error is None:
+                return self._end
+            raise self._with_cause(from_report(self._end.error))
+        if self._lost:
+            name, how, _ = self._lost[0]
+            point = self._point
+            raise MeshLost(
+                f"the process of {name if name == _MASTER else f'node {name!r}'} {how}",
+                point=point,
+                time=self._plan.grid.time(point),
+                hint="What was recorded up to then is in the result file.",
+            )
+        raise MeshLost("the master did not end in time and was killed", point=self._point)
+
+    def _with_cause(self, error: FmuMeshError) -> FmuMeshError:
+        """Say how the process of a lost node ended; only its parent knows."""
+        if isinstance(error, MeshLost) and error.instance is not None:
+            for name, how, _ in self._lost:
+                if name == error.instance or f"'{name}'" in error.message:
+                    error.message = f"{error.message}; the process {how}"
+        return error
+
+
+class _Process:
+    """One child process and the threads that read what it writes."""
+
+    def __init__(self, name: str, command: list[str], post: Callable[[Callable[[], None]], None]) -> None:
+        self.name = name
+        self._command = command
+        self._post = post
+        self._popen: subprocess.Popen[bytes] | None = None
+        self._threads: list[threading.Thread] = []
+
+    def start(
+        self,
+        on_line: Callable[[bytes], None],
+        on_error_line: Callable[[str, bytes], None],
+        on_exit: Callable[[str, int], None],
+    ) -> None:
+        """Start it in a session of its own, so that Ctrl-C reaches only the launcher."""
+        self._popen = popen = subprocess.Popen(
+            self._command,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            start_new_session=True,
+        )
+        assert popen.stdout is not None and popen.stderr is not None
+        readers = [
+            threading.Thread(target=self._read, args=(popen.stdout, on_line), daemon=True),
+            threading.Thread(
+                target=self._read, args=(popen.stderr, lambda line: on_error_line(self.name, line)), daemon=True
+            ),
+        ]
+        waiter = threading.Thread(target=self._wait, args=(readers, on_exit), daemon=True)
+        self._threads = [*readers, waiter]
+        for thread in self._threads:
+            thread.start()
+
+    @property
+    def running(self) -> bool:
+        """Whether it has not ended yet."""
+        return self._popen is not None and self._popen.poll() is None
+
+    def signal(self, number: signal.Signals) -> None:
+        """Send a signal if it still runs."""
+        if self._popen is not None and self.running:
+            self._popen.send_signal(number)
+
+    def close(self) -> None:
+        """Wait for the readers and close the pipes; call when it has ended."""
+        for thread in self._threads:
+            thread.join(1.0)
+        if self._popen is not None:
+            for pipe in (self._popen.stdin, self._popen.stdout, self._popen.stderr):
+                if pipe is not None:
+                    pipe.close()
+
+    def _read(self, pipe: IO[bytes], on_line: Callable[[bytes], None]) -> None:
+        for line in pipe:
+            self._post(lambda line=line: on_line(line))
+
+    def _wait(self, readers: Sequence[threading.Thread], on_exit: Callable[[str, int], None]) -> None:
+        assert self._popen is not None
+        code = self._popen.wait()
+        for reader in readers:
+            reader.join(1.0)
+        self._post(lambda: on_exit(self.name, code))
+
+
+def _how_it_ended(code: int) -> str:
+    if code >= 0:
+        return f"ended with exit code {code}"
+    try:
+        return f"was ended by {signal.Signals(-code).name}"
+    except ValueError:
+        return f"was ended by signal {-code}"

@@ -1,0 +1,187 @@
+"""A whole mesh in one process: the reference of invariant 1, and `launch --local`.
+
+A plain loop over points and instances, as the textbook writes it, on the same plan but none of the code of a node: what
+a distributed run must equal in every float.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import Interrupted
+from ..fmu import Fmi2Instance, LogMessage
+from ..model.plan import Plan
+from ..model.ring import Layout, Ring
+from ..record.csv_file import CsvFile
+from ..simtime import TimeGrid
+
+__all__ = ["LocalMesh"]
+
+_ROWS = 1024
+
+
+class LocalMesh:
+    """Runs a plan in this process.
+
+    Args:
+        plan: the plan; its processes and window play no part.
+        log: called with every log message of an FMU.
+        progress: called with the point now and then.
+
+    Attributes:
+        point: the last point reached.
+        rows: rows in the result file.
+        seconds: wall-clock time of the loop.
+    """
+
+    def __init__(
+        self,
+        plan: Plan,
+        log: Callable[[LogMessage], None] = lambda _message: None,
+        progress: Callable[[int], None] = lambda _point: None,
+    ) -> None:
+        self.point = 0
+        self.rows = 0
+        self.seconds = 0.0
+        self._plan = plan
+        self._log = log
+        self._progress = progress
+        self._stop: str | None = None
+
+    def interrupt(self, reason: str) -> None:
+        """From any thread: end the run with `Interrupted` at the next point."""
+        self._stop = reason
+
+    def run(self) -> None:
+        """Run from the first to the last point.
+
+        Raises:
+            FmuMeshError: an FMU failed, or the run was interrupted; rows up to then are kept.
+        """
+        plan = self._plan
+        recorded = plan.system.recorded if plan.system.result_file is not None else ()
+        types = {name: {v.name: v.type for v in i.description.variables} for name, i in plan.system.instances.items()}
+        columns = [(f"{instance}.{variable}", types[instance][variable]) for instance, variable in recorded]
+        members: dict[str, _Member] = {}
+        with tempfile.TemporaryDirectory(prefix="fmu_mesh-") as folder:
+            file = CsvFile(Path(plan.system.result_file), columns) if plan.system.result_file is not None else None
+            try:
+                for name in plan.order:
+                    members[name] = _Member(plan, name, Path(folder), self._log)
+                self._initialize(members)
+                started = time.perf_counter()
+                try:
+                    self._loop(members, file)
+                finally:
+                    self.seconds = time.perf_counter() - started
+            finally:
+                for member in members.values():
+                    member.instance.close()
+                if file is not None:
+                    file.close()
+                    self.rows = file.rows
+
+    def _initialize(self, members: dict[str, _Member]) -> None:
+        grid = self._plan.grid
+        for member in members.values():
+            member.instance.enter_initialization(grid.start_time, grid.stop_time, member.plan.start_values)
+        levels = self._plan.initialization.levels
+        known: dict[tuple[str, str], float | int | bool | str] = {}
+        for (name, variable), _ in sorted(levels.items(), key=lambda item: item[1]):
+            members[name].set_initial_inputs(known)
+            known[(name, variable)] = members[name].instance.get_values([variable])[0]
+        for member in members.values():
+            member.set_initial_inputs(known)
+        for member in members.values():
+            member.instance.exit_initialization()
+            member.bind(grid)
+
+    def _loop(self, members: dict[str, _Member], file: CsvFile | None) -> None:
+        plan, grid = self._plan, self._plan.grid
+        recorded = [(members[instance], variable) for instance, variable in plan.system.recorded]
+        buffer: list[list[float | int | bool | str]] = []
+        first = 0
+        try:
+            for point in range(grid.last_point + 1):
+                self.point = point
+                if file is not None:
+                    buffer.append([member.value_at(point, variable) for member, variable in recorded])
+                    if len(buffer) == _ROWS:
+                        _write(file, grid, first, buffer)
+                        first, buffer = point + 1, []
+                        self._progress(point)
+                if self._stop is not None:
+                    raise Interrupted(self._stop, point=point, time=grid.time(point))
+                if point == grid.last_point:
+                    break
+                for member in members.values():
+                    member.step_from(point, members)
+        finally:
+            if file is not None and buffer:
+                _write(file, grid, first, buffer)
+        self._progress(self.point)
+
+
+class _Member:
+    """One instance of a `LocalMesh`."""
+
+    def __init__(self, plan: Plan, name: str, folder: Path, log: Callable[[LogMessage], None]) -> None:
+        system = plan.system.instances[name]
+        node = plan.nodes[system.node]
+        self.plan = next(item for item in node.instances if item.name == name)
+        self.connections = [c for c in plan.connections if c.target_instance == name]
+        self.instance = Fmi2Instance(Path(system.fmu), name, system.description, folder, log)
+        self._inputs = Ring(self.plan.inputs, 1)
+        # A slower instance asks for a value as old as its own step.
+        oldest = max(instance.step_points for instance in plan.system.instances.values())
+        self._outputs = Ring(self.plan.outputs, 1 << (2 * oldest).bit_length())
+        self.step = 0
+
+    def set_initial_inputs(self, known: dict[tuple[str, str], float | int | bool | str]) -> None:
+        """Set every connected input whose source is known."""
+        values = {}
+        for c in self.connections:
+            key = (c.source_instance, c.source.name)
+            if key in known and c.target.name not in self.plan.held:
+                values[c.target.name] = _scaled(known[key], c.factor, c.offset)
+        if values:
+            self.instance.set_values(values)
+
+    def bind(self, grid: TimeGrid) -> None:
+        self.instance.bind(self._inputs, (self._outputs,), grid.start_time, grid.step_size * self.plan.step_points)
+
+    def value_at(self, point: int, variable: str) -> float | int | bool | str:
+        """The output at ``point``: that of the last own point at or before it."""
+        return self._outputs.value(point // self.plan.step_points, variable)
+
+    def step_from(self, point: int, members: dict[str, _Member]) -> None:
+        """Take the own step that ends at ``point + 1``, if there is one, with the inputs that the delays prescribe."""
+        points = self.plan.step_points
+        if (point + 1) % points:
+            return
+        layout: Layout = self._inputs.layout
+        for c in self.connections:
+            taken_at = point + 1 - points if c.delay else point + 1
+            value = _scaled(members[c.source_instance].value_at(taken_at, c.source.name), c.factor, c.offset)
+            if c.target.name in layout.reals:
+                self._inputs.reals[0, layout.reals.index(c.target.name)] = value
+            else:
+                self._inputs.integers[0, layout.integers.index(c.target.name)] = value
+        self.instance.do_step(self.step)
+        self.step += 1
+
+
+def _scaled(value: float | int | bool | str, factor: float, offset: float) -> float | int | bool | str:
+    if isinstance(value, str) or (factor, offset) == (1.0, 0.0):
+        return value
+    return value * factor + offset
+
+
+def _write(file: CsvFile, grid: TimeGrid, first: int, rows: list[list[float | int | bool | str]]) -> None:
+    times = grid.start_time + np.arange(first, first + len(rows)) * grid.step_size
+    file.write(times, [np.array(column) for column in zip(*rows, strict=True)])

@@ -1,0 +1,87 @@
+"""From a configuration file to a plan: everything is checked here, before anything is spawned."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import msgspec
+
+from ..errors import ConfigurationError, Finding, LoadFailed
+from ..fmu import read_description
+from ..model.description import ModelDescription
+from ..model.findings import nearest_file
+from ..model.loading import LoadedConfig, load
+from ..model.plan import Plan, make_plan
+from ..model.system import build
+
+__all__ = ["Options", "prepare"]
+
+
+class Options(msgspec.Struct, frozen=True):
+    """What the command line changes of a configuration.
+
+    Attributes:
+        start_values: `instance.variable=value` each.
+        window: in points.
+        output: the result file instead of the configured one.
+        connect: Zenoh endpoints instead of the configured ones.
+    """
+
+    start_values: tuple[str, ...] = ()
+    window: int | None = None
+    output: Path | None = None
+    connect: tuple[str, ...] = ()
+
+
+def prepare(path: Path, options: Options = Options()) -> Plan:  # noqa: B008 a frozen Struct
+    """Read, check and plan the configuration at ``path``.
+
+    Raises:
+        ConfigurationError: with everything that is wrong with it or its FMUs.
+    """
+    loaded = _with_options(load(path, options.start_values), options)
+    descriptions, findings = _descriptions(loaded)
+    system = build(loaded, descriptions, findings)
+    return make_plan(system, window=options.window, file=str(path))
+
+
+def _with_options(loaded: LoadedConfig, options: Options) -> LoadedConfig:
+    config = loaded.config
+    if options.output is not None:
+        record = msgspec.structs.replace(config.record, file=str(options.output.absolute()))
+        config = msgspec.structs.replace(config, record=record)
+    if options.connect:
+        config = msgspec.structs.replace(
+            config, zenoh=msgspec.structs.replace(config.zenoh, connect=list(options.connect))
+        )
+    if options.window is not None and options.window < 1:
+        raise ConfigurationError(f"--window {options.window}: a window has at least 1 point")
+    return msgspec.structs.replace(loaded, config=config)
+
+
+def _descriptions(loaded: LoadedConfig) -> tuple[dict[str, ModelDescription], Sequence[Finding]]:
+    """The description of every instance whose FMU can be read, and a finding for every other."""
+    cache: dict[Path, ModelDescription | LoadFailed] = {}
+    descriptions: dict[str, ModelDescription] = {}
+    findings = []
+    for name, instance in loaded.config.instances.items():
+        path = loaded.resolve(instance.fmu)
+        if path not in cache:
+            try:
+                cache[path] = read_description(path)
+            except LoadFailed as error:
+                cache[path] = error
+        found = cache[path]
+        if isinstance(found, LoadFailed):
+            text = found.message.rstrip(".") + (f" ({found.hint.rstrip('.')})" if found.hint else "")
+            expected = "an FMI 2.0 co-simulation FMU for this platform"
+            findings.append(loaded.finding(f"instances.{name}.fmu", text, expected, _similar(path)))
+        else:
+            descriptions[name] = found
+    return descriptions, findings
+
+
+def _similar(path: Path) -> str | None:
+    """The nearest existing file name, if there is no such file."""
+    return None if path.exists() else nearest_file(path)

@@ -1,0 +1,67 @@
+"""What every process of a mesh does about signals, its parent and its end (design, invariant 5).
+
+A process that was started by `launch` ends with it: the kernel tells it when its parent dies, and so does the end of
+its standard input. An end that was asked for is carried out by a thread, because the main thread may be inside an FMU.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+__all__ = ["GRACE_S", "die_with_parent", "ended_by_signals"]
+
+GRACE_S = 1.0
+"""How long the main thread has to end by itself before the process is ended for it."""
+
+_PR_SET_PDEATHSIG = 1
+
+
+def die_with_parent() -> None:
+    """Ask the kernel to terminate this process when its parent dies (Linux), and end now if it has died already."""
+    if sys.platform.startswith("linux"):
+        ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+
+
+@contextmanager
+def ended_by_signals(
+    interrupt: Callable[[str], None], clean_up: Callable[[], None], *, watch_stdin: bool
+) -> Iterator[None]:
+    """While inside: SIGTERM, SIGINT, or the end of standard input call ``interrupt`` with the reason.
+
+    If the main thread has not left within `GRACE_S`, ``clean_up`` is called and the process exits with 130. Use it on
+    the main thread, before any other thread is started, so that all of them leave the signals to this one.
+    """
+    left = threading.Event()
+
+    def end(reason: str) -> None:
+        interrupt(reason)
+        if not left.wait(GRACE_S):
+            clean_up()
+            os._exit(130)
+
+    def wait_for_signal() -> None:
+        number = signal.sigwait({signal.SIGTERM, signal.SIGINT})
+        end(f"{signal.Signals(number).name} was received")
+
+    def wait_for_stdin() -> None:
+        while os.read(0, 4096):
+            pass
+        if not left.is_set():
+            end("the process that started this one is gone")
+
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM, signal.SIGINT})
+    threading.Thread(target=wait_for_signal, name="signals", daemon=True).start()
+    if watch_stdin:
+        threading.Thread(target=wait_for_stdin, name="stdin", daemon=True).start()
+    try:
+        yield
+    finally:
+        left.set()
+        if not watch_stdin:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)

@@ -1,0 +1,209 @@
+"""What a process of the mesh does from its start to its end: as a node, or as the master with the recorder.
+
+The same functions serve `launch`, which starts these processes, and a person who starts them by hand.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+
+import msgspec
+
+from ..errors import ConfigurationError, FmuMeshError
+from ..fmu import Fmi2Instance, LogMessage, read_description
+from ..master.master import Master
+from ..model.findings import listed, nearest
+from ..model.instance import Instance
+from ..model.loading import load
+from ..model.plan import RECORDER, NodePlan, Plan
+from ..node.node import Node
+from ..record.recorder import Recorder
+from ..wire.runtime import MeshNote, leave_run_folder, run_folder, write_note
+from ..wire.session import open_session, own_endpoints
+from ..wire.views import LogLine, MeshStatus
+from .events import End, Event, Log, Ready, Status
+from .preparing import Options, prepare
+from .process import die_with_parent, ended_by_signals
+from .wiring import MASTER, wiring
+
+__all__ = ["BY_HAND", "run_master", "run_node"]
+
+log = logging.getLogger(__name__)
+
+BY_HAND = "hand"
+"""Name of the run whose processes were started by hand."""
+
+
+def run_node(
+    config_file: Path, name: str, options: Options, *, plan_file: Path | None = None, run: str = BY_HAND
+) -> None:
+    """Be the node ``name`` (the name of an instance without a group, or of a group).
+
+    Args:
+        plan_file: the node's plan if the launcher has made it already.
+        run: name of the run; the launcher's process id when it started this process.
+
+    Raises:
+        FmuMeshError: the node could not start, or its run ended early.
+    """
+    child = run != BY_HAND
+    if child:
+        die_with_parent()
+    if plan_file is not None:
+        plan = msgspec.json.decode(plan_file.read_bytes(), type=NodePlan)
+    else:
+        plan = _node_plan(prepare(config_file, options), name)
+    zenoh_config = load(config_file).config.zenoh
+    if options.connect:
+        zenoh_config = msgspec.structs.replace(zenoh_config, connect=list(options.connect))
+    folder = run_folder(plan.mesh, run)
+    peers = {link.source_node for link in plan.links_in} | {link.target_node for link in plan.links_out}
+    instances: list[Fmi2Instance] = []
+    node: Node | None = None
+    early: list[str] = []
+
+    def interrupt(reason: str) -> None:
+        if node is not None:
+            node.interrupt(reason)
+        else:
+            early.append(reason)
+
+    def clean_up() -> None:
+        for instance in list(instances):
+            instance.remove_files()
+        leave_run_folder(folder)
+
+    def open_instance(instance_name: str) -> Instance:
+        item = next(item for item in plan.instances if item.name == instance_name)
+        path = Path(item.fmu)
+        started = time.monotonic()
+        instance = Fmi2Instance(path, instance_name, read_description(path), folder / "fmus", publish_log)
+        log.info("instantiated", extra={"instance": instance_name, "seconds": time.monotonic() - started})
+        instances.append(instance)
+        return instance
+
+    def publish_log(message: LogMessage) -> None:
+        if node is not None:
+            points = next(item.step_points for item in plan.instances if item.name == message.instance)
+            line = LogLine(
+                message.instance, message.status, message.category, message.message, max(message.step, 0) * points
+            )
+            node.server.log_message(line)
+
+    with ended_by_signals(interrupt, clean_up, watch_stdin=child), ExitStack() as stack:
+        stack.callback(leave_run_folder, folder)
+        session = open_session(
+            wiring(zenoh_config, config_file, folder, plan.node, [peer for peer in peers if peer != RECORDER])
+        )
+        stack.callback(session.close)
+        try:
+            node = Node(plan, session, open_instance)
+            node.server.on_hang = lambda: _exit_hung(clean_up)
+            for reason in early:
+                node.interrupt(reason)
+            node.run()
+        finally:
+            for instance in instances:
+                instance.close()
+
+
+def run_master(
+    config_file: Path,
+    options: Options,
+    emit: Callable[[Event], None],
+    *,
+    plan: Plan | None = None,
+    run: str = BY_HAND,
+) -> None:
+    """Be the master, with the recorder in the same process; the end of the run is emitted as an event.
+
+    Raises:
+        FmuMeshError: the run ended early; the event before says the same.
+    """
+    child = run != BY_HAND
+    if child:
+        die_with_parent()
+    if plan is None:
+        plan = prepare(config_file, options)
+    config = plan.system.config
+    folder = run_folder(config.mesh, run)
+    master: Master | None = None
+    early: list[str] = []
+
+    def interrupt(reason: str) -> None:
+        if master is not None:
+            master.interrupt(reason)
+        else:
+            early.append(reason)
+
+    with ended_by_signals(interrupt, lambda: leave_run_folder(folder), watch_stdin=child), ExitStack() as stack:
+        stack.callback(leave_run_folder, folder)
+        session = open_session(wiring(config.zenoh, config_file, folder, MASTER, ()))
+        stack.callback(session.close)
+        endpoints = own_endpoints(session) if config.zenoh.mode == "peer" else tuple(config.zenoh.connect)
+        public = tuple(endpoint for endpoint in endpoints if not endpoint.startswith("unixsock-stream/"))
+        note = MeshNote(config.mesh, config.zenoh.key_prefix, public, os.getpid(), str(config_file))
+        if not child:
+            write_note(folder, note)
+            stack.callback((folder / "mesh.json").unlink, missing_ok=True)
+        emit(Ready(public))
+        recorder: Recorder | None = None
+        error: FmuMeshError | None = None
+        master = Master(plan, session, _Emitter(emit), endpoints=public, config_file=str(config_file))
+        for reason in early:
+            master.interrupt(reason)
+        try:
+            if RECORDER in plan.nodes:
+                with Recorder(plan.nodes[RECORDER], session) as recorder:
+                    master.run()
+            else:
+                master.run()
+        except FmuMeshError as ended:
+            error = ended
+        rows = recorder.rows if recorder is not None else 0
+        report = error.report() if error is not None else None
+        emit(End(master.last_status(), master.seconds, rows, plan.system.result_file, report))
+        if error is not None:
+            raise error
+
+
+class _Emitter:
+    """The master's events as lines for the launcher, or for the display of this process."""
+
+    def __init__(self, emit: Callable[[Event], None]) -> None:
+        self._emit = emit
+
+    def status(self, status: MeshStatus) -> None:
+        self._emit(Status(status))
+
+    def log(self, line: LogLine) -> None:
+        self._emit(Log(line))
+
+
+def _node_plan(plan: Plan, name: str) -> NodePlan:
+    """The plan of a node, or of the node that an instance runs in if it is alone there.
+
+    Raises:
+        ConfigurationError: there is no such node.
+    """
+    if name in plan.nodes and name != RECORDER:
+        return plan.nodes[name]
+    names = [node for node in plan.nodes if node != RECORDER]
+    suggestion = nearest(name, names)
+    if name in plan.system.instances:
+        group = plan.node_of(name)
+        raise ConfigurationError(f"instance '{name}' runs in the group '{group}'", hint=f"Start node '{group}'.")
+    hint = f"Did you mean '{suggestion}'?" if suggestion else None
+    raise ConfigurationError(f"there is no node '{name}'; there are: {listed(names)}.", hint=hint)
+
+
+def _exit_hung(clean_up: Callable[[], None]) -> None:
+    clean_up()
+    sys.stderr.flush()
+    os._exit(3)

@@ -1,0 +1,463 @@
+"""The master: readiness, grants, and the end of a run.
+
+::
+
+    wait until every node has registered; answer them all        (ready/ack)
+    wait until every node is at point 0                          (Initialization Mode is over)
+    until every node is at the last point:
+        grant = min(progress + window)                           (less where the wall clock or a pause holds it back)
+        publish the grant if it grew; wait for progress
+    tell the nodes to finish; wait for their reports
+
+The master never sees a value. Its work per grant depends on the number of nodes only.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import operator
+import os
+import socket
+import time
+from collections.abc import Callable, Sequence
+from typing import Protocol
+
+import msgspec
+import zenoh
+
+from .. import __version__
+from ..errors import DeadlineExceeded, ErrorReport, FmuMeshError, Interrupted, MeshLost, from_report
+from ..model.plan import Plan
+from ..wire.inbox import Inbox
+from ..wire.keys import Keys
+from ..wire.messages import (
+    FINISH,
+    GRANT,
+    HEADER,
+    PROGRESS,
+    NodeReport,
+    Registration,
+    encode_abort,
+)
+from ..wire.values import json_encoding
+from ..wire.views import Command, CommandAnswer, LogLine, MeshInfo, MeshState, MeshStatus
+
+__all__ = ["Events", "Master"]
+
+log = logging.getLogger(__name__)
+
+_HEARTBEAT_S = 0.5
+_STATUS_S = 0.1
+_NODE = "@mesh"
+
+
+class Events(Protocol):
+    """What the master tells whoever started it. Called on the master's main thread."""
+
+    def status(self, status: MeshStatus) -> None:
+        """The state of the run, about ten times a second."""
+        ...
+
+    def log(self, line: LogLine) -> None:
+        """A log message of an FMU, or about a setting that was refused."""
+        ...
+
+
+class Master:
+    """The master of one run.
+
+    Args:
+        plan: the plan of the whole mesh.
+        session: the session of this process; stays the caller's.
+        endpoints: where tools can reach this process, for `mesh/info`.
+        config_file: name of the configuration file, for `mesh/info`.
+
+    Call `run` once, from the main thread.
+    """
+
+    def __init__(
+        self, plan: Plan, session: zenoh.Session, events: Events, *, endpoints: Sequence[str], config_file: str
+    ) -> None:
+        config = plan.system.config
+        self._plan = plan
+        self._session = session
+        self._events = events
+        self._endpoints = tuple(endpoints)
+        self._config_file = config_file
+        self._timeouts = config.timeouts
+        self._keys = Keys(config.zenoh.key_prefix, config.mesh)
+        self._nodes = list(plan.nodes)
+        self._windows = [plan.nodes[node].window for node in self._nodes]
+        self._progress = [-1] * len(self._nodes)
+        self._slowest = -1
+        self._registered: dict[str, zenoh.Query] = {}
+        self._present: set[str] = set()
+        self._reports: dict[str, NodeReport] = {}
+        self._failure: FmuMeshError | None = None
+        self._state: MeshState = "starting"
+        self._grant = 0
+        self._hold: int | None = None
+        self._stop_asked = False
+        self._pacer = _Pacer(plan, config.simulation.real_time_factor)
+        self._clock = _Clock()
+        self._published = 0.0
+        self._status_published = 0.0
+        self._moved = time.monotonic()
+        self._inbox = Inbox(
+            session, self._keys.inbox(_NODE), self._keys.wake(_NODE), (plan.window + 64) * len(self._nodes) + 1024
+        )
+        self._grants = [
+            session.declare_publisher(key, congestion_control=zenoh.CongestionControl.BLOCK)
+            for key in self._keys.grants(self._nodes)
+        ]
+        self._entities: list[zenoh.Queryable[None] | zenoh.Subscriber[None] | zenoh.Publisher] = []
+        self._status_publisher = session.declare_publisher(
+            self._keys.mesh_key("status"), encoding=json_encoding, congestion_control=zenoh.CongestionControl.DROP
+        )
+
+    def run(self) -> None:
+        """Run the mesh to its last point.
+
+        Raises:
+            FmuMeshError: what ended the run early; all nodes have been told.
+        """
+        self._declare()
+        token = self._session.liveliness().declare_token(self._keys.master)
+        try:
+            self._wait_for_nodes()
+            self._state = "initializing"
+            self._wait_for(lambda: self._slowest >= 0, self._timeouts.initialize, "Initialization Mode is not over in")
+            self._grant_to_the_end()
+            self._state = "stopping"
+            self._send(FINISH, 0)
+            self._wait_for(
+                lambda: len(self._reports) == len(self._nodes), self._timeouts.stop, "the end was not reported by"
+            )
+            self._state = "done"
+        except FmuMeshError as error:
+            self._state = "failed"
+            self._failure = error
+            self._abort(error)
+            raise
+        finally:
+            self._clock.stop()
+            self._publish_status(final=True)
+            token.undeclare()
+            self._close()
+
+    @property
+    def seconds(self) -> float:
+        """Wall-clock time from the first grant to the last point in s, pauses left out."""
+        return self._clock.elapsed()
+
+    def interrupt(self, reason: str) -> None:
+        """From any thread: end the run with `Interrupted`."""
+        self._inbox.post(lambda: self._fail(Interrupted(reason)))
+
+    # --- phases
+
+    def _wait_for_nodes(self) -> None:
+        deadline = time.monotonic() + self._timeouts.start
+        while len(self._registered) < len(self._nodes):
+            if time.monotonic() > deadline:
+                missing = [node for node in self._nodes if node not in self._registered]
+                there = [node for node in missing if node in self._present]
+                raise DeadlineExceeded(
+                    f"not ready within {self._timeouts.start:g} s: {', '.join(map(_spoken, missing))}",
+                    hint=f"Started, but not ready: {', '.join(there)}." if there else "None of them was started.",
+                )
+            self._turn(0.25)
+        for number, node in enumerate(self._nodes):
+            query = self._registered[node]
+            query.reply(query.key_expr, str(number).encode())
+            query.drop()
+
+    def _grant_to_the_end(self) -> None:
+        last = self._plan.grid.last_point
+        self._state = "running"
+        self._clock.start()
+        self._pacer.start(0)
+        self._moved = time.monotonic()
+        while self._slowest < last and not self._stop_asked:
+            self._turn(self._publish_grant())
+            silent_s = time.monotonic() - self._moved
+            if silent_s > 3 * self._timeouts.step and self._state == "running" and self._slowest < self._grant:
+                raise DeadlineExceeded(
+                    f"no progress for {silent_s:.1f} s",
+                    instance=_spoken(self._nodes[self._progress.index(self._slowest)]),
+                    point=self._slowest,
+                    time=self._plan.grid.time(self._slowest),
+                )
+        self._clock.stop()
+        if self._stop_asked and self._slowest < last:
+            raise Interrupted(f"stopped by a command at point {self._slowest}")
+
+    def _publish_grant(self) -> float:
+        """Publish the grant if it may grow, or as a sign of life; returns how long to wait for the next look, in s."""
+        credit = min(map(operator.add, self._progress, self._windows))
+        grant = min(credit, self._plan.grid.last_point)
+        if self._hold is not None:
+            grant = min(grant, self._hold)
+        paced, pause = self._pacer.limit(grant)
+        grant = min(grant, paced)
+        now = time.monotonic()
+        if grant > self._grant or now - self._published >= _HEARTBEAT_S:
+            self._grant = max(grant, self._grant)
+            self._published = now
+            self._send(GRANT, self._grant)
+        return min(pause, _STATUS_S)
+
+    def _wait_for(self, reached: Callable[[], bool], timeout_s: float, what: str) -> None:
+        deadline = time.monotonic() + timeout_s
+        while not reached():
+            if time.monotonic() > deadline:
+                missing = [
+                    node
+                    for number, node in enumerate(self._nodes)
+                    if (self._progress[number] < 0 if self._state == "initializing" else node not in self._reports)
+                ]
+                raise DeadlineExceeded(f"{what} {', '.join(map(_spoken, missing))} within {timeout_s:g} s")
+            self._turn(0.1)
+
+    def _turn(self, timeout_s: float) -> None:
+        """Take what arrived, at least one message if one comes within ``timeout_s`` seconds.
+
+        Raises:
+            FmuMeshError: a node failed or was lost.
+        """
+        message = self._inbox.wait(timeout_s)
+        while message is not None:
+            kind, number, _, point, _ = message
+            if kind == PROGRESS and number < len(self._progress):
+                self._progress[number] = max(self._progress[number], point)
+            message = self._inbox.poll()
+        slowest = min(self._progress)
+        if slowest > self._slowest:
+            self._slowest = slowest
+            self._moved = time.monotonic()
+        self._publish_status()
+        if self._failure is not None:
+            raise self._failure
+
+    def _send(self, kind: int, point: int) -> None:
+        message = HEADER.pack(kind, 0, 0, point)
+        for publisher in self._grants:
+            publisher.put(message)
+
+    def _abort(self, error: FmuMeshError) -> None:
+        """Tell the nodes why the run ends, and give them the time to end by themselves."""
+        for publisher in self._grants:
+            publisher.put(encode_abort(error.report()))
+
+    def _fail(self, error: FmuMeshError) -> None:
+        if self._failure is None:
+            self._failure = error
+
+    # --- what arrives on foreign threads; all of it is posted to the main thread
+
+    def _declare(self) -> None:
+        post = self._inbox.post
+        session = self._session
+
+        def served(key: str, answer: Callable[[zenoh.Query], None]) -> None:
+            self._entities.append(session.declare_queryable(key, lambda query: post(lambda: answer(query))))
+
+        served(self._keys.register, self._register)
+        served(self._keys.report, self._take_report)
+        served(self._keys.mesh_key("info"), self._reply_with(self._info))
+        served(self._keys.mesh_key("status"), self._reply_with(self.last_status))
+        served(self._keys.mesh_key("plan"), self._reply_with(lambda: self._plan.nodes))
+        served(self._keys.mesh_key("command"), self._command)
+        self._entities.append(
+            session.liveliness().declare_subscriber(
+                self._keys.node_token("*"), lambda sample: post(lambda: self._token_changed(sample)), history=True
+            )
+        )
+        self._entities.append(
+            session.declare_subscriber(f"{self._keys.root}/*/log", lambda sample: post(lambda: self._log(sample)))
+        )
+
+    def _register(self, query: zenoh.Query) -> None:
+        registration = msgspec.json.decode(query.payload.to_bytes() if query.payload else b"", type=Registration)
+        if registration.node not in self._plan.nodes:
+            query.reply_err(f"this mesh has no node '{registration.node}'")
+        elif registration.digest != self._plan.digest:
+            where = f"process {registration.pid} on {registration.host}"
+            query.reply_err(f"node '{registration.node}' ({where}) has another configuration, or other FMUs, than the master")
+        elif registration.node in self._registered:
+            query.reply_err(f"node '{registration.node}' is there already; two processes run it")
+        else:
+            self._registered[registration.node] = query
+            return
+        query.drop()
+
+    def _take_report(self, query: zenoh.Query) -> None:
+        report = msgspec.json.decode(query.payload.to_bytes() if query.payload else b"", type=NodeReport)
+        self._reports[report.node] = report
+        if report.error is not None:
+            self._fail(from_report(report.error))
+        query.reply(query.key_expr, b"")
+        query.drop()
+
+    def _token_changed(self, sample: zenoh.Sample) -> None:
+        node = str(sample.key_expr).rsplit("/", 1)[1]
+        if sample.kind == zenoh.SampleKind.PUT:
+            self._present.add(node)
+        elif node in self._plan.nodes and node not in self._reports and self._state != "stopping":
+            self._fail(self._lost(node))
+
+    def _lost(self, node: str) -> MeshLost:
+        point = max(self._progress[self._nodes.index(node)], 0)
+        return MeshLost(
+            f"{_spoken(node)} was lost: its process is gone or does not answer",
+            instance=", ".join(item.name for item in self._plan.nodes[node].instances) or None,
+            point=point,
+            time=self._plan.grid.time(point),
+        )
+
+    def _log(self, sample: zenoh.Sample) -> None:
+        try:
+            self._events.log(msgspec.json.decode(sample.payload.to_bytes(), type=LogLine))
+        except msgspec.DecodeError as error:
+            log.warning("log_line_not_understood", extra={"key": str(sample.key_expr), "error": str(error)})
+
+    def _command(self, query: zenoh.Query) -> None:
+        """pause, resume, step N and stop; the grant is all that they move."""
+        try:
+            command = msgspec.json.decode(query.payload.to_bytes() if query.payload else b"", type=Command)
+        except msgspec.DecodeError as error:
+            query.reply_err(f"not a command: {error}")
+            query.drop()
+            return
+        if self._state not in ("running", "paused"):
+            query.reply_err(f"the mesh is {self._state}; there is nothing to {command.command}")
+            query.drop()
+            return
+        match command.command:
+            case "pause":
+                self._state, self._hold = "paused", self._grant
+                self._clock.stop()
+            case "resume":
+                self._state, self._hold = "running", None
+                self._clock.start()
+                self._pacer.start(self._slowest)
+            case "step":
+                self._state, self._hold = "paused", max(self._hold or 0, self._grant) + max(1, command.points)
+                self._pacer.start(self._slowest)
+            case "stop":
+                self._stop_asked = True
+        self._moved = time.monotonic()
+        answer = CommandAnswer(command.command, self._state, self._slowest)
+        query.reply(query.key_expr, msgspec.json.encode(answer), encoding=json_encoding)
+        query.drop()
+
+    def _reply_with(self, view: Callable[[], object]) -> Callable[[zenoh.Query], None]:
+        def reply(query: zenoh.Query) -> None:
+            query.reply(query.key_expr, msgspec.json.encode(view()), encoding=json_encoding)
+            query.drop()
+
+        return reply
+
+    # --- views
+
+    def _info(self) -> MeshInfo:
+        config = self._plan.system.config
+        grid = self._plan.grid
+        return MeshInfo(
+            mesh=config.mesh,
+            version=__version__,
+            config=self._config_file,
+            start_time=grid.start_time,
+            stop_time=grid.stop_time,
+            step_size=grid.step_size,
+            algorithm=config.simulation.algorithm,
+            window=self._plan.window,
+            real_time_factor=config.simulation.real_time_factor,
+            instances=tuple(self._plan.system.instances),
+            nodes=tuple(self._nodes),
+            result_file=self._plan.system.result_file,
+            endpoints=self._endpoints,
+            pid=os.getpid(),
+            host=socket.gethostname(),
+        )
+
+    def last_status(self) -> MeshStatus:
+        """The state of the run right now."""
+        point = max(self._slowest, 0)
+        elapsed = self._clock.elapsed()
+        rate = point / elapsed if elapsed > 0 else 0.0
+        failure: ErrorReport | None = self._failure.report() if self._failure is not None else None
+        return MeshStatus(
+            mesh=self._keys.mesh,
+            state=self._state,
+            point=point,
+            last_point=self._plan.grid.last_point,
+            time=self._plan.grid.time(point),
+            points_per_second=rate,
+            real_time_factor=rate * self._plan.grid.step_size,
+            progress={node: max(progress, 0) for node, progress in zip(self._nodes, self._progress, strict=True)},
+            error=failure,
+        )
+
+    def _publish_status(self, *, final: bool = False) -> None:
+        now = time.monotonic()
+        if not final and now - self._status_published < _STATUS_S:
+            return
+        self._status_published = now
+        status = self.last_status()
+        self._events.status(status)
+        if self._status_publisher.matching_status.matching:
+            self._status_publisher.put(msgspec.json.encode(status))
+
+    def _close(self) -> None:
+        for entity in (*self._entities, *self._grants, self._status_publisher):
+            entity.undeclare()
+        self._inbox.close()
+
+
+class _Clock:
+    """Wall-clock time since the first point, pauses left out."""
+
+    def __init__(self) -> None:
+        self._before = 0.0
+        self._since: float | None = None
+
+    def start(self) -> None:
+        if self._since is None:
+            self._since = time.perf_counter()
+
+    def stop(self) -> None:
+        self._before = self.elapsed()
+        self._since = None
+
+    def elapsed(self) -> float:
+        return self._before + (time.perf_counter() - self._since if self._since is not None else 0.0)
+
+
+class _Pacer:
+    """Holds the grant back to the wall clock; a real-time factor of 0 never does."""
+
+    def __init__(self, plan: Plan, real_time_factor: float) -> None:
+        self._rate = real_time_factor / plan.grid.step_size
+        self._origin = 0
+        self._started = 0.0
+
+    def start(self, point: int) -> None:
+        """The wall clock and ``point`` belong together now."""
+        self._origin = point
+        self._started = time.perf_counter()
+
+    def limit(self, wanted: int) -> tuple[int, float]:
+        """The point that may be granted now, and how long until ``wanted`` may be, in s."""
+        if self._rate <= 0:
+            return wanted, math.inf
+        due = self._origin + (time.perf_counter() - self._started) * self._rate
+        allowed = math.floor(due) + 1
+        if allowed >= wanted:
+            return wanted, math.inf
+        return allowed, max(0.0005, (allowed - due) / self._rate)
+
+
+def _spoken(node: str) -> str:
+    return "the recorder" if node == "@record" else f"node '{node}'"

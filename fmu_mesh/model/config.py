@@ -1,0 +1,198 @@
+"""The configuration file, version 1, as frozen Structs (design: "The configuration file").
+
+Owns the shape and the documentation of the file, from which the JSON Schema is made. Reading YAML and telling
+what is wrong with it is `fmu_mesh.model.loading`; what the names in it mean is `fmu_mesh.model.system`.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import msgspec
+from msgspec import Meta
+
+from fmu_mesh.model.description import Value
+
+__all__ = [
+    "Config",
+    "ConnectionConfig",
+    "InstanceConfig",
+    "RecordConfig",
+    "SimulationConfig",
+    "TimeoutsConfig",
+    "ZenohConfig",
+]
+
+NAME_PATTERN = r"^[A-Za-z_][A-Za-z0-9_-]*$"
+KEY_PREFIX_PATTERN = r"^[^/*$?#@\s]+(/[^/*$?#@\s]+)*$"
+ENDPOINT_PATTERN = r"^[a-z0-9_-]+/\S+$"
+
+Name = Annotated[
+    str, Meta(pattern=NAME_PATTERN, title="a name of letters, digits, _ and - that starts with a letter or _")
+]
+Endpoint = Annotated[str, Meta(pattern=ENDPOINT_PATTERN, title="a Zenoh endpoint such as tcp/192.168.1.2:7447")]
+DeadlineSeconds = Annotated[float, Meta(gt=0)]
+
+# What editors should know but `system.build` checks: these errors are shown together with those of the names.
+_POSITIVE = {"exclusiveMinimum": 0}
+_NOT_NEGATIVE = {"minimum": 0}
+
+
+class Base(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Every section is frozen and refuses unknown fields; `kw_only` is repeated: it is not inherited."""
+
+
+class SimulationConfig(Base, frozen=True, kw_only=True):
+    """When the simulation starts and stops, and how instances are synchronized."""
+
+    start_time: Annotated[float, Meta(description="Time of communication point 0 in s.")] = 0.0
+    stop_time: Annotated[
+        float,
+        Meta(description="Time of the last communication point in s: start_time plus a multiple of step_size."),
+    ]
+    step_size: Annotated[
+        float,
+        Meta(
+            description="Base communication step size in s; greater than 0.",
+            extra_json_schema=_POSITIVE,
+            examples=[0.002],
+        ),
+    ]
+    algorithm: Annotated[
+        Literal["jacobi", "gauss_seidel"],
+        Meta(
+            description="jacobi: every connection has a delay of one point. gauss_seidel: none, "
+            "except on the connections that close a cycle."
+        ),
+    ] = "gauss_seidel"
+    window: Annotated[
+        Literal["auto"] | Annotated[int, Meta(ge=1)],
+        Meta(description="How many points a node may run ahead of the slowest; 1 is strict lockstep."),
+    ] = "auto"
+    real_time_factor: Annotated[
+        float,
+        Meta(
+            description="0: as fast as possible; 1: wall clock; 2: twice as fast as the wall clock.",
+            extra_json_schema=_NOT_NEGATIVE,
+        ),
+    ] = 0.0
+
+
+class InstanceConfig(Base, frozen=True, kw_only=True):
+    """One instance of an FMU."""
+
+    fmu: Annotated[str, Meta(description="Path of the .fmu file, relative to this file.")]
+    start_values: Annotated[
+        dict[str, Value],
+        Meta(
+            description="Start values of parameters, inputs and initial values, by variable name. "
+            "An Enumeration takes the item's name or its number."
+        ),
+    ] = {}
+    step_size: Annotated[
+        float | None,
+        Meta(
+            description="Step size of this instance in s: a whole multiple of the base step size (default).",
+            extra_json_schema=_POSITIVE,
+        ),
+    ] = None
+    group: Annotated[Name | None, Meta(description="Instances of one group share one node (one process).")] = None
+    host: Annotated[
+        str | None, Meta(description="Host the node is meant to run on; `launch` starts those without.")
+    ] = None
+
+
+class ConnectionConfig(Base, frozen=True, kw_only=True):
+    """One connection from an output to an input; the short form is `a.y -> b.u`."""
+
+    source: Annotated[str, Meta(description="`instance.variable` of an output.", examples=["pendulum.a"])] = (
+        msgspec.field(name="from")
+    )
+    target: Annotated[str, Meta(description="`instance.variable` of an input.", examples=["delay.x"])] = msgspec.field(
+        name="to"
+    )
+    factor: Annotated[float, Meta(description="The input is factor * output + offset; Real inputs only.")] = 1.0
+    offset: Annotated[float, Meta(description="The input is factor * output + offset; Real inputs only.")] = 0.0
+    delay: Annotated[
+        Literal[0, 1] | None,
+        Meta(description="0: value at the end of the target's step; 1: at its start. Default: see algorithm."),
+    ] = None
+
+
+class RecordConfig(Base, frozen=True, kw_only=True):
+    """Where results go and which variables they hold."""
+
+    file: Annotated[
+        str | None,
+        Meta(description="CSV file, relative to this file; {mesh} is the name of the mesh; null: no recording."),
+    ] = "results/{mesh}.csv"
+    variables: Annotated[
+        list[str] | None,
+        Meta(description="`instance.variable` of outputs; default: all outputs of all instances but Strings."),
+    ] = None
+
+
+class ZenohConfig(Base, frozen=True, kw_only=True):
+    """How the processes of the mesh find each other."""
+
+    key_prefix: Annotated[
+        str,
+        Meta(
+            pattern=KEY_PREFIX_PATTERN,
+            title="a key such as fmu_mesh or lab/fmu_mesh, without / * $ ? # @ in its parts",
+            description="First part of every key of the mesh.",
+        ),
+    ] = "fmu_mesh"
+    mode: Annotated[
+        Literal["peer", "client"],
+        Meta(
+            description="peer: nodes link directly to each other; client: everything goes through the router "
+            "in `connect`."
+        ),
+    ] = "peer"
+    listen: Annotated[
+        list[Endpoint],
+        Meta(description="Endpoints where the master can be reached; default: a free loopback port."),
+    ] = []
+    connect: Annotated[list[Endpoint], Meta(description="Endpoints of a router or of another host's mesh.")] = []
+    config: Annotated[
+        str | None,
+        Meta(description="A Zenoh configuration file (JSON5), relative to this file, to start from."),
+    ] = None
+
+
+class TimeoutsConfig(Base, frozen=True, kw_only=True):
+    """The deadline of every kind of wait, in s; meeting it is an error that says what was missing."""
+
+    start: Annotated[
+        DeadlineSeconds,
+        Meta(description="Until all processes are there and all FMUs are instantiated, in s."),
+    ] = 60.0
+    initialize: Annotated[
+        DeadlineSeconds, Meta(description="From Initialization Mode to the first communication point, in s.")
+    ] = 60.0
+    step: Annotated[
+        DeadlineSeconds, Meta(description="Without any progress of an instance while it may step, in s.")
+    ] = 60.0
+    stop: Annotated[
+        DeadlineSeconds,
+        Meta(description="From the last communication point to the end of all processes, in s."),
+    ] = 10.0
+
+
+class Config(Base, frozen=True, kw_only=True):
+    """A mesh: its instances, connections, and how it runs (version 1)."""
+
+    mesh: Annotated[Name, Meta(description="Name of the mesh; part of every key.")]
+    simulation: SimulationConfig
+    instances: Annotated[
+        dict[Name, InstanceConfig],
+        Meta(min_length=1, description="The instances by name; `mesh` is reserved."),
+    ]
+    connections: Annotated[
+        list[ConnectionConfig], Meta(description="What flows from which output to which input.")
+    ] = []
+    record: RecordConfig = RecordConfig()
+    zenoh: ZenohConfig = ZenohConfig()
+    timeouts: TimeoutsConfig = TimeoutsConfig()
+    version: Annotated[Literal[1], Meta(description="Version of this file format.")] = 1

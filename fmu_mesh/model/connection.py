@@ -1,0 +1,180 @@
+"""Connections of the configuration to connections between variables.
+
+Owns the names of connection ends (the first dot ends the instance name), causality, and which types may be
+connected.
+Delays and cycles are `fmu_mesh.model.plan`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import msgspec
+
+from fmu_mesh.model.config import ConnectionConfig
+from fmu_mesh.model.description import Variable
+from fmu_mesh.model.findings import Findings, listed, nearest
+
+__all__ = ["Connection", "Variables", "resolve_connections", "resolve_variable", "unit_warnings"]
+
+Variables = Mapping[str, Mapping[str, Variable] | None]
+"""The variables of every instance by name; None where the model description could not be read."""
+
+_LOSSLESS = {("Integer", "Real"), ("Boolean", "Integer"), ("Enumeration", "Integer")}
+
+
+class Connection(msgspec.Struct, frozen=True):
+    """One connection: `target = factor * source + offset`.
+
+    Attributes:
+        delay: 0, 1, or None where the algorithm decides.
+        path: its place in the configuration file, such as `connections[2]`.
+    """
+
+    source_instance: str
+    source: Variable
+    target_instance: str
+    target: Variable
+    factor: float
+    offset: float
+    delay: int | None
+    path: str
+
+    def __str__(self) -> str:
+        return f"{self.source_instance}.{self.source.name} -> {self.target_instance}.{self.target.name}"
+
+
+def resolve_connections(
+    configs: Sequence[ConnectionConfig], variables: Variables, findings: Findings
+) -> tuple[Connection, ...]:
+    """All connections whose ends exist and fit; what is wrong with the others goes to ``findings``."""
+    connections: list[Connection] = []
+    sources: dict[str, tuple[str, ConnectionConfig]] = {}
+    for index, config in enumerate(configs):
+        path = f"connections[{index}]"
+        _check_single_source(config, path, sources, findings)
+        source = resolve_variable(config.source, f"{path}.from", variables, "output", findings)
+        target = resolve_variable(config.target, f"{path}.to", variables, "input", findings)
+        if source is None or target is None:
+            continue
+        connection = Connection(
+            source_instance=config.source.partition(".")[0],
+            source=source,
+            target_instance=config.target.partition(".")[0],
+            target=target,
+            factor=config.factor,
+            offset=config.offset,
+            delay=config.delay,
+            path=path,
+        )
+        if _causality_is_right(connection, findings):
+            _check_types(connection, findings)
+            _check_delay(connection, findings)
+            connections.append(connection)
+    return tuple(connections)
+
+
+def resolve_variable(
+    reference: str, path: str, variables: Variables, causality: str, findings: Findings
+) -> Variable | None:
+    """The variable that `instance.variable` names, or None where that cannot be told.
+
+    Args:
+        reference: instance name and FMI variable name; the first dot is between them.
+        path: the place of the reference in the file.
+        variables: all variables of all instances.
+        causality: the causality that names are suggested from.
+        findings: where unknown names go.
+    """
+    instance, dot, name = reference.partition(".")
+    if not instance or not dot or not name:
+        findings.add(path, f"'{reference}'", "instance.variable")
+        return None
+    if instance not in variables:
+        expected = f"one of the instances {listed(list(variables))}"
+        findings.add(path, f"the unknown instance '{instance}'", expected, nearest(instance, variables))
+        return None
+    own = variables[instance]
+    if own is None:
+        return None
+    if name not in own:
+        names = [variable.name for variable in own.values() if variable.causality == causality]
+        expected = f"one of the {causality}s of '{instance}': {listed(names)}"
+        findings.add(path, f"the unknown variable '{name}' of instance '{instance}'", expected, nearest(name, names))
+        return None
+    return own[name]
+
+
+def unit_warnings(connections: Sequence[Connection], findings: Findings) -> None:
+    """Note the connections between different units that neither factor nor offset convert.
+
+    Units are compared as they are written; a model may write one unit in several ways, so this is a warning.
+    """
+    for connection in connections:
+        source, target = connection.source.unit, connection.target.unit
+        if source and target and source != target and _is_identity(connection):
+            found = f"{connection} connects the unit '{source}' to the unit '{target}'"
+            findings.add(connection.path, found, "the same unit, or a factor that converts it")
+
+
+def _check_single_source(
+    config: ConnectionConfig, path: str, sources: dict[str, tuple[str, ConnectionConfig]], findings: Findings
+) -> None:
+    if config.target not in sources:
+        sources[config.target] = (path, config)
+        return
+    first_path, first = sources[config.target]
+    line = findings.line(first_path)
+    place = f"{first_path} in line {line}" if line is not None else first_path
+    if first.source == config.source:
+        found = f"{config.source} -> {config.target} a second time (first: {place})"
+    else:
+        found = (
+            f"a second source for the input '{config.target}': {config.source} -> {config.target}, "
+            f"after {first.source} -> {config.target} ({place})"
+        )
+    findings.add(path, found, "one source for an input")
+
+
+def _causality_is_right(connection: Connection, findings: Findings) -> bool:
+    source, target = connection.source, connection.target
+    source_name = f"{connection.source_instance}.{source.name}"
+    target_name = f"{connection.target_instance}.{target.name}"
+    if source.causality == "input" and target.causality == "output":
+        found = f"the wrong way round: '{source_name}' is an input and '{target_name}' an output"
+        findings.add(connection.path, found, "output -> input", f"{target_name} -> {source_name}")
+        return False
+    if source.causality != "output":
+        findings.add(f"{connection.path}.from", f"'{source_name}' is {_a(source.causality)}", "an output")
+    if target.causality != "input":
+        findings.add(f"{connection.path}.to", f"'{target_name}' is {_a(target.causality)}", "an input")
+    return source.causality == "output" and target.causality == "input"
+
+
+def _check_types(connection: Connection, findings: Findings) -> None:
+    source, target = connection.source.type, connection.target.type
+    if "String" in (source, target):
+        found = f"{connection} connects {_a(source)} to {_a(target)}"
+        findings.add(connection.path, found, "another type: String connections are not supported yet")
+    elif source != target and (source, target) not in _LOSSLESS:
+        accepted = [target, *(one for one, other in sorted(_LOSSLESS) if other == target)]
+        found = f"{connection} connects {_a(source)} to {_a(target)}"
+        findings.add(connection.path, found, f"a source of type {' or '.join(accepted)}")
+    elif target != "Real" and not _is_identity(connection):
+        conversion = f"factor {connection.factor:g} and offset {connection.offset:g}"
+        found = f"{conversion} for the {target} '{connection.target.name}'"
+        findings.add(connection.path, found, "factor and offset on Real inputs only")
+
+
+def _check_delay(connection: Connection, findings: Findings) -> None:
+    if connection.source_instance == connection.target_instance and connection.delay == 0:
+        found = f"delay 0 on {connection}, from an instance to itself"
+        findings.add(f"{connection.path}.delay", found, "delay 1")
+
+
+def _is_identity(connection: Connection) -> bool:
+    return connection.factor == 1.0 and connection.offset == 0.0
+
+
+def _a(word: str) -> str:
+    return f"an {word}" if word[0] in "aeiouAEIOU" else f"a {word}"

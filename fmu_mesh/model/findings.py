@@ -1,0 +1,124 @@
+"""How findings about one configuration file are collected and placed.
+
+Owns the way from a path in the file (`connections[2].to`) to its line, and the search for the nearest right
+name. Knows nothing of what is checked.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+
+from fmu_mesh.errors import ConfigurationError, Finding
+
+__all__ = ["Findings", "listed", "locate", "nearest", "nearest_file", "shown"]
+
+_LISTED_NAMES = 8
+_SHOWN_CHARACTERS = 60
+
+
+class Findings:
+    """Collects what is wrong with one file.
+
+    Args:
+        file: the file as the user named it.
+        lines: line numbers, counted from 1, by path in the file.
+        replaced: the command line options that took the place of what the file says, by path in the file.
+    """
+
+    def __init__(
+        self, file: str, lines: Mapping[str, int] | None = None, replaced: Mapping[str, str] | None = None
+    ) -> None:
+        self._file = file
+        self._lines = lines if lines is not None else {}
+        self._replaced = replaced if replaced is not None else {}
+        self._items: list[Finding] = []
+
+    def add(self, path: str, found: str, expected: str, suggestion: str | None = None) -> None:
+        """Note that ``found`` stands at ``path``, or in an option, where ``expected`` would be right."""
+        option = self._replaced.get(path)
+        line = None if option is not None or path.startswith("--") else locate(self._lines, path)
+        self._items.append(Finding(self._file, option or path, found, expected, suggestion, line))
+
+    def merge(self, findings: Iterable[Finding]) -> None:
+        """Take over findings of others as they are."""
+        self._items.extend(findings)
+
+    def line(self, path: str) -> int | None:
+        """The line of ``path``, or of the nearest place around it."""
+        return locate(self._lines, path)
+
+    def __len__(self) -> int:
+        return len(self._items)
+
+    def __iter__(self) -> Iterator[Finding]:
+        return iter(self._items)
+
+    def raise_any(self) -> None:
+        """End with all findings, in the order of the lines, if there are any.
+
+        Raises:
+            ConfigurationError: there is at least one finding.
+        """
+        if self._items:
+            count = f"{len(self._items)} problems" if len(self._items) > 1 else "1 problem"
+            by_line = sorted(self._items, key=lambda finding: (finding.line is None, finding.line or 0))
+            raise ConfigurationError(f"{self._file}: {count}", findings=tuple(by_line))
+
+
+def locate(lines: Mapping[str, int], path: str) -> int | None:
+    """The line of ``path``, or of the nearest place around it that has one; None if there is none."""
+    while path:
+        if path in lines:
+            return lines[path]
+        path = path[: max(path.rfind("."), path.rfind("["), 0)]
+    return lines.get("")
+
+
+def nearest(name: str, names: Iterable[str]) -> str | None:
+    """The one of ``names`` that ``name`` is most likely a slip of, or None."""
+    folded: dict[str, str] = {}
+    for candidate in names:
+        folded.setdefault(candidate.casefold(), candidate)
+    wanted = name.casefold()
+    close = difflib.get_close_matches(wanted, folded, n=1)
+    if not close and len(wanted) > 1:  # a beginning that fits one name only
+        longer = [candidate for candidate in folded if candidate.startswith(wanted)]
+        close = longer if len(longer) == 1 else []
+    return folded[close[0]] if close else None
+
+
+def nearest_file(path: Path) -> str | None:
+    """The existing file in the folder of ``path`` that has the nearest name, or None."""
+    try:
+        name = nearest(path.name, sorted(entry.name for entry in path.parent.iterdir() if entry.is_file()))
+    except OSError:
+        return None
+    return str(path.with_name(name)) if name is not None else None
+
+
+def listed(names: Sequence[str], *, nothing: str = "none") -> str:
+    """``names`` as text, cut where it gets long."""
+    if not names:
+        return nothing
+    rest = len(names) - _LISTED_NAMES
+    return ", ".join(names[:_LISTED_NAMES]) + (f" and {rest} more" if rest > 0 else "")
+
+
+def shown(value: object) -> str:
+    """A value of the file as a reader would write it, cut where it gets long."""
+    match value:
+        case None:
+            return "nothing (null)"
+        case bool():
+            return "true" if value else "false"
+        case str():
+            text = repr(value)
+        case dict():
+            return "a mapping"
+        case list():
+            return "a list"
+        case _:
+            text = str(value)
+    return text if len(text) <= _SHOWN_CHARACTERS else f"{text[: _SHOWN_CHARACTERS - 3]}..."

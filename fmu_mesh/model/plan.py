@@ -1,0 +1,356 @@
+"""What follows from the graph: delays, order, cycles, initialization levels, and what every node has to do.
+
+Owns the synchronization model (design, section 3) as data. The plan is a pure function of a `System`; every process of
+a mesh computes or receives the same one, and its digest proves it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable
+
+import msgspec
+from msgspec.structs import replace
+
+from ..errors import ConfigurationError, Finding
+from ..simtime import TimeGrid
+from .config import TimeoutsConfig
+from .description import Value
+from .graph import cycle_through, feedback_edges, strongly_connected, topological_order
+from .initialization import InitializationPlan, plan_initialization
+from .ring import Layout, rows_for
+from .system import Connection, System, SystemInstance
+
+__all__ = ["RECORDER", "Feed", "InstancePlan", "Link", "NodePlan", "Plan", "make_plan"]
+
+RECORDER = "@record"
+"""Name of the recorder where node names stand; no instance can have it."""
+
+RECORDER_WINDOW = 4096
+"""How many points the recorder may be behind, at least."""
+
+LAZY_ROWS = 256
+"""Rows for the recorder that may wait in a node until a frame is worth sending."""
+
+AUTO_WINDOW_POINTS = 1024
+AUTO_WINDOW_BYTES = 16 * 2**20
+
+
+class Feed(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """How one source instance feeds one instance, all connections with the same delay together.
+
+    Attributes:
+        columns: (source variable, target variable, factor, offset) of each connection.
+    """
+
+    source: str
+    delay: int
+    columns: tuple[tuple[str, str, float, float], ...]
+
+
+class InstancePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What a node has to do for one of its instances.
+
+    Attributes:
+        step_points: base points per own step.
+        outputs: the columns read after every step: connected or recorded outputs.
+        inputs: the connected inputs, set before every step.
+        initialization: the levels at which connected outputs become known in Initialization Mode, by name.
+        held: connected inputs that keep their start value in Initialization Mode, because their connection closes a
+            loop there.
+    """
+
+    name: str
+    fmu: str
+    start_values: dict[str, Value]
+    step_points: int
+    outputs: Layout
+    inputs: Layout
+    feeds: tuple[Feed, ...]
+    initialization: dict[str, int]
+    held: tuple[str, ...] = ()
+
+
+class Link(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The frames of one instance for one node: every link has its own columns and is flushed on its own.
+
+    Attributes:
+        index: number of the link in the mesh; stands in every frame.
+        levels: initialization level of each column, in the order of `layout.names`; -1 for one that is not needed then.
+    """
+
+    index: int
+    source: str
+    source_node: str
+    target_node: str
+    step_points: int
+    layout: Layout
+    levels: tuple[int, ...]
+
+
+class NodePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Everything that one node must know.
+
+    Attributes:
+        units: the instances in execution order; those of one inner tuple form a cycle within the node and step point by
+            point, the others run as far ahead as their inputs and the grant allow.
+        window: how many points this node may be behind the grant.
+        ring_rows: rows of every ring; a power of two.
+        links_in: links that end here.
+        links_out: links that start here.
+        result_file: absolute path of the result CSV (for the recorder).
+    """
+
+    mesh: str
+    node: str
+    digest: str
+    key_prefix: str
+    grid: TimeGrid
+    window: int
+    ring_rows: int
+    timeouts: TimeoutsConfig
+    instances: tuple[InstancePlan, ...]
+    units: tuple[tuple[str, ...], ...]
+    links_in: tuple[Link, ...]
+    links_out: tuple[Link, ...]
+    result_file: str | None = None
+    recorded: tuple[tuple[str, str], ...] = ()
+
+
+class Plan(msgspec.Struct, frozen=True):
+    """The plan of the whole mesh.
+
+    Attributes:
+        connections: the connections of the system, each with its delay.
+        order: instance names in execution order within one point.
+        cycles: instance names of every cycle.
+        closing: the connections that close a cycle and got a delay of 1 for it.
+        nodes: by node name, recorder included if there is one.
+    """
+
+    system: System
+    connections: tuple[Connection, ...]
+    order: tuple[str, ...]
+    cycles: tuple[tuple[str, ...], ...]
+    closing: tuple[Connection, ...]
+    initialization: InitializationPlan
+    window: int
+    digest: str
+    nodes: dict[str, NodePlan]
+
+    @property
+    def grid(self) -> TimeGrid:
+        """The communication points of the run."""
+        return self.system.grid
+
+    def node_of(self, instance: str) -> str:
+        """The node that an instance runs in."""
+        return self.system.instances[instance].node
+
+
+def make_plan(system: System, *, window: int | None = None, file: str = "") -> Plan:
+    """Plan a validated system.
+
+    Args:
+        system: the system.
+        window: overrides the window of the configuration, in points.
+        file: name of the configuration file, for errors.
+
+    Raises:
+        ConfigurationError: a cycle has no delay; names the cycle.
+    """
+    connections, closing = _with_delays(system)
+    instant = [(c.source_instance, c.target_instance) for c in connections if c.delay == 0]
+    loops = [loop for loop in strongly_connected(system.instances, instant) if _is_cycle(loop, instant)]
+    if loops:
+        findings = tuple(_algebraic_loop(loop, connections, file) for loop in loops)
+        raise ConfigurationError(f"{file}: the system has an algebraic loop", findings=findings)
+    edges = [(c.source_instance, c.target_instance) for c in connections]
+    order = topological_order(system.instances, instant)
+    cycles = tuple(tuple(part) for part in strongly_connected(system.instances, edges) if _is_cycle(part, edges))
+    initialization = plan_initialization(system.instances, connections)
+    points = window if window is not None else _window(system)
+    plan = Plan(
+        system=system,
+        connections=connections,
+        order=tuple(order),
+        cycles=cycles,
+        closing=closing,
+        initialization=initialization,
+        window=points,
+        digest="",
+        nodes={},
+    )
+    nodes = _nodes(plan)
+    digest = hashlib.sha256(msgspec.json.encode(nodes, order="deterministic")).hexdigest()[:16]
+    return replace(plan, digest=digest, nodes={name: replace(node, digest=digest) for name, node in nodes.items()})
+
+
+def _with_delays(system: System) -> tuple[tuple[Connection, ...], tuple[Connection, ...]]:
+    """All connections with a delay of 0 or 1, and those that got 1 because they close a cycle."""
+    if system.config.simulation.algorithm == "jacobi":
+        return tuple(replace(c, delay=1) if c.delay is None else c for c in system.connections), ()
+    free = [c for c in system.connections if c.delay != 1]
+    edges = [(c.source_instance, c.target_instance, c.delay is None) for c in free]
+    closing = {id(free[index]) for index in feedback_edges(system.instances, edges)}
+    connections = []
+    for connection in system.connections:
+        delay = connection.delay
+        if delay is None:
+            delay = 1 if id(connection) in closing else 0
+        connections.append(replace(connection, delay=delay))
+    chosen = tuple(new for old, new in zip(system.connections, connections, strict=True) if id(old) in closing)
+    return tuple(connections), chosen
+
+
+def _is_cycle(part: Iterable[str], edges: list[tuple[str, str]]) -> bool:
+    members = list(part)
+    return len(members) > 1 or (members[0], members[0]) in edges
+
+
+def _algebraic_loop(loop: list[str], connections: tuple[Connection, ...], file: str) -> Finding:
+    edges = [(c.source_instance, c.target_instance) for c in connections if c.delay == 0]
+    walk = cycle_through(loop, edges)
+    first = next(c for c in connections if c.delay == 0 and (c.source_instance, c.target_instance) == (walk[0], walk[1]))
+    return Finding(
+        file=file,
+        path=first.path,
+        found=f"every connection on the cycle {' -> '.join(walk)} has delay 0",
+        expected="at least one connection with delay 1 (set `delay: 1`, or leave the delays to the algorithm)",
+    )
+
+
+def _window(system: System) -> int:
+    """The window of the configuration; `auto` is as large as the memory for the rows allows.
+
+    A large window only costs memory: values do not depend on it, and what a node sends is flushed when a consumer could
+    be waiting for it.
+    """
+    configured = system.config.simulation.window
+    if configured != "auto":
+        return configured
+    widest = max(8 * len(instance.description.variables) for instance in system.instances.values())
+    return max(16, min(AUTO_WINDOW_POINTS, AUTO_WINDOW_BYTES // max(widest, 1)))
+
+
+def _nodes(plan: Plan) -> dict[str, NodePlan]:
+    system = plan.system
+    outputs = {name: _output_layout(plan, name) for name in system.instances}
+    node_names = list(dict.fromkeys(instance.node for instance in system.instances.values()))
+    links = _links(plan)
+    nodes = {}
+    for node in node_names:
+        members = [name for name in plan.order if plan.node_of(name) == node]
+        within = _units(plan, node, members)
+        nodes[node] = _node(
+            plan,
+            node,
+            instances=tuple(_instance_plan(plan, system.instances[name], outputs[name]) for name in members),
+            units=tuple(dict.fromkeys(within[name] for name in members)),
+            links=links,
+        )
+    if system.result_file is not None and system.recorded:
+        nodes[RECORDER] = _node(plan, RECORDER, instances=(), units=(), links=links)
+    return nodes
+
+
+def _units(plan: Plan, node: str, members: list[str]) -> dict[str, tuple[str, ...]]:
+    """The unit of each member of a node: its cycle, if the whole cycle is in this node, otherwise itself alone.
+
+    A cycle that leaves the node must be stepped member by member: one member may wait for what another one caused.
+    """
+    units = {name: (name,) for name in members}
+    for cycle in plan.cycles:
+        if all(plan.node_of(name) == node for name in cycle):
+            unit = tuple(name for name in plan.order if name in cycle)
+            units.update(dict.fromkeys(unit, unit))
+    return units
+
+
+def _node(
+    plan: Plan,
+    node: str,
+    *,
+    instances: tuple[InstancePlan, ...],
+    units: tuple[tuple[str, ...], ...],
+    links: tuple[Link, ...],
+) -> NodePlan:
+    config = plan.system.config
+    # Rows that nobody steps on may wait: they hold the nodes back only when there are many of them.
+    window = max(plan.window, RECORDER_WINDOW) if node == RECORDER else plan.window
+    return NodePlan(
+        mesh=config.mesh,
+        node=node,
+        digest="",
+        key_prefix=config.zenoh.key_prefix,
+        grid=plan.grid,
+        window=window,
+        ring_rows=rows_for(max(window, LAZY_ROWS) + max(instance.step_points for instance in plan.system.instances.values())),
+        timeouts=config.timeouts,
+        instances=instances,
+        units=units,
+        links_in=tuple(link for link in links if link.target_node == node),
+        links_out=tuple(link for link in links if link.source_node == node),
+        result_file=plan.system.result_file if node == RECORDER else None,
+        recorded=plan.system.recorded if node == RECORDER else (),
+    )
+
+
+def _output_layout(plan: Plan, name: str) -> Layout:
+    """Connected and recorded outputs of an instance, in the order of its model description."""
+    wanted = {c.source.name for c in plan.connections if c.source_instance == name}
+    if plan.system.result_file is not None:
+        wanted |= {variable for instance, variable in plan.system.recorded if instance == name}
+    variables = plan.system.instances[name].description.variables
+    return Layout.of([(v.name, v.type) for v in variables if v.name in wanted])
+
+
+def _instance_plan(plan: Plan, instance: SystemInstance, outputs: Layout) -> InstancePlan:
+    incoming = [c for c in plan.connections if c.target_instance == instance.name]
+    feeds: dict[tuple[str, int], list[tuple[str, str, float, float]]] = {}
+    for c in incoming:
+        feeds.setdefault((c.source_instance, c.delay or 0), []).append((c.source.name, c.target.name, c.factor, c.offset))
+    connected = {c.target.name for c in incoming}
+    levels = plan.initialization.levels
+    return InstancePlan(
+        name=instance.name,
+        fmu=instance.fmu,
+        start_values=instance.start_values,
+        step_points=instance.step_points,
+        outputs=outputs,
+        inputs=Layout.of([(v.name, v.type) for v in instance.description.variables if v.name in connected]),
+        feeds=tuple(Feed(source=s, delay=d, columns=tuple(columns)) for (s, d), columns in sorted(feeds.items())),
+        initialization={variable: level for (owner, variable), level in levels.items() if owner == instance.name},
+        held=tuple(variable for owner, variable in plan.initialization.held if owner == instance.name),
+    )
+
+
+def _links(plan: Plan) -> tuple[Link, ...]:
+    """One link per source instance and other node that needs some of its outputs, recorder last."""
+    needed: dict[tuple[str, str], set[str]] = {}
+    for c in plan.connections:
+        target_node = plan.node_of(c.target_instance)
+        if target_node != plan.node_of(c.source_instance):
+            needed.setdefault((c.source_instance, target_node), set()).add(c.source.name)
+    if plan.system.result_file is not None:
+        for instance, variable in plan.system.recorded:
+            needed.setdefault((instance, RECORDER), set()).add(variable)
+    links = []
+    for index, ((source, target_node), names) in enumerate(sorted(needed.items())):
+        instance = plan.system.instances[source]
+        layout = Layout.of([(v.name, v.type) for v in instance.description.variables if v.name in names])
+        levels = plan.initialization.levels
+        links.append(
+            Link(
+                index=index,
+                source=source,
+                source_node=instance.node,
+                target_node=target_node,
+                step_points=instance.step_points,
+                layout=layout,
+                levels=tuple(
+                    -1 if target_node == RECORDER else levels.get((source, name), -1) for name in layout.names
+                ),
+            )
+        )
+    return tuple(links)

@@ -1,0 +1,257 @@
+"""The validated system: every name of the configuration resolved against the model descriptions.
+
+Owns the meaning of a configuration (names, causality, types, step sizes). What follows from the graph
+(delays, order, cycles) is `fmu_mesh.model.plan`. Descriptions are handed in: it knows neither FMPy nor Zenoh.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import msgspec
+
+from fmu_mesh.errors import Finding
+from fmu_mesh.model.config import Config, InstanceConfig
+from fmu_mesh.model.connection import (
+    Connection,
+    Variables,
+    resolve_connections,
+    resolve_variable,
+    unit_warnings,
+)
+from fmu_mesh.model.description import ModelDescription, Value
+from fmu_mesh.model.findings import Findings, nearest_file, shown
+from fmu_mesh.model.loading import LoadedConfig
+from fmu_mesh.model.start_values import resolve_start_values
+from fmu_mesh.simtime import TimeGrid, steps_between
+
+__all__ = ["Connection", "System", "SystemInstance", "build"]
+
+_RESERVED_NAME = "mesh"
+_MAXIMUM_POINTS = 2**53  # above it, the product of a point and the step size is no longer exact
+
+
+class SystemInstance(msgspec.Struct, frozen=True):
+    """One instance of the system.
+
+    Attributes:
+        name: instance name.
+        fmu: absolute path of the FMU.
+        description: its model description.
+        start_values: start values by variable name, converted to the variable's type.
+        step_points: its step size as a multiple of the base step size; 1 or more.
+        node: name of the node (process) it runs in: its group, or its own name.
+    """
+
+    name: str
+    fmu: str
+    description: ModelDescription
+    start_values: dict[str, Value]
+    step_points: int
+    node: str
+
+
+class System(msgspec.Struct, frozen=True):
+    """A configuration whose every name has a meaning.
+
+    Attributes:
+        instances: in the order of the file.
+        recorded: the recorded outputs as (instance, variable), in the order of the result columns.
+        result_file: absolute path of the result CSV, or None if nothing is recorded.
+        warnings: what is odd but can run, such as connections between different units.
+    """
+
+    config: Config
+    grid: TimeGrid
+    instances: dict[str, SystemInstance]
+    connections: tuple[Connection, ...]
+    recorded: tuple[tuple[str, str], ...]
+    result_file: str | None
+    warnings: tuple[Finding, ...] = ()
+
+
+def build(
+    loaded: LoadedConfig, descriptions: Mapping[str, ModelDescription], findings: Sequence[Finding] = ()
+) -> System:
+    """Give every name of a configuration its meaning.
+
+    Args:
+        loaded: the configuration and its places in the file.
+        descriptions: the model descriptions by instance name. Where one is missing, because its FMU could not
+            be read, what needs it is not checked; then ``findings`` has to say why it is missing.
+        findings: earlier findings, which one error shows together with those of this function.
+
+    Raises:
+        ConfigurationError: something is wrong; carries all findings.
+    """
+    config = loaded.config
+    collected = loaded.findings()
+    collected.merge(findings)
+    variables: Variables = {
+        name: {variable.name: variable for variable in descriptions[name].variables} if name in descriptions else None
+        for name in config.instances
+    }
+    grid = _grid(config, collected)
+    instances = _instances(loaded, descriptions, variables, collected)
+    _check_nodes(config, descriptions, collected)
+    connections = resolve_connections(config.connections, variables, collected)
+    recorded = _recorded(config, variables, collected)
+    result_file = _result_file(loaded, collected)
+    _check_zenoh(loaded, collected)
+    if grid is None or len(instances) < len(config.instances):
+        collected.raise_any()
+        missing = [name for name in config.instances if name not in descriptions]
+        raise ValueError(f"no model description and no finding for {missing}")
+    collected.raise_any()
+    warnings = loaded.findings()
+    unit_warnings(connections, warnings)
+    return System(config, grid, instances, connections, recorded, result_file, tuple(warnings))
+
+
+def _grid(config: Config, findings: Findings) -> TimeGrid | None:
+    simulation = config.simulation
+    start, stop, step = simulation.start_time, simulation.stop_time, simulation.step_size
+    if simulation.real_time_factor < 0.0:
+        found = f"{simulation.real_time_factor:g}"
+        findings.add("simulation.real_time_factor", found, "0 (as fast as possible) or a positive factor")
+    if not (math.isfinite(step) and step > 0.0):
+        findings.add("simulation.step_size", f"{step:g}", "a step size > 0 in s")
+        return None
+    if stop < start:
+        findings.add("simulation.stop_time", f"{stop:g}, before start_time {start:g}", f"a time >= {start:g}")
+        return None
+    if not (stop - start) / step <= _MAXIMUM_POINTS:
+        found = f"more than {_MAXIMUM_POINTS} points from {start:g} s to {stop:g} s in steps of {step:g} s"
+        findings.add("simulation.step_size", found, "a larger step size or an earlier stop time")
+        return None
+    last_point = steps_between(stop - start, step)
+    if last_point is None:
+        below = math.floor((stop - start) / step)
+        expected = f"a whole multiple of it, as with stop_time {start + below * step:.12g}"
+        duration = f"{stop - start:.12g} s between start_time and stop_time"
+        found = f"{duration}, no whole multiple of step_size {step:.12g} s"
+        findings.add("simulation.stop_time", found, f"{expected} or {start + (below + 1) * step:.12g}")
+        return None
+    return TimeGrid(start_time=start, step_size=step, last_point=last_point)
+
+
+def _instances(
+    loaded: LoadedConfig,
+    descriptions: Mapping[str, ModelDescription],
+    variables: Variables,
+    findings: Findings,
+) -> dict[str, SystemInstance]:
+    """The instances whose model description is there."""
+    base = loaded.config.simulation.step_size
+    instances: dict[str, SystemInstance] = {}
+    for name, config in loaded.config.instances.items():
+        if name == _RESERVED_NAME:
+            findings.add(f"instances.{name}", f"the name '{name}'", "another name: it is reserved for the mesh itself")
+        step_points = _step_points(name, config, base, findings)
+        own = variables[name]
+        if own is None:
+            continue
+        instances[name] = SystemInstance(
+            name=name,
+            fmu=str(loaded.resolve(config.fmu)),
+            description=descriptions[name],
+            start_values=resolve_start_values(name, config, own, findings),
+            step_points=step_points,
+            node=config.group or name,
+        )
+    return instances
+
+
+def _step_points(name: str, config: InstanceConfig, base: float, findings: Findings) -> int:
+    """The step size of an instance in points; 1 after a finding."""
+    path, step = f"instances.{name}.step_size", config.step_size
+    if step is None:
+        return 1
+    if not (math.isfinite(step) and step > 0.0):
+        findings.add(path, f"{step:g}", "a step size > 0 in s")
+        return 1
+    if not (math.isfinite(base) and base > 0.0) or step / base > _MAXIMUM_POINTS:
+        return 1
+    points = steps_between(step, base)
+    if not points:
+        below = math.floor(step / base)
+        near = [f"{multiple * base:.12g}" for multiple in (below, below + 1) if multiple > 0]
+        expected = f"a whole multiple of the base step size {base:.12g} s, such as {' or '.join(near)}"
+        findings.add(path, f"{step:.12g} s", expected)
+        return 1
+    return points
+
+
+def _check_nodes(config: Config, descriptions: Mapping[str, ModelDescription], findings: Findings) -> None:
+    """Whether the instances of every group can share one node."""
+    first_of: dict[str, str] = {}
+    only_once: dict[tuple[str, str], str] = {}
+    for name, instance in config.instances.items():
+        group = instance.group
+        if group is None:
+            continue
+        path = f"instances.{name}.group"
+        first = first_of.setdefault(group, name)
+        if group == _RESERVED_NAME:
+            findings.add(path, f"the group '{group}'", "another name: it is reserved for the mesh itself")
+        elif group in config.instances and config.instances[group].group != group:
+            found = f"the group '{group}', which is the name of an instance outside the group"
+            findings.add(path, found, "a name of its own")
+        if config.instances[first].host != instance.host:
+            found = f"{shown(instance.host)}, while '{first}' has {shown(config.instances[first].host)}"
+            expected = f"one host for all instances of the group '{group}'"
+            findings.add(f"instances.{name}.host", found, expected)
+        description = descriptions.get(name)
+        if description is not None and description.only_once_per_process:
+            other = only_once.setdefault((group, description.guid), name)
+            if other != name:
+                found = f"'{name}' in one process with '{other}'"
+                findings.add(path, found, "different groups: this FMU allows one instance per process")
+
+
+def _recorded(config: Config, variables: Variables, findings: Findings) -> tuple[tuple[str, str], ...]:
+    """The recorded outputs; by default all that are no String."""
+    if config.record.variables is None:
+        return tuple(
+            (name, variable.name)
+            for name, own in variables.items()
+            for variable in (own or {}).values()
+            if variable.causality == "output" and variable.type != "String"
+        )
+    recorded: dict[tuple[str, str], str] = {}
+    for index, reference in enumerate(config.record.variables):
+        path = f"record.variables[{index}]"
+        instance, _, name = reference.partition(".")
+        if (instance, name) in recorded:
+            found = f"'{reference}' a second time (first: {recorded[instance, name]})"
+            findings.add(path, found, "every variable at most once")
+            continue
+        recorded[instance, name] = path
+        variable = resolve_variable(reference, path, variables, "output", findings)
+        if variable is None:
+            continue
+        if variable.causality != "output":
+            findings.add(path, f"'{reference}', whose causality is {variable.causality}", "an output")
+        elif variable.type == "String":
+            findings.add(path, f"the String '{reference}'", "a Real, Integer, Boolean or Enumeration output")
+    return tuple(recorded)
+
+
+def _result_file(loaded: LoadedConfig, findings: Findings) -> str | None:
+    text = loaded.config.record.file
+    if text is None:
+        return None
+    path = loaded.resolve(text.replace("{mesh}", loaded.config.mesh))
+    if path.is_dir():
+        findings.add("record.file", f"the folder '{text}'", "a file, or null to record nothing")
+    return str(path)
+
+
+def _check_zenoh(loaded: LoadedConfig, findings: Findings) -> None:
+    zenoh = loaded.config.zenoh
+    if zenoh.mode == "client" and not zenoh.connect and zenoh.config is None:
+        findings.add("zenoh.mode", "client without a router", "an endpoint in zenoh.connect")
+    if zenoh.config is not None and not (path := loaded.resolve(zenoh.config)).is_file():
+        found = f"no such file '{zenoh.config}'"
+        findings.add("zenoh.config", found, "an existing Zenoh configuration", nearest_file(path))

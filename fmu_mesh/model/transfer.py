@@ -1,0 +1,144 @@
+"""Moving values from rows of a source to rows of a target: which step needs which, and the arithmetic of a connection.
+
+Owns the mapping of invariant 1: values are matched by instance and point, never by arrival order. Used on frames that
+arrive and on rings of the same process alike.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .plan import Feed
+from .ring import Layout, Ring
+
+__all__ = ["Transfer"]
+
+Index = slice | NDArray[np.intp]
+
+
+class Transfer:
+    """Copies the columns of one feed into the input ring of its target.
+
+    Own step ``j`` of the target, which takes ``target_points`` base points, uses the source's value at base point
+    ``j * target_points`` with a delay of 1, and ``(j + 1) * target_points`` with a delay of 0 (design, section 3). A
+    source that takes ``source_points`` base points per step holds its value between them.
+    """
+
+    def __init__(
+        self, feed: Feed, source_layout: Layout, inputs: Ring, *, source_points: int, target_points: int
+    ) -> None:
+        self.feed = feed
+        self._inputs = inputs
+        self._source_points = source_points
+        self._target_points = target_points
+        self._lead = 0 if feed.delay else target_points
+        self._same_rate = source_points == target_points
+        self._copies = _copies(feed, source_layout, inputs)
+
+    def ready(self, source_steps: int) -> int:
+        """How many own steps of the target are fed once the source's rows ``0 .. source_steps - 1`` are there."""
+        return max(0, -(-(source_steps * self._source_points - self._lead) // self._target_points))
+
+    def source_step(self, step: int) -> int:
+        """The source's own step whose row feeds own step ``step`` of the target."""
+        return (step * self._target_points + self._lead) // self._source_points
+
+    def from_rows(self, first: int, reals: NDArray[np.float64], integers: NDArray[np.int32]) -> None:
+        """Take all that the source's consecutive rows from own step ``first`` on feed (arrays of shape (rows, columns))."""
+        low, high = self.ready(first), self.ready(first + len(reals))
+        if low >= high:
+            return
+        if self._same_rate:
+            skip = self.source_step(low) - first
+            picked: Index = slice(skip, skip + high - low)
+        else:
+            steps = np.arange(low, high)
+            picked = (steps * self._target_points + self._lead) // self._source_points - first
+        self._write(low, high, (reals[picked], integers[picked] if len(integers) else integers))
+
+    def from_ring(self, source: Ring, low: int, high: int) -> None:
+        """Feed own steps ``low .. high - 1`` of the target from the rows of ``source``."""
+        steps = np.arange(low, high)
+        slots = ((steps * self._target_points + self._lead) // self._source_points) & source.mask
+        self._write(low, high, (source.reals[slots], source.integers[slots]))
+
+    def step_from_ring(self, source: Ring, step: int) -> None:
+        """Feed one own step of the target from ``source``; the cheap way for one row."""
+        slot = ((step * self._target_points + self._lead) // self._source_points) & source.mask
+        rows = (source.reals[slot], source.integers[slot])
+        target = step & self._inputs.mask
+        for copy in self._copies:
+            copy.part[target, copy.columns] = copy.convert(rows[copy.source_part][copy.source_columns])
+
+    def _write(self, low: int, high: int, rows: tuple[NDArray[Any], NDArray[Any]]) -> None:
+        """Write rows of own steps ``low .. high - 1``, in two pieces where the ring wraps."""
+        size, mask = self._inputs.rows, self._inputs.mask
+        start = low & mask
+        cut = min(high - low, size - start)
+        for copy in self._copies:
+            values = copy.convert(rows[copy.source_part][:, copy.source_columns])
+            copy.part[start : start + cut, copy.columns] = values[:cut]
+            if cut < high - low:
+                copy.part[: high - low - cut, copy.columns] = values[cut:]
+
+
+class _Copy:
+    """Columns of one part of the source rows for columns of one part of the target ring."""
+
+    def __init__(
+        self, source_part: int, source_columns: Index, part: NDArray[Any], columns: Index, scale: tuple[Any, Any] | None
+    ) -> None:
+        self.source_part = source_part
+        self.source_columns = source_columns
+        self.part = part
+        self.columns = columns
+        self.scale = scale
+
+    def convert(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Apply factor and offset, one rounding each, as any program would."""
+        if self.scale is None:
+            return values
+        factor, offset = self.scale
+        scaled: NDArray[Any] = values * factor + offset
+        return scaled
+
+
+def _copies(feed: Feed, source: Layout, inputs: Ring) -> list[_Copy]:
+    """Group the columns by part of source and target, and by whether they are scaled (an unscaled value stays as it is)."""
+    groups: dict[tuple[int, int, bool], list[tuple[int, int, float, float]]] = {}
+    for source_name, target_name, factor, offset in feed.columns:
+        source_part, source_column = _place(source, source_name)
+        target_part, target_column = _place(inputs.layout, target_name)
+        scaled = (factor, offset) != (1.0, 0.0)
+        groups.setdefault((source_part, target_part, scaled), []).append((source_column, target_column, factor, offset))
+    copies = []
+    for (source_part, target_part, scaled), columns in groups.items():
+        scale = (np.array([c[2] for c in columns]), np.array([c[3] for c in columns])) if scaled else None
+        copies.append(
+            _Copy(
+                source_part,
+                _index([c[0] for c in columns]),
+                inputs.parts()[target_part],
+                _index([c[1] for c in columns]),
+                scale,
+            )
+        )
+    return copies
+
+
+def _place(layout: Layout, name: str) -> tuple[int, int]:
+    """Part (0: Real, 1: others) and column of a variable."""
+    if name in layout.reals:
+        return 0, layout.reals.index(name)
+    return 1, layout.integers.index(name)
+
+
+def _index(columns: Sequence[int]) -> Index:
+    """A slice if the columns are consecutive, which numpy handles faster, otherwise an index array."""
+    if list(columns) == list(range(columns[0], columns[0] + len(columns))):
+        return slice(columns[0], columns[0] + len(columns))
+    return np.array(columns, dtype=np.intp)

@@ -1,0 +1,383 @@
+"""The node: from a plan to the last communication point.
+
+One step of a node, in pseudocode::
+
+    while an instance has steps left:
+        for unit in units:                      # in the order of the plan
+            step as far as k < grant and the inputs allow, one burst (about 1 ms) at most
+            send the frames that are full, or whose burst took its time
+        take what arrived: frames into the input rings, a higher grant
+        if nothing was stepped:
+            send all frames, tell the master the progress, wait for the next message
+
+Owns the life of the process between `ready` and `done`. The FMUs are only called here, on the main thread; queries are
+served by `fmu_mesh.node.serving` from snapshots.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import socket
+import time
+from collections.abc import Callable
+
+import msgspec
+import zenoh
+
+from ..errors import DeadlineExceeded, FmuError, FmuMeshError, Interrupted, MeshLost, from_report
+from ..model.instance import Instance
+from ..model.plan import NodePlan
+from ..model.transfer import Transfer
+from ..wire.frames import FrameReceiver, initial_values, needed_levels
+from ..wire.inbox import Inbox, Message
+from ..wire.keys import Keys
+from ..wire.messages import (
+    ABORT,
+    FINISH,
+    FRAME,
+    GRANT,
+    HEADER,
+    INITIAL,
+    PROGRESS,
+    NodeReport,
+    Registration,
+    decode_abort,
+)
+from ..wire.session import ask
+from .links import OutLink
+from .serving import Server
+from .stepping import LocalFeed, RemoteFeed, Runner, Unit
+
+__all__ = ["Node"]
+
+log = logging.getLogger(__name__)
+
+_LOOK_S = 0.5
+_LAZY_S = 0.02
+
+
+class Node:
+    """One node of a mesh.
+
+    Args:
+        plan: what it has to do.
+        session: the session of this process; stays the caller's.
+        instances: the instances of the plan by name; they stay the caller's, too.
+
+    Call `run` once, from the main thread.
+    """
+
+    def __init__(self, plan: NodePlan, session: zenoh.Session, open_instance: Callable[[str], Instance]) -> None:
+        self._plan = plan
+        self._session = session
+        self._open_instance = open_instance
+        self._keys = Keys(plan.key_prefix, plan.mesh)
+        self._grant = 0
+        self._finished = False
+        self._heard = time.monotonic()
+        self._lazy_flushed = 0.0
+        self._lazy_pending = False
+        self._waited_long = False
+        self._progress_sent = -1
+        self._progress_stride = max(1, plan.window // 4)
+        self._runners: dict[str, Runner] = {}
+        self._units: list[Unit] = []
+        self._remote: dict[int, tuple[FrameReceiver, list[RemoteFeed]]] = {}
+        self._initial: dict[tuple[str, str], float | int] = {}
+        self._initial_seen: set[tuple[int, int]] = set()
+        capacity = sum(plan.window + 8 for _ in plan.links_in) + 4096
+        self._inbox = Inbox(session, self._keys.inbox(plan.node), self._keys.wake(plan.node), capacity)
+        self._progress_number = 0
+        self._progress = session.declare_publisher(self._keys.progress(), congestion_control=_BLOCK)
+        self.server = Server(plan, session, self._keys, self._inbox)
+
+    def run(self) -> None:
+        """Load, initialize and step to the last point, then report to the master.
+
+        Raises:
+            FmuMeshError: what ended the run early; the master knows of it already if it could be reached.
+        """
+        watcher: zenoh.Subscriber[None] | None = None
+        try:
+            with self._session.declare_queryable(self._keys.hello(self._plan.node), _answer):
+                tokens = [self._session.liveliness().declare_token(key) for key in self._token_keys()]
+                watcher = self._session.liveliness().declare_subscriber(self._keys.master, self._master_token_changed)
+                self._load()
+                self._meet()
+                self._initialize()
+                self._step_to_the_end()
+                self._report(None)
+                del tokens
+        except FmuMeshError as error:
+            located = self._located(error)
+            self._report_failure(located)
+            raise located from error
+        finally:
+            if watcher is not None:
+                watcher.undeclare()
+            self.server.close()
+            for runner in self._runners.values():
+                for link in runner.out_links:
+                    link.close()
+            self._inbox.close()
+
+    def interrupt(self, reason: str) -> None:
+        """From any thread: end the run with `Interrupted` at the next point or during the current wait."""
+        self._inbox.post(lambda: _raise(Interrupted(reason)))
+
+    # --- before the first point
+
+    def _token_keys(self) -> list[str]:
+        names = [self._keys.instance(instance.name) for instance in self._plan.instances]
+        return [self._keys.node_token(self._plan.node), *names]
+
+    def _load(self) -> None:
+        """Instantiate the FMUs and wire rings, feeds and links together."""
+        plan = self._plan
+        self.server.state = "loading"
+        for item in plan.instances:
+            instance = self._open_instance(item.name)
+            self._runners[item.name] = Runner(item, instance, plan.grid, plan.ring_rows)
+        for link in plan.links_in:
+            self._remote[link.index] = (FrameReceiver(link, f"node '{plan.node}'", plan.ring_rows), [])
+        receivers = {receiver.link.source: (receiver, feeds) for receiver, feeds in self._remote.values()}
+        for runner in self._runners.values():
+            for feed in runner.plan.feeds:
+                points = runner.plan.step_points
+                if feed.source in self._runners:
+                    source = self._runners[feed.source]
+                    local = Transfer(
+                        feed,
+                        source.outputs.layout,
+                        runner.inputs,
+                        source_points=source.plan.step_points,
+                        target_points=points,
+                    )
+                    runner.local_feeds.append(LocalFeed(source, local))
+                else:
+                    receiver, feeds = receivers[feed.source]
+                    link = receiver.link
+                    transfer = Transfer(
+                        feed, link.layout, runner.inputs, source_points=link.step_points, target_points=points
+                    )
+                    feeds.append(RemoteFeed(receiver, transfer))
+                    runner.remote_feeds.append(feeds[-1])
+        for link in plan.links_out:
+            runner = self._runners[link.source]
+            publisher = self._session.declare_publisher(
+                self._keys.frames(link.source, link.target_node), congestion_control=_BLOCK
+            )
+            runner.out_links.append(OutLink(link, runner.outputs, publisher, plan.window))
+        self._units = [Unit([self._runners[name] for name in names]) for names in plan.units]
+        self.server.serve(self._runners)
+
+    def _meet(self) -> None:
+        """Wait until the links with all other nodes work in both directions, then register with the master.
+
+        A source that answers has our subscription: it was declared before the question was asked, on the same link.
+        """
+        self.server.state = "waiting for the mesh"
+        deadline_s = self._plan.timeouts.start
+        for node in dict.fromkeys(link.source_node for link in self._plan.links_in):
+            ask(self._session, self._keys.hello(node), b"", deadline_s, f"node '{node}'")
+        registration = Registration(self._plan.node, self._plan.digest, os.getpid(), socket.gethostname())
+        payload = msgspec.json.encode(registration)
+        answer = ask(self._session, self._keys.register, payload, deadline_s, "the master, with all other nodes there")
+        self._progress_number = int(answer)
+        self._heard = time.monotonic()
+
+    def _initialize(self) -> None:
+        """Initialization Mode: set and get level by level, exchange over the wire, then make the outputs point 0."""
+        self.server.state = "initializing"
+        grid = self._plan.grid
+        for runner in self._runners.values():
+            runner.instance.enter_initialization(grid.start_time, grid.stop_time, runner.plan.start_values)
+        levels = sorted({level for runner in self._runners.values() for level in runner.plan.initialization.values()})
+        for level in levels:
+            for runner in self._runners.values():
+                if level in runner.plan.initialization.values():
+                    self._set_initial_inputs(runner, below=level)
+                    self._get_initial_outputs(runner, level)
+        for runner in self._runners.values():
+            self._set_initial_inputs(runner, below=None)
+        for runner in self._runners.values():
+            runner.instance.exit_initialization()
+            runner.bind()
+            runner.flush()
+        self.server.started()
+        self._send_progress()
+
+    def _set_initial_inputs(self, runner: Runner, below: int | None) -> None:
+        """Set the inputs whose sources are known below a level (None: all); waits for those of other nodes."""
+        values: dict[str, float | int | bool | str] = {}
+        for feed in runner.plan.feeds:
+            for source, target, factor, offset in feed.columns:
+                level = self._level_of(feed.source, source)
+                if target in runner.plan.held or (below is not None and level >= below):
+                    continue
+                value = self._initial_value(feed.source, source, level)
+                values[target] = value if (factor, offset) == (1.0, 0.0) else value * factor + offset
+        if values:
+            runner.instance.set_values(values)
+
+    def _level_of(self, instance: str, variable: str) -> int:
+        if instance in self._runners:
+            return self._runners[instance].plan.initialization[variable]
+        link = next(receiver.link for receiver, _ in self._remote.values() if receiver.link.source == instance)
+        return link.levels[link.layout.names.index(variable)]
+
+    def _get_initial_outputs(self, runner: Runner, level: int) -> None:
+        names = [name for name, own in runner.plan.initialization.items() if own == level]
+        numbers: dict[str, float | int] = {
+            name: value for name, value in zip(names, runner.instance.get_values(names), strict=True) if not isinstance(value, str)
+        }
+        self._initial.update({(runner.name, name): value for name, value in numbers.items()})
+        for link in runner.out_links:
+            if level in needed_levels(link.link):
+                link.send_initial(level, numbers)
+
+    def _initial_value(self, instance: str, variable: str, level: int) -> float | int:
+        deadline = time.monotonic() + self._plan.timeouts.initialize
+        while (instance, variable) not in self._initial:
+            left = deadline - time.monotonic()
+            if left <= 0:
+                raise DeadlineExceeded(
+                    f"its initial value did not come within {self._plan.timeouts.initialize:g} s",
+                    instance=instance,
+                    variable=variable,
+                )
+            if (message := self._inbox.wait(left)) is not None:
+                self._take(message)
+        return self._initial[(instance, variable)]
+
+    # --- from point to point
+
+    def _step_to_the_end(self) -> None:
+        """The loop of the module's docstring."""
+        self.server.state = "running"
+        poll = self._inbox.poll
+        while not self._finished:
+            stepped = False
+            for unit in self._units:
+                stepped = unit.advance(self._grant) or stepped
+            while (message := poll()) is not None:
+                self._take(message)
+            if stepped:
+                if self._covered() - self._progress_sent >= self._progress_stride:
+                    self._send_progress()
+                self.server.stepped()
+            else:
+                self._flush_before_waiting()
+                self._send_progress()
+                self._wait()
+
+    def _flush_before_waiting(self) -> None:
+        """Send what a consumer could be waiting for; rows that are only recorded at least every 20 ms."""
+        now = time.monotonic()
+        lazy = self._waited_long or now - self._lazy_flushed > _LAZY_S
+        if lazy:
+            self._lazy_flushed = now
+        for runner in self._runners.values():
+            runner.flush(lazy=lazy)
+        self._lazy_pending = not lazy
+
+    def _wait(self) -> None:
+        """Wait for one message; nothing can be stepped before it comes."""
+        started = time.monotonic()
+        self.server.waiting = True
+        message = self._inbox.wait(_LAZY_S if self._lazy_pending else _LOOK_S)
+        self.server.waiting = False
+        self._waited_long = message is None
+        if message is not None:
+            self._take(message)
+        now = time.monotonic()
+        self.server.waited_s += now - started
+        if now - self._heard > self._plan.timeouts.step:
+            text = f"the master has said nothing for {now - self._heard:.1f} s"
+            raise DeadlineExceeded(text, hint="Is its process stopped, or its host gone?")
+
+    def _take(self, message: Message) -> None:
+        """One message into the rings, or a new grant."""
+        kind, number, count, point, data = message
+        if kind == FRAME:
+            receiver, feeds = self._remote[number]
+            new = receiver.take(point, count, data)
+            if new is not None:
+                first, (reals, integers) = new
+                for feed in feeds:
+                    feed.transfer.from_rows(first, reals, integers)
+                    feed.ready = feed.transfer.ready(receiver.received)
+        elif kind == GRANT:
+            self._heard = time.monotonic()
+            self._grant = max(self._grant, min(point, self._plan.grid.last_point))
+        elif kind == INITIAL:
+            link = self._remote[number][0].link
+            for name, value in initial_values(link, point, data).items():
+                self._initial[(link.source, name)] = value
+        elif kind == FINISH:
+            self._finished = True
+        elif kind == ABORT:
+            raise _Aborted(from_report(decode_abort(data)))
+
+    def _covered(self) -> int:
+        return min(runner.covered for runner in self._runners.values())
+
+    def _send_progress(self) -> None:
+        covered = self._covered()
+        if covered != self._progress_sent:
+            self._progress_sent = covered
+            self._progress.put(HEADER.pack(PROGRESS, self._progress_number, 0, covered))
+
+    # --- the end
+
+    def _master_token_changed(self, sample: zenoh.Sample) -> None:
+        if sample.kind == zenoh.SampleKind.DELETE and not self._finished:
+            self._inbox.post(lambda: _raise(MeshLost("the master is gone", hint="See the messages of its process.")))
+
+    def _located(self, error: FmuMeshError) -> FmuMeshError:
+        """The error with the point and time of its instance."""
+        if isinstance(error, _Aborted):
+            return error.cause
+        runner = self._runners.get(error.instance or "")
+        if runner is not None and error.point is None and isinstance(error, FmuError) and self._grant:
+            error.point = runner.point
+            error.time = self._plan.grid.time(runner.point)
+        return error
+
+    def _report_failure(self, error: FmuMeshError) -> None:
+        """Tell the master, unless it is the one that ended the run or cannot be reached."""
+        self.server.state = "failed"
+        for runner in self._runners.values():
+            runner.flush()
+        if isinstance(error, MeshLost | Interrupted) and not isinstance(error, DeadlineExceeded):
+            return
+        try:
+            self._report(error)
+        except FmuMeshError as unreachable:
+            log.warning("failure_not_reported", extra={"error": str(unreachable)})
+
+    def _report(self, error: FmuMeshError | None) -> None:
+        point = min((runner.point for runner in self._runners.values()), default=0)
+        report = NodeReport(self._plan.node, point, error.report() if error is not None else None)
+        ask(self._session, self._keys.report, msgspec.json.encode(report), self._plan.timeouts.stop, "the master")
+
+
+class _Aborted(FmuMeshError):
+    """The master ended the run; carries why."""
+
+    def __init__(self, cause: FmuMeshError) -> None:
+        super().__init__(cause.message)
+        self.cause = cause
+
+
+_BLOCK = zenoh.CongestionControl.BLOCK
+
+
+def _raise(error: FmuMeshError) -> None:
+    raise error
+
+
+def _answer(query: zenoh.Query) -> None:
+    query.reply(query.key_expr, b"")
+    query.drop()

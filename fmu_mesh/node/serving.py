@@ -1,0 +1,424 @@
+"""The node's face to the rest of the world: info, status, current values, settings, streams and log.
+
+Runs on a thread of its own. Values come from the rings (rows that were completed), or are read by the main thread at
+the next point; settings are checked here and made by the main thread. So a query never waits for a step, a step never
+waits for a query, and `status` answers while an FMU hangs.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import queue
+import socket
+import threading
+import time
+from collections.abc import Callable, Mapping
+from functools import partial
+
+import msgspec
+import zenoh
+
+from ..errors import FmuMeshError, InitializationFailed, StepFailed
+from ..model.description import Value, Variable
+from ..model.plan import NodePlan
+from ..wire.inbox import Inbox
+from ..wire.keys import Keys, escape, unescape
+from ..wire.messages import NodeReport
+from ..wire.session import ask
+from ..wire.values import ValueRefused, attachment, decode_value, encode_value, json_encoding
+from ..wire.views import ConnectionView, InstanceInfo, InstanceStatus, LogLine, SetAnswer, VariableView
+from .stepping import Runner
+from .streams import Batch, InstanceStreams, kind_of
+
+__all__ = ["Server"]
+
+log = logging.getLogger(__name__)
+
+_TICK_S = 0.25
+_ANSWER_S = 2.0
+
+Job = Callable[[], None]
+
+
+class Server:
+    """Serves the instances of one node.
+
+    Attributes:
+        state: what the node is doing, for `status`.
+        waited_s: how long the main thread has waited since the first point.
+    """
+
+    def __init__(self, plan: NodePlan, session: zenoh.Session, keys: Keys, inbox: Inbox) -> None:
+        self.state = "starting"
+        self.waiting = False
+        self.waited_s = 0.0
+        self.on_hang: Callable[[], None] = lambda: None
+        self._plan = plan
+        self._session = session
+        self._keys = keys
+        self._inbox = inbox
+        self._runners: Mapping[str, Runner] = {}
+        self._streams: list[InstanceStreams] = []
+        self._waiting_rows = 0
+        self._pending: list[_Pending] = []
+        self._jobs: queue.SimpleQueue[Job | None] = queue.SimpleQueue()
+        self._entities: list[zenoh.Queryable[None] | zenoh.Subscriber[None] | zenoh.Publisher] = []
+        self._status_publishers: dict[str, zenoh.Publisher] = {}
+        self._log_publishers: dict[str, zenoh.Publisher] = {}
+        self._stalled_since: dict[str, tuple[int, float]] = {}
+        self._state_since = ("", time.monotonic())
+        for instance in plan.instances:
+            self._declare_early(instance.name)
+        self._thread = threading.Thread(target=self._run, name="server", daemon=True)
+        self._thread.start()
+
+    # --- called by the main thread
+
+    def serve(self, runners: Mapping[str, Runner]) -> None:
+        """From now on values can be asked for and set, and outputs be subscribed."""
+        self._runners = runners
+        for runner in runners.values():
+            self._streams.append(
+                InstanceStreams(runner, self._session, self._keys, self._plan.grid, self._streams_changed)
+            )
+            for kind in ("in", "param"):
+                key = f"{self._keys.instance(runner.name)}/{kind}/*"
+                take = partial(self._put_arrived, runner)
+                self._entities.append(
+                    self._session.declare_subscriber(key, take, allowed_origin=zenoh.Locality.REMOTE)
+                )
+
+    def stepped(self) -> None:
+        """Hand rows that were just stepped to the streams that have subscribers."""
+        for streams in self._streams:
+            collected = streams.collect(self._waiting_rows)
+            if collected is not None:
+                rows, batch = collected
+                self._waiting_rows += rows
+                self._jobs.put(partial(self._publish_rows, rows, batch))
+
+    def started(self) -> None:
+        """All streams begin at the first point: subscriptions made before it are looked at now."""
+        for streams in self._streams:
+            streams.update()
+        self.stepped()
+
+    def log_message(self, line: LogLine) -> None:
+        """Publish one log message; never waits."""
+        self._jobs.put(partial(self._publish_log, line))
+
+    def close(self) -> None:
+        """Publish what is waiting, for a second at most, and undeclare everything."""
+        self._jobs.put(None)
+        self._thread.join(1.0)
+        for entity in (*self._entities, *self._status_publishers.values(), *self._log_publishers.values()):
+            entity.undeclare()
+        for streams in self._streams:
+            streams.close()
+
+    # --- the thread
+
+    def _run(self) -> None:
+        published = 0.0
+        while True:
+            try:
+                job = self._jobs.get(timeout=_TICK_S)
+            except queue.Empty:
+                pass
+            else:
+                if job is None:
+                    return
+                try:
+                    job()
+                except zenoh.ZError as error:  # the peer that asked is gone
+                    log.info("answer_not_sent", extra={"error": str(error)})
+            now = time.monotonic()
+            if now - published >= _TICK_S:
+                published = now
+                self._tick(now)
+
+    def _tick(self, now: float) -> None:
+        for pending in [p for p in self._pending if now - p.asked > _ANSWER_S]:
+            self._pending.remove(pending)
+            pending.refuse(f"not at a point yet: {self._status(pending.instance).activity}")
+        for name, publisher in self._status_publishers.items():
+            if publisher.matching_status.matching:
+                publisher.put(msgspec.json.encode(self._status(name)))
+        self._look_for_hang(now)
+
+    def _look_for_hang(self, now: float) -> None:
+        """An FMU call that meets its deadline ends the process: nothing else can get the main thread back."""
+        if self.state != self._state_since[0]:
+            self._state_since = (self.state, now)
+        limits = self._plan.timeouts
+        limit = {"loading": limits.start, "initializing": 2 * limits.initialize, "running": limits.step}.get(self.state)
+        if limit is None or self.waiting:
+            return
+        for name in self._runners or [instance.name for instance in self._plan.instances]:
+            stalled_s = now - (self._stalled(name, now) if self.state == "running" else self._state_since[1])
+            if stalled_s > limit:
+                self._report_hang(name, stalled_s)
+                return
+
+    def _report_hang(self, name: str, stalled_s: float) -> None:
+        kind = StepFailed if self.state == "running" else InitializationFailed
+        runner = self._runners.get(name)
+        point = runner.point if runner is not None else None
+        error = kind(
+            f"the FMU has not returned for {stalled_s:.1f} s while {self.state}; its process is ended",
+            instance=name,
+            point=point,
+            time=self._plan.grid.time(point) if point is not None else None,
+            hint="If it needs that long, raise `timeouts` in the configuration.",
+        )
+        report = NodeReport(self._plan.node, point or 0, error.report())
+        try:
+            ask(self._session, self._keys.report, msgspec.json.encode(report), 2.0, "the master")
+        except FmuMeshError as unreachable:
+            log.warning("hang_not_reported", extra={"error": str(unreachable)})
+        self.on_hang()
+
+    # --- queries
+
+    def _declare_early(self, name: str) -> None:
+        """What can be asked from the start, even before the FMU is loaded."""
+        root = self._keys.instance(name)
+        self._entities.append(self._session.declare_queryable(f"{root}/**", partial(self._query_arrived, name)))
+        for what, publishers in (("status", self._status_publishers), ("log", self._log_publishers)):
+            publishers[name] = self._session.declare_publisher(
+                f"{root}/{what}", encoding=json_encoding, congestion_control=zenoh.CongestionControl.DROP
+            )
+
+    def _query_arrived(self, name: str, query: zenoh.Query) -> None:
+        self._jobs.put(partial(self._answer, name, query))
+
+    def _answer(self, name: str, query: zenoh.Query) -> None:
+        """Answer everything under the instance's key that the query's key expression matches."""
+        root = self._keys.instance(name)
+        asked = query.key_expr
+        runner = self._runners.get(name)
+        if query.payload is not None:
+            self._answer_setting(name, query)
+            return
+        for what in ("info", "status"):
+            if asked.intersects(zenoh.KeyExpr(f"{root}/{what}")):
+                if what == "status":
+                    query.reply(f"{root}/status", msgspec.json.encode(self._status(name)), encoding=json_encoding)
+                elif runner is not None:
+                    query.reply(f"{root}/info", msgspec.json.encode(self._info(runner)), encoding=json_encoding)
+        wanted = self._variables_matching(runner, asked) if runner is not None else []
+        if runner is None or not wanted:
+            query.drop()
+            return
+        if self.state != "running":
+            query.reply_err(f"'{name}' has no values now: {self.state}")
+            query.drop()
+            return
+        known, unknown = self._split(runner, wanted)
+        self._reply_values(runner, query, known, runner.step)
+        if unknown:
+            self._read_at_next_point(runner, query, unknown)
+        else:
+            query.drop()
+
+    def _variables_matching(self, runner: Runner, asked: zenoh.KeyExpr) -> list[tuple[str, Variable]]:
+        """(key, variable) of all variables that a key expression matches."""
+        matching = []
+        for variable in runner.instance.description.variables:
+            kind = kind_of(variable)
+            if kind is not None:
+                key = self._keys.variable(runner.name, kind, variable.name)
+                if asked.intersects(zenoh.KeyExpr(key)):
+                    matching.append((key, variable))
+        return matching
+
+    def _split(
+        self, runner: Runner, wanted: list[tuple[str, Variable]]
+    ) -> tuple[list[tuple[str, Value]], list[tuple[str, Variable]]]:
+        """Values that the rings hold, and variables that only the FMU knows."""
+        names = {*runner.outputs.layout.names}
+        known = [(key, runner.outputs.value(runner.step, v.name)) for key, v in wanted if v.name in names]
+        return known, [(key, v) for key, v in wanted if v.name not in names]
+
+    def _reply_values(self, runner: Runner, query: zenoh.Query, values: list[tuple[str, Value]], step: int) -> None:
+        point = step * runner.plan.step_points
+        stamp = attachment(point, self._plan.grid.time(point))
+        for key, value in values:
+            query.reply(key, encode_value(value), encoding=json_encoding, attachment=stamp)
+
+    def _read_at_next_point(self, runner: Runner, query: zenoh.Query, wanted: list[tuple[str, Variable]]) -> None:
+        pending = _Pending(runner.name, query)
+        self._pending.append(pending)
+
+        def read() -> None:
+            values = runner.instance.get_values([variable.name for _, variable in wanted])
+            pairs = [(key, value) for (key, _), value in zip(wanted, values, strict=True)]
+            step = runner.step
+            self._jobs.put(lambda: self._finish(pending, lambda: self._reply_values(runner, query, pairs, step)))
+
+        self._inbox.post(read)
+
+    def _finish(self, pending: _Pending, reply: Job) -> None:
+        """Answer a query that waited for a point, unless it was refused in the meantime."""
+        if pending in self._pending:
+            self._pending.remove(pending)
+            reply()
+            pending.query.drop()
+
+    # --- settings
+
+    def _put_arrived(self, runner: Runner, sample: zenoh.Sample) -> None:
+        self._jobs.put(partial(self._take_put, runner, str(sample.key_expr), sample.payload.to_bytes()))
+
+    def _take_put(self, runner: Runner, key: str, data: bytes) -> None:
+        try:
+            variable, value = self._checked_setting(runner, key, data)
+        except ValueRefused as refused:
+            self._publish_log(LogLine(runner.name, "warning", "set", str(refused), runner.point))
+            return
+        self._inbox.post(lambda: runner.instance.set_values({variable.name: value}))
+
+    def _answer_setting(self, name: str, query: zenoh.Query) -> None:
+        """A query with a payload sets a value and is told from which point on it holds, or why it was refused."""
+        runner = self._runners.get(name)
+        key = str(query.key_expr)
+        try:
+            if runner is None:
+                raise ValueRefused(f"'{name}' is still being loaded")
+            variable, value = self._checked_setting(runner, key, query.payload.to_bytes() if query.payload else b"")
+        except ValueRefused as refused:
+            query.reply_err(str(refused))
+            query.drop()
+            return
+        pending = _Pending(name, query)
+        self._pending.append(pending)
+
+        def take() -> None:
+            runner.instance.set_values({variable.name: value})
+            point = runner.point
+            answer = SetAnswer(key, point, self._plan.grid.time(point))
+            self._jobs.put(
+                lambda: self._finish(
+                    pending, lambda: query.reply(key, msgspec.json.encode(answer), encoding=json_encoding)
+                )
+            )
+
+        self._inbox.post(take)
+
+    def _checked_setting(self, runner: Runner, key: str, data: bytes) -> tuple[Variable, Value]:
+        """The variable and value of a setting.
+
+        Raises:
+            ValueRefused: with the reason.
+        """
+        parts = key.removeprefix(self._keys.instance(runner.name) + "/").split("/")
+        if len(parts) != 2 or "*" in key:
+            raise ValueRefused(f"'{key}' is not the key of one variable")
+        kind, name = parts[0], unescape(parts[1])
+        variable = runner.instance.description.variable(name)
+        if variable is None or kind_of(variable) != kind:
+            raise ValueRefused(f"'{runner.name}' has no variable '{name}' under '{kind}'")
+        if kind == "in" and name in runner.plan.inputs.names:
+            feed = next(feed for feed in runner.plan.feeds if name in {column[1] for column in feed.columns})
+            raise ValueRefused(f"'{runner.name}.{name}' is connected to '{feed.source}'; only unconnected inputs can be set")
+        if kind == "param" and variable.variability != "tunable":
+            raise ValueRefused(f"'{runner.name}.{name}' is a {variable.variability} parameter; only tunable ones can be set")
+        if kind not in ("in", "param"):
+            raise ValueRefused(f"'{runner.name}.{name}' is no input and no parameter, so it cannot be set")
+        try:
+            return variable, decode_value(data, variable)
+        except ValueRefused as refused:
+            raise ValueRefused(f"'{runner.name}.{name}': {refused}") from refused
+
+    # --- views
+
+    def _info(self, runner: Runner) -> InstanceInfo:
+        description = runner.instance.description
+        return InstanceInfo(
+            instance=runner.name,
+            model_name=description.model_name,
+            description=description.description,
+            fmi_version=description.fmi_version,
+            kind=description.kind,
+            fmu=runner.plan.fmu,
+            generation_tool=description.generation_tool,
+            capabilities={
+                "can_handle_variable_step_size": description.can_handle_variable_step_size,
+                "can_get_and_set_state": description.can_get_and_set_state,
+                "can_serialize_state": description.can_serialize_state,
+            },
+            default_experiment=description.default_experiment,
+            step_size=self._plan.grid.step_size * runner.plan.step_points,
+            variables=tuple(
+                VariableView(
+                    v.name, f"{kind}/{escape(v.name)}", v.type, v.causality, v.variability, v.unit, v.start, v.description
+                )
+                for v in description.variables
+                if (kind := kind_of(v)) is not None
+            ),
+            connections=tuple(
+                ConnectionView(f"{feed.source}.{source}", f"{runner.name}.{target}", feed.delay, factor, offset)
+                for feed in runner.plan.feeds
+                for source, target, factor, offset in feed.columns
+            ),
+            node=self._plan.node,
+            pid=os.getpid(),
+            host=socket.gethostname(),
+            problems=description.problems,
+        )
+
+    def _status(self, name: str) -> InstanceStatus:
+        runner = self._runners.get(name)
+        if runner is None:
+            return InstanceStatus(name, self.state, self.state, 0, self._plan.grid.time(0), 0.0, 0.0)
+        return InstanceStatus(
+            instance=name,
+            state=self.state,
+            activity=self._activity(runner),
+            point=runner.point,
+            time=self._plan.grid.time(runner.point),
+            step_time=runner.step_seconds / runner.step if runner.step else 0.0,
+            wait_time=self.waited_s,
+        )
+
+    def _activity(self, runner: Runner) -> str:
+        if self.state != "running":
+            return self.state
+        if self.waiting:
+            return f"waiting at point {runner.point} for {runner.lacking()}"
+        now = time.monotonic()
+        return f"in doStep at point {runner.point} for {now - self._stalled(runner.name, now):.1f} s"
+
+    def _stalled(self, name: str, now: float) -> float:
+        """Since when an instance has been at its point, as far as was seen; costs the hot loop nothing."""
+        step = self._runners[name].step
+        if self.waiting or self._stalled_since.get(name, (-1, 0.0))[0] != step:
+            self._stalled_since[name] = (step, now)
+        return self._stalled_since[name][1]
+
+    # --- publishing
+
+    def _streams_changed(self, streams: InstanceStreams) -> None:
+        self._inbox.post(streams.update)
+
+    def _publish_rows(self, rows: int, batch: Batch) -> None:
+        streams, first, values = batch
+        self._waiting_rows -= rows
+        streams.publish(first, values)
+
+    def _publish_log(self, line: LogLine) -> None:
+        self._log_publishers[line.instance].put(msgspec.json.encode(line))
+
+
+class _Pending:
+    """A query that waits for its instance to come to a point."""
+
+    def __init__(self, instance: str, query: zenoh.Query) -> None:
+        self.instance = instance
+        self.query = query
+        self.asked = time.monotonic()
+
+    def refuse(self, reason: str) -> None:
+        self.query.reply_err(reason)
+        self.query.drop()

@@ -1,0 +1,195 @@
+"""Stepping: the hot loop of a node.
+
+A `Runner` is one instance with its rings and feeds. A `Unit` is what is stepped together: one runner, which goes as far
+ahead as its inputs and the grant allow, or a cycle of runners, which go point by point. Nothing here waits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from time import perf_counter
+
+from ..model.instance import Instance
+from ..model.plan import InstancePlan
+from ..model.ring import Layout, Ring
+from ..model.transfer import Transfer
+from ..simtime import TimeGrid
+from ..wire.frames import FrameReceiver
+from .links import OutLink
+
+__all__ = ["LocalFeed", "RemoteFeed", "Runner", "Unit"]
+
+_BURST_S = 0.001
+"""A burst of steps ends after about this time, so that its rows are sent and messages are looked at."""
+
+
+class RemoteFeed:
+    """A feed from another node; `FrameReceiver` and `Transfer` of the frames that bring it."""
+
+    def __init__(self, receiver: FrameReceiver, transfer: Transfer) -> None:
+        self.receiver = receiver
+        self.transfer = transfer
+        self.ready = 0
+
+
+class LocalFeed:
+    """A feed from a runner of the same node."""
+
+    def __init__(self, source: Runner, transfer: Transfer) -> None:
+        self.source = source
+        self.transfer = transfer
+
+
+class Runner:
+    """One instance with its rings.
+
+    Attributes:
+        step: own steps done; the row of this step in `outputs` is the newest.
+    """
+
+    def __init__(self, plan: InstancePlan, instance: Instance, grid: TimeGrid, ring_rows: int) -> None:
+        self.plan = plan
+        self.name = plan.name
+        self.instance = instance
+        self.inputs = Ring(plan.inputs, ring_rows)
+        self.outputs = Ring(plan.outputs, ring_rows)
+        self.watched: Ring | None = None
+        self.step = 0
+        self.last_step = grid.last_point // plan.step_points
+        self.out_links: list[OutLink] = []
+        self.remote_feeds: list[RemoteFeed] = []
+        self.local_feeds: list[LocalFeed] = []
+        self.step_seconds = 0.0
+        self._grid = grid
+
+    def bind(self) -> None:
+        """Let the instance work on the rings, and read the current outputs. Call after Initialization Mode."""
+        step_size = self._grid.step_size * self.plan.step_points
+        outputs = (self.outputs,) if self.watched is None else (self.outputs, self.watched)
+        self.instance.bind(self.inputs, outputs, self._grid.start_time, step_size, self.step)
+
+    def watch(self, names: Sequence[str]) -> None:
+        """From now on also read these outputs after every step; they are not among the plan's columns."""
+        types = {variable.name: variable.type for variable in self.instance.description.variables}
+        self.watched = Ring(Layout.of([(name, types[name]) for name in names]), self.outputs.rows) if names else None
+        self.bind()
+
+    @property
+    def point(self) -> int:
+        """The communication point this instance is at."""
+        return self.step * self.plan.step_points
+
+    @property
+    def covered(self) -> int:
+        """The last point for which nobody has to wait for this instance: its outputs hold until its next own point."""
+        if self.step >= self.last_step:
+            return self._grid.last_point
+        return min((self.step + 1) * self.plan.step_points - 1, self._grid.last_point)
+
+    def limit(self, grant: int) -> int:
+        """The own step up to which this instance may step now: k < grant and every input is there."""
+        return min(-(-grant // self.plan.step_points), self.last_step, *self.ready_steps())
+
+    def ready_steps(self, without: frozenset[str] = frozenset()) -> Iterator[int]:
+        """Own steps for which each feed has its values; feeds from the instances in ``without`` are left out."""
+        for remote in self.remote_feeds:
+            yield remote.ready
+        for local in self.local_feeds:
+            if local.source.name not in without:
+                yield local.transfer.ready(local.source.step + 1)
+
+    def lacking(self) -> str:
+        """In words what the next step waits for: the first feed that is not there, or the grant."""
+        for feed in (*self.remote_feeds, *self.local_feeds):
+            source_steps = feed.receiver.received if isinstance(feed, RemoteFeed) else feed.source.step + 1
+            if feed.transfer.ready(source_steps) <= self.step:
+                plan = feed.transfer.feed
+                source, target = plan.columns[0][:2]
+                return f"'{plan.source}.{source}', which feeds '{self.name}.{target}'"
+        return "the master's grant"
+
+    def flush(self, *, lazy: bool = True) -> None:
+        """Send all rows that were not sent yet; those of lazy links only if ``lazy``."""
+        end = self.step + 1
+        for link in self.out_links:
+            if lazy or not link.lazy:
+                link.flush(end)
+
+    def flush_full(self) -> None:
+        """Send the rows of those links whose frame is full."""
+        end = self.step + 1
+        for link in self.out_links:
+            if end - link.sent >= link.capacity:
+                link.flush(end)
+
+
+class Unit:
+    """Runners that are stepped together, in the order of the plan."""
+
+    def __init__(self, runners: Sequence[Runner]) -> None:
+        self.runners = runners
+        self._single = runners[0] if len(runners) == 1 else None
+        self._inner = frozenset(runner.name for runner in runners)
+        self._point = 0
+        self._burst = 1
+
+    def advance(self, grant: int) -> bool:
+        """Step as far as inputs and ``grant`` allow, for one burst at most; whether anything was stepped."""
+        started = perf_counter()
+        steps = self._advance_single(self._single, grant) if self._single is not None else self._advance_cycle(grant)
+        if not steps:
+            return False
+        elapsed = perf_counter() - started
+        if steps == self._burst and elapsed < _BURST_S:
+            self._burst = min(2 * self._burst, 4096)
+        elif elapsed > 2 * _BURST_S:
+            self._burst = max(1, self._burst // 2)
+        for runner in self.runners:
+            runner.step_seconds += elapsed
+            if elapsed >= _BURST_S:
+                runner.flush()
+            else:
+                runner.flush_full()
+        return True
+
+    def _advance_single(self, runner: Runner, grant: int) -> int:
+        first = runner.step
+        end = min(runner.limit(grant), first + self._burst)
+        if end <= first:
+            return 0
+        for link in runner.out_links:
+            end = min(end, max(first + 1, link.sent + link.capacity - 1))
+        for feed in runner.local_feeds:
+            feed.transfer.from_ring(feed.source.outputs, first, end)
+        do_step = runner.instance.do_step
+        for step in range(first, end):
+            do_step(step)
+            runner.step = step + 1
+        return end - first
+
+    def _advance_cycle(self, grant: int) -> int:
+        first = self._point
+        end = min(self._cycle_limit(grant), first + self._burst)
+        for point in range(first, end):
+            for runner in self.runners:
+                # A slower instance steps when the end of its step is reached: only then all its inputs can be there.
+                step, rest = divmod(point + 1 - runner.plan.step_points, runner.plan.step_points)
+                if rest:
+                    continue
+                for feed in runner.local_feeds:
+                    feed.transfer.step_from_ring(feed.source.outputs, step)
+                runner.instance.do_step(step)
+                runner.step = step + 1
+        self._point = max(first, end)
+        return max(0, end - first)
+
+    def _cycle_limit(self, grant: int) -> int:
+        """The point up to which the whole cycle may step: bounded by the grant and by what comes from outside."""
+        limit = grant
+        for runner in self.runners:
+            for ready in runner.ready_steps(without=self._inner):
+                if ready < runner.last_step:
+                    limit = min(limit, ready * runner.plan.step_points)
+            for link in runner.out_links:
+                limit = min(limit, max(runner.step + 1, link.sent + link.capacity - 1) * link.link.step_points)
+        return limit

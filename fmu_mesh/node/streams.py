@@ -1,0 +1,128 @@
+"""Streams: every value of a variable as a Zenoh sample, while somebody subscribes, and no work while nobody does.
+
+The main thread only copies the subscribed columns of the rows it has just stepped; encoding and publishing happen on
+the server's thread. A subscriber that stops loses samples (their points tell which), and slows nobody down.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import zenoh
+
+from ..model.description import Value, Variable
+from ..simtime import TimeGrid
+from ..wire.keys import Keys, VariableKind
+from ..wire.values import attachment, encode_value, json_encoding
+from .stepping import Runner
+
+__all__ = ["Batch", "InstanceStreams", "kind_of"]
+
+MAX_WAITING_ROWS = 1 << 16
+
+Batch = tuple["InstanceStreams", int, dict[str, list[Value]]]
+"""Streams, first own step, and the values by variable name."""
+
+
+def kind_of(variable: Variable) -> VariableKind | None:
+    """The part of the key space a variable lives in; None for the independent variable."""
+    match variable.causality:
+        case "output":
+            return "out"
+        case "input":
+            return "in"
+        case "parameter" | "calculatedParameter":
+            return "param"
+        case "local":
+            return "local"
+        case _:
+            return None
+
+
+class InstanceStreams:
+    """The streams of one instance.
+
+    Args:
+        changed: called on a foreign thread when a variable gets its first or loses its last subscriber.
+    """
+
+    def __init__(
+        self, runner: Runner, session: zenoh.Session, keys: Keys, grid: TimeGrid, changed: Callable[[InstanceStreams], None]
+    ) -> None:
+        self.runner = runner
+        self.dropped = 0
+        self._grid = grid
+        self._next = 0
+        self._active: tuple[str, ...] = ()
+        self._publishers: dict[str, zenoh.Publisher] = {}
+        self._listeners: list[zenoh.MatchingListener[Any]] = []
+        for variable in runner.instance.description.variables:
+            kind = kind_of(variable)
+            if kind is None:
+                continue
+            publisher = session.declare_publisher(
+                keys.variable(runner.name, kind, variable.name),
+                encoding=json_encoding,
+                congestion_control=zenoh.CongestionControl.DROP,
+                # Frames and grants must not queue behind what is only looked at.
+                priority=zenoh.Priority.DATA_LOW,
+                allowed_destination=zenoh.Locality.REMOTE,
+            )
+            self._publishers[variable.name] = publisher
+            self._listeners.append(publisher.declare_matching_listener(lambda _status: changed(self)))
+
+    def update(self) -> None:
+        """On the main thread, between steps: see which variables have subscribers, and read those from now on."""
+        active = tuple(name for name, publisher in self._publishers.items() if publisher.matching_status.matching)
+        if active == self._active:
+            return
+        have = {*self.runner.outputs.layout.names}
+        watched = tuple(name for name in active if name not in have)
+        if watched != (self.runner.watched.layout.names if self.runner.watched is not None else ()):
+            self.runner.watch(watched)
+        if not self._active:
+            self._next = self.runner.step
+        self._active = active
+
+    def collect(self, waiting_rows: int) -> tuple[int, Batch] | None:
+        """On the main thread: the rows since the last call, copied; None if there is nothing to publish."""
+        if not self._active:
+            return None
+        first, end = self._next, self.runner.step + 1
+        if first >= end:
+            return None
+        self._next = end
+        if waiting_rows > MAX_WAITING_ROWS:
+            self.dropped += end - first
+            return None
+        values = {name: self._column(name, first, end) for name in self._active}
+        return end - first, (self, first, values)
+
+    def _column(self, name: str, first: int, end: int) -> list[Value]:
+        ring = self.runner.outputs
+        if name not in ring.layout.names and self.runner.watched is not None:
+            ring = self.runner.watched
+        return [ring.value(row, name) for row in range(first, end)]
+
+    def publish(self, first: int, values: dict[str, list[Value]]) -> None:
+        """On the server's thread: publish what `collect` returned."""
+        points = self.runner.plan.step_points
+        for offset, stamp in enumerate(self._stamps(first, points)):
+            if offset >= len(next(iter(values.values()))):
+                return
+            for name, column in values.items():
+                self._publishers[name].put(encode_value(column[offset]), attachment=stamp)
+
+    def _stamps(self, first: int, points: int) -> Iterator[bytes]:
+        step = first
+        while True:
+            yield attachment(step * points, self._grid.time(step * points))
+            step += 1
+
+    def close(self) -> None:
+        """Undeclare all publishers."""
+        for listener in self._listeners:
+            listener.undeclare()
+        for publisher in self._publishers.values():
+            publisher.undeclare()

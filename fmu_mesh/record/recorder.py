@@ -1,0 +1,215 @@
+"""The recorder: a participant of the mesh that takes frames as a node does and writes rows as soon as they are complete.
+
+It runs on a thread of the master's process, with an inbox, a liveliness token and progress of its own: what it has not
+written yet holds the grant back, so that nothing has to be dropped and memory stays bounded.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import socket
+import threading
+import time
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import zenoh
+from numpy.typing import NDArray
+
+from ..errors import DeadlineExceeded, FmuMeshError, from_report
+from ..model.description import VariableType
+from ..model.plan import RECORDER, NodePlan
+from ..wire.frames import FrameReceiver
+from ..wire.inbox import Inbox, Message
+from ..wire.keys import Keys
+from ..wire.messages import ABORT, FINISH, FRAME, HEADER, PROGRESS, NodeReport, Registration, decode_abort
+from ..wire.session import ask
+from .csv_file import CsvFile
+
+__all__ = ["Recorder"]
+
+log = logging.getLogger(__name__)
+
+_LOOK_S = 0.2
+_WRITE_ROWS = 512
+_FLUSH_S = 0.2
+
+
+class Recorder:
+    """Records one run.
+
+    Args:
+        plan: the recorder's part of the plan.
+        session: the session of this process; stays the caller's.
+
+    Use it as a context manager: the thread runs inside, and the file is complete up to the last complete row outside.
+    """
+
+    def __init__(self, plan: NodePlan, session: zenoh.Session) -> None:
+        self._plan = plan
+        self._session = session
+        self._keys = Keys(plan.key_prefix, plan.mesh)
+        self._sources = {
+            link.index: _Source(FrameReceiver(link, "the recorder", plan.ring_rows)) for link in plan.links_in
+        }
+        by_name = {source.receiver.link.source: source for source in self._sources.values()}
+        self._columns = [(by_name[instance], variable) for instance, variable in plan.recorded]
+        self._file = CsvFile(
+            Path(plan.result_file or ""),
+            [(f"{i}.{v}", by_name[i].type_of(v)) for i, v in plan.recorded],
+        )
+        self._written = 0
+        self._progress_sent = -1
+        self._number = 0
+        self._finished = False
+        self._flushed = time.monotonic()
+        capacity = (plan.window + 8) * len(plan.links_in) + 1024
+        self._inbox = Inbox(session, self._keys.inbox(RECORDER), self._keys.wake(RECORDER), capacity)
+        self._progress = session.declare_publisher(
+            self._keys.progress(), congestion_control=zenoh.CongestionControl.BLOCK
+        )
+        self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
+
+    @property
+    def rows(self) -> int:
+        """Rows written so far."""
+        return self._file.rows
+
+    def __enter__(self) -> Recorder:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._thread.is_alive():
+            self._inbox.post(self._end)
+        self._thread.join(5.0)
+        self._write_complete_rows()
+        self._file.close()
+        self._inbox.close()
+
+    def _end(self) -> None:
+        self._finished = True
+
+    def _run(self) -> None:
+        try:
+            with self._session.liveliness().declare_token(self._keys.node_token(RECORDER)):
+                self._meet()
+                self._record()
+                self._report(None)
+        except _Ended:
+            log.info("recording_ended_early", extra={"rows": self._written})
+        except Exception as error:  # noqa: BLE001 whatever it is, the master must know that nothing is recorded any more
+            known = error if isinstance(error, FmuMeshError) else FmuMeshError(f"recording failed: {error!r}")
+            self._try_to_report(known)
+
+    def _meet(self) -> None:
+        deadline_s = self._plan.timeouts.start
+        for node in dict.fromkeys(link.source_node for link in self._plan.links_in):
+            ask(self._session, self._keys.hello(node), b"", deadline_s, f"node '{node}'")
+        registration = Registration(RECORDER, self._plan.digest, os.getpid(), socket.gethostname())
+        payload = msgspec.json.encode(registration)
+        self._number = int(ask(self._session, self._keys.register, payload, deadline_s, "the master"))
+
+    def _record(self) -> None:
+        """Take what comes, write rows when they are many or nothing more is there, and tell the progress."""
+        heard = time.monotonic()
+        while not self._finished:
+            message = self._inbox.poll()
+            if message is None:
+                self._write_complete_rows()
+                self._send_progress()
+                message = self._inbox.wait(_LOOK_S)
+            if message is not None:
+                heard = time.monotonic()
+                self._take(message)
+                if self._complete() - self._written >= _WRITE_ROWS:
+                    self._write_complete_rows()
+                    self._send_progress()
+            elif time.monotonic() - heard > self._plan.timeouts.step:
+                raise DeadlineExceeded("the recorder heard nothing from the master")
+
+    def _take(self, message: Message) -> None:
+        kind, number, count, point, data = message
+        if kind == FRAME:
+            self._sources[number].receiver.take(point, count, data)
+        elif kind == FINISH:
+            self._finished = True
+        elif kind == ABORT:
+            self._drain()
+            raise _Ended(from_report(decode_abort(data)))
+
+    def _complete(self) -> int:
+        """The last point whose row is complete, or -1."""
+        return min(source.covered(self._plan.grid.last_point) for source in self._sources.values())
+
+    def _write_complete_rows(self) -> None:
+        end = self._complete() + 1
+        first = self._written
+        if end > first:
+            grid = self._plan.grid
+            points = np.arange(first, end)
+            times: NDArray[np.float64] = grid.start_time + points * grid.step_size
+            self._file.write(times, [source.column(variable, points) for source, variable in self._columns])
+            self._written = end
+            now = time.monotonic()
+            if now - self._flushed > _FLUSH_S:
+                self._flushed = now
+                self._file.flush()
+
+    def _drain(self) -> None:
+        """Take the frames that have come but were not looked at; what they complete is written before the end."""
+        while (message := self._inbox.poll()) is not None:
+            if message[0] == FRAME:
+                self._take(message)
+
+    def _send_progress(self) -> None:
+        complete = self._complete()
+        if complete > self._progress_sent:
+            self._progress_sent = complete
+            self._progress.put(HEADER.pack(PROGRESS, self._number, 0, complete))
+
+    def _report(self, error: FmuMeshError | None) -> None:
+        report = NodeReport(RECORDER, max(self._written - 1, 0), error.report() if error is not None else None)
+        ask(self._session, self._keys.report, msgspec.json.encode(report), self._plan.timeouts.stop, "the master")
+
+    def _try_to_report(self, error: FmuMeshError) -> None:
+        try:
+            self._report(error)
+        except FmuMeshError as unreachable:
+            log.warning("failure_not_reported", extra={"error": str(unreachable)})
+
+
+class _Ended(FmuMeshError):
+    """The run ended before its last point; what was written stays."""
+
+    def __init__(self, cause: FmuMeshError) -> None:
+        super().__init__(cause.message)
+
+
+class _Source:
+    """Rows of one instance that wait for those of the others."""
+
+    def __init__(self, receiver: FrameReceiver) -> None:
+        self.receiver = receiver
+
+    def covered(self, last_point: int) -> int:
+        """The last point for which the value is known; it holds until the next own point."""
+        received, points = self.receiver.received, self.receiver.link.step_points
+        if received * points > last_point:
+            return last_point
+        return received * points - 1
+
+    def column(self, variable: str, points: NDArray[np.int64]) -> NDArray[np.float64] | NDArray[np.int32]:
+        """The values of a variable at ``points``."""
+        ring = self.receiver.kept
+        slots = (points // self.receiver.link.step_points) & ring.mask
+        if variable in ring.layout.reals:
+            return ring.reals[slots, ring.layout.reals.index(variable)]
+        return ring.integers[slots, ring.layout.integers.index(variable)]
+
+    def type_of(self, variable: str) -> VariableType:
+        """The type of a variable."""
+        layout = self.receiver.link.layout
+        return dict(zip(layout.names, layout.types(), strict=True))[variable]

@@ -1,0 +1,48 @@
+"""Simulation time: a communication point is an integer, its time is one multiplication.
+
+This module owns the arithmetic between points and seconds, so that no other module ever adds step sizes up.
+"""
+
+from __future__ import annotations
+
+import math
+
+import msgspec
+
+__all__ = ["TimeGrid", "steps_between"]
+
+
+class TimeGrid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The communication points `0 .. last_point` of a run: `t = start_time + point * step_size`.
+
+    Attributes:
+        start_time: time of point 0 in s.
+        step_size: base communication step size in s, greater than 0.
+        last_point: index of the last communication point.
+    """
+
+    start_time: float
+    step_size: float
+    last_point: int
+
+    def time(self, point: int) -> float:
+        """The time of ``point`` in s."""
+        return self.start_time + point * self.step_size
+
+    @property
+    def stop_time(self) -> float:
+        """The time of the last point in s."""
+        return self.time(self.last_point)
+
+
+def steps_between(duration: float, step_size: float) -> int | None:
+    """How many steps of ``step_size`` fill ``duration`` (both in s), or None if it is not a whole number.
+
+    Decimal step sizes have no exact binary form (40 s are 20,000.000000000004 steps of 2 ms), so the quotient may be
+    off a whole number by a few units in its last place; anything more is a different duration.
+    """
+    if not (math.isfinite(duration) and math.isfinite(step_size)) or step_size <= 0.0 or duration < 0.0:
+        return None
+    quotient = duration / step_size
+    nearest = round(quotient)
+    return nearest if abs(quotient - nearest) <= 8 * math.ulp(max(quotient, 1.0)) else None

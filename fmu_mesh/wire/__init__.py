@@ -1,0 +1,1 @@
+"""Everything that touches Zenoh: keys, messages, sessions, the inbox. The only package that imports zenoh."""

@@ -1,0 +1,94 @@
+"""The receiving end of a link: frames in, new rows out; nothing missing, nothing twice (design, invariant 3)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import FrameGap
+from ..model.plan import Link
+from ..model.ring import Ring
+from .messages import Rows, decode_rows
+
+__all__ = ["FrameReceiver", "initial_values", "needed_levels"]
+
+
+class FrameReceiver:
+    """Checks the frames of one link.
+
+    Args:
+        link: the link.
+        target: who receives, for errors.
+        keep: how many rows are kept, a power of two: at least the window, so that a frame always fits.
+
+    Attributes:
+        kept: the newest rows.
+        received: own steps of the source whose rows are here; the next row must be this one.
+    """
+
+    def __init__(self, link: Link, target: str, keep: int) -> None:
+        self.link = link
+        self.received = 0
+        self._target = target
+        self.kept = Ring(link.layout, keep)
+
+    def take(self, first: int, count: int, data: bytes) -> tuple[int, Rows] | None:
+        """The new rows of a FRAME message with ``count`` rows from own step ``first`` of the source on.
+
+        Returns:
+            The own step of the first new row and the rows, or None if all of them came before.
+
+        Raises:
+            FrameGap: rows are missing before it, or a row came twice with other values.
+        """
+        rows = decode_rows(data, count, self.link.layout)
+        if first > self.received:
+            missing, last = self.received * self.link.step_points, first * self.link.step_points - 1
+            text = f"points {missing} to {last} of '{self.link.source}' never reached {self._target}"
+            raise FrameGap(text, instance=self.link.source, point=missing)
+        if first < self.received:
+            known = min(self.received - first, count)
+            self._compare(first, known, rows)
+            if known == count:
+                return None
+            first, rows = first + known, (rows[0][known:], rows[1][known:])
+        self._keep(first, rows)
+        self.received = first + len(rows[0])
+        return first, rows
+
+    def _keep(self, first: int, rows: Rows) -> None:
+        kept = self.kept
+        start, count = first & kept.mask, len(rows[0])
+        cut = min(count, kept.rows - start)
+        for part, new in zip(kept.parts(), rows, strict=True):
+            if len(new):
+                part[start : start + cut] = new[:cut]
+                part[: count - cut] = new[cut:]
+
+    def _compare(self, first: int, known: int, rows: Rows) -> None:
+        """A row that came before must come again with the same bits, as far as it is still kept."""
+        for row in range(max(0, self.received - self.kept.rows - first), known):
+            slot = (first + row) & self.kept.mask
+            if any(_bits(part, slot) != _bits(new, row) for part, new in zip(self.kept.parts(), rows, strict=True)):
+                raise FrameGap(
+                    f"the values of '{self.link.source}' came twice and differ",
+                    instance=self.link.source,
+                    point=(first + row) * self.link.step_points,
+                    hint="Two processes publish as this instance: end one of them.",
+                )
+
+
+def _bits(array: NDArray[np.float64] | NDArray[np.int32], row: int) -> bytes:
+    return array[row].tobytes() if array.shape[1] else b""
+
+
+def initial_values(link: Link, level: int, data: bytes) -> dict[str, float | int]:
+    """The values in an INITIAL message that became known at ``level``."""
+    reals, integers = decode_rows(data, 1, link.layout)
+    row = [*reals[0].tolist(), *(integers[0].tolist() if len(integers) else [])]
+    return {name: value for name, value, own in zip(link.layout.names, row, link.levels, strict=True) if own == level}
+
+
+def needed_levels(link: Link) -> frozenset[int]:
+    """The levels of Initialization Mode at which the target of this link expects a message."""
+    return frozenset(level for level in link.levels if level >= 0)

@@ -1,0 +1,122 @@
+"""The runtime folder: where the processes of a mesh on one host find each other, and where tools find meshes.
+
+Owns the folder of a run (sockets, plans, extracted FMUs) and the note about a running mesh. A run's folder is removed
+by whoever made it, whatever becomes of the processes that used it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import msgspec
+
+from ..errors import ConfigurationError
+
+__all__ = ["MeshNote", "leave_run_folder", "meshes", "remove_run_folder", "run_folder", "runtime_folder", "socket_endpoint", "write_note"]
+
+_SOCKET_PATH_LIMIT = 100
+
+
+class MeshNote(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What the note about a running mesh says.
+
+    Attributes:
+        endpoints: Zenoh endpoints where the master can be reached.
+        pid: process that keeps the note: the launcher, or a master started by hand.
+    """
+
+    mesh: str
+    key_prefix: str
+    endpoints: tuple[str, ...]
+    pid: int
+    config: str
+
+
+def runtime_folder() -> Path:
+    """The user's own folder for running meshes; made with mode 0700.
+
+    Raises:
+        ConfigurationError: it belongs to somebody else.
+    """
+    if chosen := os.environ.get("FMU_MESH_RUNTIME_DIR"):
+        folder = Path(chosen)
+    elif base := os.environ.get("XDG_RUNTIME_DIR"):
+        folder = Path(base) / "fmu_mesh"
+    else:
+        folder = Path(tempfile.gettempdir()) / f"fmu_mesh-{os.getuid()}"
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    if folder.stat().st_uid != os.getuid():
+        raise ConfigurationError(f"the runtime folder '{folder}' belongs to another user", hint="Set FMU_MESH_RUNTIME_DIR.")
+    return folder
+
+
+def run_folder(mesh: str, run: str) -> Path:
+    """The folder of one run of a mesh; ``run`` is the launcher's process id, or `hand` for processes started by hand."""
+    folder = runtime_folder() / f"{mesh}.{run}"
+    folder.mkdir(mode=0o700, exist_ok=True)
+    (folder / "fmus").mkdir(exist_ok=True)
+    return folder
+
+
+def remove_run_folder(folder: Path) -> None:
+    """Remove the folder of a run and all that is in it."""
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+def leave_run_folder(folder: Path) -> None:
+    """Remove the folder of a run if nobody uses it any more; called by every process on its way out."""
+    for empty in (folder / "fmus", folder):
+        try:
+            empty.rmdir()
+        except OSError:
+            return
+
+
+def socket_endpoint(folder: Path, node: str) -> str:
+    """The Zenoh endpoint of a node's socket in the folder of a run.
+
+    Raises:
+        ConfigurationError: the path is too long for a Unix socket.
+    """
+    path = folder / f"{hashlib.sha256(node.encode()).hexdigest()[:8]}.sock"
+    if len(os.fsencode(path)) > _SOCKET_PATH_LIMIT:
+        raise ConfigurationError(
+            f"'{path}' is too long for a socket ({_SOCKET_PATH_LIMIT} bytes)",
+            hint="Set FMU_MESH_RUNTIME_DIR to a shorter path.",
+        )
+    return f"unixsock-stream/{path}"
+
+
+def write_note(folder: Path, note: MeshNote) -> None:
+    """Write the note of a running mesh in one step, so that no reader sees half of it."""
+    temporary = folder / "mesh.json.new"
+    temporary.write_bytes(msgspec.json.format(msgspec.json.encode(note)))
+    temporary.replace(folder / "mesh.json")
+
+
+def meshes() -> Iterator[MeshNote]:
+    """The meshes that run on this host for this user; folders whose process is gone are removed on the way."""
+    for file in sorted(runtime_folder().glob("*/mesh.json")):
+        try:
+            note = msgspec.json.decode(file.read_bytes(), type=MeshNote)
+        except (OSError, msgspec.DecodeError):
+            continue
+        if _is_alive(note.pid):
+            yield note
+        else:
+            remove_run_folder(file.parent)
+
+
+def _is_alive(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    return True

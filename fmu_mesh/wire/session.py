@@ -1,0 +1,127 @@
+"""Opening Zenoh sessions; the only `zenoh.open` of the project, and the reasons for every setting."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import zenoh
+
+from ..errors import ConfigurationError, DeadlineExceeded, MeshLost
+
+__all__ = ["Wiring", "ask", "open_session", "own_endpoints"]
+
+LEASE_MS = 4_000
+"""A stopped (not dead) process is noticed after this time; a dead one within milliseconds."""
+
+NEVER_DROP_US = 24 * 3600 * 1_000_000
+"""How long a blocked sender waits before Zenoh would close the transport: longer than any deadline of ours."""
+
+
+class Wiring(msgspec.Struct, frozen=True):
+    """How one process is connected.
+
+    Attributes:
+        mode: `peer` or `client`.
+        listen: endpoints to listen on.
+        connect: endpoints to connect to; tried again until they answer.
+        gossip: whether peers learn of each other through those they know (meshes over several hosts).
+        config: a Zenoh configuration file to start from.
+    """
+
+    mode: str = "peer"
+    listen: tuple[str, ...] = ()
+    connect: tuple[str, ...] = ()
+    gossip: bool = False
+    config: Path | None = None
+
+
+def open_session(wiring: Wiring) -> zenoh.Session:
+    """Open a session.
+
+    Raises:
+        ConfigurationError: an endpoint or the configuration file is not usable.
+    """
+    zenoh.init_log_from_env_or("error")
+    try:
+        return zenoh.open(_configuration(wiring))
+    except zenoh.ZError as error:
+        endpoints = ", ".join((*wiring.listen, *wiring.connect)) or "no endpoints"
+        raise ConfigurationError(f"no Zenoh session can be opened ({endpoints}): {error}") from error
+
+
+def _configuration(wiring: Wiring) -> zenoh.Config:
+    try:
+        config = zenoh.Config.from_file(wiring.config) if wiring.config is not None else zenoh.Config()
+    except zenoh.ZError as error:
+        raise ConfigurationError(f"'{wiring.config}' is no Zenoh configuration: {error}") from error
+    settings: dict[str, Any] = {
+        "mode": wiring.mode,
+        # Nothing on the network unless the user asked for it: no multicast, and gossip only between hosts.
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": wiring.gossip,
+        "listen/endpoints": list(wiring.listen),
+        "connect/endpoints": list(wiring.connect),
+        # Processes start in any order: an endpoint that does not answer yet is tried again, in the background.
+        "connect/exit_on_failure": False,
+        "connect/timeout_ms": -1 if wiring.mode == "peer" else 20_000,
+        "connect/retry": {"period_init_ms": 20, "period_max_ms": 250, "period_increase_factor": 1.5},
+        "listen/exit_on_failure": True,
+        "transport/link/tx/lease": LEASE_MS,
+        # A full queue blocks the producer (design, invariant 3); the default would close the link after 5 s.
+        "transport/link/tx/queue/congestion_control/block/wait_before_close": NEVER_DROP_US,
+        # Measured: the implicit shared memory slows Python down from 3 kB on.
+        "transport/shared_memory/enabled": False,
+        "adminspace/enabled": True,
+    }
+    for key, value in settings.items():
+        config.insert_json5(key, json.dumps(value))
+    return config
+
+
+def own_endpoints(session: zenoh.Session, deadline_s: float = 5.0) -> tuple[str, ...]:
+    """The endpoints this session really listens on, with the ports that the system chose.
+
+    Raises:
+        DeadlineExceeded: the session does not tell within ``deadline_s`` seconds.
+    """
+    answer = ask(session, f"@/{session.zid()}/*", b"", deadline_s, "the session's own endpoints")
+    return tuple(str(locator) for locator in json.loads(answer).get("locators", ()))
+
+
+def ask(session: zenoh.Session, key: str, payload: bytes, deadline_s: float, what: str) -> bytes:
+    """Query ``key`` until somebody is there to answer, and return the answer's payload.
+
+    A query sent before the queryable is known gets no reply at all, so this waits until a queryable matches, and asks
+    again when the matching changes.
+
+    Args:
+        what: what is being waited for, for the error.
+
+    Raises:
+        DeadlineExceeded: nobody answered within ``deadline_s`` seconds.
+        MeshLost: the answer was an error; its text is the message.
+    """
+    end = time.monotonic() + deadline_s
+    changed = threading.Event()
+    with session.declare_querier(key, timeout=deadline_s) as querier:
+        listener = querier.declare_matching_listener(lambda _status: changed.set())
+        try:
+            while (left := end - time.monotonic()) > 0:
+                changed.clear()
+                if querier.matching_status.matching:
+                    for reply in querier.get(payload=payload):
+                        if reply.ok is not None:
+                            return reply.ok.payload.to_bytes()
+                        text = reply.err.payload.to_bytes().decode(errors="replace") if reply.err else ""
+                        if text != "Timeout":
+                            raise MeshLost(text)
+                changed.wait(min(left, 0.05))
+        finally:
+            listener.undeclare()
+    raise DeadlineExceeded(f"nobody answered for {what} within {deadline_s:g} s")
+

@@ -1,0 +1,89 @@
+"""Values as any Zenoh client sees them: JSON, with the point and the time in the attachment."""
+
+from __future__ import annotations
+
+import math
+
+import msgspec
+import zenoh
+
+from ..model.description import Value, Variable
+
+__all__ = ["Stamp", "ValueRefused", "attachment", "decode_stamp", "decode_value", "encode_value", "json_encoding"]
+
+MAX_VALUE_SIZE = 1 << 20
+_INT32 = range(-(2**31), 2**31)
+
+json_encoding = zenoh.Encoding.APPLICATION_JSON
+
+
+class ValueRefused(ValueError):
+    """A value that was sent to the mesh cannot be taken; the message says why."""
+
+
+class Stamp(msgspec.Struct, frozen=True):
+    """The communication point of a value and its time in s."""
+
+    point: int
+    time: float
+
+
+def attachment(point: int, time: float) -> bytes:
+    """The attachment of a value at ``point``, whose time is ``time`` s."""
+    return msgspec.json.encode(Stamp(point, time))
+
+
+def decode_stamp(data: bytes) -> Stamp:
+    """The point and time in an attachment.
+
+    Raises:
+        msgspec.DecodeError: it is none of ours.
+    """
+    return msgspec.json.decode(data, type=Stamp)
+
+
+def encode_value(value: Value) -> bytes:
+    """A value as JSON; NaN and the infinities, which JSON does not have, as the strings FMI 3.0 uses for them."""
+    if isinstance(value, float) and not math.isfinite(value):
+        return b'"NaN"' if math.isnan(value) else (b'"INF"' if value > 0 else b'"-INF"')
+    return msgspec.json.encode(value)
+
+
+def decode_value(data: bytes, variable: Variable) -> Value:
+    """The value that JSON ``data`` gives for ``variable``.
+
+    Raises:
+        ValueRefused: it is no JSON, or not of the variable's type or range.
+    """
+    if len(data) > MAX_VALUE_SIZE:
+        raise ValueRefused(f"{len(data)} bytes are too many for a value")
+    try:
+        value = msgspec.json.decode(data)
+    except msgspec.DecodeError as error:
+        raise ValueRefused(f"it is no JSON value ({error})") from error
+    match variable.type, value:
+        case "Real", str() if value in ("NaN", "INF", "-INF"):
+            return float(value.lower())
+        case "Real", float() | int() if not isinstance(value, bool):
+            return _checked_real(float(value), variable)
+        case "Integer", int() if not isinstance(value, bool) and value in _INT32:
+            return value
+        case "Boolean", bool():
+            return value
+        case "String", str():
+            return value
+        case "Enumeration", int() if not isinstance(value, bool):
+            if not variable.items or value in {number for _, number in variable.items}:
+                return value
+        case "Enumeration", str():
+            for name, number in variable.items:
+                if name == value:
+                    return number
+    raise ValueRefused(f"{data[:80].decode(errors='replace')} is no {variable.type} value for it")
+
+
+def _checked_real(value: float, variable: Variable) -> float:
+    low, high = variable.minimum, variable.maximum
+    if (low is not None and value < low) or (high is not None and value > high):
+        raise ValueRefused(f"{value!r} is outside its range [{low}, {high}]")
+    return value

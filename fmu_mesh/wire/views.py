@@ -1,0 +1,166 @@
+"""What the queryables answer, as Structs: `info` and `status` of an instance and of the mesh (design, section 6)."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import msgspec
+
+from ..errors import ErrorReport
+from ..model.description import DefaultExperiment
+
+__all__ = [
+    "Command",
+    "CommandAnswer",
+    "ConnectionView",
+    "InstanceInfo",
+    "InstanceStatus",
+    "LogLine",
+    "MeshInfo",
+    "MeshState",
+    "MeshStatus",
+    "SetAnswer",
+    "VariableView",
+]
+
+MeshState = Literal["starting", "initializing", "running", "paused", "stopping", "done", "failed"]
+
+
+class VariableView(msgspec.Struct, frozen=True, omit_defaults=True):
+    """One variable as `info` shows it; ``key`` is where its value is."""
+
+    name: str
+    key: str
+    type: str
+    causality: str
+    variability: str
+    unit: str | None = None
+    start: float | int | bool | str | None = None
+    description: str | None = None
+
+
+class ConnectionView(msgspec.Struct, frozen=True):
+    """One connection as `info` shows it."""
+
+    source: str = msgspec.field(name="from")
+    target: str = msgspec.field(name="to")
+    delay: int
+    factor: float = 1.0
+    offset: float = 0.0
+
+
+class InstanceInfo(msgspec.Struct, frozen=True):
+    """Answer of `…/<instance>/info`."""
+
+    instance: str
+    model_name: str
+    description: str | None
+    fmi_version: str
+    kind: str
+    fmu: str
+    generation_tool: str | None
+    capabilities: dict[str, bool]
+    default_experiment: DefaultExperiment
+    step_size: float
+    variables: tuple[VariableView, ...]
+    connections: tuple[ConnectionView, ...]
+    node: str
+    pid: int
+    host: str
+    problems: tuple[str, ...]
+
+
+class InstanceStatus(msgspec.Struct, frozen=True):
+    """Answer of `…/<instance>/status`, and what is published there about twice a second.
+
+    Attributes:
+        state: loading, waiting for the mesh, initializing, running, done or failed.
+        activity: in words what the instance does right now, such as `in doStep at point 812 for 12.4 s`.
+        time: simulation time in s.
+        step_time: mean wall-clock time of a step in s.
+        wait_time: wall-clock time spent waiting since the first point in s.
+    """
+
+    instance: str
+    state: str
+    activity: str
+    point: int
+    time: float
+    step_time: float
+    wait_time: float
+    overruns: int = 0
+    restarts: int = 0
+
+
+class LogLine(msgspec.Struct, frozen=True):
+    """One line of `…/<instance>/log`."""
+
+    instance: str
+    status: str
+    category: str
+    message: str
+    point: int
+
+
+class SetAnswer(msgspec.Struct, frozen=True):
+    """Answer to a query that carries a value for an input or a parameter: the point from which on it holds."""
+
+    key: str
+    point: int
+    time: float
+
+
+class MeshInfo(msgspec.Struct, frozen=True):
+    """Answer of `…/mesh/info`."""
+
+    mesh: str
+    version: str
+    config: str
+    start_time: float
+    stop_time: float
+    step_size: float
+    algorithm: str
+    window: int
+    real_time_factor: float
+    instances: tuple[str, ...]
+    nodes: tuple[str, ...]
+    result_file: str | None
+    endpoints: tuple[str, ...]
+    pid: int
+    host: str
+
+
+class MeshStatus(msgspec.Struct, frozen=True):
+    """Answer of `…/mesh/status`.
+
+    Attributes:
+        point: the last point that every instance has reached; ``time`` is its time in s.
+        points_per_second: since the first point, or since the last pause.
+        real_time_factor: simulated over wall-clock time since the first point.
+        progress: last point of every node.
+    """
+
+    mesh: str
+    state: MeshState
+    point: int
+    last_point: int
+    time: float
+    points_per_second: float
+    real_time_factor: float
+    progress: dict[str, int]
+    error: ErrorReport | None = None
+
+
+class Command(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What `…/mesh/command` takes; ``points`` belongs to step."""
+
+    command: Literal["pause", "resume", "step", "stop"]
+    points: int = 1
+
+
+class CommandAnswer(msgspec.Struct, frozen=True):
+    """What `…/mesh/command` answers."""
+
+    command: str
+    state: MeshState
+    point: int
