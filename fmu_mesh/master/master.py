@@ -108,7 +108,7 @@ class Master:
             session, self._keys.inbox(_NODE), self._keys.wake(_NODE), (plan.window + 64) * len(self._nodes) + 1024
         )
         self._grants = [
-            session.declare_publisher(key, congestion_control=zenoh.CongestionControl.BLOCK)
+            session.declare_publisher(key, congestion_control=zenoh.CongestionControl.BLOCK, express=True)
             for key in self._keys.grants(self._nodes)
         ]
         self._entities: list[zenoh.Queryable[None] | zenoh.Subscriber[None] | zenoh.Publisher] = []

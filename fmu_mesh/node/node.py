@@ -89,7 +89,7 @@ class Node:
         capacity = sum(plan.window + 8 for _ in plan.links_in) + 4096
         self._inbox = Inbox(session, self._keys.inbox(plan.node), self._keys.wake(plan.node), capacity)
         self._progress_number = 0
-        self._progress = session.declare_publisher(self._keys.progress(), congestion_control=_BLOCK)
+        self._progress = session.declare_publisher(self._keys.progress(), congestion_control=_BLOCK, express=True)
         self.server = Server(plan, session, self._keys, self._inbox)
 
     def run(self) -> None:
@@ -166,7 +166,7 @@ class Node:
         for link in plan.links_out:
             runner = self._runners[link.source]
             publisher = self._session.declare_publisher(
-                self._keys.frames(link.source, link.target_node), congestion_control=_BLOCK
+                self._keys.frames(link.source, link.target_node), congestion_control=_BLOCK, express=True
             )
             runner.out_links.append(OutLink(link, runner.outputs, publisher, plan.window))
         self._units = [Unit([self._runners[name] for name in names]) for names in plan.units]
@@ -261,13 +261,15 @@ class Node:
             stepped = False
             for unit in self._units:
                 stepped = unit.advance(self._grant) or stepped
+            taken = False
             while (message := poll()) is not None:
                 self._take(message)
+                taken = True
             if stepped:
                 if self._covered() - self._progress_sent >= self._progress_stride:
                     self._send_progress()
                 self.server.stepped()
-            else:
+            elif not taken:
                 self._flush_before_waiting()
                 self._send_progress()
                 self._wait()

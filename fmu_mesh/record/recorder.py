@@ -68,7 +68,7 @@ class Recorder:
         capacity = (plan.window + 8) * len(plan.links_in) + 1024
         self._inbox = Inbox(session, self._keys.inbox(RECORDER), self._keys.wake(RECORDER), capacity)
         self._progress = session.declare_publisher(
-            self._keys.progress(), congestion_control=zenoh.CongestionControl.BLOCK
+            self._keys.progress(), congestion_control=zenoh.CongestionControl.BLOCK, express=True
         )
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
 

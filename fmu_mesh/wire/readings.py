@@ -1,0 +1,65 @@
+"""Values of variables as a tool receives them: which variable, and at which point."""
+
+from __future__ import annotations
+
+import queue
+
+import msgspec
+import zenoh
+
+from ..model.description import Value
+from .values import decode_stamp
+from .views import VariableView
+
+__all__ = ["Keeper", "Reading", "Target", "reading_of"]
+
+_WAITING_SAMPLES = 1 << 16
+
+
+class Target(msgspec.Struct, frozen=True):
+    """One variable of the mesh, and the key where its value is."""
+
+    instance: str
+    key: str
+    variable: VariableView
+
+
+class Reading(msgspec.Struct, frozen=True, omit_defaults=True):
+    """One value as it came, with its communication point and the time of that in s."""
+
+    key: str
+    instance: str
+    variable: str
+    value: Value
+    point: int
+    time: float
+    unit: str | None = None
+
+
+def reading_of(target: Target, sample: zenoh.Sample) -> Reading | None:
+    """A sample as a value; None if it has no point, as what somebody else puts on the key of an input."""
+    if sample.attachment is None:
+        return None
+    try:
+        stamp = decode_stamp(sample.attachment.to_bytes())
+        value: Value = msgspec.json.decode(sample.payload.to_bytes())
+    except msgspec.DecodeError:
+        return None
+    view = target.variable
+    return Reading(target.key, target.instance, view.name, value, stamp.point, stamp.time, view.unit)
+
+
+class Keeper:
+    """Puts the samples of one subscriber into the queue of all.
+
+    A reader that falls far behind loses samples: this runs on a thread of Zenoh, which must not wait for it.
+    """
+
+    def __init__(self, target: Target, arrived: queue.SimpleQueue[Reading | None]) -> None:
+        self._target = target
+        self._arrived = arrived
+
+    def keep(self, sample: zenoh.Sample) -> None:
+        """The subscriber's callback."""
+        if self._arrived.qsize() < _WAITING_SAMPLES and (reading := reading_of(self._target, sample)) is not None:
+            self._arrived.put(reading)
