@@ -3,6 +3,7 @@
 ```
 FmuMeshError                     1   an internal error
 ├── ConfigurationError           2   a file, an option or a command is wrong; carries all findings
+├── CallRefused                  2   a program called the library wrongly; also a ValueError
 ├── FmuError                     3   an FMU failed
 │   ├── LoadFailed                   it cannot be extracted, loaded or instantiated
 │   ├── InitializationFailed         a call in or around Initialization Mode failed
@@ -24,6 +25,7 @@ from typing import ClassVar
 import msgspec
 
 __all__ = [
+    "CallRefused",
     "ConfigurationError",
     "DeadlineExceeded",
     "ErrorReport",
@@ -62,6 +64,9 @@ class FmuMeshError(Exception):
         point: the communication point index it happened at.
         time: the simulation time of that point in s.
         hint: what the reader can do next.
+
+    Attributes:
+        told: whether somebody else tells the reader already.
     """
 
     exit_code: ClassVar[int] = 1
@@ -83,6 +88,7 @@ class FmuMeshError(Exception):
         self.point = point
         self.time = time
         self.hint = hint
+        self.told = False
 
     def __str__(self) -> str:
         where = []
@@ -149,6 +155,12 @@ class ConfigurationError(FmuMeshError):
 
     def __str__(self) -> str:
         return "\n".join([super().__str__(), *(f"  - {finding}" for finding in self.findings)])
+
+
+class CallRefused(FmuMeshError, ValueError):
+    """A program called the library in the wrong mode, or with a wrong name, type or time. The call changed nothing."""
+
+    exit_code = 2
 
 
 class FmuError(FmuMeshError):

@@ -1,6 +1,177 @@
-"""Placeholder."""
+"""`check` and `schema`: what a configuration means, and what it may look like."""
+
 from __future__ import annotations
+
 import argparse
+import sys
+from pathlib import Path
 from typing import Any
+
+from ..launch.preparing import Options, prepare
+from ..model.description import Variable
+from ..model.findings import shown
+from ..model.plan import Plan
+from ..model.schema import schema_text
+from ..model.system import Connection, SystemInstance
+from .tables import pairs, table
+
+__all__ = ["add_commands", "plan_page"]
+
+_PROBLEM_CHARACTERS = 100
+
+
 def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.ArgumentParser) -> None:
-    return
+    """Add the commands of this module."""
+    check = commands.add_parser("check", parents=[common], help="check a configuration and show its plan; run nothing")
+    check.add_argument("config", type=Path, metavar="CONFIG", help="the configuration file")
+    check.add_argument("--window", type=int, metavar="N", help="how many points a node may run ahead; 1 is lockstep")
+    check.add_argument(
+        "--set", action="append", default=[], metavar="INSTANCE.VARIABLE=VALUE", help="another start value; repeatable"
+    )
+    check.set_defaults(run_command=_check)
+    schema = commands.add_parser("schema", parents=[common], help="print the JSON Schema of configurations")
+    schema.set_defaults(run_command=_schema)
+
+
+def _check(arguments: argparse.Namespace) -> int:
+    plan = prepare(arguments.config, Options(start_values=tuple(arguments.set), window=arguments.window))
+    print("\n".join(plan_page(plan)))
+    print(f"\nOK: {arguments.config} can run.")
+    return 0
+
+
+def _schema(_arguments: argparse.Namespace) -> int:
+    sys.stdout.write(schema_text())
+    return 0
+
+
+def plan_page(plan: Plan) -> list[str]:
+    """The plan as lines of text, the same on every terminal and in every pipe."""
+    sections = [
+        ("", _head(plan)),
+        ("Instances", _instances(plan)),
+        ("Connections", _connections(plan)),
+        ("Execution order within one point", _order(plan)),
+        ("Initialization", _initialization(plan)),
+        ("Recorded", _recorded(plan)),
+        ("Warnings", _warnings(plan)),
+    ]
+    lines: list[str] = []
+    for title, content in sections:
+        if content:
+            lines += ([""] if lines else []) + ([title] if title else []) + content
+    return lines
+
+
+def _head(plan: Plan) -> list[str]:
+    simulation, grid = plan.system.config.simulation, plan.grid
+    factor = simulation.real_time_factor
+    window = f"{plan.window} points" if plan.window > 1 else "1 point: lockstep"
+    times = f"{_number(grid.start_time)} s to {_number(grid.stop_time)} s in {grid.last_point} steps of"
+    return pairs(
+        [
+            ("Mesh", plan.system.config.mesh),
+            ("Simulation", f"{times} {_number(grid.step_size)} s"),
+            ("Algorithm", simulation.algorithm),
+            ("Window", window),
+            ("Speed", f"{factor:g} times real time" if factor else "as fast as possible"),
+        ]
+    )
+
+
+def _instances(plan: Plan) -> list[str]:
+    rows = [
+        [
+            instance.name,
+            f"{Path(instance.fmu).name} (FMI {instance.description.fmi_version})",
+            f"step {_number(instance.step_points * plan.grid.step_size)} s",
+            "a process of its own" if instance.node == instance.name else f"group {instance.node}",
+            _start_values(instance),
+        ]
+        for instance in plan.system.instances.values()
+    ]
+    return table(rows, indent=2)
+
+
+def _start_values(instance: SystemInstance) -> str:
+    return ", ".join(
+        f"{name} = {shown(value)}{_unit(instance.description.variable(name))}"
+        for name, value in instance.start_values.items()
+    )
+
+
+def _connections(plan: Plan) -> list[str]:
+    rows = []
+    for c in plan.connections:
+        what = "value at the start of the step" if c.delay else "value at the end of the step"
+        closing = "closes a cycle" if c in plan.closing else ""
+        rows.append([str(c), f"delay {c.delay}", what, _arithmetic(c), closing])
+    return table(rows, indent=2)
+
+
+def _arithmetic(c: Connection) -> str:
+    """What a connection calculates; empty if it hands the value on as it is."""
+    if (c.factor, c.offset) == (1.0, 0.0):
+        return ""
+    product = f"{_number(c.factor)} * {c.source.name}" if c.factor != 1.0 else c.source.name
+    sign = "-" if c.offset < 0.0 else "+"
+    sum_ = f"{product} {sign} {_number(abs(c.offset))}" if c.offset else product
+    return f"{c.target.name} = {sum_}"
+
+
+def _order(plan: Plan) -> list[str]:
+    instant = {(c.source_instance, c.target_instance) for c in plan.connections if c.delay == 0}
+    arrow = " -> " if instant else ", "
+    lines = [f"  {arrow.join(plan.order)}" + ("" if instant else "  (at the same time)" if len(plan.order) > 1 else "")]
+    lines += [f"  cycle: {', '.join(cycle)}" for cycle in plan.cycles]
+    return lines
+
+
+def _initialization(plan: Plan) -> list[str]:
+    levels: dict[int, list[str]] = {}
+    for (name, variable), level in plan.initialization.levels.items():
+        levels.setdefault(level, []).append(f"{name}.{variable}")
+    lines = [f"  level {level}: {', '.join(names)}" for level, names in sorted(levels.items())]
+    for name, variable in plan.initialization.held:
+        instance = plan.system.instances[name]
+        described = instance.description.variable(variable)
+        start = instance.start_values.get(variable, described.start if described is not None else None)
+        value = f" {shown(start)}{_unit(described)}" if start is not None else ""
+        lines.append(f"  {name}.{variable} keeps its start value{value} until the first step")
+    return lines
+
+
+def _recorded(plan: Plan) -> list[str]:
+    if plan.system.result_file is None or not plan.system.recorded:
+        return ["  nothing"]
+    instances = plan.system.instances
+    rows = []
+    for name, variable in plan.system.recorded:
+        described = instances[name].description.variable(variable)
+        rows.append([f"{name}.{variable}", described.type if described else "", _unit(described).strip()])
+    return [*table(rows, indent=2), f"  into {_short(plan.system.result_file)}"]
+
+
+def _warnings(plan: Plan) -> list[str]:
+    lines = [f"  {warning}" for warning in plan.system.warnings]
+    for instance in plan.system.instances.values():
+        for problem in instance.description.problems:
+            text = " ".join(problem.split())
+            short = text if len(text) <= _PROBLEM_CHARACTERS else text[: _PROBLEM_CHARACTERS - 3] + "..."
+            lines.append(f"  {instance.name}: {Path(instance.fmu).name}: {short}")
+    return lines
+
+
+def _unit(variable: Variable | None) -> str:
+    return f" {variable.unit}" if variable is not None and variable.unit else ""
+
+
+def _number(value: float) -> str:
+    return f"{value:.12g}"
+
+
+def _short(path: str) -> str:
+    try:
+        return str(Path(path).relative_to(Path.cwd()))
+    except ValueError:
+        return path

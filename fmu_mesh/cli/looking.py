@@ -1,6 +1,266 @@
-"""Placeholder."""
+"""`ls`, `status`, `info`, `get`, `set`, `watch`, `pause`, `resume`, `step` and `stop`: looking into a running mesh.
+
+Owns what these commands print; what they ask is `fmu_mesh.wire.client`.
+"""
+
 from __future__ import annotations
+
 import argparse
+import math
+from collections.abc import Callable
+from itertools import islice
 from typing import Any
+
+import msgspec
+
+from ..errors import ConfigurationError, Interrupted
+from ..wire.client import MeshClient
+from ..wire.reaching import Meshes
+from ..wire.readings import Target
+from ..wire.views import Command, InstanceInfo, InstanceStatus, MeshInfo, MeshStatus
+from .pages import (
+    cells,
+    instance_info,
+    instance_status,
+    instances,
+    mesh_info,
+    mesh_status,
+    progress,
+    seconds,
+    variables,
+)
+from .tables import table
+
+__all__ = ["add_commands"]
+
+_TIMEOUT_S = 5.0
+_REFERENCE = "`instance.variable` (with `*` for any characters), or a key (with the wildcards of Zenoh)"
+
+Run = Callable[[argparse.Namespace, Meshes], int]
+
+
 def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.ArgumentParser) -> None:
-    return
+    """Add the commands of this module."""
+    reaching = argparse.ArgumentParser(add_help=False)
+    reaching.add_argument(
+        "--connect",
+        action="append",
+        default=[],
+        metavar="ENDPOINT",
+        help="Zenoh endpoint of a mesh or a router; repeatable; default: the meshes of this user on this host",
+    )
+    reaching.add_argument(
+        "--timeout", type=_seconds, default=_TIMEOUT_S, metavar="S", help="deadline of every question in s (5)"
+    )
+
+    def add(name: str, run: Run, text: str, *, json: bool = True) -> argparse.ArgumentParser:
+        parser: argparse.ArgumentParser = commands.add_parser(name, parents=[common, reaching], help=text)
+        if json:
+            parser.add_argument("--json", action="store_true", help="JSON, one object per line")
+        parser.set_defaults(run_command=lambda arguments: _with_meshes(arguments, run))
+        return parser
+
+    ls = add("ls", _ls, "list meshes, instances and variables")
+    ls.add_argument("name", nargs="?", metavar="NAME", help="a mesh, or an instance, whose variables are listed")
+    ls.add_argument("-l", "--long", action="store_true", help="the variables of every instance, too")
+    status = add("status", _status, "show how far a mesh or an instance is")
+    status.add_argument(
+        "key", nargs="?", metavar="KEY", help="a mesh or an instance, by name or key; default: every mesh"
+    )
+    info = add("info", _info, "show what a mesh or an instance is")
+    info.add_argument("key", metavar="KEY", help="a mesh or an instance, by name or key")
+    get = add("get", _get, "show current values")
+    get.add_argument("key", nargs="+", metavar="KEY", help=_REFERENCE)
+    set_ = add("set", _set, "set an unconnected input or a tunable parameter")
+    set_.add_argument("key", metavar="KEY", help="`instance.variable`, or a key")
+    set_.add_argument("value", metavar="VALUE", help="a number, true, false, or text")
+    watch = add("watch", _watch, "show every value of variables until the mesh ends")
+    watch.add_argument("key", nargs="+", metavar="KEY", help=_REFERENCE)
+    watch.add_argument("--count", type=_positive, metavar="N", help="end after N values")
+    for name, text in (
+        ("pause", "hold a mesh at a point"),
+        ("resume", "let a paused mesh run on"),
+        ("step", "let a mesh run for some points and hold it there"),
+        ("stop", "end a mesh"),
+    ):
+        parser = add(name, _command, text)
+        parser.add_argument("mesh", metavar="MESH", help="name or key of the mesh")
+        if name == "step":
+            parser.add_argument("points", nargs="?", type=_positive, default=1, metavar="N", help="points (1)")
+
+
+def _with_meshes(arguments: argparse.Namespace, run: Run) -> int:
+    with Meshes(arguments.connect, arguments.timeout) as meshes:
+        return run(arguments, meshes)
+
+
+def _seconds(text: str) -> float:
+    value = float(text)
+    if not (math.isfinite(value) and value > 0.0):
+        raise argparse.ArgumentTypeError(f"{text} is not a time above 0")
+    return value
+
+
+def _positive(text: str) -> int:
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"{text} is not a number of 1 or more")
+    return value
+
+
+# --- ls, status, info
+
+
+def _ls(arguments: argparse.Namespace, meshes: Meshes) -> int:
+    clients = meshes.all()
+    if arguments.name is not None:
+        clients = [meshes.one(arguments.name)]
+    instance = clients[0].instance_in(arguments.name) if arguments.name is not None else None
+    if arguments.json:
+        for client in clients:
+            infos = _infos(client, instance) if instance is not None or arguments.long else ()
+            _print_json({"mesh": client.info(), "status": client.status(), "instances": infos})
+        return 0
+    if instance is None:
+        statuses = [client.status() for client in clients]
+        rows = [
+            [status.mesh, status.state, progress(status), seconds(status.time), ", ".join(client.endpoints)]
+            for client, status in zip(clients, statuses, strict=True)
+        ]
+        _print(table(rows, heading=["mesh", "state", "point", "time", "endpoint"]))
+    if len(clients) == 1 and instance is None:
+        print()
+        _print(instances(_statuses(clients[0])))
+    if instance is not None or arguments.long:
+        for client in clients:
+            for item in _infos(client, instance):
+                print(
+                    f"\n{client.keys.instance(item.instance)}" if instance is None else client.keys.instance(instance)
+                )
+                _print(variables(item))
+    return 0
+
+
+def _infos(client: MeshClient, instance: str | None) -> list[InstanceInfo]:
+    names = [instance] if instance is not None else client.info().instances
+    return [client.instance_info(name) for name in names]
+
+
+def _statuses(client: MeshClient) -> list[InstanceStatus]:
+    return [client.instance_status(name) for name in client.info().instances]
+
+
+def _status(arguments: argparse.Namespace, meshes: Meshes) -> int:
+    clients = [meshes.one(arguments.key)] if arguments.key is not None else meshes.all()
+    instance = clients[0].instance_in(arguments.key) if arguments.key is not None else None
+    for number, client in enumerate(clients):
+        view = client.status() if instance is None else client.instance_status(instance)
+        if arguments.json:
+            _print_json(view)
+            continue
+        if number:
+            print()
+        match view:
+            case MeshStatus():
+                _print(mesh_status(view))
+                _print(["", *instances(_statuses(client))])
+            case InstanceStatus():
+                _print(instance_status(view))
+    return 0
+
+
+def _info(arguments: argparse.Namespace, meshes: Meshes) -> int:
+    client = meshes.one(arguments.key)
+    instance = client.instance_in(arguments.key)
+    view = client.info() if instance is None else client.instance_info(instance)
+    if arguments.json:
+        _print_json(view)
+        return 0
+    match view:
+        case MeshInfo():
+            _print(mesh_info(view))
+        case InstanceInfo():
+            _print(instance_info(view))
+    return 0
+
+
+# --- values
+
+
+def _get(arguments: argparse.Namespace, meshes: Meshes) -> int:
+    rows = []
+    for client, targets in _selected(arguments.key, meshes):
+        for reading in client.get(targets):
+            if arguments.json:
+                _print_json(reading)
+            rows.append(cells(reading))
+    if not arguments.json:
+        _print(table(rows))
+    return 0
+
+
+def _set(arguments: argparse.Namespace, meshes: Meshes) -> int:
+    client = meshes.one(arguments.key)
+    answer = client.set(client.target(arguments.key), arguments.value)
+    if arguments.json:
+        _print_json(answer)
+    else:
+        print(f"{answer.key} holds from point {answer.point} on (t = {seconds(answer.time)})")
+    return 0
+
+
+def _watch(arguments: argparse.Namespace, meshes: Meshes) -> int:
+    (client, targets), *others = _selected(arguments.key, meshes)
+    if others:
+        raise ConfigurationError("only variables of one mesh can be watched together.")
+    with client.watch(targets) as readings:
+        try:
+            for reading in islice(readings, arguments.count):
+                if arguments.json:
+                    _print_json(reading)
+                else:
+                    print("  ".join(cell for cell in cells(reading) if cell), flush=True)
+        except KeyboardInterrupt:
+            return Interrupted.exit_code
+    return 0
+
+
+def _selected(references: list[str], meshes: Meshes) -> list[tuple[MeshClient, list[Target]]]:
+    """The variables that references mean, each once, by mesh."""
+    found: dict[str, tuple[MeshClient, dict[str, Target]]] = {}
+    for reference in references:
+        client = meshes.one(reference)
+        _, targets = found.setdefault(client.keys.root, (client, {}))
+        targets.update({target.key: target for target in client.targets(reference)})
+    return [(client, list(targets.values())) for client, targets in found.values()]
+
+
+# --- commands
+
+
+def _command(arguments: argparse.Namespace, meshes: Meshes) -> int:
+    client = meshes.named(arguments.mesh)
+    answer = client.command(Command(arguments.command, getattr(arguments, "points", 1)))
+    if arguments.json:
+        _print_json(answer)
+        return 0
+    match answer.command:
+        case "stop":
+            what = "is told to end"
+        case "step":
+            what = f"runs {arguments.points} points on and is held there;"
+        case _:
+            what = f"is {answer.state}"
+    print(f"mesh '{client.keys.mesh}' {what} at point {answer.point}")
+    return 0
+
+
+# --- text
+
+
+def _print(lines: list[str]) -> None:
+    print("\n".join(lines))
+
+
+def _print_json(view: object) -> None:
+    print(msgspec.json.encode(view).decode(), flush=True)

@@ -33,7 +33,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except FmuMeshError as error:
         if options.debug:
             raise
-        print(f"fmu-mesh: {error}", file=sys.stderr)
+        if not error.told:
+            print(f"fmu-mesh: {error}", file=sys.stderr)
         return error.exit_code
     except KeyboardInterrupt:
         print("fmu-mesh: interrupted", file=sys.stderr)

@@ -148,8 +148,10 @@ class Fmi2Instance:
         """The model description."""
         return self._description
 
-    def enter_initialization(self, start_time: float, stop_time: float, start_values: Mapping[str, Value]) -> None:
-        """Set ``start_values`` and enter Initialization Mode (times in s; FMI 2.0, 2.1.6 and 4.2.1)."""
+    def enter_initialization(
+        self, start_time: float, stop_time: float | None, start_values: Mapping[str, Value]
+    ) -> None:
+        """Set ``start_values`` and enter Initialization Mode (times in s, None: open end; FMI 2.0, 2.1.6 and 4.2.1)."""
         fmu = self._live()
         tolerance = self._description.default_experiment.tolerance
         self._initializing(

@@ -20,9 +20,9 @@ from typing import IO
 
 import msgspec
 
-from ..errors import FmuMeshError, MeshLost, from_report
+from ..errors import FmuMeshError, Interrupted, MeshLost, from_report
 from ..model.plan import RECORDER, Plan
-from ..wire.runtime import MeshNote, remove_run_folder, run_folder, write_note
+from ..wire.runtime import MeshNote, remove_run_folder, remove_stale_folders, run_folder, write_note
 from .events import End, Event, Ready, Status, decode_event
 from .preparing import Options
 
@@ -67,6 +67,7 @@ class Launcher:
         Raises:
             FmuMeshError: the run ended early, and why.
         """
+        remove_stale_folders()
         run = str(os.getpid())
         folder = run_folder(self._plan.system.config.mesh, run)
         try:
@@ -190,7 +191,12 @@ class Launcher:
         if self._end is not None:
             if self._end.error is None:
                 return self._end
-            raise self._with_cause(from_report(self._end.error))
+            error = self._with_cause(from_report(self._end.error))
+            if isinstance(error, Interrupted) and self._interrupted_at is not None:
+                error = Interrupted(f"interrupted at point {self._end.status.point}", time=self._end.status.time)
+            if self._end.rows and error.hint is None:
+                error.hint = f"What was recorded up to then ({self._end.rows} rows) is in '{self._end.result_file}'."
+            raise error
         if self._lost:
             name, how, _ = self._lost[0]
             point = self._point

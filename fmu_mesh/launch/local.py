@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import Interrupted
+from ..errors import Interrupted, StepFailed
 from ..fmu import Fmi2Instance, LogMessage
 from ..model.plan import Plan
 from ..model.ring import Layout, Ring
@@ -121,6 +121,9 @@ class LocalMesh:
                     break
                 for member in members.values():
                     member.step_from(point, members)
+        except StepFailed as error:
+            error.point, error.time = self.point, grid.time(self.point)
+            raise
         finally:
             if file is not None and buffer:
                 _write(file, grid, first, buffer)

@@ -11,7 +11,7 @@ from ..errors import ConfigurationError, Finding, LoadFailed
 from ..fmu import read_description
 from ..model.description import ModelDescription
 from ..model.findings import nearest_file
-from ..model.loading import LoadedConfig, load
+from ..model.loading import LoadedConfig, examine
 from ..model.plan import Plan, make_plan
 from ..model.system import build
 
@@ -40,9 +40,11 @@ def prepare(path: Path, options: Options = Options()) -> Plan:  # noqa: B008 a f
     Raises:
         ConfigurationError: with everything that is wrong with it or its FMUs.
     """
-    loaded = _with_options(load(path, options.start_values), options)
-    descriptions, findings = _descriptions(loaded)
-    system = build(loaded, descriptions, findings)
+    loaded, findings = examine(path, options.start_values)
+    loaded = _with_options(loaded, options)
+    descriptions, unreadable = _descriptions(loaded)
+    findings.merge(unreadable)
+    system = build(loaded, descriptions, tuple(findings))
     return make_plan(system, window=options.window, file=str(path))
 
 
@@ -66,6 +68,8 @@ def _descriptions(loaded: LoadedConfig) -> tuple[dict[str, ModelDescription], Se
     descriptions: dict[str, ModelDescription] = {}
     findings = []
     for name, instance in loaded.config.instances.items():
+        if not instance.fmu:
+            continue  # what stands there instead is a finding already
         path = loaded.resolve(instance.fmu)
         if path not in cache:
             try:

@@ -13,6 +13,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from types import FrameType
 
 __all__ = ["GRACE_S", "die_with_parent", "ended_by_signals"]
 
@@ -35,9 +36,11 @@ def ended_by_signals(
     """While inside: SIGTERM, SIGINT, or the end of standard input call ``interrupt`` with the reason.
 
     If the main thread has not left within `GRACE_S`, ``clean_up`` is called and the process exits with 130. Use it on
-    the main thread, before any other thread is started, so that all of them leave the signals to this one.
+    the main thread.
     """
     left = threading.Event()
+    reading, writing = os.pipe()
+    os.set_blocking(writing, False)
 
     def end(reason: str) -> None:
         interrupt(reason)
@@ -46,8 +49,9 @@ def ended_by_signals(
             os._exit(130)
 
     def wait_for_signal() -> None:
-        number = signal.sigwait({signal.SIGTERM, signal.SIGINT})
-        end(f"{signal.Signals(number).name} was received")
+        number = os.read(reading, 1)
+        if number:
+            end(f"{signal.Signals(number[0]).name} was received")
 
     def wait_for_stdin() -> None:
         while os.read(0, 4096):
@@ -55,13 +59,24 @@ def ended_by_signals(
         if not left.is_set():
             end("the process that started this one is gone")
 
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM, signal.SIGINT})
-    threading.Thread(target=wait_for_signal, name="signals", daemon=True).start()
+    # The C level handler writes the number at once, whichever thread the signal reaches and whatever it is doing.
+    wakeup = signal.set_wakeup_fd(writing, warn_on_full_buffer=False)
+    handlers = {number: signal.signal(number, _ignore) for number in (signal.SIGTERM, signal.SIGINT)}
+    watcher = threading.Thread(target=wait_for_signal, name="signals", daemon=True)
+    watcher.start()
     if watch_stdin:
         threading.Thread(target=wait_for_stdin, name="stdin", daemon=True).start()
     try:
         yield
     finally:
         left.set()
-        if not watch_stdin:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+        signal.set_wakeup_fd(wakeup)
+        os.close(writing)
+        watcher.join(GRACE_S)
+        os.close(reading)
+
+
+def _ignore(_number: int, _frame: FrameType | None) -> None:
+    """The wakeup descriptor does the work."""

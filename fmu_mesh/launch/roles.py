@@ -57,6 +57,7 @@ def run_node(
         die_with_parent()
     if plan_file is not None:
         plan = msgspec.json.decode(plan_file.read_bytes(), type=NodePlan)
+        plan_file.unlink()
     else:
         plan = _node_plan(prepare(config_file, options), name)
     zenoh_config = load(config_file).config.zenoh
@@ -108,6 +109,10 @@ def run_node(
             for reason in early:
                 node.interrupt(reason)
             node.run()
+        except FmuMeshError as error:
+            # Under a launcher, one process tells what happened, and the others only end.
+            error.told = child and (node is not None and node.failure_is_known)
+            raise
         finally:
             for instance in instances:
                 instance.close()

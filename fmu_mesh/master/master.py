@@ -310,7 +310,7 @@ class Master:
     def _lost(self, node: str) -> MeshLost:
         point = max(self._progress[self._nodes.index(node)], 0)
         return MeshLost(
-            f"{_spoken(node)} was lost: its process is gone or does not answer",
+            f"{_spoken(node)} was lost: its process does not answer any more",
             instance=", ".join(item.name for item in self._plan.nodes[node].instances) or None,
             point=point,
             time=self._plan.grid.time(point),

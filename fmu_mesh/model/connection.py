@@ -52,6 +52,9 @@ def resolve_connections(
     sources: dict[str, tuple[str, ConnectionConfig]] = {}
     for index, config in enumerate(configs):
         path = f"connections[{index}]"
+        if not config.source and not config.target:
+            findings.add(path, "no ends", "instance.output -> instance.input")
+            continue
         _check_single_source(config, path, sources, findings)
         source = resolve_variable(config.source, f"{path}.from", variables, "output", findings)
         target = resolve_variable(config.target, f"{path}.to", variables, "input", findings)

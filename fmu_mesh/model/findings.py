@@ -34,16 +34,31 @@ class Findings:
         self._lines = lines if lines is not None else {}
         self._replaced = replaced if replaced is not None else {}
         self._items: list[Finding] = []
+        self._places: set[str] = set()
+        self._settled: frozenset[str] = frozenset()
 
     def add(self, path: str, found: str, expected: str, suggestion: str | None = None) -> None:
         """Note that ``found`` stands at ``path``, or in an option, where ``expected`` would be right."""
+        if any(_same_place(path, settled) for settled in self._settled):
+            return
+        self._places.add(path)
         option = self._replaced.get(path)
         line = None if option is not None or path.startswith("--") else locate(self._lines, path)
         self._items.append(Finding(self._file, option or path, found, expected, suggestion, line))
 
     def merge(self, findings: Iterable[Finding]) -> None:
-        """Take over findings of others as they are."""
-        self._items.extend(findings)
+        """Take over earlier findings; what is added from now on at, in or around their places only follows them."""
+        for finding in findings:
+            self._items.append(finding)
+            self._places.add(finding.path)
+        if isinstance(findings, Findings):
+            self._places |= findings.places
+        self._settled = frozenset(self._places - {""})
+
+    @property
+    def places(self) -> frozenset[str]:
+        """The paths of all findings, also where an option took the place of what the file says."""
+        return frozenset(self._places)
 
     def line(self, path: str) -> int | None:
         """The line of ``path``, or of the nearest place around it."""
@@ -122,3 +137,9 @@ def shown(value: object) -> str:
         case _:
             text = str(value)
     return text if len(text) <= _SHOWN_CHARACTERS else f"{text[: _SHOWN_CHARACTERS - 3]}..."
+
+
+def _same_place(path: str, other: str) -> bool:
+    """Whether one of two paths is the other one, or in it."""
+    short, long = sorted((path, other), key=len)
+    return long.startswith(short) and long[len(short) : len(short) + 1] in ("", ".", "[")

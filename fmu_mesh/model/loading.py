@@ -16,10 +16,11 @@ from msgspec import inspect
 from fmu_mesh.errors import Finding
 from fmu_mesh.model.config import Config
 from fmu_mesh.model.findings import Findings, listed, locate, nearest, nearest_file, shown
+from fmu_mesh.model.salvage import salvage
 from fmu_mesh.model.structure import check
 from fmu_mesh.model.yaml_text import Plain, read
 
-__all__ = ["MAXIMUM_BYTES", "LoadedConfig", "load", "parse"]
+__all__ = ["MAXIMUM_BYTES", "LoadedConfig", "examine", "load", "parse"]
 
 MAXIMUM_BYTES = 4 * 1024 * 1024
 
@@ -74,10 +75,23 @@ def load(path: Path, overrides: Sequence[str] = ()) -> LoadedConfig:
     Raises:
         ConfigurationError: the file cannot be read, or its structure is wrong; carries all findings.
     """
+    loaded, findings = examine(path, overrides)
+    return _right(loaded, findings)
+
+
+def examine(path: Path, overrides: Sequence[str] = ()) -> tuple[LoadedConfig, Findings]:
+    """As `load`, but go on where the structure is wrong: give what is left, and the findings.
+
+    Hand both to `system.build`, which checks the meaning of what is left and raises one error with everything. With
+    findings the configuration holds placeholders (an empty `fmu`, a step size that is NaN) and must not be run.
+
+    Raises:
+        ConfigurationError: the file cannot be read, or too little of it is left.
+    """
     findings = Findings(str(path))
     text = _text(path, findings)
     findings.raise_any()
-    return parse(text, path, overrides)
+    return _examine(text, path, overrides)
 
 
 def parse(text: str, path: Path, overrides: Sequence[str] = ()) -> LoadedConfig:
@@ -86,6 +100,16 @@ def parse(text: str, path: Path, overrides: Sequence[str] = ()) -> LoadedConfig:
     Raises:
         ConfigurationError: the structure is wrong; carries all findings.
     """
+    loaded, findings = _examine(text, path, overrides)
+    return _right(loaded, findings)
+
+
+def _right(loaded: LoadedConfig, findings: Findings) -> LoadedConfig:
+    findings.raise_any()
+    return loaded
+
+
+def _examine(text: str, path: Path, overrides: Sequence[str]) -> tuple[LoadedConfig, Findings]:
     lines: dict[str, int] = {}
     replaced: dict[str, str] = {}
     findings = Findings(str(path), lines, replaced)
@@ -98,8 +122,11 @@ def parse(text: str, path: Path, overrides: Sequence[str] = ()) -> LoadedConfig:
         data = _with_long_connections(data, findings)
         data = _with_overrides(data, overrides, replaced, findings)
     check(data, inspect.type_info(Config), "", findings)
-    findings.raise_any()
-    return LoadedConfig(msgspec.convert(data, Config), path, lines, replaced)
+    config = salvage(data, findings.places) if len(findings) else msgspec.convert(data, Config)
+    if config is None:
+        findings.raise_any()
+    assert config is not None  # without a finding there is a configuration
+    return LoadedConfig(config, path, lines, replaced), findings
 
 
 def _text(path: Path, findings: Findings) -> str:
@@ -129,18 +156,19 @@ def _text(path: Path, findings: Findings) -> str:
 
 
 def _with_long_connections(data: dict[str, Plain], findings: Findings) -> dict[str, Plain]:
-    """``data`` with every connection in its long form; what cannot be read is noted and left out."""
+    """``data`` with every connection in its long form; what cannot be read is noted and has empty ends."""
     connections = data.get("connections")
     if not isinstance(connections, list):
         return data
     written: list[Plain] = []
     for index, connection in enumerate(connections):
-        if not isinstance(connection, str):
-            written.append(connection if isinstance(connection, dict) else {"from": "", "to": ""})
+        if isinstance(connection, dict):
+            written.append(connection)
+            continue
         ends = [end.strip() for end in connection.split(_ARROW)] if isinstance(connection, str) else []
         if len(ends) == 2 and all(ends):
             written.append({"from": ends[0], "to": ends[1]})
-        elif not isinstance(connection, dict):
+        else:
             findings.add(f"connections[{index}]", shown(connection), _SHORT_FORM, _arrow_meant(connection))
             written.append({"from": "", "to": ""})
     return {**data, "connections": written}

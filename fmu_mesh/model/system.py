@@ -7,7 +7,7 @@ Owns the meaning of a configuration (names, causality, types, step sizes). What 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 
 import msgspec
 
@@ -72,7 +72,7 @@ class System(msgspec.Struct, frozen=True):
 
 
 def build(
-    loaded: LoadedConfig, descriptions: Mapping[str, ModelDescription], findings: Sequence[Finding] = ()
+    loaded: LoadedConfig, descriptions: Mapping[str, ModelDescription], findings: Iterable[Finding] = ()
 ) -> System:
     """Give every name of a configuration its meaning.
 
@@ -115,6 +115,8 @@ def _grid(config: Config, findings: Findings) -> TimeGrid | None:
     if simulation.real_time_factor < 0.0:
         found = f"{simulation.real_time_factor:g}"
         findings.add("simulation.real_time_factor", found, "0 (as fast as possible) or a positive factor")
+    if any(math.isnan(time) for time in (start, stop, step)):
+        return None  # no time of a file is NaN: the structure is wrong there, which is found already
     if not (math.isfinite(step) and step > 0.0):
         findings.add("simulation.step_size", f"{step:g}", "a step size > 0 in s")
         return None

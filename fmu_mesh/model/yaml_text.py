@@ -44,7 +44,7 @@ _WORDS: dict[str, bool | None] = {
     **dict.fromkeys(("true", "True", "TRUE"), True),
     **dict.fromkeys(("false", "False", "FALSE"), False),
 }
-_LONGEST_INTEGER = 18  # decimal digits that fit 64 bits; what is longer is a float
+_LONGEST_INTEGER = 18  # characters that fit 64 bits; what is longer is a float, and text in another base
 
 
 def read(text: str, findings: Findings, lines: dict[str, int]) -> Plain:
@@ -77,9 +77,9 @@ def resolve(text: str) -> Plain:
     if text in _WORDS:
         return _WORDS[text]
     if _INTEGER.fullmatch(text):
-        if len(text) > _LONGEST_INTEGER:
-            return float.fromhex(text) if text.startswith("0x") else float(text.replace("0o", ""))
-        return int(text, 0) if text[:2] in ("0x", "0o") else int(text)
+        if len(text) <= _LONGEST_INTEGER:
+            return int(text, 0) if text[:2] in ("0x", "0o") else int(text)
+        return text if text[:2] in ("0x", "0o") else float(text)
     if _FLOAT.fullmatch(text):
         return float(text.replace(".inf", "inf").replace(".nan", "nan")) if text[-1].isalpha() else float(text)
     return text

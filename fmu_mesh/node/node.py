@@ -25,7 +25,7 @@ from collections.abc import Callable
 import msgspec
 import zenoh
 
-from ..errors import DeadlineExceeded, FmuError, FmuMeshError, Interrupted, MeshLost, from_report
+from ..errors import DeadlineExceeded, FmuMeshError, Interrupted, MeshLost, StepFailed, from_report
 from ..model.instance import Instance
 from ..model.plan import NodePlan
 from ..model.transfer import Transfer
@@ -55,6 +55,7 @@ log = logging.getLogger(__name__)
 
 _LOOK_S = 0.5
 _LAZY_S = 0.02
+_LAST_WORD_S = 0.3
 
 
 class Node:
@@ -63,7 +64,10 @@ class Node:
     Args:
         plan: what it has to do.
         session: the session of this process; stays the caller's.
-        instances: the instances of the plan by name; they stay the caller's, too.
+        open_instance: opens an instance of the plan by name; instances stay the caller's, too.
+
+    Attributes:
+        failure_is_known: whether somebody else knows what ended the run: the master, or who sees that it is gone.
 
     Call `run` once, from the main thread.
     """
@@ -75,6 +79,8 @@ class Node:
         self._keys = Keys(plan.key_prefix, plan.mesh)
         self._grant = 0
         self._finished = False
+        self.failure_is_known = False
+        self._master_is_gone = False
         self._heard = time.monotonic()
         self._lazy_flushed = 0.0
         self._lazy_pending = False
@@ -111,7 +117,7 @@ class Node:
                 del tokens
         except FmuMeshError as error:
             located = self._located(error)
-            self._report_failure(located)
+            self.failure_is_known = isinstance(error, _Aborted) or self._report_failure(located)
             raise located from error
         finally:
             if watcher is not None:
@@ -335,29 +341,46 @@ class Node:
 
     def _master_token_changed(self, sample: zenoh.Sample) -> None:
         if sample.kind == zenoh.SampleKind.DELETE and not self._finished:
-            self._inbox.post(lambda: _raise(MeshLost("the master is gone", hint="See the messages of its process.")))
+            self._inbox.post(self._end_without_master)
+
+    def _end_without_master(self) -> None:
+        """The master's token is gone; what it said last may still be on its way.
+
+        Raises:
+            FmuMeshError: why the master ended the run, or that it is gone.
+        """
+        self._master_is_gone = True
+        deadline = time.monotonic() + _LAST_WORD_S
+        while not self._finished and (left := deadline - time.monotonic()) > 0:
+            if (message := self._inbox.wait(left)) is not None:
+                self._take(message)
+        if not self._finished:
+            raise MeshLost("the master is gone", hint="See the messages of its process.")
 
     def _located(self, error: FmuMeshError) -> FmuMeshError:
         """The error with the point and time of its instance."""
         if isinstance(error, _Aborted):
             return error.cause
         runner = self._runners.get(error.instance or "")
-        if runner is not None and error.point is None and isinstance(error, FmuError) and self._grant:
+        if runner is not None and isinstance(error, StepFailed) and error.point is None:
             error.point = runner.point
             error.time = self._plan.grid.time(runner.point)
         return error
 
-    def _report_failure(self, error: FmuMeshError) -> None:
-        """Tell the master, unless it is the one that ended the run or cannot be reached."""
+    def _report_failure(self, error: FmuMeshError) -> bool:
+        """Tell the master, unless it is the one that is gone; whether it knows now."""
+        if self.server.state == "running":
+            for runner in self._runners.values():
+                runner.flush()
         self.server.state = "failed"
-        for runner in self._runners.values():
-            runner.flush()
-        if isinstance(error, MeshLost | Interrupted) and not isinstance(error, DeadlineExceeded):
-            return
+        if self._master_is_gone:
+            return True
         try:
             self._report(error)
         except FmuMeshError as unreachable:
             log.warning("failure_not_reported", extra={"error": str(unreachable)})
+            return False
+        return True
 
     def _report(self, error: FmuMeshError | None) -> None:
         point = min((runner.point for runner in self._runners.values()), default=0)

@@ -115,21 +115,22 @@ class MeshClient:
         return found[0]
 
     def get(self, targets: Sequence[Target]) -> list[Reading]:
-        """The current values."""
-        readings = []
+        """The current values, in the order of the targets; each comes with the point that it belongs to."""
+        readings: dict[str, Reading] = {}
         for instance in dict.fromkeys(target.instance for target in targets):
             own = {target.key: target for target in targets if target.instance == instance}
             key = next(iter(own)) if len(own) == 1 else f"{self._instance_key(instance)}/*/*"
             for sample in self._ask(key, f"the values of instance '{instance}'"):
                 target = own.get(str(sample.key_expr))
                 if target is not None and (reading := reading_of(target, sample)) is not None:
-                    readings.append(reading)
-        return readings
+                    readings[target.key] = reading
+        return [readings[target.key] for target in targets if target.key in readings]
 
     def set(self, target: Target, text: str) -> SetAnswer:
         """Give an unconnected input or a tunable parameter a value; the answer says from which point on it holds.
 
         Args:
+            target: the variable.
             text: the value as JSON; what is no JSON is taken as text, so an item or a String needs no quotes.
         """
         payload = text.encode()
@@ -142,7 +143,7 @@ class MeshClient:
         return self._view(target.key, SetAnswer, f"'{target.instance}.{target.variable.name}'", payload)
 
     def command(self, command: Command) -> CommandAnswer:
-        """Pause, resume, step or stop the mesh."""
+        """Pause, resume, step or stop the mesh; the answer comes before the points of a step are done."""
         payload = msgspec.json.encode(command)
         return self._view(self.keys.mesh_key("command"), CommandAnswer, f"mesh '{self.keys.mesh}'", payload)
 
@@ -187,7 +188,9 @@ class MeshClient:
         found = [target for candidate in instances for target in self._variables(candidate)]
         matching = [target for target in found if _fits(name, target.variable.name)]
         if not matching:
-            where = f"instance '{instances[0]}' has" if len(instances) == 1 else f"the instances {listed(instances)} have"
+            where = (
+                f"instance '{instances[0]}' has" if len(instances) == 1 else f"the instances {listed(instances)} have"
+            )
             raise _unknown(f"{where} no variable '{name}'", name, [target.variable.name for target in found])
         return matching
 

@@ -1,7 +1,7 @@
 """Which meshes a tool can reach, and which of them a key means.
 
-Owns the way from the notes in the runtime folder, or from endpoints, to a `MeshClient` for each running mesh. Tools open
-sessions in client mode: the master, which is their way in, passes everything on to the nodes.
+Owns the way from the notes in the runtime folder, or from endpoints, to a `MeshClient` for each running mesh. Tools
+open sessions in client mode: the master, which is their way in, passes everything on to the nodes.
 """
 
 from __future__ import annotations
@@ -126,7 +126,10 @@ class Meshes:
 
 
 def _open(stack: ExitStack, endpoints: Sequence[str], timeout_s: float) -> zenoh.Session:
-    """A session in client mode; a thread waits for it, because Zenoh's own deadline is for processes that start late."""
+    """A session in client mode.
+
+    Opened on a thread: `open_session` is patient with endpoints that start late, a person at a terminal is not.
+    """
     sessions: list[zenoh.Session] = []
     errors: list[FmuMeshError] = []
 

@@ -17,7 +17,7 @@ import msgspec
 
 from ..errors import ConfigurationError
 
-__all__ = ["MeshNote", "leave_run_folder", "meshes", "remove_run_folder", "run_folder", "runtime_folder", "socket_endpoint", "write_note"]
+__all__ = ["MeshNote", "leave_run_folder", "meshes", "remove_run_folder", "remove_stale_folders", "run_folder", "runtime_folder", "socket_endpoint", "write_note"]
 
 _SOCKET_PATH_LIMIT = 100
 
@@ -70,6 +70,10 @@ def remove_run_folder(folder: Path) -> None:
 
 def leave_run_folder(folder: Path) -> None:
     """Remove the folder of a run if nobody uses it any more; called by every process on its way out."""
+    note = _read_note(folder / "mesh.json")
+    if note is not None and not _is_alive(note.pid):
+        remove_run_folder(folder)  # the launcher was killed
+        return
     for empty in (folder / "fmus", folder):
         try:
             empty.rmdir()
@@ -102,14 +106,24 @@ def write_note(folder: Path, note: MeshNote) -> None:
 def meshes() -> Iterator[MeshNote]:
     """The meshes that run on this host for this user; folders whose process is gone are removed on the way."""
     for file in sorted(runtime_folder().glob("*/mesh.json")):
-        try:
-            note = msgspec.json.decode(file.read_bytes(), type=MeshNote)
-        except (OSError, msgspec.DecodeError):
-            continue
-        if _is_alive(note.pid):
+        note = _read_note(file)
+        if note is not None and _is_alive(note.pid):
             yield note
-        else:
+        elif note is not None:
             remove_run_folder(file.parent)
+
+
+def remove_stale_folders() -> None:
+    """Remove the folders of runs whose launcher is gone and whose processes could not do it themselves."""
+    for _ in meshes():
+        continue
+
+
+def _read_note(file: Path) -> MeshNote | None:
+    try:
+        return msgspec.json.decode(file.read_bytes(), type=MeshNote)
+    except (OSError, msgspec.DecodeError):
+        return None
 
 
 def _is_alive(pid: int) -> bool:

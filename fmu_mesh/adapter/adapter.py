@@ -1,0 +1,360 @@
+"""`FMIAdapter`: one FMU for a program that steps it by itself.
+
+Owns the modes, the time reached and the FMU's private folder. Knows nothing of meshes, Zenoh or ROS.
+"""
+
+from __future__ import annotations
+
+import itertools
+import logging
+import math
+import os
+import shutil
+import tempfile
+import weakref
+from collections.abc import Iterator
+from contextlib import contextmanager
+from fractions import Fraction
+from pathlib import Path
+from types import TracebackType
+from typing import Literal, Self
+
+from ..errors import FmuError
+from ..fmu import Fmi2Instance, LogMessage, read_description
+from ..model.description import ModelDescription, Value
+from .arguments import Arguments
+from .trajectory import Clock, Trajectory
+
+__all__ = ["FMIAdapter"]
+
+log = logging.getLogger(__name__)
+
+_instance_numbers = itertools.count(1)
+_HALF = Fraction(1, 2)
+
+
+class FMIAdapter:
+    """One FMI 2.0 co-simulation FMU, stepped by the program that owns this object.
+
+    Call sequence: `set_initial_value` as often as needed, `exit_initialization_mode`, then `do_step` or
+    `do_steps_until` with `set_input_value` and `get_output_value` in between; `close`, or the end of a `with` block, at
+    the end. All calls come from one thread.
+
+    Times are seconds of the caller's clock, whatever its zero is; the FMU's own time starts at 0.0. What a step from
+    t to t + h does:
+
+        for every input with a trajectory: set its value at t
+        fmi2DoStep from t to t + h
+
+    The trajectory of an input is its value at the start, and each value of `set_input_value` from its time on. In
+    between, a Real is linear if ``interpolate_input`` is true and else constant; every other type is constant. After
+    the last time the last value holds.
+
+    Args:
+        fmu_path: the .fmu file.
+        step_size: communication step size in s; None takes the default experiment's.
+        interpolate_input: whether Real inputs are linear between their times.
+
+    Raises:
+        CallRefused: ``step_size`` is not above 0, or missing here and in the FMU.
+        LoadFailed: the FMU cannot be read, extracted or instantiated. Nothing is left behind.
+    """
+
+    def __init__(
+        self,
+        fmu_path: str | os.PathLike[str],
+        step_size: float | None = None,
+        interpolate_input: bool = True,  # noqa: FBT001, FBT002 as the constructor of fmi_adapter has it
+    ) -> None:
+        path = Path(fmu_path)
+        self._description = description = read_description(path)
+        # No instance of a configuration can have this name, so both can be in one process.
+        name = f"{description.model_identifier}@{next(_instance_numbers)}"
+        self._arguments = Arguments(name, description)
+        self._step_size = self._arguments.step_size(step_size)
+        self._interpolate_input = interpolate_input
+        self._mode: Literal["initialization", "stepping", "failed", "closed"] = "initialization"
+        self._entered = False
+        self._start_values: dict[str, Value] = {}
+        self._early_inputs: dict[str, dict[float, Value]] = {}
+        self._initial_inputs: dict[str, Value] = {}
+        self._trajectories: dict[str, Trajectory] = {}
+        self._clock = Clock(0.0)
+        self._elapsed = Fraction(0)
+        self._point = 0
+        folder = Path(tempfile.mkdtemp(prefix="fmu_mesh-"))
+        try:
+            self._instance = Fmi2Instance(path, name, description, folder, _forward)
+            self._release = weakref.finalize(self, _release, self._instance, folder)
+        except BaseException:
+            shutil.rmtree(folder, ignore_errors=True)
+            raise
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    @property
+    def description(self) -> ModelDescription:
+        """The model description: units, types, start values and all else that is not asked for below."""
+        return self._description
+
+    @property
+    def all_variable_names(self) -> tuple[str, ...]:
+        """Names of all variables, in the order of the model description, as are the three below."""
+        return tuple(self._arguments.all)
+
+    @property
+    def input_variable_names(self) -> tuple[str, ...]:
+        """Names of all inputs."""
+        return tuple(self._arguments.inputs)
+
+    @property
+    def output_variable_names(self) -> tuple[str, ...]:
+        """Names of all outputs."""
+        return tuple(self._arguments.outputs)
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """Names of all parameters; calculated parameters are not among them, because they cannot be set."""
+        return tuple(self._arguments.parameters)
+
+    @property
+    def can_handle_variable_communication_step_size(self) -> bool:
+        """Whether the FMU takes steps of different sizes."""
+        return self._description.can_handle_variable_step_size
+
+    @property
+    def default_experiment_step(self) -> float | None:
+        """The step size in s that the FMU itself proposes, or None."""
+        return self._description.default_experiment.step_size
+
+    @property
+    def step_size(self) -> float:
+        """The default step size in s: that of the constructor, or else the FMU's."""
+        return self._step_size
+
+    @property
+    def is_in_initialization_mode(self) -> bool:
+        """Whether `exit_initialization_mode` is still to come."""
+        return self._mode == "initialization"
+
+    @property
+    def simulation_time(self) -> float:
+        """The time that the FMU has reached, on the caller's clock, in s.
+
+        Raises:
+            CallRefused: there is none before `exit_initialization_mode`.
+        """
+        self._demand("stepping", "simulation_time")
+        return self._clock.from_fmu(float(self._elapsed))
+
+    def set_initial_value(self, name: str, value: Value) -> None:
+        """Set a parameter, an input or the initial value of another variable.
+
+        Raises:
+            CallRefused: the mode, the name or the type is wrong, or the variable cannot be set before the start.
+            InitializationFailed: the FMU refuses it.
+        """
+        self._demand("initialization", "set_initial_value")
+        variable = self._arguments.settable(name)
+        converted = self._arguments.value(variable, value)
+        if not self._entered:
+            self._start_values[name] = converted
+            return
+        if variable.causality != "input" and variable.initial != "exact":  # FMI 2.0, 4.2.4
+            raise self._arguments.refusal("it can only be set before the first value is read.", variable=name)
+        with self._fmu_called():
+            self._instance.set_values({name: converted})
+
+    def exit_initialization_mode(self, time: float) -> None:
+        """Start the simulation: ``time`` (s) on the caller's clock is 0.0 on the FMU's.
+
+        An input whose trajectory begins at or before ``time`` starts with its value there, any other with its initial
+        value.
+
+        Raises:
+            CallRefused: it was called before, or ``time`` is no finite number.
+            InitializationFailed: the FMU refuses a start value, or does not start.
+        """
+        self._demand("initialization", "exit_initialization_mode")
+        self._clock = Clock(self._arguments.seconds(time, "time"))
+        self._enter()
+        with self._fmu_called():
+            names = self.input_variable_names
+            self._initial_inputs = dict(zip(names, self._instance.get_values(names), strict=True))
+            for name, values in self._early_inputs.items():
+                times = [self._clock.to_fmu(time) for time in values]
+                trajectory = self._begin_trajectory(name, initial=min(times) > self._clock.resolution(0.0))
+                for when, value in zip(times, values.values(), strict=True):
+                    trajectory.add(when, value)
+            self._early_inputs.clear()
+            self._set_inputs(0.0)
+            self._instance.exit_initialization()
+        self._mode = "stepping"
+
+    def set_input_value(self, name: str, time: float, value: Value) -> None:
+        """Add a value to the trajectory of an input: it is valid from ``time`` (s, caller's clock) on.
+
+        Times may come in any order and lie any time ahead. Of several values for one time the last one counts. A time
+        that is past is accepted: its value holds from the next step on, unless that of a later time is already in use.
+
+        Raises:
+            CallRefused: the adapter is closed, or the name, the type or the time is wrong.
+        """
+        self._demand(None, "set_input_value")
+        converted = self._arguments.value(self._arguments.input(name), value)
+        seconds = self._arguments.seconds(time, "time")
+        if self._mode == "initialization":
+            self._early_inputs.setdefault(name, {})[seconds] = converted
+            return
+        if name not in self._trajectories:
+            self._begin_trajectory(name, initial=True)
+        self._trajectories[name].add(self._clock.to_fmu(seconds), converted)
+
+    def set_parameter_value(self, name: str, value: Value) -> None:
+        """Change a tunable parameter between two steps.
+
+        Raises:
+            CallRefused: the mode, the name or the type is wrong, or the parameter is not tunable.
+            StepFailed: the FMU refuses it; only `close` is allowed now.
+        """
+        self._demand("stepping", "set_parameter_value")
+        converted = self._arguments.value(self._arguments.tunable(name), value)
+        with self._fmu_called():
+            self._instance.set_values({name: converted})
+
+    def do_step(self, step_size: float | None = None) -> float:
+        """Advance by one step of ``step_size`` (s; None: the default one) and return the time reached, in s.
+
+        Raises:
+            CallRefused: the mode is wrong, or the step size is not above 0, or not one that this FMU takes.
+            StepFailed: the FMU failed; only `close` is allowed now.
+        """
+        self._demand("stepping", "do_step")
+        default = self._step_size
+        self._step(default if step_size is None else self._arguments.other_step_size(step_size, default))
+        return self.simulation_time
+
+    def do_steps_until(self, time: float, max_steps: int | None = None) -> float:
+        """Take as many default steps as bring the FMU nearest to ``time`` (s), and return the time reached.
+
+        Of two times equally near the earlier one is taken. So the time reached may be up to half a step past ``time``,
+        and a ``time`` that is past by no more than that is no error.
+
+        Args:
+            time: on the caller's clock.
+            max_steps: take no more steps than this, to stay responsive when the caller's clock jumps ahead.
+
+        Raises:
+            CallRefused: the mode is wrong, or the FMU is already more than half a step past ``time``.
+            StepFailed: the FMU failed; only `close` is allowed now.
+        """
+        self._demand("stepping", "do_steps_until")
+        if max_steps is not None and max_steps < 1:
+            raise self._arguments.refusal(f"max_steps is {max_steps!r}; expected 1 or more.")
+        target = Fraction(self._clock.to_fmu(self._arguments.seconds(time, "time")))
+        missing = (target - self._elapsed) / Fraction(self._step_size)
+        if missing < -_HALF:
+            now = self.simulation_time
+            raise self._arguments.refusal(f"cannot step until {time!r} s, because {now!r} s is already reached.")
+        steps = max(0, math.ceil(missing - _HALF))
+        for _ in range(steps if max_steps is None else min(steps, max_steps)):
+            self._step(self._step_size)
+        return self.simulation_time
+
+    def get_output_value(self, name: str) -> Value:
+        """The current value of an output; before the first step, its initial value.
+
+        Raises:
+            CallRefused: the adapter is closed, or there is no such output.
+            FmuError: the FMU refuses it; only `close` is allowed now.
+        """
+        self._arguments.output(name)
+        return self.get_value(name)
+
+    def get_value(self, name: str) -> Value:
+        """The current value of any variable.
+
+        Raises:
+            CallRefused: the adapter is closed, or there is no such variable.
+            FmuError: the FMU refuses it; only `close` is allowed now.
+        """
+        self._demand(None, "get_value")
+        self._arguments.any(name)
+        self._enter()
+        with self._fmu_called():
+            return self._instance.get_values([name])[0]
+
+    def close(self) -> None:
+        """Free the FMU and remove its files. Never raises; may be called twice."""
+        self._mode = "closed"
+        self._release()
+
+    def _demand(self, mode: Literal["initialization", "stepping"] | None, call: str) -> None:
+        if self._mode in ("initialization", "stepping") and mode in (None, self._mode):
+            return
+        reason, hint = {
+            "closed": ("the adapter is closed", None),
+            "failed": ("the FMU has failed before", "Only close() is allowed now."),
+            "initialization": ("the adapter is in initialization mode", "Call exit_initialization_mode first."),
+            "stepping": (
+                "initialization mode is over",
+                "Inputs change by set_input_value, tunable parameters by set_parameter_value.",
+            ),
+        }[self._mode]
+        raise self._arguments.refusal(f"{call} is not possible, because {reason}.", hint)
+
+    def _enter(self) -> None:
+        """Let the FMU enter Initialization Mode: as late as possible, because some start values come before it."""
+        if not self._entered:
+            with self._fmu_called():
+                self._instance.enter_initialization(0.0, None, self._start_values)
+            self._entered = True
+
+    def _begin_trajectory(self, name: str, *, initial: bool) -> Trajectory:
+        """A new trajectory, whose first value is the initial one at 0.0 if ``initial`` is true."""
+        linear = self._interpolate_input and self._arguments.inputs[name].type == "Real"
+        self._trajectories[name] = trajectory = Trajectory(linear=linear)
+        if initial:
+            trajectory.add(0.0, self._initial_inputs[name])
+        return trajectory
+
+    def _step(self, step_size: float) -> None:
+        time = float(self._elapsed)
+        with self._fmu_called():
+            self._set_inputs(time)
+            self._instance.advance(time, step_size)
+        # Exact, so it never drifts: while the step size stays the same, its float is that of point * step_size.
+        self._elapsed += Fraction(step_size)
+        self._point += 1
+
+    def _set_inputs(self, time: float) -> None:
+        resolution = self._clock.resolution(time)
+        values = {name: trajectory.value(time, resolution) for name, trajectory in self._trajectories.items()}
+        if values:
+            self._instance.set_values(values)
+
+    @contextmanager
+    def _fmu_called(self) -> Iterator[None]:
+        try:
+            yield
+        except FmuError as error:
+            if self._mode == "stepping":
+                error.point, error.time = self._point, self.simulation_time
+            self._mode = "failed"
+            raise
+
+
+def _forward(message: LogMessage) -> None:
+    level = {"ok": logging.DEBUG, "warning": logging.WARNING}.get(message.status, logging.ERROR)
+    log.log(level, "fmu_message instance=%s category=%s: %s", message.instance, message.category, message.message)
+
+
+def _release(instance: Fmi2Instance, folder: Path) -> None:
+    instance.close()
+    shutil.rmtree(folder, ignore_errors=True)
