@@ -71,7 +71,7 @@ class FmuMeshError(Exception):
 
     exit_code: ClassVar[int] = 1
 
-    def __init__(
+    def __init__(  # noqa: PLR0913  each is a field of its own that the reader of an error needs
         self,
         message: str,
         *,
@@ -203,7 +203,16 @@ class Interrupted(FmuMeshError):
 
 _BY_KIND: dict[str, type[FmuMeshError]] = {
     kind.__name__: kind
-    for kind in (FmuError, LoadFailed, InitializationFailed, StepFailed, MeshLost, DeadlineExceeded, FrameGap, Interrupted)
+    for kind in (
+        FmuError,
+        LoadFailed,
+        InitializationFailed,
+        StepFailed,
+        MeshLost,
+        DeadlineExceeded,
+        FrameGap,
+        Interrupted,
+    )
 }
 
 

@@ -8,6 +8,8 @@ from __future__ import annotations
 import math
 
 import msgspec
+import numpy as np
+from numpy.typing import NDArray
 
 __all__ = ["TimeGrid", "steps_between"]
 
@@ -28,6 +30,11 @@ class TimeGrid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def time(self, point: int) -> float:
         """The time of ``point`` in s."""
         return self.start_time + point * self.step_size
+
+    def times(self, first: int, end: int) -> NDArray[np.float64]:
+        """The times of the points ``first .. end - 1`` in s, each as `time` computes it."""
+        times: NDArray[np.float64] = self.start_time + np.arange(first, end, dtype=np.float64) * self.step_size
+        return times
 
     @property
     def stop_time(self) -> float:

@@ -129,7 +129,8 @@ def _order(plan: Plan) -> list[str]:
 
 def _initialization(plan: Plan) -> list[str]:
     levels: dict[int, list[str]] = {}
-    for (name, variable), level in plan.initialization.levels.items():
+    by_order = sorted(plan.initialization.levels.items(), key=lambda item: plan.order.index(item[0][0]))
+    for (name, variable), level in by_order:
         levels.setdefault(level, []).append(f"{name}.{variable}")
     lines = [f"  level {level}: {', '.join(names)}" for level, names in sorted(levels.items())]
     for name, variable in plan.initialization.held:

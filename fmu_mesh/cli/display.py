@@ -78,7 +78,7 @@ class Display:
             self._console.print(f"[dim]{escape(name)} |[/] {escape(text)}")
 
     def _status(self, status: MeshStatus) -> None:
-        text = status.state
+        text: str = status.state
         if status.state in ("running", "paused", "stopping"):
             text = (
                 f"t = {status.time:.6g} s  {status.points_per_second:,.0f} points/s  "

@@ -23,7 +23,7 @@ from ..model.plan import Plan
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["Results", "add_commands", "plot_results", "read_results", "reduced", "require_matplotlib"]
+__all__ = ["Results", "add_commands", "draw", "plot_results", "read_results", "reduced", "require_matplotlib"]
 
 _TIME = "time"
 _WORDS = {"true": 1.0, "false": 0.0, "": float("nan")}
@@ -38,11 +38,13 @@ class Results(msgspec.Struct, frozen=True):
         times: the times in s.
         columns: the values by variable; true is 1 and false is 0.
         flags: the variables that hold nothing but true and false.
+        whole: the variables that are Integer or Enumeration: a Real is never written without a point or an exponent.
     """
 
     times: NDArray[np.float64]
     columns: dict[str, NDArray[np.float64]]
     flags: frozenset[str]
+    whole: frozenset[str]
 
 
 def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.ArgumentParser) -> None:
@@ -105,7 +107,7 @@ def read_results(path: Path, wanted: Sequence[str] | None = None) -> Results:
     """
     try:
         with path.open(encoding="utf-8", newline="") as file:
-            names, values, flags = _read(path, file)
+            names, first, values = _read(path, file)
     except OSError as error:
         raise ConfigurationError(f"the result file '{path}' cannot be read: {error.strerror}.") from error
     except (UnicodeDecodeError, csv.Error) as error:
@@ -113,18 +115,21 @@ def read_results(path: Path, wanted: Sequence[str] | None = None) -> Results:
     chosen = _chosen(path, names[1:], wanted)
     table = np.frombuffer(values, np.float64).reshape(-1, len(names))
     columns = {name: table[:, names.index(name, 1)] for name in chosen}
-    return Results(table[:, 0], columns, flags.intersection(chosen))
+    texts = {name: text for name, text in zip(names, first, strict=False) if name in columns}
+    flags = frozenset(name for name, text in texts.items() if text in ("true", "false"))
+    whole = frozenset(name for name, text in texts.items() if text.removeprefix("-").isdecimal())
+    return Results(table[:, 0], columns, flags, whole)
 
 
-def _read(path: Path, file: TextIO) -> tuple[list[str], array[float], frozenset[str]]:
-    """The heading, the values row by row, and the variables whose first value is true or false."""
+def _read(path: Path, file: TextIO) -> tuple[list[str], list[str], array[float]]:
+    """The heading, the first row as text, and the values row by row."""
     heading = file.readline()
     names = next(csv.reader([heading]), [])
     if not names or names[0] != _TIME:
-        first = f"its first column is '{names[0][:40]}'" if names else "it is empty"
-        raise ConfigurationError(f"'{path}' is no result file: {first}, not '{_TIME}'.")
+        found = f"its first column is '{names[0][:40]}'" if names else "it is empty"
+        raise ConfigurationError(f"'{path}' is no result file: {found}, not '{_TIME}'.")
     values: array[float] = array("d")
-    flags: frozenset[str] = frozenset()
+    first: list[str] = []
     for number, line in enumerate(file, 2):
         if not line.endswith("\n"):  # the last row, cut off perhaps within a number
             break
@@ -132,13 +137,12 @@ def _read(path: Path, file: TextIO) -> tuple[list[str], array[float], frozenset[
         if len(row) != len(names):
             found = f"{len(row)} values where the heading has {len(names)}"
             raise ConfigurationError(f"'{path}' is no result file: line {number}: {found}.")
-        if not values:
-            flags = frozenset(name for name, text in zip(names, row, strict=True) if text in ("true", "false"))
+        first = first or row
         try:
             values.extend([_WORDS[text] if text in _WORDS else float(text) for text in row])
         except ValueError as error:
             raise ConfigurationError(f"'{path}' is no result file: line {number}: {error}.") from error
-    return names, values, flags
+    return names, first, values
 
 
 def _chosen(path: Path, names: list[str], wanted: Sequence[str] | None) -> Sequence[str]:
@@ -175,11 +179,9 @@ def draw(results: Results, output: Path, *, title: str, variables: Mapping[str, 
     )
     FigureCanvasAgg(figure)
     figure.suptitle(title, fontweight="bold")
-    colours = {name: f"C{number % 10}" for number, name in enumerate(results.columns)}
     all_axes = figure.subplots(len(groups), 1, sharex=True, squeeze=False)[:, 0]
     for number, (axes, (label, names)) in enumerate(zip(all_axes, groups.items(), strict=True)):
-        axes.set_prop_cycle(color=[colours[name] for name in names] or ["C0"])
-        _draw_axes(axes, results, names, label, variables)
+        _draw_axes(axes, results, names, label)
         axes.label_outer()
         if number == len(groups) - 1:
             axes.set_xlabel("time in s")
@@ -202,16 +204,21 @@ def _axis_of(name: str, results: Results, variables: Mapping[str, Variable]) -> 
     return f"value in {variable.unit}" if variable.unit else "value, no unit"
 
 
-def _draw_axes(
-    axes: Axes, results: Results, names: Sequence[str], label: str, variables: Mapping[str, Variable]
-) -> None:
+def _draw_axes(axes: Axes, results: Results, names: Sequence[str], label: str) -> None:
+    colours = {name: f"C{number}" for number, name in enumerate(results.columns)}
     for name in names:
-        variable = variables.get(name)
-        steps = name in results.flags or (variable is not None and variable.type != "Real")
+        steps = name in results.flags or name in results.whole
         times, values = reduced(results.times, results.columns[name], _MAX_POINTS)
-        style = "steps-post" if steps else "default"
-        # A line of one point would show nothing.
-        axes.plot(times, values, label=name, drawstyle=style, linewidth=1.4, marker="o" if len(times) == 1 else None)
+        lone = "o" if len(times) == 1 else None  # a line of one point would show nothing
+        axes.plot(
+            times,
+            values,
+            label=name,
+            color=colours[name],
+            drawstyle="steps-post" if steps else "default",
+            linewidth=1.4,
+            marker=lone,
+        )
     axes.set_ylabel(label)
     axes.grid(visible=True, alpha=0.35)
     axes.margins(x=0.01)

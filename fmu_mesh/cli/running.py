@@ -129,9 +129,7 @@ def _close(plan: Plan, point: int, seconds: float, rows: int, plot: Path | None)
 
 
 def _node(arguments: argparse.Namespace) -> int:
-    run_node(
-        arguments.config, arguments.node, _options(arguments), plan_file=arguments.plan, run=arguments.run
-    )
+    run_node(arguments.config, arguments.node, _options(arguments), plan_file=arguments.plan, run=arguments.run)
     return 0
 
 

@@ -1,4 +1,4 @@
-"""FMUs: reading their descriptions, extracting and loading them, and calling them. The only package that imports fmpy."""
+"""FMUs: reading, extracting, loading and calling them. The only package that imports fmpy."""
 
 from .fmi2 import Fmi2Instance, LogMessage
 from .reading import read_description

@@ -155,7 +155,8 @@ class Fmi2Instance:
         fmu = self._live()
         tolerance = self._description.default_experiment.tolerance
         self._initializing(
-            "fmi2SetupExperiment", lambda: fmu.setupExperiment(tolerance=tolerance, startTime=start_time, stopTime=stop_time)
+            "fmi2SetupExperiment",
+            lambda: fmu.setupExperiment(tolerance=tolerance, startTime=start_time, stopTime=stop_time),
         )
         self.set_values(start_values)
         self._initializing("fmi2EnterInitializationMode", fmu.enterInitializationMode)
@@ -182,9 +183,7 @@ class Fmi2Instance:
             values.update({name: _from_c(type_, raw) for name, raw in zip(members, array, strict=True)})
         return [values[name] for name in names]
 
-    def bind(
-        self, inputs: Ring, outputs: Sequence[Ring], start_time: float, step_size: float, step: int = 0
-    ) -> None:
+    def bind(self, inputs: Ring, outputs: Sequence[Ring], start_time: float, step_size: float, step: int = 0) -> None:
         """Let `do_step` work on these rings (times in s), and write the current outputs as row ``step``."""
         self._hot = hot = _HotLoop(self._live(), self._variables, inputs, outputs)
         self._start_time = start_time
@@ -264,7 +263,7 @@ class Fmi2Instance:
             groups.setdefault(self._variables[name].type, []).append(name)
         return groups
 
-    def _get_or_set(self, function: str, names: Sequence[str], array: Any) -> None:
+    def _get_or_set(self, function: str, names: Sequence[str], array: ctypes.Array[Any]) -> None:
         fmu = self._live()
         references = (ctypes.c_uint * len(names))(*(self._variables[name].value_reference for name in names))
         try:
@@ -333,7 +332,7 @@ def _runs(ring: Ring) -> list[tuple[str, int, tuple[str, ...], Any]]:
     return runs
 
 
-def _to_c(type_: VariableType, value: Value) -> Any:
+def _to_c(type_: VariableType, value: Value) -> float | int | bytes:
     match type_:
         case "Real":
             return float(value)
@@ -343,16 +342,16 @@ def _to_c(type_: VariableType, value: Value) -> Any:
             return int(value)
 
 
-def _from_c(type_: VariableType, raw: Any) -> Value:
+def _from_c(type_: VariableType, raw: float | bytes | None) -> Value:
     match type_:
         case "Boolean":
             return bool(raw)
         case "String":
-            return (raw or b"").decode(errors="replace")
+            return raw.decode(errors="replace") if isinstance(raw, bytes) else ""
         case "Real":
-            return float(raw)
+            return float(raw or 0.0)
         case _:
-            return int(raw)
+            return int(raw or 0)
 
 
 def _quietly(call: Callable[[], object]) -> None:

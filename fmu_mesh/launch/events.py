@@ -49,7 +49,7 @@ class End(msgspec.Struct, frozen=True, tag="end"):
 
 Event = Ready | Status | Log | End
 
-_decoder = msgspec.json.Decoder(Event)
+_decoder: msgspec.json.Decoder[Event] = msgspec.json.Decoder(Event)
 
 
 def decode_event(line: bytes) -> Event:
@@ -69,6 +69,7 @@ class EventWriter:
         self._lock = threading.Lock()
 
     def __call__(self, event: Event) -> None:
+        """Write one event."""
         line = msgspec.json.encode(event) + b"\n"
         with self._lock:
             try:

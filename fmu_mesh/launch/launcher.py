@@ -15,6 +15,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import IO
 
@@ -241,7 +242,8 @@ class _Process:
             stderr=subprocess.PIPE,
             start_new_session=True,
         )
-        assert popen.stdout is not None and popen.stderr is not None
+        assert popen.stdout is not None
+        assert popen.stderr is not None
         readers = [
             threading.Thread(target=self._read, args=(popen.stdout, on_line), daemon=True),
             threading.Thread(
@@ -274,7 +276,7 @@ class _Process:
 
     def _read(self, pipe: IO[bytes], on_line: Callable[[bytes], None]) -> None:
         for line in pipe:
-            self._post(lambda line=line: on_line(line))
+            self._post(partial(on_line, line))
 
     def _wait(self, readers: Sequence[threading.Thread], on_exit: Callable[[str, int], None]) -> None:
         assert self._popen is not None

@@ -15,6 +15,7 @@ import numpy as np
 
 from ..errors import Interrupted, StepFailed
 from ..fmu import Fmi2Instance, LogMessage
+from ..model.description import Value
 from ..model.plan import Plan
 from ..model.ring import Layout, Ring
 from ..record.csv_file import CsvFile
@@ -91,7 +92,7 @@ class LocalMesh:
         for member in members.values():
             member.instance.enter_initialization(grid.start_time, grid.stop_time, member.plan.start_values)
         levels = self._plan.initialization.levels
-        known: dict[tuple[str, str], float | int | bool | str] = {}
+        known: dict[tuple[str, str], Value] = {}
         for (name, variable), _ in sorted(levels.items(), key=lambda item: item[1]):
             members[name].set_initial_inputs(known)
             known[(name, variable)] = members[name].instance.get_values([variable])[0]
@@ -104,7 +105,7 @@ class LocalMesh:
     def _loop(self, members: dict[str, _Member], file: CsvFile | None) -> None:
         plan, grid = self._plan, self._plan.grid
         recorded = [(members[instance], variable) for instance, variable in plan.system.recorded]
-        buffer: list[list[float | int | bool | str]] = []
+        buffer: list[list[Value]] = []
         first = 0
         try:
             for point in range(grid.last_point + 1):
@@ -136,7 +137,7 @@ class _Member:
     def __init__(self, plan: Plan, name: str, folder: Path, log: Callable[[LogMessage], None]) -> None:
         system = plan.system.instances[name]
         node = plan.nodes[system.node]
-        self.plan = next(item for item in node.instances if item.name == name)
+        self.plan = node.instance(name)
         self.connections = [c for c in plan.connections if c.target_instance == name]
         self.instance = Fmi2Instance(Path(system.fmu), name, system.description, folder, log)
         self._inputs = Ring(self.plan.inputs, 1)
@@ -145,7 +146,7 @@ class _Member:
         self._outputs = Ring(self.plan.outputs, 1 << (2 * oldest).bit_length())
         self.step = 0
 
-    def set_initial_inputs(self, known: dict[tuple[str, str], float | int | bool | str]) -> None:
+    def set_initial_inputs(self, known: dict[tuple[str, str], Value]) -> None:
         """Set every connected input whose source is known."""
         values = {}
         for c in self.connections:
@@ -158,7 +159,7 @@ class _Member:
     def bind(self, grid: TimeGrid) -> None:
         self.instance.bind(self._inputs, (self._outputs,), grid.start_time, grid.step_size * self.plan.step_points)
 
-    def value_at(self, point: int, variable: str) -> float | int | bool | str:
+    def value_at(self, point: int, variable: str) -> Value:
         """The output at ``point``: that of the last own point at or before it."""
         return self._outputs.value(point // self.plan.step_points, variable)
 
@@ -179,12 +180,12 @@ class _Member:
         self.step += 1
 
 
-def _scaled(value: float | int | bool | str, factor: float, offset: float) -> float | int | bool | str:
+def _scaled(value: Value, factor: float, offset: float) -> Value:
     if isinstance(value, str) or (factor, offset) == (1.0, 0.0):
         return value
     return value * factor + offset
 
 
-def _write(file: CsvFile, grid: TimeGrid, first: int, rows: list[list[float | int | bool | str]]) -> None:
-    times = grid.start_time + np.arange(first, first + len(rows)) * grid.step_size
+def _write(file: CsvFile, grid: TimeGrid, first: int, rows: list[list[Value]]) -> None:
+    times = grid.times(first, first + len(rows))
     file.write(times, [np.array(column) for column in zip(*rows, strict=True)])

@@ -6,16 +6,18 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import msgspec
+from msgspec.structs import replace
 
 from ..errors import ConfigurationError, Finding, LoadFailed
 from ..fmu import read_description
+from ..model.config import ZenohConfig
 from ..model.description import ModelDescription
 from ..model.findings import nearest_file
 from ..model.loading import LoadedConfig, examine
 from ..model.plan import Plan, make_plan
 from ..model.system import build
 
-__all__ = ["Options", "prepare"]
+__all__ = ["Options", "prepare", "zenoh_section"]
 
 
 class Options(msgspec.Struct, frozen=True):
@@ -48,18 +50,19 @@ def prepare(path: Path, options: Options = Options()) -> Plan:  # noqa: B008 a f
     return make_plan(system, window=options.window, file=str(path))
 
 
+def zenoh_section(loaded: LoadedConfig, options: Options) -> ZenohConfig:
+    """The `zenoh` section, with the endpoints of the command line if there are any."""
+    section = loaded.config.zenoh
+    return replace(section, connect=list(options.connect)) if options.connect else section
+
+
 def _with_options(loaded: LoadedConfig, options: Options) -> LoadedConfig:
-    config = loaded.config
-    if options.output is not None:
-        record = msgspec.structs.replace(config.record, file=str(options.output.absolute()))
-        config = msgspec.structs.replace(config, record=record)
-    if options.connect:
-        config = msgspec.structs.replace(
-            config, zenoh=msgspec.structs.replace(config.zenoh, connect=list(options.connect))
-        )
     if options.window is not None and options.window < 1:
         raise ConfigurationError(f"--window {options.window}: a window has at least 1 point")
-    return msgspec.structs.replace(loaded, config=config)
+    config = replace(loaded.config, zenoh=zenoh_section(loaded, options))
+    if options.output is not None:
+        config = replace(config, record=replace(config.record, file=str(options.output.absolute())))
+    return replace(loaded, config=config)
 
 
 def _descriptions(loaded: LoadedConfig) -> tuple[dict[str, ModelDescription], Sequence[Finding]]:

@@ -5,21 +5,18 @@ The same functions serve `launch`, which starts these processes, and a person wh
 
 from __future__ import annotations
 
-import logging
 import os
 import sys
-import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 
 import msgspec
 
-from ..errors import ConfigurationError, FmuMeshError
+from ..errors import ConfigurationError, FmuMeshError, StepFailed
 from ..fmu import Fmi2Instance, LogMessage, read_description
 from ..master.master import Master
 from ..model.findings import listed, nearest
-from ..model.instance import Instance
 from ..model.loading import load
 from ..model.plan import RECORDER, NodePlan, Plan
 from ..node.node import Node
@@ -28,13 +25,11 @@ from ..wire.runtime import MeshNote, leave_run_folder, run_folder, write_note
 from ..wire.session import open_session, own_endpoints
 from ..wire.views import LogLine, MeshStatus
 from .events import End, Event, Log, Ready, Status
-from .preparing import Options, prepare
+from .preparing import Options, prepare, zenoh_section
 from .process import die_with_parent, ended_by_signals
 from .wiring import MASTER, wiring
 
 __all__ = ["BY_HAND", "run_master", "run_node"]
-
-log = logging.getLogger(__name__)
 
 BY_HAND = "hand"
 """Name of the run whose processes were started by hand."""
@@ -43,10 +38,13 @@ BY_HAND = "hand"
 def run_node(
     config_file: Path, name: str, options: Options, *, plan_file: Path | None = None, run: str = BY_HAND
 ) -> None:
-    """Be the node ``name`` (the name of an instance without a group, or of a group).
+    """Be one node of a mesh.
 
     Args:
-        plan_file: the node's plan if the launcher has made it already.
+        config_file: the configuration file.
+        name: name of the node: that of an instance without a group, or of a group.
+        options: what the command line changes.
+        plan_file: the node's plan if the launcher has made it already; removed once it is read.
         run: name of the run; the launcher's process id when it started this process.
 
     Raises:
@@ -60,62 +58,73 @@ def run_node(
         plan_file.unlink()
     else:
         plan = _node_plan(prepare(config_file, options), name)
-    zenoh_config = load(config_file).config.zenoh
-    if options.connect:
-        zenoh_config = msgspec.structs.replace(zenoh_config, connect=list(options.connect))
-    folder = run_folder(plan.mesh, run)
-    peers = {link.source_node for link in plan.links_in} | {link.target_node for link in plan.links_out}
-    instances: list[Fmi2Instance] = []
-    node: Node | None = None
-    early: list[str] = []
+    _NodeProcess(config_file, plan, options, run_folder(plan.mesh, run)).run(child=child)
 
-    def interrupt(reason: str) -> None:
-        if node is not None:
-            node.interrupt(reason)
-        else:
-            early.append(reason)
 
-    def clean_up() -> None:
-        for instance in list(instances):
-            instance.remove_files()
-        leave_run_folder(folder)
+class _NodeProcess:
+    """A node with all that it takes from its host: a session, a folder, FMUs, and an answer to signals."""
 
-    def open_instance(instance_name: str) -> Instance:
-        item = next(item for item in plan.instances if item.name == instance_name)
+    def __init__(self, config_file: Path, plan: NodePlan, options: Options, folder: Path) -> None:
+        self._config_file = config_file
+        self._plan = plan
+        self._zenoh = zenoh_section(load(config_file), options)
+        self._folder = folder
+        self._instances: list[Fmi2Instance] = []
+        self._node: Node | None = None
+        self._interrupted: str | None = None
+
+    def run(self, *, child: bool) -> None:
+        """Run the node; ``child`` tells whether a launcher watches this process."""
+        with ended_by_signals(self._interrupt, self._clean_up, watch_stdin=child), ExitStack() as stack:
+            stack.callback(leave_run_folder, self._folder)
+            session = open_session(
+                wiring(self._zenoh, self._config_file, self._folder, self._plan.node, self._plan.peers())
+            )
+            stack.callback(session.close)
+            stack.callback(self._close_instances)
+            self._node = node = Node(self._plan, session, self._open)
+            node.server.on_hang = self._exit_hung
+            if self._interrupted is not None:
+                node.interrupt(self._interrupted)
+            try:
+                node.run()
+            except FmuMeshError as error:
+                # Under a launcher one process tells what happened, and the others only end.
+                error.told = child and node.failure_is_known
+                raise
+
+    def _open(self, name: str) -> Fmi2Instance:
+        item = self._plan.instance(name)
         path = Path(item.fmu)
-        started = time.monotonic()
-        instance = Fmi2Instance(path, instance_name, read_description(path), folder / "fmus", publish_log)
-        log.info("instantiated", extra={"instance": instance_name, "seconds": time.monotonic() - started})
-        instances.append(instance)
+        instance = Fmi2Instance(path, name, read_description(path), self._folder / "fmus", self._log)
+        self._instances.append(instance)
         return instance
 
-    def publish_log(message: LogMessage) -> None:
-        if node is not None:
-            points = next(item.step_points for item in plan.instances if item.name == message.instance)
-            line = LogLine(
-                message.instance, message.status, message.category, message.message, max(message.step, 0) * points
-            )
-            node.server.log_message(line)
+    def _log(self, message: LogMessage) -> None:
+        point = max(message.step, 0) * self._plan.instance(message.instance).step_points
+        if self._node is not None:
+            line = LogLine(message.instance, message.status, message.category, message.message, point)
+            self._node.server.log_message(line)
 
-    with ended_by_signals(interrupt, clean_up, watch_stdin=child), ExitStack() as stack:
-        stack.callback(leave_run_folder, folder)
-        session = open_session(
-            wiring(zenoh_config, config_file, folder, plan.node, [peer for peer in peers if peer != RECORDER])
-        )
-        stack.callback(session.close)
-        try:
-            node = Node(plan, session, open_instance)
-            node.server.on_hang = lambda: _exit_hung(clean_up)
-            for reason in early:
-                node.interrupt(reason)
-            node.run()
-        except FmuMeshError as error:
-            # Under a launcher, one process tells what happened, and the others only end.
-            error.told = child and (node is not None and node.failure_is_known)
-            raise
-        finally:
-            for instance in instances:
-                instance.close()
+    def _close_instances(self) -> None:
+        for instance in self._instances:
+            instance.close()
+
+    def _interrupt(self, reason: str) -> None:
+        self._interrupted = reason
+        if self._node is not None:
+            self._node.interrupt(reason)
+
+    def _clean_up(self) -> None:
+        """From another thread, when the main thread does not come back from an FMU."""
+        for instance in self._instances:
+            instance.remove_files()
+        leave_run_folder(self._folder)
+
+    def _exit_hung(self) -> None:
+        self._clean_up()
+        sys.stderr.flush()
+        os._exit(StepFailed.exit_code)
 
 
 def run_master(
@@ -206,9 +215,3 @@ def _node_plan(plan: Plan, name: str) -> NodePlan:
         raise ConfigurationError(f"instance '{name}' runs in the group '{group}'", hint=f"Start node '{group}'.")
     hint = f"Did you mean '{suggestion}'?" if suggestion else None
     raise ConfigurationError(f"there is no node '{name}'; there are: {listed(names)}.", hint=hint)
-
-
-def _exit_hung(clean_up: Callable[[], None]) -> None:
-    clean_up()
-    sys.stderr.flush()
-    os._exit(3)

@@ -40,6 +40,7 @@ from ..wire.messages import (
     Registration,
     encode_abort,
 )
+from ..wire.session import matches, undeclare_all
 from ..wire.values import json_encoding
 from ..wire.views import Command, CommandAnswer, LogLine, MeshInfo, MeshState, MeshStatus
 
@@ -111,7 +112,7 @@ class Master:
             session.declare_publisher(key, congestion_control=zenoh.CongestionControl.BLOCK, express=True)
             for key in self._keys.grants(self._nodes)
         ]
-        self._entities: list[zenoh.Queryable[None] | zenoh.Subscriber[None] | zenoh.Publisher] = []
+        self._entities: list[zenoh.Queryable[None] | zenoh.Subscriber[None]] = []
         self._status_publisher = session.declare_publisher(
             self._keys.mesh_key("status"), encoding=json_encoding, congestion_control=zenoh.CongestionControl.DROP
         )
@@ -182,7 +183,7 @@ class Master:
         while self._slowest < last and not self._stop_asked:
             self._turn(self._publish_grant())
             silent_s = time.monotonic() - self._moved
-            if silent_s > 3 * self._timeouts.step and self._state == "running" and self._slowest < self._grant:
+            if silent_s > 3 * self._timeouts.step and self._slowest < self._grant and self._hold is None:
                 raise DeadlineExceeded(
                     f"no progress for {silent_s:.1f} s",
                     instance=_spoken(self._nodes[self._progress.index(self._slowest)]),
@@ -284,7 +285,9 @@ class Master:
             query.reply_err(f"this mesh has no node '{registration.node}'")
         elif registration.digest != self._plan.digest:
             where = f"process {registration.pid} on {registration.host}"
-            query.reply_err(f"node '{registration.node}' ({where}) has another configuration, or other FMUs, than the master")
+            query.reply_err(
+                f"node '{registration.node}' ({where}) has another configuration, or other FMUs, than the master"
+            )
         elif registration.node in self._registered:
             query.reply_err(f"node '{registration.node}' is there already; two processes run it")
         else:
@@ -407,12 +410,11 @@ class Master:
         self._status_published = now
         status = self.last_status()
         self._events.status(status)
-        if self._status_publisher.matching_status.matching:
+        if matches(self._status_publisher):
             self._status_publisher.put(msgspec.json.encode(status))
 
     def _close(self) -> None:
-        for entity in (*self._entities, *self._grants, self._status_publisher):
-            entity.undeclare()
+        undeclare_all(self._entities, self._grants, [self._status_publisher])
         self._inbox.close()
 
 

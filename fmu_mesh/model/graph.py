@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterable, Sequence
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from typing import TypeVar
 
 __all__ = ["cycle_through", "feedback_edges", "strongly_connected", "topological_order"]
@@ -20,10 +20,10 @@ def strongly_connected(vertices: Iterable[V], edges: Iterable[tuple[V, V]]) -> l
     stack: list[V] = []
     on_stack: set[V] = set()
     components: list[list[V]] = []
-    for root in successors:
+    for root, first in successors.items():
         if root in index:
             continue
-        work = [(root, iter(successors[root]))]
+        work = [(root, iter(first))]
         index[root] = low[root] = len(index)
         stack.append(root)
         on_stack.add(root)
@@ -80,57 +80,34 @@ def topological_order(vertices: Iterable[V], edges: Iterable[tuple[V, V]]) -> li
 def feedback_edges(vertices: Iterable[V], edges: Sequence[tuple[V, V, bool]]) -> list[int]:
     """Indices of edges whose removal leaves no cycle, taken only from those whose flag says that they may be.
 
-    Walks depth first in the order of ``vertices`` and of ``edges`` and takes the edges that lead back to a vertex on the
-    current path; where such an edge must stay, the last free one on the path since that vertex is taken instead, if any.
-    The choice is deterministic; cycles made of fixed edges only remain.
+    The edges that must stay are laid first, then the others in their order; one that would lead back to its own source
+    is taken. So it is the connection written last that closes a cycle. Cycles made only of edges that must stay remain.
     """
-    order = list(vertices)
-    removed: set[int] = set()
-    while True:
-        cycle = _find_cycle(order, edges, removed)
-        if cycle is None:
-            return sorted(removed)
-        free = [index for index in cycle if edges[index][2]]
+    successors: dict[V, list[V]] = {vertex: [] for vertex in vertices}
+    for source, target, free in edges:
         if not free:
-            return sorted(removed)
-        removed.add(free[-1])
+            successors[source].append(target)
+    taken = []
+    for index, (source, target, free) in enumerate(edges):
+        if free and _reaches(successors, target, source):
+            taken.append(index)
+        elif free:
+            successors[source].append(target)
+    return taken
 
 
-def _find_cycle(order: list[V], edges: Sequence[tuple[V, V, bool]], removed: set[int]) -> list[int] | None:
-    """Edge indices of the first cycle found, that has a free edge if any such cycle exists; the closing edge is last."""
-    outgoing: dict[V, list[int]] = {vertex: [] for vertex in order}
-    for index, (source, _, _) in enumerate(edges):
-        if index not in removed:
-            outgoing[source].append(index)
-    fixed_only: list[int] | None = None
-    state: dict[V, int] = {}
-    for root in order:
-        if root in state:
-            continue
-        path: list[int] = []
-        state[root] = 1
-        work = [(root, iter(outgoing[root]))]
-        while work:
-            vertex, following = work[-1]
-            for index in following:
-                target = edges[index][1]
-                if state.get(target) == 1:
-                    start = 0 if target == root else next(i for i, e in enumerate(path) if edges[e][1] == target) + 1
-                    cycle = [*path[start:], index]
-                    if any(edges[i][2] for i in cycle):
-                        return cycle
-                    fixed_only = fixed_only or cycle
-                elif target not in state:
-                    state[target] = 1
-                    path.append(index)
-                    work.append((target, iter(outgoing[target])))
-                    break
-            else:
-                work.pop()
-                state[vertex] = 2
-                if path:
-                    path.pop()
-    return fixed_only
+def _reaches(successors: Mapping[V, Sequence[V]], start: V, goal: V) -> bool:
+    seen = {start}
+    stack = [start]
+    while stack:
+        vertex = stack.pop()
+        if vertex == goal:
+            return True
+        for target in successors[vertex]:
+            if target not in seen:
+                seen.add(target)
+                stack.append(target)
+    return False
 
 
 def cycle_through(component: Sequence[V], edges: Iterable[tuple[V, V]]) -> list[V]:

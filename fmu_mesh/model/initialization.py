@@ -13,7 +13,7 @@ import msgspec
 
 from .description import Variable
 from .graph import strongly_connected
-from .system import Connection, SystemInstance
+from .system import Connection
 
 __all__ = ["InitializationPlan", "plan_initialization"]
 
@@ -33,14 +33,14 @@ class InitializationPlan(msgspec.Struct, frozen=True):
 
 
 def plan_initialization(
-    instances: Mapping[str, SystemInstance], connections: Sequence[Connection]
+    connections: Sequence[Connection],
 ) -> InitializationPlan:
     """Levels of all connected outputs. Every loop must contain a connection with delay 1."""
     outputs: dict[Key, Variable] = {(c.source_instance, c.source.name): c.source for c in connections}
     held: list[Key] = []
     used = list(connections)
     while True:
-        edges = _edges(instances, outputs, used)
+        edges = _edges(outputs, used)
         loops = [part for part in strongly_connected(outputs, edges) if len(part) > 1 or (part[0], part[0]) in edges]
         if not loops:
             break
@@ -58,9 +58,7 @@ def plan_initialization(
     return InitializationPlan(levels=levels, held=tuple(held))
 
 
-def _edges(
-    instances: Mapping[str, SystemInstance], outputs: Mapping[Key, Variable], connections: Sequence[Connection]
-) -> list[tuple[Key, Key]]:
+def _edges(outputs: Mapping[Key, Variable], connections: Sequence[Connection]) -> list[tuple[Key, Key]]:
     """Edges from an output to the outputs that depend on it through one connection."""
     edges = []
     for c in connections:

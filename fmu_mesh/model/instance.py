@@ -43,18 +43,17 @@ class Instance(Protocol):
         """Current values of variables by name, between two calls of `do_step` or in Initialization Mode."""
         ...
 
-    def bind(
-        self, inputs: Ring, outputs: Sequence[Ring], start_time: float, step_size: float, step: int = 0
-    ) -> None:
+    def bind(self, inputs: Ring, outputs: Sequence[Ring], start_time: float, step_size: float, step: int = 0) -> None:
         """Let `do_step` read inputs from and write outputs to these rings; write the current outputs as row ``step``.
 
         ``step_size`` is this instance's own, in s; the time at the start of own step ``n`` is
-        ``start_time + n * step_size``. All output rings have the same number of rows. May be called again between steps, with other rings.
+        ``start_time + n * step_size``. All output rings have the same number of rows.
+        May be called again between steps, with other rings.
         """
         ...
 
     def do_step(self, step: int) -> None:
-        """Set the inputs of row ``step``, advance from own step ``step`` to ``step + 1``, write outputs to row ``step + 1``."""
+        """Set the inputs of row ``step``, advance to own step ``step + 1``, write the outputs to row ``step + 1``."""
         ...
 
     def close(self) -> None:

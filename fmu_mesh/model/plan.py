@@ -116,6 +116,15 @@ class NodePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     result_file: str | None = None
     recorded: tuple[tuple[str, str], ...] = ()
 
+    def instance(self, name: str) -> InstancePlan:
+        """The plan of one of its instances."""
+        return next(instance for instance in self.instances if instance.name == name)
+
+    def peers(self) -> set[str]:
+        """Names of the nodes that this one exchanges frames with; the recorder is with the master."""
+        nodes = {link.source_node for link in self.links_in} | {link.target_node for link in self.links_out}
+        return nodes - {RECORDER}
+
 
 class Plan(msgspec.Struct, frozen=True):
     """The plan of the whole mesh.
@@ -168,7 +177,7 @@ def make_plan(system: System, *, window: int | None = None, file: str = "") -> P
     edges = [(c.source_instance, c.target_instance) for c in connections]
     order = topological_order(system.instances, instant)
     cycles = tuple(tuple(part) for part in strongly_connected(system.instances, edges) if _is_cycle(part, edges))
-    initialization = plan_initialization(system.instances, connections)
+    initialization = plan_initialization(connections)
     points = window if window is not None else _window(system)
     plan = Plan(
         system=system,
@@ -211,7 +220,9 @@ def _is_cycle(part: Iterable[str], edges: list[tuple[str, str]]) -> bool:
 def _algebraic_loop(loop: list[str], connections: tuple[Connection, ...], file: str) -> Finding:
     edges = [(c.source_instance, c.target_instance) for c in connections if c.delay == 0]
     walk = cycle_through(loop, edges)
-    first = next(c for c in connections if c.delay == 0 and (c.source_instance, c.target_instance) == (walk[0], walk[1]))
+    first = next(
+        c for c in connections if c.delay == 0 and (c.source_instance, c.target_instance) == (walk[0], walk[1])
+    )
     return Finding(
         file=file,
         path=first.path,
@@ -259,7 +270,7 @@ def _units(plan: Plan, node: str, members: list[str]) -> dict[str, tuple[str, ..
 
     A cycle that leaves the node must be stepped member by member: one member may wait for what another one caused.
     """
-    units = {name: (name,) for name in members}
+    units: dict[str, tuple[str, ...]] = {name: (name,) for name in members}
     for cycle in plan.cycles:
         if all(plan.node_of(name) == node for name in cycle):
             unit = tuple(name for name in plan.order if name in cycle)
@@ -285,7 +296,9 @@ def _node(
         key_prefix=config.zenoh.key_prefix,
         grid=plan.grid,
         window=window,
-        ring_rows=rows_for(max(window, LAZY_ROWS) + max(instance.step_points for instance in plan.system.instances.values())),
+        ring_rows=rows_for(
+            max(window, LAZY_ROWS) + max(instance.step_points for instance in plan.system.instances.values())
+        ),
         timeouts=config.timeouts,
         instances=instances,
         units=units,
@@ -309,7 +322,9 @@ def _instance_plan(plan: Plan, instance: SystemInstance, outputs: Layout) -> Ins
     incoming = [c for c in plan.connections if c.target_instance == instance.name]
     feeds: dict[tuple[str, int], list[tuple[str, str, float, float]]] = {}
     for c in incoming:
-        feeds.setdefault((c.source_instance, c.delay or 0), []).append((c.source.name, c.target.name, c.factor, c.offset))
+        feeds.setdefault((c.source_instance, c.delay or 0), []).append(
+            (c.source.name, c.target.name, c.factor, c.offset)
+        )
     connected = {c.target.name for c in incoming}
     levels = plan.initialization.levels
     return InstancePlan(
@@ -333,8 +348,8 @@ def _links(plan: Plan) -> tuple[Link, ...]:
         if target_node != plan.node_of(c.source_instance):
             needed.setdefault((c.source_instance, target_node), set()).add(c.source.name)
     if plan.system.result_file is not None:
-        for instance, variable in plan.system.recorded:
-            needed.setdefault((instance, RECORDER), set()).add(variable)
+        for name, variable in plan.system.recorded:
+            needed.setdefault((name, RECORDER), set()).add(variable)
     links = []
     for index, ((source, target_node), names) in enumerate(sorted(needed.items())):
         instance = plan.system.instances[source]

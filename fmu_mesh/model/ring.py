@@ -58,7 +58,14 @@ class Layout(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def types(self) -> tuple[VariableType, ...]:
         """The types of all columns, in the order of `names`."""
-        return ("Real",) * len(self.reals) + self.integer_types
+        real: VariableType = "Real"
+        return (*(real for _ in self.reals), *self.integer_types)
+
+    def place(self, name: str) -> tuple[int, int]:
+        """Part (0: Real, 1: others) and column of a variable."""
+        if name in self.reals:
+            return 0, self.reals.index(name)
+        return 1, self.integers.index(name)
 
 
 class Ring:

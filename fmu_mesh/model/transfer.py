@@ -48,7 +48,7 @@ class Transfer:
         return (step * self._target_points + self._lead) // self._source_points
 
     def from_rows(self, first: int, reals: NDArray[np.float64], integers: NDArray[np.int32]) -> None:
-        """Take all that the source's consecutive rows from own step ``first`` on feed (arrays of shape (rows, columns))."""
+        """Take what the source's rows from own step ``first`` on feed; arrays of shape (rows, columns)."""
         low, high = self.ready(first), self.ready(first + len(reals))
         if low >= high:
             return
@@ -108,11 +108,11 @@ class _Copy:
 
 
 def _copies(feed: Feed, source: Layout, inputs: Ring) -> list[_Copy]:
-    """Group the columns by part of source and target, and by whether they are scaled (an unscaled value stays as it is)."""
+    """Group the columns by part of source and target, and by whether they are scaled: others stay as they are."""
     groups: dict[tuple[int, int, bool], list[tuple[int, int, float, float]]] = {}
     for source_name, target_name, factor, offset in feed.columns:
-        source_part, source_column = _place(source, source_name)
-        target_part, target_column = _place(inputs.layout, target_name)
+        source_part, source_column = source.place(source_name)
+        target_part, target_column = inputs.layout.place(target_name)
         scaled = (factor, offset) != (1.0, 0.0)
         groups.setdefault((source_part, target_part, scaled), []).append((source_column, target_column, factor, offset))
     copies = []
@@ -128,13 +128,6 @@ def _copies(feed: Feed, source: Layout, inputs: Ring) -> list[_Copy]:
             )
         )
     return copies
-
-
-def _place(layout: Layout, name: str) -> tuple[int, int]:
-    """Part (0: Real, 1: others) and column of a variable."""
-    if name in layout.reals:
-        return 0, layout.reals.index(name)
-    return 1, layout.integers.index(name)
 
 
 def _index(columns: Sequence[int]) -> Index:

@@ -75,4 +75,3 @@ class OutLink:
 def _columns(have: tuple[str, ...], want: tuple[str, ...]) -> list[int] | None:
     """Indices of the wanted columns, or None if all are wanted."""
     return None if have == want else [have.index(name) for name in want]
-

@@ -222,7 +222,7 @@ class Node:
                 level = self._level_of(feed.source, source)
                 if target in runner.plan.held or (below is not None and level >= below):
                     continue
-                value = self._initial_value(feed.source, source, level)
+                value = self._initial_value(feed.source, source)
                 values[target] = value if (factor, offset) == (1.0, 0.0) else value * factor + offset
         if values:
             runner.instance.set_values(values)
@@ -236,14 +236,16 @@ class Node:
     def _get_initial_outputs(self, runner: Runner, level: int) -> None:
         names = [name for name, own in runner.plan.initialization.items() if own == level]
         numbers: dict[str, float | int] = {
-            name: value for name, value in zip(names, runner.instance.get_values(names), strict=True) if not isinstance(value, str)
+            name: value
+            for name, value in zip(names, runner.instance.get_values(names), strict=True)
+            if not isinstance(value, str)
         }
         self._initial.update({(runner.name, name): value for name, value in numbers.items()})
         for link in runner.out_links:
             if level in needed_levels(link.link):
                 link.send_initial(level, numbers)
 
-    def _initial_value(self, instance: str, variable: str, level: int) -> float | int:
+    def _initial_value(self, instance: str, variable: str) -> float | int:
         deadline = time.monotonic() + self._plan.timeouts.initialize
         while (instance, variable) not in self._initial:
             left = deadline - time.monotonic()

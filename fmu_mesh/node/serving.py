@@ -25,7 +25,7 @@ from ..model.plan import NodePlan
 from ..wire.inbox import Inbox
 from ..wire.keys import Keys, escape, unescape
 from ..wire.messages import NodeReport
-from ..wire.session import ask
+from ..wire.session import ask, matches, undeclare_all
 from ..wire.values import ValueRefused, attachment, decode_value, encode_value, json_encoding
 from ..wire.views import ConnectionView, InstanceInfo, InstanceStatus, LogLine, SetAnswer, VariableView
 from .stepping import Runner
@@ -63,7 +63,7 @@ class Server:
         self._waiting_rows = 0
         self._pending: list[_Pending] = []
         self._jobs: queue.SimpleQueue[Job | None] = queue.SimpleQueue()
-        self._entities: list[zenoh.Queryable[None] | zenoh.Subscriber[None] | zenoh.Publisher] = []
+        self._entities: list[zenoh.Queryable[None] | zenoh.Subscriber[None]] = []
         self._status_publishers: dict[str, zenoh.Publisher] = {}
         self._log_publishers: dict[str, zenoh.Publisher] = {}
         self._stalled_since: dict[str, tuple[int, float]] = {}
@@ -85,9 +85,7 @@ class Server:
             for kind in ("in", "param"):
                 key = f"{self._keys.instance(runner.name)}/{kind}/*"
                 take = partial(self._put_arrived, runner)
-                self._entities.append(
-                    self._session.declare_subscriber(key, take, allowed_origin=zenoh.Locality.REMOTE)
-                )
+                self._entities.append(self._session.declare_subscriber(key, take, allowed_origin=zenoh.Locality.REMOTE))
 
     def stepped(self) -> None:
         """Hand rows that were just stepped to the streams that have subscribers."""
@@ -112,8 +110,7 @@ class Server:
         """Publish what is waiting, for a second at most, and undeclare everything."""
         self._jobs.put(None)
         self._thread.join(1.0)
-        for entity in (*self._entities, *self._status_publishers.values(), *self._log_publishers.values()):
-            entity.undeclare()
+        undeclare_all(self._entities, self._status_publishers.values(), self._log_publishers.values())
         for streams in self._streams:
             streams.close()
 
@@ -143,7 +140,7 @@ class Server:
             self._pending.remove(pending)
             pending.refuse(f"not at a point yet: {self._status(pending.instance).activity}")
         for name, publisher in self._status_publishers.items():
-            if publisher.matching_status.matching:
+            if matches(publisher):
                 publisher.put(msgspec.json.encode(self._status(name)))
         self._look_for_hang(now)
 
@@ -283,9 +280,11 @@ class Server:
         """A query with a payload sets a value and is told from which point on it holds, or why it was refused."""
         runner = self._runners.get(name)
         key = str(query.key_expr)
+        if runner is None:
+            query.reply_err(f"'{name}' is still being loaded")
+            query.drop()
+            return
         try:
-            if runner is None:
-                raise ValueRefused(f"'{name}' is still being loaded")
             variable, value = self._checked_setting(runner, key, query.payload.to_bytes() if query.payload else b"")
         except ValueRefused as refused:
             query.reply_err(str(refused))
@@ -321,9 +320,13 @@ class Server:
             raise ValueRefused(f"'{runner.name}' has no variable '{name}' under '{kind}'")
         if kind == "in" and name in runner.plan.inputs.names:
             feed = next(feed for feed in runner.plan.feeds if name in {column[1] for column in feed.columns})
-            raise ValueRefused(f"'{runner.name}.{name}' is connected to '{feed.source}'; only unconnected inputs can be set")
+            raise ValueRefused(
+                f"'{runner.name}.{name}' is connected to '{feed.source}'; only unconnected inputs can be set"
+            )
         if kind == "param" and variable.variability != "tunable":
-            raise ValueRefused(f"'{runner.name}.{name}' is a {variable.variability} parameter; only tunable ones can be set")
+            raise ValueRefused(
+                f"'{runner.name}.{name}' is a {variable.variability} parameter; only tunable ones can be set"
+            )
         if kind not in ("in", "param"):
             raise ValueRefused(f"'{runner.name}.{name}' is no input and no parameter, so it cannot be set")
         try:
@@ -352,7 +355,14 @@ class Server:
             step_size=self._plan.grid.step_size * runner.plan.step_points,
             variables=tuple(
                 VariableView(
-                    v.name, f"{kind}/{escape(v.name)}", v.type, v.causality, v.variability, v.unit, v.start, v.description
+                    v.name,
+                    f"{kind}/{escape(v.name)}",
+                    v.type,
+                    v.causality,
+                    v.variability,
+                    v.unit,
+                    v.start,
+                    v.description,
                 )
                 for v in description.variables
                 if (kind := kind_of(v)) is not None

@@ -100,7 +100,8 @@ class Runner:
 
     def lacking(self) -> str:
         """In words what the next step waits for: the first feed that is not there, or the grant."""
-        for feed in (*self.remote_feeds, *self.local_feeds):
+        feeds: list[RemoteFeed | LocalFeed] = [*self.remote_feeds, *self.local_feeds]
+        for feed in feeds:
             source_steps = feed.receiver.received if isinstance(feed, RemoteFeed) else feed.source.step + 1
             if feed.transfer.ready(source_steps) <= self.step:
                 plan = feed.transfer.feed

@@ -14,6 +14,7 @@ import zenoh
 from ..model.description import Value, Variable
 from ..simtime import TimeGrid
 from ..wire.keys import Keys, VariableKind
+from ..wire.session import matches, undeclare_all
 from ..wire.values import attachment, encode_value, json_encoding
 from .stepping import Runner
 
@@ -48,7 +49,12 @@ class InstanceStreams:
     """
 
     def __init__(
-        self, runner: Runner, session: zenoh.Session, keys: Keys, grid: TimeGrid, changed: Callable[[InstanceStreams], None]
+        self,
+        runner: Runner,
+        session: zenoh.Session,
+        keys: Keys,
+        grid: TimeGrid,
+        changed: Callable[[InstanceStreams], None],
     ) -> None:
         self.runner = runner
         self.dropped = 0
@@ -74,7 +80,7 @@ class InstanceStreams:
 
     def update(self) -> None:
         """On the main thread, between steps: see which variables have subscribers, and read those from now on."""
-        active = tuple(name for name, publisher in self._publishers.items() if publisher.matching_status.matching)
+        active = tuple(name for name, publisher in self._publishers.items() if matches(publisher))
         if active == self._active:
             return
         have = {*self.runner.outputs.layout.names}
@@ -122,7 +128,4 @@ class InstanceStreams:
 
     def close(self) -> None:
         """Undeclare all publishers."""
-        for listener in self._listeners:
-            listener.undeclare()
-        for publisher in self._publishers.values():
-            publisher.undeclare()
+        undeclare_all(self._listeners, self._publishers.values())

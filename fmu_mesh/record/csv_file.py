@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
@@ -85,5 +86,8 @@ class CsvFile:
         return self._encode(list(rows)).translate(None, b"[]")
 
 
-def _text(value: float | int | bool) -> str:
-    return str(value).lower() if isinstance(value, bool) else msgspec.json.encode(value).decode() if value == value and abs(value) != float("inf") else repr(value)
+def _text(value: float) -> str:
+    """One value where JSON has no word for it: `nan`, `inf` and `-inf`; all others as JSON has them."""
+    if not math.isfinite(value):
+        return repr(value)
+    return msgspec.json.encode(value).decode()

@@ -1,4 +1,4 @@
-"""The recorder: a participant of the mesh that takes frames as a node does and writes rows as soon as they are complete.
+"""The recorder: it takes frames as a node does, and writes rows as soon as they are complete.
 
 It runs on a thread of the master's process, with an inbox, a liveliness token and progress of its own: what it has not
 written yet holds the grant back, so that nothing has to be dropped and memory stays bounded.
@@ -12,6 +12,7 @@ import socket
 import threading
 import time
 from pathlib import Path
+from typing import Any, Self
 
 import msgspec
 import numpy as np
@@ -77,7 +78,7 @@ class Recorder:
         """Rows written so far."""
         return self._file.rows
 
-    def __enter__(self) -> Recorder:
+    def __enter__(self) -> Self:
         self._thread.start()
         return self
 
@@ -150,8 +151,8 @@ class Recorder:
         if end > first:
             grid = self._plan.grid
             points = np.arange(first, end)
-            times: NDArray[np.float64] = grid.start_time + points * grid.step_size
-            self._file.write(times, [source.column(variable, points) for source, variable in self._columns])
+            columns = [source.column(variable, points) for source, variable in self._columns]
+            self._file.write(grid.times(first, end), columns)
             self._written = end
             now = time.monotonic()
             if now - self._flushed > _FLUSH_S:
@@ -201,13 +202,13 @@ class _Source:
             return last_point
         return received * points - 1
 
-    def column(self, variable: str, points: NDArray[np.int64]) -> NDArray[np.float64] | NDArray[np.int32]:
+    def column(self, variable: str, points: NDArray[np.int64]) -> NDArray[Any]:
         """The values of a variable at ``points``."""
         ring = self.receiver.kept
         slots = (points // self.receiver.link.step_points) & ring.mask
-        if variable in ring.layout.reals:
-            return ring.reals[slots, ring.layout.reals.index(variable)]
-        return ring.integers[slots, ring.layout.integers.index(variable)]
+        part, column = ring.layout.place(variable)
+        values: NDArray[Any] = ring.parts()[part][slots, column]
+        return values
 
     def type_of(self, variable: str) -> VariableType:
         """The type of a variable."""

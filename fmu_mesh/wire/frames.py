@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import numpy as np
+from typing import Any
+
 from numpy.typing import NDArray
 
 from ..errors import FrameGap
@@ -60,7 +61,8 @@ class FrameReceiver:
         kept = self.kept
         start, count = first & kept.mask, len(rows[0])
         cut = min(count, kept.rows - start)
-        for part, new in zip(kept.parts(), rows, strict=True):
+        parts: list[tuple[NDArray[Any], NDArray[Any]]] = list(zip(kept.parts(), rows, strict=True))
+        for part, new in parts:
             if len(new):
                 part[start : start + cut] = new[:cut]
                 part[: count - cut] = new[cut:]
@@ -69,7 +71,8 @@ class FrameReceiver:
         """A row that came before must come again with the same bits, as far as it is still kept."""
         for row in range(max(0, self.received - self.kept.rows - first), known):
             slot = (first + row) & self.kept.mask
-            if any(_bits(part, slot) != _bits(new, row) for part, new in zip(self.kept.parts(), rows, strict=True)):
+            kept = b"".join(_bits(part, slot) for part in self.kept.parts())
+            if kept != b"".join(_bits(part, row) for part in rows):
                 raise FrameGap(
                     f"the values of '{self.link.source}' came twice and differ",
                     instance=self.link.source,
@@ -78,7 +81,7 @@ class FrameReceiver:
                 )
 
 
-def _bits(array: NDArray[np.float64] | NDArray[np.int32], row: int) -> bytes:
+def _bits(array: NDArray[Any], row: int) -> bytes:
     return array[row].tobytes() if array.shape[1] else b""
 
 

@@ -17,7 +17,17 @@ import msgspec
 
 from ..errors import ConfigurationError
 
-__all__ = ["MeshNote", "leave_run_folder", "meshes", "remove_run_folder", "remove_stale_folders", "run_folder", "runtime_folder", "socket_endpoint", "write_note"]
+__all__ = [
+    "MeshNote",
+    "leave_run_folder",
+    "meshes",
+    "remove_run_folder",
+    "remove_stale_folders",
+    "run_folder",
+    "runtime_folder",
+    "socket_endpoint",
+    "write_note",
+]
 
 _SOCKET_PATH_LIMIT = 100
 
@@ -51,12 +61,14 @@ def runtime_folder() -> Path:
         folder = Path(tempfile.gettempdir()) / f"fmu_mesh-{os.getuid()}"
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     if folder.stat().st_uid != os.getuid():
-        raise ConfigurationError(f"the runtime folder '{folder}' belongs to another user", hint="Set FMU_MESH_RUNTIME_DIR.")
+        raise ConfigurationError(
+            f"the runtime folder '{folder}' belongs to another user", hint="Set FMU_MESH_RUNTIME_DIR."
+        )
     return folder
 
 
 def run_folder(mesh: str, run: str) -> Path:
-    """The folder of one run of a mesh; ``run`` is the launcher's process id, or `hand` for processes started by hand."""
+    """The folder of one run of a mesh; ``run`` is the launcher's process id, or `hand` for those by hand."""
     folder = runtime_folder() / f"{mesh}.{run}"
     folder.mkdir(mode=0o700, exist_ok=True)
     (folder / "fmus").mkdir(exist_ok=True)

@@ -5,15 +5,17 @@ from __future__ import annotations
 import json
 import threading
 import time
+from collections.abc import Iterable
+from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import msgspec
 import zenoh
 
 from ..errors import ConfigurationError, DeadlineExceeded, MeshLost
 
-__all__ = ["Wiring", "ask", "open_session", "own_endpoints"]
+__all__ = ["Wiring", "ask", "matches", "open_session", "own_endpoints", "undeclare_all"]
 
 LEASE_MS = 4_000
 """A stopped (not dead) process is noticed after this time; a dead one within milliseconds."""
@@ -93,6 +95,22 @@ def own_endpoints(session: zenoh.Session, deadline_s: float = 5.0) -> tuple[str,
     return tuple(str(locator) for locator in json.loads(answer).get("locators", ()))
 
 
+def matches(entity: zenoh.Publisher | zenoh.Querier) -> bool:
+    """Whether anybody is there for what this publisher or querier sends."""
+    # The stub says bool, but it is an object that is always true (zenoh-python 1.10).
+    return bool(entity.matching_status.matching)  # type: ignore[attr-defined]  # the stub is wrong
+
+
+class _Declared(Protocol):
+    def undeclare(self) -> object: ...
+
+
+def undeclare_all(*entities: Iterable[_Declared]) -> None:
+    """Undeclare publishers, subscribers, queryables and listeners."""
+    for entity in chain.from_iterable(entities):
+        entity.undeclare()
+
+
 def ask(session: zenoh.Session, key: str, payload: bytes, deadline_s: float, what: str) -> bytes:
     """Query ``key`` until somebody is there to answer, and return the answer's payload.
 
@@ -100,6 +118,10 @@ def ask(session: zenoh.Session, key: str, payload: bytes, deadline_s: float, wha
     again when the matching changes.
 
     Args:
+        session: the session to ask with.
+        key: key expression of the queryable.
+        payload: what goes with the query.
+        deadline_s: how long to wait for an answer, in s.
         what: what is being waited for, for the error.
 
     Raises:
@@ -113,7 +135,7 @@ def ask(session: zenoh.Session, key: str, payload: bytes, deadline_s: float, wha
         try:
             while (left := end - time.monotonic()) > 0:
                 changed.clear()
-                if querier.matching_status.matching:
+                if matches(querier):
                     for reply in querier.get(payload=payload):
                         if reply.ok is not None:
                             return reply.ok.payload.to_bytes()
@@ -124,4 +146,3 @@ def ask(session: zenoh.Session, key: str, payload: bytes, deadline_s: float, wha
         finally:
             listener.undeclare()
     raise DeadlineExceeded(f"nobody answered for {what} within {deadline_s:g} s")
-

@@ -13,6 +13,7 @@ __all__ = ["Stamp", "ValueRefused", "attachment", "decode_stamp", "decode_value"
 
 MAX_VALUE_SIZE = 1 << 20
 _INT32 = range(-(2**31), 2**31)
+_NOT_FINITE = ("NaN", "INF", "-INF")
 
 json_encoding = zenoh.Encoding.APPLICATION_JSON
 
@@ -61,24 +62,20 @@ def decode_value(data: bytes, variable: Variable) -> Value:
         value = msgspec.json.decode(data)
     except msgspec.DecodeError as error:
         raise ValueRefused(f"it is no JSON value ({error})") from error
-    match variable.type, value:
-        case "Real", str() if value in ("NaN", "INF", "-INF"):
-            return float(value.lower())
-        case "Real", float() | int() if not isinstance(value, bool):
+    number = isinstance(value, int) and not isinstance(value, bool)
+    match variable.type:
+        case "Real" if number or isinstance(value, float) or value in _NOT_FINITE:
             return _checked_real(float(value), variable)
-        case "Integer", int() if not isinstance(value, bool) and value in _INT32:
+        case "Integer" if number and value in _INT32:
+            return int(value)
+        case "Boolean" | "String" if isinstance(value, bool if variable.type == "Boolean" else str):
             return value
-        case "Boolean", bool():
-            return value
-        case "String", str():
-            return value
-        case "Enumeration", int() if not isinstance(value, bool):
-            if not variable.items or value in {number for _, number in variable.items}:
-                return value
-        case "Enumeration", str():
-            for name, number in variable.items:
-                if name == value:
-                    return number
+        case "Enumeration":
+            items = dict(variable.items)
+            if value in items:
+                return items[value]
+            if number and (not items or value in items.values()):
+                return int(value)
     raise ValueRefused(f"{data[:80].decode(errors='replace')} is no {variable.type} value for it")
 
 
