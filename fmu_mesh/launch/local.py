@@ -16,6 +16,7 @@ import numpy as np
 from ..errors import Interrupted, StepFailed
 from ..fmu import Fmi2Instance, LogMessage
 from ..model.description import Value
+from ..model.instance import Instance
 from ..model.plan import Plan
 from ..model.ring import Layout, Ring
 from ..record.csv_file import CsvFile
@@ -33,6 +34,7 @@ class LocalMesh:
         plan: the plan; its processes and window play no part.
         log: called with every log message of an FMU.
         progress: called with the point now and then.
+        open_instance: opens an instance by name, where it is not the FMU of the plan; this closes it.
 
     Attributes:
         point: the last point reached.
@@ -45,6 +47,7 @@ class LocalMesh:
         plan: Plan,
         log: Callable[[LogMessage], None] = lambda _message: None,
         progress: Callable[[int], None] = lambda _point: None,
+        open_instance: Callable[[str], Instance] | None = None,
     ) -> None:
         self.point = 0
         self.rows = 0
@@ -52,6 +55,7 @@ class LocalMesh:
         self._plan = plan
         self._log = log
         self._progress = progress
+        self._open_instance = open_instance
         self._stop: str | None = None
 
     def interrupt(self, reason: str) -> None:
@@ -73,7 +77,7 @@ class LocalMesh:
             file = CsvFile(Path(plan.system.result_file), columns) if plan.system.result_file is not None else None
             try:
                 for name in plan.order:
-                    members[name] = _Member(plan, name, Path(folder), self._log)
+                    members[name] = _Member(plan, name, self._open(name, Path(folder)))
                 self._initialize(members)
                 started = time.perf_counter()
                 try:
@@ -86,6 +90,12 @@ class LocalMesh:
                 if file is not None:
                     file.close()
                     self.rows = file.rows
+
+    def _open(self, name: str, folder: Path) -> Instance:
+        if self._open_instance is not None:
+            return self._open_instance(name)
+        system = self._plan.system.instances[name]
+        return Fmi2Instance(Path(system.fmu), name, system.description, folder, self._log)
 
     def _initialize(self, members: dict[str, _Member]) -> None:
         grid = self._plan.grid
@@ -134,12 +144,11 @@ class LocalMesh:
 class _Member:
     """One instance of a `LocalMesh`."""
 
-    def __init__(self, plan: Plan, name: str, folder: Path, log: Callable[[LogMessage], None]) -> None:
-        system = plan.system.instances[name]
-        node = plan.nodes[system.node]
+    def __init__(self, plan: Plan, name: str, instance: Instance) -> None:
+        node = plan.nodes[plan.node_of(name)]
         self.plan = node.instance(name)
         self.connections = [c for c in plan.connections if c.target_instance == name]
-        self.instance = Fmi2Instance(Path(system.fmu), name, system.description, folder, log)
+        self.instance = instance
         self._inputs = Ring(self.plan.inputs, 1)
         # A slower instance asks for a value as old as its own step.
         oldest = max(instance.step_points for instance in plan.system.instances.values())

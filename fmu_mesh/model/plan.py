@@ -95,6 +95,8 @@ class NodePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         units: the instances in execution order; those of one inner tuple form a cycle within the node and step point by
             point, the others run as far ahead as their inputs and the grant allow.
         window: how many points this node may be behind the grant.
+        progress_stride: points after which the master is told; a quarter of the window, or every point where a single
+            step is as long as that.
         ring_rows: rows of every ring; a power of two.
         links_in: links that end here.
         links_out: links that start here.
@@ -107,6 +109,7 @@ class NodePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     key_prefix: str
     grid: TimeGrid
     window: int
+    progress_stride: int
     ring_rows: int
     timeouts: TimeoutsConfig
     instances: tuple[InstancePlan, ...]
@@ -289,6 +292,7 @@ def _node(
     config = plan.system.config
     # Rows that nobody steps on may wait: they hold the nodes back only when there are many of them.
     window = max(plan.window, RECORDER_WINDOW) if node == RECORDER else plan.window
+    longest_step = max(instance.step_points for instance in plan.system.instances.values())
     return NodePlan(
         mesh=config.mesh,
         node=node,
@@ -296,9 +300,10 @@ def _node(
         key_prefix=config.zenoh.key_prefix,
         grid=plan.grid,
         window=window,
-        ring_rows=rows_for(
-            max(window, LAZY_ROWS) + max(instance.step_points for instance in plan.system.instances.values())
-        ),
+        progress_stride=window // 4 if window >= 4 * longest_step else 1,
+        # A source may be two own steps beyond the grant (the one it takes, and the one it holds its value for), and a
+        # target one own step before what it told.
+        ring_rows=rows_for(max(window, LAZY_ROWS) + 3 * longest_step),
         timeouts=config.timeouts,
         instances=instances,
         units=units,

@@ -55,6 +55,7 @@ log = logging.getLogger(__name__)
 
 _LOOK_S = 0.5
 _LAZY_S = 0.02
+_TELL_S = 0.1
 _LAST_WORD_S = 0.3
 
 
@@ -86,7 +87,7 @@ class Node:
         self._lazy_pending = False
         self._waited_long = False
         self._progress_sent = -1
-        self._progress_stride = max(1, plan.window // 4)
+        self._progress_told_at = 0.0
         self._runners: dict[str, Runner] = {}
         self._units: list[Unit] = []
         self._remote: dict[int, tuple[FrameReceiver, list[RemoteFeed]]] = {}
@@ -212,7 +213,7 @@ class Node:
             runner.bind()
             runner.flush()
         self.server.started()
-        self._send_progress()
+        self._tell_progress()
 
     def _set_initial_inputs(self, runner: Runner, below: int | None) -> None:
         """Set the inputs whose sources are known below a level (None: all); waits for those of other nodes."""
@@ -274,12 +275,11 @@ class Node:
                 self._take(message)
                 taken = True
             if stepped:
-                if self._covered() - self._progress_sent >= self._progress_stride:
-                    self._send_progress()
+                self._tell_progress()
                 self.server.stepped()
             elif not taken:
                 self._flush_before_waiting()
-                self._send_progress()
+                self._tell_progress()
                 self._wait()
 
     def _flush_before_waiting(self) -> None:
@@ -333,10 +333,20 @@ class Node:
     def _covered(self) -> int:
         return min(runner.covered for runner in self._runners.values())
 
-    def _send_progress(self) -> None:
+    def _tell_progress(self) -> None:
+        """Tell the master how far this node is, if the grant can hang on it or somebody may want to see it.
+
+        A node that waits for another one keeps quiet: nobody waits for what it could say, because what it has not told
+        is less than a quarter of the window, and the other one has the rest.
+        """
         covered = self._covered()
-        if covered != self._progress_sent:
+        if covered == self._progress_sent:
+            return
+        now = time.monotonic()
+        due = covered - self._progress_sent >= self._plan.progress_stride or now - self._progress_told_at > _TELL_S
+        if due or covered >= self._grant:
             self._progress_sent = covered
+            self._progress_told_at = now
             self._progress.put(HEADER.pack(PROGRESS, self._progress_number, 0, covered))
 
     # --- the end

@@ -190,7 +190,8 @@ class Unit:
         for runner in self.runners:
             for ready in runner.ready_steps(without=self._inner):
                 if ready < runner.last_step:
-                    limit = min(limit, ready * runner.plan.step_points)
+                    # The first own step that lacks something is taken at its last point; the others go on up to there.
+                    limit = min(limit, (ready + 1) * runner.plan.step_points - 1)
             for link in runner.out_links:
                 limit = min(limit, max(runner.step + 1, link.sent + link.capacity - 1) * link.link.step_points)
         return limit

@@ -35,6 +35,7 @@ log = logging.getLogger(__name__)
 
 _LOOK_S = 0.2
 _WRITE_ROWS = 512
+_TELL_S = 0.1
 _FLUSH_S = 0.2
 
 
@@ -63,6 +64,7 @@ class Recorder:
         )
         self._written = 0
         self._progress_sent = -1
+        self._progress_told_at = 0.0
         self._number = 0
         self._finished = False
         self._flushed = time.monotonic()
@@ -120,14 +122,14 @@ class Recorder:
             message = self._inbox.poll()
             if message is None:
                 self._write_complete_rows()
-                self._send_progress()
+                self._tell_progress()
                 message = self._inbox.wait(_LOOK_S)
             if message is not None:
                 heard = time.monotonic()
                 self._take(message)
                 if self._complete() - self._written >= _WRITE_ROWS:
                     self._write_complete_rows()
-                    self._send_progress()
+                    self._tell_progress()
             elif time.monotonic() - heard > self._plan.timeouts.step:
                 raise DeadlineExceeded("the recorder heard nothing from the master")
 
@@ -165,10 +167,14 @@ class Recorder:
             if message[0] == FRAME:
                 self._take(message)
 
-    def _send_progress(self) -> None:
+    def _tell_progress(self) -> None:
+        """Tell the master how far the rows are complete, if the grant can hang on it or somebody may want to see it."""
         complete = self._complete()
-        if complete > self._progress_sent:
+        now = time.monotonic()
+        due = complete - self._progress_sent >= self._plan.progress_stride or now - self._progress_told_at > _TELL_S
+        if complete > self._progress_sent and (due or complete == self._plan.grid.last_point):
             self._progress_sent = complete
+            self._progress_told_at = now
             self._progress.put(HEADER.pack(PROGRESS, self._number, 0, complete))
 
     def _report(self, error: FmuMeshError | None) -> None:

@@ -22,6 +22,7 @@ from ..errors import ConfigurationError, DeadlineExceeded
 from ..model.findings import listed, nearest
 from .keys import Keys
 from .readings import Keeper, Reading, Target, reading_of
+from .session import matches
 from .values import json_encoding
 from .views import (
     Command,
@@ -33,7 +34,7 @@ from .views import (
     SetAnswer,
 )
 
-__all__ = ["MeshClient"]
+__all__ = ["MeshClient", "key_expression"]
 
 View = TypeVar("View")
 
@@ -90,10 +91,7 @@ class MeshClient:
         """
         if not self.is_key(reference):
             return self._targets_by_name(reference)
-        try:
-            asked = zenoh.KeyExpr(reference)
-        except zenoh.ZError as error:
-            raise ConfigurationError(f"'{reference}' is no key expression: {error}") from error
+        asked = key_expression(reference)
         instances = [
             name for name in self.info().instances if asked.intersects(zenoh.KeyExpr(f"{self.keys.instance(name)}/**"))
         ]
@@ -151,23 +149,28 @@ class MeshClient:
     def watch(self, targets: Sequence[Target]) -> Iterator[Iterator[Reading]]:
         """Every value from now on, in the order in which it comes; ends when the mesh does.
 
-        A reader that falls far behind loses the newest samples; the points tell which.
+        A reader that falls far behind loses the newest samples; the points tell which. Strings are left out.
         """
+        watched = [target for target in targets if target.variable.type != "String"]
+        if not watched:
+            names = listed([f"{target.instance}.{target.variable.name}" for target in targets])
+            raise ConfigurationError(f"a String cannot be watched: {names}.", hint="`get` shows its current value.")
         arrived: queue.SimpleQueue[Reading | None] = queue.SimpleQueue()
         with ExitStack() as stack:
+            there = threading.Event()
 
-            def ended(sample: zenoh.Sample) -> None:
-                if sample.kind == zenoh.SampleKind.DELETE:
+            def changed(sample: zenoh.Sample) -> None:
+                if sample.kind == zenoh.SampleKind.PUT:
+                    there.set()
+                else:
                     arrived.put(None)
 
-            token = self._session.liveliness().declare_subscriber(self.keys.master, ended, history=True)
+            token = self._session.liveliness().declare_subscriber(self.keys.master, changed, history=True)
             stack.callback(token.undeclare)
-            for target in targets:
+            for target in watched:
                 subscriber = self._session.declare_subscriber(target.key, Keeper(target, arrived).keep)
                 stack.callback(subscriber.undeclare)
-            tokens = self._session.liveliness().get(self.keys.master, timeout=self._timeout_s)
-            alive = any(reply.ok is not None for reply in tokens)
-            yield iter(arrived.get, None) if alive else iter(())
+            yield iter(arrived.get, None) if there.wait(self._timeout_s) else iter(())
 
     def is_key(self, reference: str) -> bool:
         """Whether a reference is a key; otherwise it is a name, or `instance.variable`."""
@@ -230,7 +233,7 @@ class MeshClient:
             listener: zenoh.MatchingListener[Any] = querier.declare_matching_listener(lambda _status: changed.set())
             try:
                 while (left := end - time.monotonic()) > 0:
-                    if querier.matching_status.matching:
+                    if matches(querier):
                         samples = _answers(querier.get(payload=payload, encoding=encoding))
                         if samples is None:
                             break
@@ -241,6 +244,18 @@ class MeshClient:
             finally:
                 listener.undeclare()
         raise DeadlineExceeded(f"no answer from {who} within {self._timeout_s:g} s.", hint="--timeout waits longer.")
+
+
+def key_expression(text: str) -> zenoh.KeyExpr:
+    """A key expression that a person wrote.
+
+    Raises:
+        ConfigurationError: it is none.
+    """
+    try:
+        return zenoh.KeyExpr(text)
+    except zenoh.ZError as error:
+        raise ConfigurationError(f"'{text}' is no key expression: {error}.") from error
 
 
 def _answers(replies: Any) -> list[zenoh.Sample] | None:  # noqa: ANN401 a Zenoh handler

@@ -16,7 +16,7 @@ import zenoh
 
 from ..errors import ConfigurationError, DeadlineExceeded, FmuMeshError
 from ..model.findings import listed, nearest
-from .client import MeshClient
+from .client import MeshClient, key_expression
 from .keys import Keys
 from .runtime import MeshNote, meshes
 from .session import Wiring, open_session
@@ -154,12 +154,7 @@ def _means(client: MeshClient, reference: str) -> bool:
     """Whether a reference says that it is about this mesh."""
     if reference in (client.keys.mesh, client.keys.root):
         return True
-    if not client.is_key(reference):
-        return False
-    try:
-        return zenoh.KeyExpr(reference).intersects(zenoh.KeyExpr(f"{client.keys.root}/**"))
-    except zenoh.ZError:
-        return False
+    return client.is_key(reference) and key_expression(reference).intersects(zenoh.KeyExpr(f"{client.keys.root}/**"))
 
 
 def _not_running(reference: str, clients: Sequence[MeshClient]) -> ConfigurationError:
