@@ -248,7 +248,7 @@ def _command(arguments: argparse.Namespace, meshes: Meshes) -> int:
         case "stop":
             what = "is told to end"
         case "step":
-            what = f"runs {arguments.points} points on and is held there;"
+            what = f"goes {arguments.points} points on and stays there, starting"
         case _:
             what = f"is {answer.state}"
     print(f"mesh '{client.keys.mesh}' {what} at point {answer.point}")

@@ -167,8 +167,8 @@ def draw(results: Results, output: Path, *, title: str, variables: Mapping[str, 
         ConfigurationError: the file cannot be written.
     """
     # The object interface: no window, no global state of pyplot. It is an extra, so it is imported late.
-    from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415
-    from matplotlib.figure import Figure  # noqa: PLC0415
+    from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415  matplotlib is an extra, and slow to import
+    from matplotlib.figure import Figure  # noqa: PLC0415  matplotlib is an extra, and slow to import
 
     groups: dict[str, list[str]] = {}
     for name in results.columns:

@@ -194,8 +194,23 @@ def make_plan(system: System, *, window: int | None = None, file: str = "") -> P
         nodes={},
     )
     nodes = _nodes(plan)
-    digest = hashlib.sha256(msgspec.json.encode(nodes, order="deterministic")).hexdigest()[:16]
+    digest = _digest(system, nodes)
     return replace(plan, digest=digest, nodes={name: replace(node, digest=digest) for name, node in nodes.items()})
+
+
+def _digest(system: System, nodes: dict[str, NodePlan]) -> str:
+    """What all processes of a mesh must agree on; where files lie is each host's own matter."""
+    agreed = [
+        replace(
+            node,
+            result_file=None,
+            instances=tuple(
+                replace(instance, fmu=system.instances[instance.name].description.guid) for instance in node.instances
+            ),
+        )
+        for node in nodes.values()
+    ]
+    return hashlib.sha256(msgspec.json.encode(agreed, order="deterministic")).hexdigest()[:16]
 
 
 def _with_delays(system: System) -> tuple[tuple[Connection, ...], tuple[Connection, ...]]:

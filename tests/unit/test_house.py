@@ -1,0 +1,116 @@
+"""The project's files agree with one another: versions, packages, commands and checks."""
+
+import importlib
+import importlib.metadata
+import pkgutil
+import re
+import subprocess
+import sys
+import tarfile
+import zipfile
+from pathlib import Path
+
+import pytest
+import yaml
+from hatchling.builders.sdist import SdistBuilder
+from hatchling.builders.wheel import WheelBuilder
+
+import fmu_mesh
+
+ROOT = Path(__file__).parents[2]
+MODULES = sorted(
+    module.name
+    for module in pkgutil.walk_packages(fmu_mesh.__path__, "fmu_mesh.")
+    if not module.name.endswith("__main__")
+)
+
+
+def text(path: str) -> str:
+    return (ROOT / path).read_text(encoding="utf-8")
+
+
+def test_the_installed_version_is_that_of_the_package_and_has_its_entry_in_the_changelog() -> None:
+    assert importlib.metadata.version("fmu-mesh") == fmu_mesh.__version__
+    assert re.search(rf"^## \[{re.escape(fmu_mesh.__version__)}\]", text("CHANGELOG.md"), re.MULTILINE)
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_a_module_has_what_it_says_it_exports(name: str) -> None:
+    module = importlib.import_module(name)
+
+    assert [export for export in getattr(module, "__all__", []) if not hasattr(module, export)] == []
+
+
+def test_importing_the_whole_package_prints_nothing() -> None:
+    program = "import importlib, sys\nfor name in sys.argv[1:]: importlib.import_module(name)"
+
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", program, *MODULES], capture_output=True, check=True
+    )
+
+    assert (done.stdout, done.stderr) == (b"", b"")
+
+
+def test_the_wheel_holds_the_typed_package_and_nothing_else(tmp_path: Path) -> None:
+    wheel = next(WheelBuilder(str(ROOT)).build(directory=str(tmp_path), versions=["standard"]))
+    with zipfile.ZipFile(wheel) as archive:
+        names = archive.namelist()
+
+    assert {name.split("/")[0] for name in names} == {
+        "fmu_mesh",
+        f"fmu_mesh-{fmu_mesh.__version__}.dist-info",
+    }
+    assert "fmu_mesh/py.typed" in names
+    assert [name for name in names if name.endswith(".pyc")] == []
+
+
+def test_the_source_distribution_has_the_tests_and_what_they_need(tmp_path: Path) -> None:
+    sdist = next(SdistBuilder(str(ROOT)).build(directory=str(tmp_path), versions=["standard"]))
+    with tarfile.open(sdist) as archive:
+        tops = {Path(name).parts[1] for name in archive.getnames()}
+
+    assert {"LICENSE", "Makefile", "configs", "docker", "fmu_mesh", "fmus", "pyproject.toml", "tests"} <= tops
+    assert {".venv", "results", "dist"} & tops == set()
+
+
+def test_every_rule_that_is_switched_off_says_why() -> None:
+    lists = re.findall(
+        r'^(?:ignore|"[\w*/]+") = \[\n(.*?)^\]', text("pyproject.toml"), re.MULTILINE | re.DOTALL
+    )
+    rules = [line for entries in lists for line in entries.splitlines()]
+
+    assert rules
+    assert [line for line in rules if not re.search(r'^  "\w+", +# \S', line)] == []
+
+
+def test_every_check_that_a_line_switches_off_says_why() -> None:
+    switch = re.compile(r"#\s*(noqa|type: ignore|pragma: no)\b")
+    with_reason = re.compile(
+        r"#\s*(noqa: [A-Z0-9, ]+|type: ignore\[[\w, -]+\]|pragma: no (cover|branch))\W+\w"
+    )
+    silent = [
+        f"{path.relative_to(ROOT)}:{number}: {line.strip()}"
+        for folder in ("fmu_mesh", "tests")
+        for path in sorted((ROOT / folder).rglob("*.py"))
+        if path != Path(__file__)
+        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1)
+        if switch.search(line) and not with_reason.search(line)
+    ]
+
+    assert silent == []
+
+
+def test_a_commit_is_checked_by_the_tools_of_make_check() -> None:
+    checks = set(re.findall(r"^\trun ([\w-]+)", text("Makefile"), re.MULTILINE))
+    hooks = yaml.safe_load(text(".pre-commit-config.yaml"))["repos"][0]["hooks"]
+
+    assert checks
+    assert {Path(hook["entry"].split()[0]).name for hook in hooks} == checks
+
+
+@pytest.mark.parametrize("page", sorted(path.name for path in ROOT.glob("*.md")))
+def test_every_make_command_that_a_page_names_exists(page: str) -> None:
+    targets = set(re.findall(r"^([a-z]+):", text("Makefile"), re.MULTILINE))
+    named = set(re.findall(r"^(?:    )?make ([a-z]+)$|`make ([a-z]+)`", text(page), re.MULTILINE))
+
+    assert {fenced or quoted for fenced, quoted in named} <= targets

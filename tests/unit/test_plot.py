@@ -1,0 +1,174 @@
+"""Result files as pictures: what is read, what is drawn, and what is refused."""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib import image
+from msgspec.structs import replace
+from numpy.typing import NDArray
+
+from fmu_mesh.cli.main import main
+from fmu_mesh.cli.plotting import plot_results, read_results, reduced
+from fmu_mesh.errors import ConfigurationError
+from fmu_mesh.launch.preparing import prepare
+
+CONFIGS = Path(__file__).parents[2] / "configs"
+
+RESULTS = """\
+time,a.y,"a.der(x,2)",b.on,b.count
+0.0,1.5,-2.0,true,3
+0.5,1e-3,nan,false,-4
+1.0,2.5,inf,true,5
+"""
+
+
+@pytest.fixture
+def results(tmp_path: Path) -> Path:
+    path = tmp_path / "run.csv"
+    path.write_text(RESULTS, encoding="utf-8")
+    return path
+
+
+def pixels(picture: Path) -> NDArray[np.float64]:
+    """Height x width x colour."""
+    return np.asarray(image.imread(picture), dtype=np.float64)
+
+
+def test_a_result_file_is_read_as_it_was_written(results: Path) -> None:
+    read = read_results(results)
+
+    assert read.times.tolist() == [0.0, 0.5, 1.0]
+    assert list(read.columns) == ["a.y", "a.der(x,2)", "b.on", "b.count"]
+    assert read.columns["a.y"].tolist() == [1.5, 0.001, 2.5]
+    assert math.isnan(read.columns["a.der(x,2)"][1])
+    assert read.columns["a.der(x,2)"][2] == math.inf
+    assert read.columns["b.on"].tolist() == [1.0, 0.0, 1.0]
+    assert read.flags == {"b.on"}
+    assert read.whole == {"b.count"}
+
+
+@pytest.mark.parametrize("rest", ["1.5", "1.5,0.1", "1.5,0.1,0.2,true,1", ""])
+def test_a_last_row_that_is_cut_off_is_left_out(results: Path, rest: str) -> None:
+    results.write_text(RESULTS + rest, encoding="utf-8")
+    assert read_results(results).times.tolist() == [0.0, 0.5, 1.0]
+
+
+def test_variables_are_chosen_in_the_order_asked_for(results: Path) -> None:
+    assert list(read_results(results, ["b.count", "a.y"]).columns) == ["b.count", "a.y"]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "it is empty, not 'time'"),
+        ("mesh: pair\n", "its first column is 'mesh: pair', not 'time'"),
+        (RESULTS + "1.5,1\n", "line 5: 2 values where the heading has 5"),
+        (RESULTS + "1.5,x,1.0,true,1\n", "line 5: could not convert string to float: 'x'"),
+        ("time,a\n\0\xff", ""),
+    ],
+)
+def test_what_is_no_result_file_is_refused_with_the_place(results: Path, text: str, message: str) -> None:
+    results.write_text(text, encoding="latin-1")
+    if not message:
+        results.write_bytes(b"time,a\n\xff\xfe\n")
+        message = "codec can't decode"
+    with pytest.raises(ConfigurationError, match=r"'.*run\.csv' is no result file: ") as caught:
+        read_results(results)
+    assert message in str(caught.value)
+
+
+def test_a_missing_file_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["plot", str(tmp_path / "nothing.csv")]) == 2
+    assert "cannot be read: No such file or directory" in capsys.readouterr().err
+
+
+def test_an_unknown_variable_is_refused_with_the_nearest_name(
+    results: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["plot", str(results), "--variables", "b.cont"]) == 2
+    assert "has no variable 'b.cont'. Did you mean 'b.count'?" in capsys.readouterr().err
+
+
+def test_the_command_draws_beside_the_result_file(results: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["plot", str(results)]) == 0
+
+    picture = results.with_suffix(".png")
+    assert capsys.readouterr().out == f"plot: {picture}\n"
+    height, width, _ = pixels(picture).shape
+    assert (height, width) == (816, 1200)
+    assert len(np.unique(pixels(picture).reshape(-1, 4), axis=0)) > 10
+
+
+def test_a_format_that_does_not_exist_is_refused(results: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["plot", str(results), "--output", str(results.with_suffix(".xyz"))]) == 2
+    assert "supported formats" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("rows", ["", "0.0,1.0,1.0,true,1\n"])
+def test_no_points_and_one_point_can_be_drawn(results: Path, rows: str) -> None:
+    results.write_text(RESULTS.splitlines(keepends=True)[0] + rows, encoding="utf-8")
+    assert main(["plot", str(results)]) == 0
+    assert results.with_suffix(".png").stat().st_size > 1000
+
+
+def test_with_a_plan_every_unit_has_axes_of_its_own(tmp_path: Path) -> None:
+    plan = prepare(CONFIGS / "chain8.yaml")
+    names = [".".join(recorded) for recorded in plan.system.recorded]
+    result = tmp_path / "chain8.csv"
+    heading = ",".join(["time", *(f'"{name}"' for name in names)])
+    result.write_text(f"{heading}\n0.0{',1.0' * len(names)}\n", encoding="utf-8")
+    picture, text = tmp_path / "chain8.png", tmp_path / "chain8.svg"
+
+    plot_results(result, picture, plan)
+    plot_results(result, text, plan)
+
+    assert pixels(picture).shape[0] == 1488  # rad, rad/s, rad/s2 and no unit
+    drawn = text.read_text(encoding="utf-8")
+    for words in ("chain8", "value in rad", "value in rad/s2", "value, no unit", "time in s", *names):
+        assert f"<!-- {words} -->" in drawn
+
+
+def test_without_matplotlib_the_error_says_what_to_install(
+    results: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(importlib.util, "find_spec", lambda _name: None)
+
+    assert main(["plot", str(results)]) == 2
+    assert main(["launch", str(CONFIGS / "pendulum_delay.yaml"), "--plot", str(results.with_suffix(".png"))]) == 2
+
+    assert capsys.readouterr().err.count("pip install 'fmu-mesh[plot]'") == 2
+
+
+def test_a_reduced_line_keeps_its_extremes_and_gaps() -> None:
+    times: NDArray[np.float64] = np.linspace(0.0, 100.0, 100_000)
+    values: NDArray[np.float64] = np.sin(times)
+    values[12_345], values[54_321] = 7.0, -9.0
+    values[70_000:80_000] = math.nan
+    values[90_000] = math.inf
+
+    few_times, few = reduced(times, values, 1000)
+
+    assert 900 < len(few) <= 1002
+    assert np.nanmax(few) == 7.0
+    assert few_times[np.nanargmax(few)] == times[12_345]
+    assert np.nanmin(few) == -9.0
+    assert np.isnan(few[(few_times >= 71.0) & (few_times < 79.0)]).all()
+    assert (few_times[0], few_times[-1]) == (times[0], times[-1])
+    assert (np.diff(few_times) > 0).all()
+
+
+def test_a_short_line_is_drawn_as_it_is() -> None:
+    times = np.arange(5.0)
+    assert reduced(times, times * 2, 5)[1].tolist() == [0.0, 2.0, 4.0, 6.0, 8.0]
+
+
+def test_the_plot_of_a_finished_plan_may_lie_in_a_new_folder(results: Path, tmp_path: Path) -> None:
+    plan = prepare(CONFIGS / "pendulum_delay.yaml")
+    plan = replace(plan, system=replace(plan.system, recorded=()))
+    plot_results(results, tmp_path / "new" / "run.png", plan)
+    assert (tmp_path / "new" / "run.png").exists()

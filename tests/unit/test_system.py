@@ -1,0 +1,467 @@
+"""What `build` makes of a configuration, and what it says about names and values that do not fit."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from fmu_mesh.errors import ConfigurationError, Finding
+from fmu_mesh.model.description import Causality, ModelDescription, Value, Variable, VariableType
+from fmu_mesh.model.loading import examine, parse
+from fmu_mesh.model.system import System, build
+from fmu_mesh.simtime import TimeGrid
+
+FILE = Path("/models/configs/mesh.yaml")
+
+
+def variable(name: str, kind: VariableType, causality: Causality, **more: object) -> Variable:
+    fields: dict[str, object] = {
+        "variability": "discrete" if causality in ("input", "output") else "fixed",
+        "initial": {"parameter": "exact", "output": "calculated", "local": "calculated"}.get(causality),
+        **more,
+    }
+    return Variable(name, 0, kind, causality, **fields)  # type: ignore[arg-type] # checked by the tests themselves
+
+
+def description(*variables: Variable, only_once: bool = False) -> ModelDescription:
+    return ModelDescription(
+        model_name="model",
+        model_identifier="model",
+        fmi_version="2.0",
+        kind="co_simulation",
+        guid="{1}",
+        variables=variables,
+        only_once_per_process=only_once,
+    )
+
+
+SOURCE = description(
+    variable("a", "Real", "output", initial="exact", unit="rad"),
+    variable("der(a,2)", "Real", "output"),
+    variable("count", "Integer", "output"),
+    variable("flag", "Boolean", "output"),
+    variable("mode", "Enumeration", "output"),
+    variable("name", "String", "output"),
+    variable("body[1].x", "Real", "local"),
+    variable("l", "Real", "parameter", minimum=0.0, maximum=10.0),
+    variable("n", "Integer", "parameter", minimum=1.0),
+    variable("on", "Boolean", "parameter"),
+    variable("label", "String", "parameter"),
+    variable("kind", "Enumeration", "parameter", items=(("stiff", 1), ("soft", 2))),
+    variable("pi", "Real", "parameter", variability="constant"),
+    variable("time", "Real", "independent"),
+)
+TARGET = description(
+    variable("x", "Real", "input", unit="m"),
+    variable("body[1].u", "Real", "input"),
+    variable("i", "Integer", "input"),
+    variable("b", "Boolean", "input"),
+    variable("e", "Enumeration", "input"),
+    variable("s", "String", "input"),
+    variable("y", "Real", "output"),
+)
+DESCRIPTIONS = {"pendulum": SOURCE, "delay": TARGET}
+
+
+def text(
+    simulation: str = "stop_time: 1, step_size: 0.1",
+    pendulum: str = "fmu: p.fmu",
+    delay: str = "fmu: d.fmu",
+    connections: str = "",
+    rest: str = "",
+) -> str:
+    return f"""\
+mesh: pair
+simulation: {{{simulation}}}
+instances:
+  pendulum: {{{pendulum}}}
+  delay: {{{delay}}}
+connections: [{connections}]
+{rest}
+"""
+
+
+def built(config: str, *overrides: str) -> System:
+    return build(parse(config, FILE, overrides), DESCRIPTIONS)
+
+
+def findings_of(config: str, *overrides: str) -> list[str]:
+    with pytest.raises(ConfigurationError) as caught:
+        built(config, *overrides)
+    return [str(finding).removeprefix(f"{FILE}:") for finding in caught.value.findings]
+
+
+def test_a_good_configuration_becomes_a_system() -> None:
+    system = built(
+        text(
+            simulation="start_time: 1, stop_time: 41, step_size: 0.002",
+            pendulum="fmu: ../fmus/p.fmu, start_values: {a: 1, l: 2}, group: fast",
+            delay="fmu: d.fmu, step_size: 0.004",
+            connections='{from: "pendulum.der(a,2)", to: "delay.body[1].u", factor: 2, offset: 1, delay: 1}',
+        )
+    )
+    assert system.grid == TimeGrid(1.0, 0.002, 20_000)
+    pendulum, delay = system.instances.values()
+    assert (pendulum.fmu, pendulum.node, pendulum.step_points) == ("/models/fmus/p.fmu", "fast", 1)
+    assert pendulum.start_values == {"a": 1.0, "l": 2.0}
+    assert type(pendulum.start_values["a"]) is float
+    assert (delay.name, delay.node, delay.step_points) == ("delay", "delay", 2)
+    (connection,) = system.connections
+    assert str(connection) == "pendulum.der(a,2) -> delay.body[1].u"
+    assert (connection.factor, connection.offset, connection.delay) == (2.0, 1.0, 1)
+    assert connection.path == "connections[0]"
+    assert system.result_file == "/models/configs/results/pair.csv"
+    assert system.warnings == ()
+
+
+def test_by_default_all_outputs_but_strings_are_recorded() -> None:
+    assert built(text()).recorded == (
+        ("pendulum", "a"),
+        ("pendulum", "der(a,2)"),
+        ("pendulum", "count"),
+        ("pendulum", "flag"),
+        ("pendulum", "mode"),
+        ("delay", "y"),
+    )
+
+
+def test_recorded_variables_keep_the_order_of_the_file() -> None:
+    system = built(text(rest="record: {file: /results/a.csv, variables: [delay.y, 'pendulum.der(a,2)']}"))
+    assert system.recorded == (("delay", "y"), ("pendulum", "der(a,2)"))
+    assert system.result_file == "/results/a.csv"
+
+
+def test_nothing_is_recorded_without_a_file() -> None:
+    assert built(text(rest="record: {file: null}")).result_file is None
+
+
+def test_a_run_may_have_no_step() -> None:
+    assert built(text(simulation="stop_time: 0, step_size: 1")).grid.last_point == 0
+
+
+SIMULATION = [
+    ("stop_time: 1, step_size: 0", "2: simulation.step_size: 0; expected a step size > 0 in s"),
+    ("stop_time: 1, step_size: -0.1", "2: simulation.step_size: -0.1; expected a step size > 0 in s"),
+    (
+        "start_time: 2, stop_time: 1, step_size: 0.1",
+        "2: simulation.stop_time: 1, before start_time 2; expected a time >= 2",
+    ),
+    (
+        "stop_time: 1, step_size: 0.3",
+        (
+            "2: simulation.stop_time: 1 s between start_time and stop_time, no whole multiple of step_size 0.3 s; "
+            "expected a whole multiple of it, as with stop_time 0.9 or 1.2"
+        ),
+    ),
+    (
+        "stop_time: 1e300, step_size: 1e-300",
+        (
+            "2: simulation.step_size: more than 9007199254740992 points from 0 s to 1e+300 s in steps of 1e-300 s; "
+            "expected a larger step size or an earlier stop time"
+        ),
+    ),
+    (
+        "stop_time: 1, step_size: 1, real_time_factor: -1",
+        "2: simulation.real_time_factor: -1; expected 0 (as fast as possible) or a positive factor",
+    ),
+]
+
+
+@pytest.mark.parametrize(("simulation", "expected"), SIMULATION)
+def test_a_simulation_that_cannot_run_is_refused(simulation: str, expected: str) -> None:
+    assert findings_of(text(simulation=simulation)) == [expected]
+
+
+@pytest.mark.parametrize(
+    ("step", "expected"),
+    [
+        ("0", "0; expected a step size > 0 in s"),
+        ("-1", "-1; expected a step size > 0 in s"),
+        ("0.15", "0.15 s; expected a whole multiple of the base step size 0.1 s, such as 0.1 or 0.2"),
+        ("0.01", "0.01 s; expected a whole multiple of the base step size 0.1 s, such as 0.1"),
+    ],
+)
+def test_an_own_step_size_is_a_multiple_of_the_base_step_size(step: str, expected: str) -> None:
+    found = findings_of(text(delay=f"fmu: d.fmu, step_size: {step}"))
+    assert found == [f"5: instances.delay.step_size: {expected}"]
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "converted"),
+    [
+        ("a", "1", 1.0),
+        ("a", "-0.5", -0.5),
+        ("n", "2147483647", 2**31 - 1),
+        ("on", "true", True),
+        ("label", "off", "off"),
+        ("kind", "soft", 2),
+        ("kind", "1", 1),
+        ("l", "0", 0.0),
+    ],
+)
+def test_a_start_value_takes_the_type_of_its_variable(name: str, value: str, converted: Value) -> None:
+    start_values = built(text(), f"pendulum.{name}={value}").instances["pendulum"].start_values
+    assert start_values == {name: converted}
+    assert type(start_values[name]) is type(converted)
+
+
+START_VALUES = [
+    ("q: 1", "q: the unknown variable 'q' of instance 'pendulum'; expected one of a, l, n, on, label, kind"),
+    ("LABEL: x",
+     ("LABEL: the unknown variable 'LABEL' of instance 'pendulum'; expected one of a, l, n, on, label, kind. "
+                 "Did you mean 'label'?")),
+    ("'der(a,2)': 1", ("der(a,2): 'der(a,2)', an output with initial 'calculated' that cannot be set before the start; "
+                      "expected one of a, l, n, on, label, kind")),
+    ("pi: 3", "pi: 'pi', a constant that cannot be set before the start; expected one of a, l, n, on, label, kind"),
+    ("time: 3", ("time: 'time', an independent that cannot be set before the start; "
+                "expected one of a, l, n, on, label, kind")),
+    ("a: '1'", "a: '1' for the Real 'a'; expected a finite number"),
+    ("a: true", "a: true for the Real 'a'; expected a finite number"),
+    ("n: 1.5", "n: 1.5 for the Integer 'n'; expected a whole number from -2147483648 to 2147483647"),
+    ("n: true", "n: true for the Integer 'n'; expected a whole number from -2147483648 to 2147483647"),
+    ("n: 2147483648", "n: 2147483648 for the Integer 'n'; expected a whole number from -2147483648 to 2147483647"),
+    ("on: 1", "on: 1 for the Boolean 'on'; expected true or false"),
+    ("label: 1", "label: 1 for the String 'label'; expected text"),
+    ("kind: sofd",
+     "kind: 'sofd' for the Enumeration 'kind'; expected one of stiff (1), soft (2). Did you mean 'soft'?"),
+    ("kind: 3", "kind: 3 for the Enumeration 'kind'; expected one of stiff (1), soft (2)"),
+    ("kind: true", "kind: true for the Enumeration 'kind'; expected one of stiff (1), soft (2)"),
+    ("l: -1", "l: -1 for 'l', which is out of its range; expected a value >= 0 and <= 10"),
+    ("l: 11.5", "l: 11.5 for 'l', which is out of its range; expected a value >= 0 and <= 10"),
+    ("n: 0", "n: 0 for 'n', which is out of its range; expected a value >= 1"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("values", "expected"), START_VALUES)
+def test_a_wrong_start_value_is_told_with_its_place(values: str, expected: str) -> None:
+    found = findings_of(text(pendulum=f"fmu: p.fmu, start_values: {{{values}}}"))
+    assert found == [f"4: instances.pendulum.start_values.{expected}"]
+
+
+def test_a_wrong_start_value_of_an_option_is_told_by_the_option() -> None:
+    found = findings_of(text(pendulum="fmu: p.fmu, start_values: {l: 1}"), "pendulum.l=long", "delay.z=1")
+    assert found == [
+        " --set pendulum.l=long: 'long' for the Real 'l'; expected a finite number",
+        " --set delay.z=1: the unknown variable 'z' of instance 'delay'; expected one of x, body[1].u, i, b, e, s",
+    ]
+
+
+CONNECTIONS = [
+    ("pendulum -> delay.x", "[0].from: 'pendulum'; expected instance.variable"),
+    ("{from: '', to: ''}", "[0]: no ends; expected instance.output -> instance.input"),
+    ("pendulum.a -> .x", "[0].to: '.x'; expected instance.variable"),
+    ("pendulam.a -> delay.x", ("[0].from: the unknown instance 'pendulam'; "
+     "expected one of the instances pendulum, delay. Did you mean 'pendulum'?")),
+    ("pendulum.a -> dely.x", ("[0].to: the unknown instance 'dely'; "
+     "expected one of the instances pendulum, delay. Did you mean 'delay'?")),
+    ("pendulum.moda -> delay.x", ("[0].from: the unknown variable 'moda' of instance 'pendulum'; "
+     "expected one of the outputs of 'pendulum': a, der(a,2), count, flag, mode, name. Did you mean 'mode'?")),
+    ("pendulum.a -> delay.y", "[0].to: 'delay.y' is an output; expected an input"),
+    ("pendulum.l -> delay.x", "[0].from: 'pendulum.l' is a parameter; expected an output"),
+    ("delay.x -> pendulum.a", ("[0]: the wrong way round: 'delay.x' is an input and 'pendulum.a' an output; "
+     "expected output -> input. Did you mean 'pendulum.a -> delay.x'?")),
+    ("pendulum.a -> delay.i", ("[0]: pendulum.a -> delay.i connects a Real to an Integer; "
+     "expected a source of type Integer or Boolean or Enumeration")),
+    ("pendulum.flag -> delay.x", ("[0]: pendulum.flag -> delay.x connects a Boolean to a Real; "
+     "expected a source of type Real or Integer")),
+    ("pendulum.mode -> delay.x", ("[0]: pendulum.mode -> delay.x connects an Enumeration to a Real; "
+     "expected a source of type Real or Integer")),
+    ("pendulum.count -> delay.b", ("[0]: pendulum.count -> delay.b connects an Integer to a Boolean; "
+     "expected a source of type Boolean")),
+    ("pendulum.count -> delay.e", ("[0]: pendulum.count -> delay.e connects an Integer to an Enumeration; "
+     "expected a source of type Enumeration")),
+    ("pendulum.name -> delay.s", ("[0]: pendulum.name -> delay.s connects a String to a String; "
+     "expected another type: String connections are not supported yet")),
+    ("{from: pendulum.count, to: delay.i, factor: 2}", ("[0]: factor 2 and offset 0 for the Integer 'i'; "
+     "expected factor and offset on Real inputs only")),
+    ("{from: delay.y, to: delay.x, delay: 0}", ("[0].delay: delay 0 on delay.y -> delay.x, "
+     "from an instance to itself; expected delay 1")),
+    ("pendulum.a -> delay.x, pendulum.count -> delay.x", ("[1]: a second source for the input 'delay.x': "
+     "pendulum.count -> delay.x, after pendulum.a -> delay.x (connections[0] in line 6); "
+     "expected one source for an input")),
+    ("pendulum.a -> delay.x, {from: pendulum.a, to: delay.x}", ("[1]: pendulum.a -> delay.x a second time "
+     "(first: connections[0] in line 6); expected one source for an input")),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("connections", "expected"), CONNECTIONS)
+def test_a_wrong_connection_is_told_with_its_place(connections: str, expected: str) -> None:
+    assert findings_of(text(connections=connections)) == [f"6: connections{expected}"]
+
+
+@pytest.mark.parametrize(
+    "connection",
+    [
+        "pendulum.count -> delay.x",
+        "pendulum.flag -> delay.i",
+        "pendulum.mode -> delay.i",
+        "pendulum.mode -> delay.e",
+        "pendulum.flag -> delay.b",
+        "delay.y -> delay.x",
+        "{from: pendulum.count, to: delay.x, factor: 0.5}",
+    ],
+)
+def test_lossless_types_and_loops_may_be_connected(connection: str) -> None:
+    assert len(built(text(connections=connection)).connections) == 1
+
+
+def test_different_units_without_a_factor_are_a_warning() -> None:
+    (warning,) = built(text(connections="pendulum.a -> delay.x")).warnings
+    assert warning == Finding(
+        str(FILE),
+        "connections[0]",
+        "pendulum.a -> delay.x connects the unit 'rad' to the unit 'm'",
+        "the same unit, or a factor that converts it",
+        None,
+        6,
+    )
+    assert built(text(connections="{from: pendulum.a, to: delay.x, factor: 2}")).warnings == ()
+
+
+NODES = [
+    ("fmu: p.fmu, group: delay", "fmu: d.fmu", ("4: instances.pendulum.group: the group 'delay', "
+     "which is the name of an instance outside the group; expected a name of its own")),
+    ("fmu: p.fmu, group: mesh", "fmu: d.fmu", ("4: instances.pendulum.group: the group 'mesh'; "
+     "expected another name: it is reserved for the mesh itself")),
+    ("fmu: p.fmu, group: g, host: one", "fmu: d.fmu, group: g", ("5: instances.delay.host: nothing (null), "
+     "while 'pendulum' has 'one'; expected one host for all instances of the group 'g'")),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("pendulum", "delay", "expected"), NODES)
+def test_a_group_that_cannot_be_one_node_is_refused(pendulum: str, delay: str, expected: str) -> None:
+    assert findings_of(text(pendulum=pendulum, delay=delay)) == [expected]
+
+
+def test_a_group_may_have_the_name_of_an_instance_inside_it() -> None:
+    system = built(text(pendulum="fmu: p.fmu, group: delay", delay="fmu: d.fmu, group: delay, host: null"))
+    assert {instance.node for instance in system.instances.values()} == {"delay"}
+
+
+@pytest.mark.parametrize("group", ["g", "h"])
+def test_an_fmu_for_one_instance_per_process_is_once_in_a_group(group: str) -> None:
+    loaded = parse(text(pendulum="fmu: a.fmu, group: g", delay=f"fmu: a.fmu, group: {group}"), FILE)
+    model = description(only_once=True)
+    if group == "h":
+        assert len(build(loaded, {"pendulum": model, "delay": model}).instances) == 2
+        return
+    with pytest.raises(ConfigurationError, match=r"instances\.delay\.group: 'delay' in one process with 'pendulum'"):
+        build(loaded, {"pendulum": model, "delay": model})
+
+
+def test_mesh_is_no_instance_name() -> None:
+    loaded = parse("mesh: m\nsimulation: {stop_time: 1, step_size: 1}\ninstances: {mesh: {fmu: a.fmu}}\n", FILE)
+    with pytest.raises(ConfigurationError, match=r"instances\.mesh: the name 'mesh'; expected another name"):
+        build(loaded, {"mesh": SOURCE})
+
+
+RECORD = [
+    ("[pendulum.b]", ("[0]: the unknown variable 'b' of instance 'pendulum'; expected one of the outputs of "
+     "'pendulum': a, der(a,2), count, flag, mode, name")),
+    ("[delai.y]", ("[0]: the unknown instance 'delai'; expected one of the instances pendulum, delay. "
+     "Did you mean 'delay'?")),
+    ("[delay.y, delay.y]", ("[1]: 'delay.y' a second time (first: record.variables[0]); "
+     "expected every variable at most once")),
+    ("[delay.x]", "[0]: 'delay.x', whose causality is input; expected an output"),
+    ("[pendulum.name]", "[0]: the String 'pendulum.name'; expected a Real, Integer, Boolean or Enumeration output"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("variables", "expected"), RECORD)
+def test_what_cannot_be_recorded_is_refused(variables: str, expected: str) -> None:
+    assert findings_of(text(rest=f"record: {{variables: {variables}}}")) == [f"7: record.variables{expected}"]
+
+
+def test_a_folder_is_no_result_file(tmp_path: Path) -> None:
+    (found,) = findings_of(text(rest=f"record: {{file: {tmp_path}}}"))
+    assert found == f"7: record.file: the folder '{tmp_path}'; expected a file, or null to record nothing"
+
+
+def test_a_client_needs_a_router() -> None:
+    assert findings_of(text(rest="zenoh: {mode: client}")) == [
+        "7: zenoh.mode: client without a router; expected an endpoint in zenoh.connect"
+    ]
+
+
+def test_a_zenoh_configuration_exists(tmp_path: Path) -> None:
+    (tmp_path / "zenoh.json5").touch()
+    assert findings_of(text(rest=f"zenoh: {{config: {tmp_path}/zenoh.json}}")) == [
+        (
+            f"7: zenoh.config: no such file '{tmp_path}/zenoh.json'; expected an existing Zenoh configuration. "
+            f"Did you mean '{tmp_path}/zenoh.json5'?"
+        )
+    ]
+
+
+def test_all_findings_are_shown_together_with_earlier_ones_and_those_without_a_description() -> None:
+    loaded = parse(
+        text(
+            simulation="stop_time: 1, step_size: 0",
+            pendulum="fmu: p.fmu, start_values: {q: 1}, step_size: 0.1",
+            delay="fmu: d.fmu, start_values: {q: 1}, step_size: -1",
+            connections="pendulum.q -> delay.q, pendulum.a -> delays.x",
+            rest="record: {variables: [pendulum.l, delay.q, x.y]}",
+        ),
+        FILE,
+    )
+    earlier = loaded.finding("instances.delay.fmu", "no such file", "an FMU")
+    with pytest.raises(ConfigurationError, match="8 problems") as caught:
+        build(loaded, {"pendulum": SOURCE}, [earlier])
+    assert [(finding.line, finding.path) for finding in caught.value.findings] == [
+        (2, "simulation.step_size"),
+        (4, "instances.pendulum.start_values.q"),
+        (5, "instances.delay.fmu"),
+        (5, "instances.delay.step_size"),
+        (6, "connections[0].from"),
+        (6, "connections[1].to"),
+        (7, "record.variables[0]"),
+        (7, "record.variables[2]"),
+    ]
+
+
+def test_what_a_wrong_structure_leaves_is_checked_too_without_findings_that_only_follow(tmp_path: Path) -> None:
+    file = tmp_path / "mesh.yaml"
+    file.write_text(
+        """\
+mesh: a pair
+simulation: {stop_time: 1, step_sise: 0.3, real_time_factor: -1}
+instances:
+  pendulum: {fmu: p.fmu, start_values: {a: , l: -1}, step_size: no}
+  delay: {fmuu: d.fmu, step_size: -1, start_values: {d: 1}}
+connections:
+  - pendulum.a => delay.x
+  - 3
+  - {from: pendulum.a, too: delay.x, factor: x}
+  - {from: pendulum.q, to: delai.x, factor: x}
+record: {variables: [3, pendulum.a]}
+"""
+    )
+    loaded, findings = examine(file, ["pendulum.n=1.5", "delay.q={}"])
+    with pytest.raises(ConfigurationError) as caught:
+        build(loaded, {"pendulum": SOURCE}, findings)
+    assert [(finding.line, finding.path) for finding in caught.value.findings] == [
+        (1, "mesh"),
+        (2, "simulation.step_sise"),
+        (2, "simulation.real_time_factor"),
+        (4, "instances.pendulum.start_values.a"),
+        (4, "instances.pendulum.step_size"),
+        (4, "instances.pendulum.start_values.l"),
+        (5, "instances.delay.fmuu"),
+        (5, "instances.delay.step_size"),
+        (7, "connections[0]"),
+        (8, "connections[1]"),
+        (9, "connections[2].too"),
+        (9, "connections[2].factor"),
+        (10, "connections[3].factor"),
+        (10, "connections[3].from"),
+        (10, "connections[3].to"),
+        (11, "record.variables[0]"),
+        (None, "--set delay.q={}"),
+        (None, "--set pendulum.n=1.5"),
+    ]
+
+
+def test_a_description_that_is_missing_without_a_finding_is_an_error_of_the_caller() -> None:
+    with pytest.raises(ValueError, match=r"no model description and no finding for \['delay'\]"):
+        build(parse(text(), FILE), {"pendulum": SOURCE})
