@@ -40,10 +40,8 @@ check: $(VENV)/.installed-check $(VENV)/.installed-test ## lint, format, types, 
 	if [ -n "$$failed" ]; then printf "\nmake check failed:$$failed\n" >&2; exit 1; fi; \
 	echo "make check: all clean"
 
-bench: $(VENV)/.installed-test ## all benchmarks
-	@for script in $(sort $(wildcard benchmarks/*.py)); do \
-	  echo "== $$script"; $(BIN)/python $$script || exit 1; \
-	done
+bench: $(VENV)/.installed-test ## us and the peers on this machine: one table (about 20 minutes)
+	@$(BIN)/python -m benchmarks
 
 fmus: $(VENV)/.installed-plot ## rebuild the example FMUs from fmus/src (needs a C compiler)
 	@$(BIN)/python fmus/build.py

@@ -10,7 +10,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from ..errors import FmuMeshError
+from ..errors import ConfigurationError, FmuMeshError
 from ..fmu import LogMessage
 from ..launch.events import End, Event, EventWriter
 from ..launch.launcher import Launcher
@@ -19,10 +19,12 @@ from ..launch.preparing import Options, prepare
 from ..launch.process import ended_by_signals
 from ..launch.roles import BY_HAND, run_master, run_node
 from ..model.plan import Plan
+from ..wire.profile import MeshProfile
 from ..wire.router import run_router
 from ..wire.views import LogLine
 from .display import Display, summary
 from .plotting import plot_results, require_matplotlib
+from .profiling import add_profile, show_profile
 
 __all__ = ["add_commands"]
 
@@ -34,6 +36,7 @@ def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.Arg
     launch.add_argument("--local", action="store_true", help="run everything in this one process")
     launch.add_argument("--plot", type=Path, metavar="FILE.png", help="plot the result when done")
     launch.add_argument("--no-progress", action="store_true", help="no progress line")
+    add_profile(launch)
     launch.set_defaults(run_command=_launch)
 
     node = commands.add_parser("node", parents=[common], help="run one node by hand")
@@ -47,6 +50,7 @@ def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.Arg
     _add_config(master)
     master.add_argument("--plot", type=Path, metavar="FILE.png", help="plot the result when done")
     master.add_argument("--no-progress", action="store_true", help="no progress line")
+    add_profile(master)
     master.add_argument("--events", action="store_true", help=argparse.SUPPRESS)
     master.add_argument("--run", default=BY_HAND, help=argparse.SUPPRESS)
     master.set_defaults(run_command=_master)
@@ -74,6 +78,7 @@ def _options(arguments: argparse.Namespace) -> Options:
         window=arguments.window,
         output=arguments.output,
         connect=tuple(arguments.connect),
+        profile=getattr(arguments, "profile", None) is not None,
     )
 
 
@@ -81,14 +86,19 @@ def _launch(arguments: argparse.Namespace) -> int:
     if arguments.plot is not None:
         require_matplotlib()
     options = _options(arguments)
+    if arguments.local and options.profile:
+        raise ConfigurationError("--profile measures nodes, and --local has none", hint="Leave one of them out.")
     plan = prepare(arguments.config, options)
+    profile: MeshProfile | None = None
     with Display(plan, show_progress=not arguments.no_progress) as display:
         if arguments.local:
             point, seconds, rows = _run_local(plan, display)
         else:
             launcher = Launcher(plan, arguments.config, options, display.event, display.output)
             end = _run_launcher(launcher)
-            point, seconds, rows = end.status.point, end.seconds, end.rows
+            point, seconds, rows, profile = end.status.point, end.seconds, end.rows, end.profile
+    if profile is not None:
+        show_profile(plan, profile, seconds, arguments.profile)
     _close(plan, point, seconds, rows, arguments.plot)
     return 0
 
@@ -153,6 +163,8 @@ def _master(arguments: argparse.Namespace) -> int:
 
     with Display(plan, show_progress=not arguments.no_progress) as display:
         run_master(arguments.config, options, show, plan=plan)
+    if ends[0].profile is not None:
+        show_profile(plan, ends[0].profile, ends[0].seconds, arguments.profile)
     _close(plan, ends[0].status.point, ends[0].seconds, ends[0].rows, arguments.plot)
     return 0
 

@@ -27,6 +27,7 @@ from fmpy.logging import addLoggerProxy
 from ..errors import InitializationFailed, LoadFailed, StepFailed
 from ..model.description import ModelDescription, Value, Variable, VariableType
 from ..model.ring import Layout, Ring
+from ..simtime import TimeGrid
 from .archive import extract
 
 __all__ = ["Fmi2Instance", "LogMessage"]
@@ -183,11 +184,13 @@ class Fmi2Instance:
             values.update({name: _from_c(type_, raw) for name, raw in zip(members, array, strict=True)})
         return [values[name] for name in names]
 
-    def bind(self, inputs: Ring, outputs: Sequence[Ring], start_time: float, step_size: float, step: int = 0) -> None:
-        """Let `do_step` work on these rings (times in s), and write the current outputs as row ``step``."""
+    def bind(self, inputs: Ring, outputs: Sequence[Ring], grid: TimeGrid, points: int, step: int = 0) -> None:
+        """Let `do_step` work on these rings, ``points`` of ``grid`` each; write the current outputs as row ``step``."""
         self._hot = hot = _HotLoop(self._live(), self._variables, inputs, outputs)
-        self._start_time = start_time
-        self._step_size = step_size
+        self._start_time = grid.start_time
+        self._base_step_size = grid.step_size
+        self._points = points
+        self._step_size = points * grid.step_size
         self._step = step
         self._hot_setters = hot.setters
         self._hot_getters = hot.getters
@@ -208,7 +211,8 @@ class Fmi2Instance:
             status = function(component, references, count, rows[slot])
             if status > WARNING:
                 raise self._failed(f"setting the inputs returned {_STATUS_NAMES[status]}")
-        status = self._hot_do_step(component, self._start_time + step * self._step_size, self._step_size, 1)
+        time = self._start_time + step * self._points * self._base_step_size  # `grid.time`, without a call
+        status = self._hot_do_step(component, time, self._step_size, 1)
         if status > WARNING:
             raise self._failed(f"fmi2DoStep returned {_STATUS_NAMES[status]}")
         self._step = step + 1

@@ -9,6 +9,7 @@ from typing import BinaryIO
 import msgspec
 
 from ..errors import ErrorReport
+from ..wire.profile import MeshProfile
 from ..wire.views import LogLine, MeshStatus
 
 __all__ = ["End", "Event", "EventWriter", "Log", "Ready", "Status", "decode_event"]
@@ -38,6 +39,7 @@ class End(msgspec.Struct, frozen=True, tag="end"):
     Attributes:
         seconds: wall-clock time from the first grant to the last point in s.
         rows: rows in the result file.
+        profile: where the time went, if that was asked for.
     """
 
     status: MeshStatus
@@ -45,6 +47,7 @@ class End(msgspec.Struct, frozen=True, tag="end"):
     rows: int
     result_file: str | None
     error: ErrorReport | None = None
+    profile: MeshProfile | None = None
 
 
 Event = Ready | Status | Log | End

@@ -23,7 +23,7 @@ import msgspec
 
 from ..errors import FmuMeshError, Interrupted, MeshLost, from_report
 from ..model.plan import RECORDER, Plan
-from ..wire.runtime import MeshNote, remove_run_folder, remove_stale_folders, run_folder, write_note
+from ..wire.runtime import MeshNote, remove_run_folder, remove_stale_folders, run_folder, runtime_folder, write_note
 from .events import End, Event, Ready, Status, decode_event
 from .preparing import Options
 
@@ -31,7 +31,9 @@ __all__ = ["Launcher", "Output"]
 
 _MASTER = "the master"
 _REPORT_S = 1.5
-_KILL_S = 1.0
+_KILL_S = 0.7
+_SILENCE_S = 10.0
+"""The master says something ten times a second; after this time without a word it is taken for lost."""
 
 Output = Callable[[str, str], None]
 """Called with the name of a process and a line that it wrote to its standard output or error."""
@@ -53,13 +55,18 @@ class Launcher:
         self._plan = plan
         self._config_file = config_file
         self._options = options
+        self._timeouts = plan.system.config.timeouts
         self._on_event = on_event
         self._on_output = on_output
         self._happened: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._processes: dict[str, _Process] = {}
-        self._lost: list[tuple[str, str, float]] = []
+        self._lost: list[tuple[str, int, float]] = []
+        self._how: dict[str, str] = {}
         self._end: End | None = None
-        self._point = 0
+        self._point: int | None = None
+        self._heard = time.monotonic()
+        self._quiet = False
+        self._ending = False
         self._interrupted_at: float | None = None
 
     def run(self) -> End:
@@ -69,6 +76,7 @@ class Launcher:
             FmuMeshError: the run ended early, and why.
         """
         remove_stale_folders()
+        _remove_folders_without_note()
         run = str(os.getpid())
         folder = run_folder(self._plan.system.config.mesh, run)
         try:
@@ -96,6 +104,8 @@ class Launcher:
             changes.append(f"--window={self._options.window}")
         if self._options.output is not None:
             changes.append(f"--output={self._options.output}")
+        if self._options.profile:
+            changes.append("--profile")
         self._spawn(_MASTER, ["master", config_file, *common, *changes, "--events"], folder)
         for number, (node, plan) in enumerate(self._plan.nodes.items()):
             if node == RECORDER:
@@ -117,8 +127,9 @@ class Launcher:
     def _turn(self) -> None:
         try:
             self._happened.get(timeout=0.25)()
+            self._quiet = False
         except queue.Empty:
-            return
+            self._quiet = True
 
     def _take_event(self, line: bytes, folder: Path) -> None:
         try:
@@ -126,6 +137,7 @@ class Launcher:
         except msgspec.DecodeError:
             self._take_output(_MASTER, line)
             return
+        self._heard = time.monotonic()
         if isinstance(event, Ready):
             config = self._plan.system.config
             note = MeshNote(
@@ -142,8 +154,11 @@ class Launcher:
         self._on_output(name, line.decode(errors="replace").rstrip())
 
     def _take_exit(self, name: str, code: int) -> None:
+        if self._ending:
+            return
+        self._how[name] = _how_it_ended(code)
         if self._end is None and (code != 0 or name == _MASTER):
-            self._lost.append((name, _how_it_ended(code), time.monotonic()))
+            self._lost.append((name, code, time.monotonic()))
 
     def _interrupt(self) -> None:
         master = self._processes.get(_MASTER)
@@ -156,20 +171,25 @@ class Launcher:
     def _over(self) -> bool:
         """Whether there is nothing left to wait for."""
         now = time.monotonic()
-        if self._end is not None and not self._processes[_MASTER].running:
-            return True
+        silent_s = now - self._heard if self._quiet else 0.0
+        if self._end is not None:
+            return not self._processes[_MASTER].running or silent_s > self._timeouts.stop
         if any(name == _MASTER for name, _, _ in self._lost):
             return True
         # A node is gone: the master sees it within milliseconds and says so; if it does not, we do.
         if self._lost and now - self._lost[0][2] > _REPORT_S:
             return True
-        return self._interrupted_at is not None and now - self._interrupted_at > _REPORT_S
+        if self._interrupted_at is not None and now - self._interrupted_at > _REPORT_S:
+            return True
+        return silent_s > (_SILENCE_S if self._point is not None else self._timeouts.start)
 
     # --- the end
 
     def _end_all(self) -> None:
         """Wait for those that end by themselves, then ask, then kill."""
+        self._ending = True
         patience = _KILL_S if self._end is not None else 0.1
+        grace_s = 0.3 if self._interrupted_at == 0.0 else _KILL_S
         for step in (None, signal.SIGTERM, signal.SIGKILL):
             running = [process for process in self._processes.values() if process.running]
             if not running:
@@ -177,7 +197,7 @@ class Launcher:
             if step is not None:
                 for process in running:
                     process.signal(step)
-            deadline = time.monotonic() + (patience if step is None else _KILL_S)
+            deadline = time.monotonic() + (patience if step is None else grace_s)
             while any(process.running for process in running) and time.monotonic() < deadline:
                 try:
                     self._happened.get(timeout=0.05)()
@@ -189,32 +209,63 @@ class Launcher:
             self._happened.get()()
 
     def _outcome(self) -> End:
+        """How the run ended, as the master says; as this process saw it where the master could not say it any more."""
+        rows = self._recorded_rows()
         if self._end is not None:
             if self._end.error is None:
                 return self._end
             error = self._with_cause(from_report(self._end.error))
-            if isinstance(error, Interrupted) and self._interrupted_at is not None:
-                error = Interrupted(f"interrupted at point {self._end.status.point}", time=self._end.status.time)
-            if self._end.rows and error.hint is None:
-                error.hint = f"What was recorded up to then ({self._end.rows} rows) is in '{self._end.result_file}'."
-            raise error
-        if self._lost:
-            name, how, _ = self._lost[0]
-            point = self._point
-            raise MeshLost(
-                f"the process of {name if name == _MASTER else f'node {name!r}'} {how}",
-                point=point,
-                time=self._plan.grid.time(point),
-                hint="What was recorded up to then is in the result file.",
-            )
-        raise MeshLost("the master did not end in time and was killed", point=self._point)
+        else:
+            error = self._own_account()
+        if type(error) in (Interrupted, MeshLost) and rows > (error.point or 0):
+            # What is recorded is newer than what the last progress said.
+            error.point, error.time = rows - 1, self._plan.grid.time(rows - 1)
+        if rows and error.hint is None:
+            error.hint = f"What was recorded up to then ({rows} rows) is in '{self._plan.system.result_file}'."
+        raise error
+
+    def _own_account(self) -> FmuMeshError:
+        """Why the run ended without a last word of the master."""
+        point = self._point or 0
+        if self._interrupted_at is not None:
+            return Interrupted("interrupted", point=point, time=self._plan.grid.time(point))
+        # A node that ends with this code only says that it misses another process.
+        named = [loss for loss in self._lost if loss[0] == _MASTER or loss[1] != MeshLost.exit_code]
+        if not named:
+            text = "the master was lost: its process does not answer any more"
+            return MeshLost(text, point=point, time=self._plan.grid.time(point))
+        name = named[0][0]
+        if name == _MASTER:
+            text = f"the master was lost: its process {self._how[name]}"
+            return MeshLost(text, point=point, time=self._plan.grid.time(point))
+        instances = ", ".join(item.name for item in self._plan.nodes[name].instances)
+        text = f"node '{name}' was lost: its process {self._how[name]}"
+        return MeshLost(text, instance=instances, point=point, time=self._plan.grid.time(point))
+
+    def _recorded_rows(self) -> int:
+        """Complete rows in the result file of this run; what follows the last of them is cut off."""
+        name = self._plan.system.result_file
+        if self._point is None or name is None or not Path(name).is_file():
+            return 0
+        rows, end, offset = -1, 0, 0
+        with Path(name).open("r+b") as file:
+            while chunk := file.read(1 << 20):
+                rows += chunk.count(b"\n")
+                if (last := chunk.rfind(b"\n")) >= 0:
+                    end = offset + last + 1
+                offset += len(chunk)
+            if end < offset:
+                file.truncate(end)
+        return max(rows, 0)
 
     def _with_cause(self, error: FmuMeshError) -> FmuMeshError:
         """Say how the process of a lost node ended; only its parent knows."""
         if isinstance(error, MeshLost) and error.instance is not None:
-            for name, how, _ in self._lost:
-                if name == error.instance or f"'{name}'" in error.message:
-                    error.message = f"{error.message}; the process {how}"
+            for name, how in self._how.items():
+                if f"node '{name}' was lost" in error.message:
+                    error.message = f"node '{name}' was lost: its process {how}"
+        elif isinstance(error, Interrupted) and self._interrupted_at is not None and self._end is not None:
+            error.message, error.point, error.time = "interrupted", self._end.status.point, self._end.status.time
         return error
 
 
@@ -284,6 +335,19 @@ class _Process:
         for reader in readers:
             reader.join(1.0)
         self._post(lambda: on_exit(self.name, code))
+
+
+def _remove_folders_without_note() -> None:
+    """Remove the folders of launchers that were killed before they knew where their master can be reached."""
+    for folder in runtime_folder().glob("*.*"):
+        pid = folder.suffix.removeprefix(".")
+        if pid.isdigit() and not (folder / "mesh.json").exists():
+            try:
+                os.kill(int(pid), 0)
+            except ProcessLookupError:
+                remove_run_folder(folder)
+            except PermissionError:
+                continue
 
 
 def _how_it_ended(code: int) -> str:

@@ -6,6 +6,7 @@ a distributed run must equal in every float.
 
 from __future__ import annotations
 
+import shutil
 import tempfile
 import time
 from collections.abc import Callable
@@ -13,13 +14,14 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import Interrupted, StepFailed
+from ..errors import FmuMeshError, Interrupted, StepFailed
 from ..fmu import Fmi2Instance, LogMessage
 from ..model.description import Value
 from ..model.instance import Instance
 from ..model.plan import Plan
 from ..model.ring import Layout, Ring
 from ..record.csv_file import CsvFile
+from ..record.recorder import unwritable
 from ..simtime import TimeGrid
 
 __all__ = ["LocalMesh"]
@@ -57,10 +59,16 @@ class LocalMesh:
         self._progress = progress
         self._open_instance = open_instance
         self._stop: str | None = None
+        self._folder: Path | None = None
 
     def interrupt(self, reason: str) -> None:
         """From any thread: end the run with `Interrupted` at the next point."""
         self._stop = reason
+
+    def clean_up(self) -> None:
+        """From another thread, when the main thread does not come back from an FMU: remove the extracted files."""
+        if self._folder is not None:
+            shutil.rmtree(self._folder, ignore_errors=True)
 
     def run(self) -> None:
         """Run from the first to the last point.
@@ -68,12 +76,21 @@ class LocalMesh:
         Raises:
             FmuMeshError: an FMU failed, or the run was interrupted; rows up to then are kept.
         """
+        try:
+            self._run()
+        except FmuMeshError as error:
+            if self.rows and error.hint is None:
+                error.hint = f"What was recorded up to then ({self.rows} rows) is in '{self._plan.system.result_file}'."
+            raise
+
+    def _run(self) -> None:
         plan = self._plan
         recorded = plan.system.recorded if plan.system.result_file is not None else ()
         types = {name: {v.name: v.type for v in i.description.variables} for name, i in plan.system.instances.items()}
         columns = [(f"{instance}.{variable}", types[instance][variable]) for instance, variable in recorded]
         members: dict[str, _Member] = {}
         with tempfile.TemporaryDirectory(prefix="fmu_mesh-") as folder:
+            self._folder = Path(folder)
             file = CsvFile(Path(plan.system.result_file), columns) if plan.system.result_file is not None else None
             try:
                 for name in plan.order:
@@ -88,8 +105,8 @@ class LocalMesh:
                 for member in members.values():
                     member.instance.close()
                 if file is not None:
-                    file.close()
                     self.rows = file.rows
+                    _close(file)
 
     def _open(self, name: str, folder: Path) -> Instance:
         if self._open_instance is not None:
@@ -166,7 +183,7 @@ class _Member:
             self.instance.set_values(values)
 
     def bind(self, grid: TimeGrid) -> None:
-        self.instance.bind(self._inputs, (self._outputs,), grid.start_time, grid.step_size * self.plan.step_points)
+        self.instance.bind(self._inputs, (self._outputs,), grid, self.plan.step_points)
 
     def value_at(self, point: int, variable: str) -> Value:
         """The output at ``point``: that of the last own point at or before it."""
@@ -197,4 +214,14 @@ def _scaled(value: Value, factor: float, offset: float) -> Value:
 
 def _write(file: CsvFile, grid: TimeGrid, first: int, rows: list[list[Value]]) -> None:
     times = grid.times(first, first + len(rows))
-    file.write(times, [np.array(column) for column in zip(*rows, strict=True)])
+    try:
+        file.write(times, [np.array(column) for column in zip(*rows, strict=True)])
+    except OSError as error:
+        raise unwritable(file.path, error) from error
+
+
+def _close(file: CsvFile) -> None:
+    try:
+        file.close()
+    except OSError as error:
+        raise unwritable(file.path, error) from error

@@ -28,12 +28,14 @@ class Options(msgspec.Struct, frozen=True):
         window: in points.
         output: the result file instead of the configured one.
         connect: Zenoh endpoints instead of the configured ones.
+        profile: whether the nodes measure where their time goes.
     """
 
     start_values: tuple[str, ...] = ()
     window: int | None = None
     output: Path | None = None
     connect: tuple[str, ...] = ()
+    profile: bool = False
 
 
 def prepare(path: Path, options: Options = Options()) -> Plan:  # noqa: B008 a frozen Struct

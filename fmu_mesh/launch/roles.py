@@ -6,6 +6,7 @@ The same functions serve `launch`, which starts these processes, and a person wh
 from __future__ import annotations
 
 import os
+import socket
 import sys
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -16,12 +17,13 @@ import msgspec
 from ..errors import ConfigurationError, FmuMeshError, StepFailed
 from ..fmu import Fmi2Instance, LogMessage, read_description
 from ..master.master import Master
+from ..master.profiling import GrantWatch
 from ..model.findings import listed, nearest
 from ..model.loading import load
 from ..model.plan import RECORDER, NodePlan, Plan
 from ..node.node import Node
 from ..record.recorder import Recorder
-from ..wire.runtime import MeshNote, leave_run_folder, run_folder, write_note
+from ..wire.runtime import MeshNote, leave_run_folder, run_folder, socket_endpoint, write_note
 from ..wire.session import open_session, own_endpoints
 from ..wire.views import LogLine, MeshStatus
 from .events import End, Event, Log, Ready, Status
@@ -77,6 +79,7 @@ class _NodeProcess:
         """Run the node; ``child`` tells whether a launcher watches this process."""
         with ended_by_signals(self._interrupt, self._clean_up, watch_stdin=child), ExitStack() as stack:
             stack.callback(leave_run_folder, self._folder)
+            _refuse_second(self._folder, self._plan.node, f"node '{self._plan.node}' of mesh '{self._plan.mesh}'")
             session = open_session(
                 wiring(self._zenoh, self._config_file, self._folder, self._plan.node, self._plan.peers())
             )
@@ -158,6 +161,7 @@ def run_master(
 
     with ended_by_signals(interrupt, lambda: leave_run_folder(folder), watch_stdin=child), ExitStack() as stack:
         stack.callback(leave_run_folder, folder)
+        _refuse_second(folder, MASTER, f"the master of mesh '{config.mesh}'")
         session = open_session(wiring(config.zenoh, config_file, folder, MASTER, ()))
         stack.callback(session.close)
         endpoints = own_endpoints(session) if config.zenoh.mode == "peer" else tuple(config.zenoh.connect)
@@ -170,6 +174,7 @@ def run_master(
         recorder: Recorder | None = None
         error: FmuMeshError | None = None
         master = Master(plan, session, _Emitter(emit), endpoints=public, config_file=str(config_file))
+        master.watch = GrantWatch() if options.profile else None
         for reason in early:
             master.interrupt(reason)
         try:
@@ -182,9 +187,23 @@ def run_master(
             error = ended
         rows = recorder.rows if recorder is not None else 0
         report = error.report() if error is not None else None
-        emit(End(master.last_status(), master.seconds, rows, plan.system.result_file, report))
+        emit(End(master.last_status(), master.seconds, rows, plan.system.result_file, report, master.profile()))
         if error is not None:
             raise error
+
+
+def _refuse_second(folder: Path, process: str, who: str) -> None:
+    """Look whether somebody listens already where this process is going to.
+
+    Raises:
+        ConfigurationError: the process runs already.
+    """
+    with socket.socket(socket.AF_UNIX) as probe:
+        try:
+            probe.connect(socket_endpoint(folder, process).partition("/")[2])
+        except OSError:
+            return
+    raise ConfigurationError(f"{who} runs already", hint="Stop it first, or give this mesh another name.")
 
 
 class _Emitter:

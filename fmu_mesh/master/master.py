@@ -21,14 +21,14 @@ import os
 import socket
 import time
 from collections.abc import Callable, Sequence
-from typing import Protocol
+from typing import Literal, Protocol
 
 import msgspec
 import zenoh
 
 from .. import __version__
 from ..errors import DeadlineExceeded, ErrorReport, FmuMeshError, Interrupted, MeshLost, from_report
-from ..model.plan import Plan
+from ..model.plan import RECORDER, Plan
 from ..wire.inbox import Inbox
 from ..wire.keys import Keys
 from ..wire.messages import (
@@ -40,9 +40,11 @@ from ..wire.messages import (
     Registration,
     encode_abort,
 )
+from ..wire.profile import TIME_LINE_ENTRIES, MeshProfile, Welcome
 from ..wire.session import matches, undeclare_all
 from ..wire.values import json_encoding
 from ..wire.views import Command, CommandAnswer, LogLine, MeshInfo, MeshState, MeshStatus
+from .profiling import CLOCK, PAUSE, GrantWatch
 
 __all__ = ["Events", "Master"]
 
@@ -74,6 +76,9 @@ class Master:
         endpoints: where tools can reach this process, for `mesh/info`.
         config_file: name of the configuration file, for `mesh/info`.
 
+    Attributes:
+        watch: set it before `run` for a profile: then nodes measure themselves, and this sums up what holds the grant.
+
     Call `run` once, from the main thread.
     """
 
@@ -100,6 +105,7 @@ class Master:
         self._grant = 0
         self._hold: int | None = None
         self._stop_asked = False
+        self.watch: GrantWatch | None = None
         self._pacer = _Pacer(plan, config.simulation.real_time_factor)
         self._clock = _Clock()
         self._published = 0.0
@@ -152,6 +158,13 @@ class Master:
         """Wall-clock time from the first grant to the last point in s, pauses left out."""
         return self._clock.elapsed()
 
+    def profile(self) -> MeshProfile | None:
+        """What the nodes that ended well have measured; None without a `watch`."""
+        if self.watch is None:
+            return None
+        reports = [self._reports[node] for node in self._nodes if node in self._reports]
+        return MeshProfile(tuple(r.profile for r in reports if r.profile is not None), self.watch.held_s)
+
     def interrupt(self, reason: str) -> None:
         """From any thread: end the run with `Interrupted`."""
         self._inbox.post(lambda: self._fail(Interrupted(reason)))
@@ -163,15 +176,18 @@ class Master:
         while len(self._registered) < len(self._nodes):
             if time.monotonic() > deadline:
                 missing = [node for node in self._nodes if node not in self._registered]
+                if len(missing) > 1:  # the recorder only waits for the others
+                    missing = [node for node in missing if node != RECORDER]
                 there = [node for node in missing if node in self._present]
                 raise DeadlineExceeded(
                     f"not ready within {self._timeouts.start:g} s: {', '.join(map(_spoken, missing))}",
                     hint=f"Started, but not ready: {', '.join(there)}." if there else "None of them was started.",
                 )
             self._turn(0.25)
+        entries = TIME_LINE_ENTRIES // len(self._nodes) if self.watch is not None else 0
         for number, node in enumerate(self._nodes):
             query = self._registered[node]
-            query.reply(query.key_expr, str(number).encode())
+            query.reply(query.key_expr, msgspec.json.encode(Welcome(number, entries)))
             query.drop()
 
     def _grant_to_the_end(self) -> None:
@@ -192,7 +208,8 @@ class Master:
                 )
         self._clock.stop()
         if self._stop_asked and self._slowest < last:
-            raise Interrupted(f"stopped by a command at point {self._slowest}")
+            point = self._slowest
+            raise Interrupted("stopped by a command", point=point, time=self._plan.grid.time(point))
 
     def _publish_grant(self) -> float:
         """Publish the grant if it may grow, or as a sign of life; returns how long to wait for the next look, in s."""
@@ -202,12 +219,22 @@ class Master:
             grant = min(grant, self._hold)
         paced, pause = self._pacer.limit(grant)
         grant = min(grant, paced)
+        if self.watch is not None:
+            self.watch.look(self._holder(credit, grant))
         now = time.monotonic()
         if grant > self._grant or now - self._published >= _HEARTBEAT_S:
             self._grant = max(grant, self._grant)
             self._published = now
             self._send(GRANT, self._grant)
         return min(pause, _STATUS_S)
+
+    def _holder(self, credit: int, grant: int) -> str | None:
+        """What keeps the grant from growing, for a profile."""
+        if grant == self._plan.grid.last_point:
+            return None
+        if grant < credit:
+            return PAUSE if grant == self._hold else CLOCK
+        return self._nodes[min(range(len(self._nodes)), key=lambda n: self._progress[n] + self._windows[n])]
 
     def _wait_for(self, reached: Callable[[], bool], timeout_s: float, what: str) -> None:
         deadline = time.monotonic() + timeout_s
@@ -266,9 +293,9 @@ class Master:
 
         served(self._keys.register, self._register)
         served(self._keys.report, self._take_report)
-        served(self._keys.mesh_key("info"), self._reply_with(self._info))
-        served(self._keys.mesh_key("status"), self._reply_with(self.last_status))
-        served(self._keys.mesh_key("plan"), self._reply_with(lambda: self._plan.nodes))
+        served(self._keys.mesh_key("info"), self._reply_with("info", self._info))
+        served(self._keys.mesh_key("status"), self._reply_with("status", self.last_status))
+        served(self._keys.mesh_key("plan"), self._reply_with("plan", lambda: self._plan.nodes))
         served(self._keys.mesh_key("command"), self._command)
         self._entities.append(
             session.liveliness().declare_subscriber(
@@ -352,12 +379,16 @@ class Master:
                 self._stop_asked = True
         self._moved = time.monotonic()
         answer = CommandAnswer(command.command, self._state, self._slowest)
-        query.reply(query.key_expr, msgspec.json.encode(answer), encoding=json_encoding)
+        query.reply(self._keys.mesh_key("command"), msgspec.json.encode(answer), encoding=json_encoding)
         query.drop()
 
-    def _reply_with(self, view: Callable[[], object]) -> Callable[[zenoh.Query], None]:
+    def _reply_with(
+        self, what: Literal["info", "status", "plan"], view: Callable[[], object]
+    ) -> Callable[[zenoh.Query], None]:
+        key = self._keys.mesh_key(what)
+
         def reply(query: zenoh.Query) -> None:
-            query.reply(query.key_expr, msgspec.json.encode(view()), encoding=json_encoding)
+            query.reply(key, msgspec.json.encode(view()), encoding=json_encoding)
             query.drop()
 
         return reply

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Protocol
 
+from ..simtime import TimeGrid
 from .description import ModelDescription, Value
 from .ring import Ring
 
@@ -43,12 +44,11 @@ class Instance(Protocol):
         """Current values of variables by name, between two calls of `do_step` or in Initialization Mode."""
         ...
 
-    def bind(self, inputs: Ring, outputs: Sequence[Ring], start_time: float, step_size: float, step: int = 0) -> None:
+    def bind(self, inputs: Ring, outputs: Sequence[Ring], grid: TimeGrid, points: int, step: int = 0) -> None:
         """Let `do_step` read inputs from and write outputs to these rings; write the current outputs as row ``step``.
 
-        ``step_size`` is this instance's own, in s; the time at the start of own step ``n`` is
-        ``start_time + n * step_size``. All output rings have the same number of rows.
-        May be called again between steps, with other rings.
+        An own step takes ``points`` points of ``grid``; own step ``n`` starts at the time of point ``n * points``. All
+        output rings have the same number of rows. May be called again between steps, with other rings.
         """
         ...
 

@@ -371,7 +371,9 @@ def _links(plan: Plan) -> tuple[Link, ...]:
         for name, variable in plan.system.recorded:
             needed.setdefault((name, RECORDER), set()).add(variable)
     links = []
-    for index, ((source, target_node), names) in enumerate(sorted(needed.items())):
+    ends = sorted(needed, key=lambda end: (end[0], end[1] == RECORDER, end[1]))
+    for index, (source, target_node) in enumerate(ends):
+        names = needed[source, target_node]
         instance = plan.system.instances[source]
         layout = Layout.of([(v.name, v.type) for v in instance.description.variables if v.name in names])
         levels = plan.initialization.levels

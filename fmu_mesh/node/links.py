@@ -32,7 +32,7 @@ class OutLink:
         by_window = LAZY_ROWS // 2 if self.lazy else max(1, window // (4 * link.step_points))
         self.capacity = max(1, min(_FRAME_POINTS, _FRAME_BYTES // max(link.layout.row_size, 1), by_window))
         self._outputs = outputs
-        self._publisher = publisher
+        self.publisher = publisher
         self._put = publisher.put
         self._reals = _columns(outputs.layout.reals, link.layout.reals)
         self._integers = _columns(outputs.layout.integers, link.layout.integers)
@@ -69,7 +69,7 @@ class OutLink:
 
     def close(self) -> None:
         """Undeclare the publisher."""
-        self._publisher.undeclare()
+        self.publisher.undeclare()
 
 
 def _columns(have: tuple[str, ...], want: tuple[str, ...]) -> list[int] | None:

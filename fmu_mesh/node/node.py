@@ -43,9 +43,12 @@ from ..wire.messages import (
     NodeReport,
     Registration,
     decode_abort,
+    decode_json,
 )
+from ..wire.profile import Welcome
 from ..wire.session import ask
 from .links import OutLink
+from .profiling import Profiler
 from .serving import Server
 from .stepping import LocalFeed, RemoteFeed, Runner, Unit
 
@@ -57,6 +60,8 @@ _LOOK_S = 0.5
 _LAZY_S = 0.02
 _TELL_S = 0.1
 _LAST_WORD_S = 0.3
+_NO_MASTER_S = 1.0
+"""How long a failure waits for a master that was never seen."""
 
 
 class Node:
@@ -82,6 +87,7 @@ class Node:
         self._finished = False
         self.failure_is_known = False
         self._master_is_gone = False
+        self._master_was_there = False
         self._heard = time.monotonic()
         self._lazy_flushed = 0.0
         self._lazy_pending = False
@@ -97,6 +103,11 @@ class Node:
         self._inbox = Inbox(session, self._keys.inbox(plan.node), self._keys.wake(plan.node), capacity)
         self._progress_number = 0
         self._progress = session.declare_publisher(self._keys.progress(), congestion_control=_BLOCK, express=True)
+        self._profiler: Profiler | None = None
+        # The calls that a profile measures; without one they are what they seem.
+        self._poll = self._inbox.poll
+        self._take = self._sort_in
+        self._put_progress: Callable[[bytes], None] = self._progress.put
         self.server = Server(plan, session, self._keys, self._inbox)
 
     def run(self) -> None:
@@ -109,12 +120,15 @@ class Node:
         try:
             with self._session.declare_queryable(self._keys.hello(self._plan.node), _answer):
                 tokens = [self._session.liveliness().declare_token(key) for key in self._token_keys()]
-                watcher = self._session.liveliness().declare_subscriber(self._keys.master, self._master_token_changed)
+                watcher = self._session.liveliness().declare_subscriber(
+                    self._keys.master, self._master_token_changed, history=True
+                )
                 self._load()
                 self._meet()
                 self._initialize()
                 self._step_to_the_end()
-                self._report(None)
+                self.server.close()  # the last samples, while the master is there to bring them to clients
+                self._report(None, self._plan.timeouts.stop)
                 del tokens
         except FmuMeshError as error:
             located = self._located(error)
@@ -191,8 +205,19 @@ class Node:
         registration = Registration(self._plan.node, self._plan.digest, os.getpid(), socket.gethostname())
         payload = msgspec.json.encode(registration)
         answer = ask(self._session, self._keys.register, payload, deadline_s, "the master, with all other nodes there")
-        self._progress_number = int(answer)
+        welcome = decode_json(answer, Welcome)
+        self._progress_number = welcome.number
         self._heard = time.monotonic()
+        if welcome.profile:
+            self._measure(welcome.profile)
+
+    def _measure(self, entries: int) -> None:
+        """From now on measured units, links and calls take the place of the plain ones."""
+        self._profiler = profiler = Profiler(self._plan.node, entries, self._plan.window)
+        self._units = profiler.measure(self._units, self._runners.values())
+        self._poll = profiler.receiving(self._poll)
+        self._take = profiler.receiving(self._take)
+        self._put_progress = profiler.sending(self._put_progress)
 
     def _initialize(self) -> None:
         """Initialization Mode: set and get level by level, exchange over the wire, then make the outputs point 0."""
@@ -265,7 +290,9 @@ class Node:
     def _step_to_the_end(self) -> None:
         """The loop of the module's docstring."""
         self.server.state = "running"
-        poll = self._inbox.poll
+        poll = self._poll
+        if self._profiler is not None:
+            self._profiler.start()
         while not self._finished:
             stepped = False
             for unit in self._units:
@@ -299,6 +326,8 @@ class Node:
         message = self._inbox.wait(_LAZY_S if self._lazy_pending else _LOOK_S)
         self.server.waiting = False
         self._waited_long = message is None
+        if self._profiler is not None:
+            self._profiler.waited(time.monotonic() - started, running=self._grant > 0)
         if message is not None:
             self._take(message)
         now = time.monotonic()
@@ -307,7 +336,7 @@ class Node:
             text = f"the master has said nothing for {now - self._heard:.1f} s"
             raise DeadlineExceeded(text, hint="Is its process stopped, or its host gone?")
 
-    def _take(self, message: Message) -> None:
+    def _sort_in(self, message: Message) -> None:
         """One message into the rings, or a new grant."""
         kind, number, count, point, data = message
         if kind == FRAME:
@@ -347,12 +376,14 @@ class Node:
         if due or covered >= self._grant:
             self._progress_sent = covered
             self._progress_told_at = now
-            self._progress.put(HEADER.pack(PROGRESS, self._progress_number, 0, covered))
+            self._put_progress(HEADER.pack(PROGRESS, self._progress_number, 0, covered))
 
     # --- the end
 
     def _master_token_changed(self, sample: zenoh.Sample) -> None:
-        if sample.kind == zenoh.SampleKind.DELETE and not self._finished:
+        if sample.kind == zenoh.SampleKind.PUT:
+            self._master_was_there = True
+        elif not self._finished:
             self._inbox.post(self._end_without_master)
 
     def _end_without_master(self) -> None:
@@ -387,17 +418,19 @@ class Node:
         self.server.state = "failed"
         if self._master_is_gone:
             return True
+        timeout_s = self._plan.timeouts.stop
         try:
-            self._report(error)
+            self._report(error, timeout_s if self._master_was_there else min(timeout_s, _NO_MASTER_S))
         except FmuMeshError as unreachable:
-            log.warning("failure_not_reported", extra={"error": str(unreachable)})
+            log.info("failure_not_reported", extra={"error": str(unreachable)})
             return False
         return True
 
-    def _report(self, error: FmuMeshError | None) -> None:
+    def _report(self, error: FmuMeshError | None, timeout_s: float) -> None:
         point = min((runner.point for runner in self._runners.values()), default=0)
-        report = NodeReport(self._plan.node, point, error.report() if error is not None else None)
-        ask(self._session, self._keys.report, msgspec.json.encode(report), self._plan.timeouts.stop, "the master")
+        profile = self._profiler.profile() if self._profiler is not None and error is None else None
+        report = NodeReport(self._plan.node, point, error.report() if error is not None else None, profile)
+        ask(self._session, self._keys.report, msgspec.json.encode(report), timeout_s, "the master")
 
 
 class _Aborted(FmuMeshError):

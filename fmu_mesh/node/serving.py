@@ -29,7 +29,7 @@ from ..wire.session import ask, matches, undeclare_all
 from ..wire.values import ValueRefused, attachment, decode_value, encode_value, json_encoding
 from ..wire.views import ConnectionView, InstanceInfo, InstanceStatus, LogLine, SetAnswer, VariableView
 from .stepping import Runner
-from .streams import Batch, InstanceStreams, kind_of
+from .streams import MAX_WAITING_ROWS, Batch, InstanceStreams, kind_of
 
 __all__ = ["Server"]
 
@@ -37,6 +37,8 @@ log = logging.getLogger(__name__)
 
 _TICK_S = 0.25
 _ANSWER_S = 2.0
+_LAST_ROWS_S = 1.0
+_STREAM_SHARE = 4.0
 
 Job = Callable[[], None]
 
@@ -70,6 +72,7 @@ class Server:
         self._state_since = ("", time.monotonic())
         for instance in plan.instances:
             self._declare_early(instance.name)
+        self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="server", daemon=True)
         self._thread.start()
 
@@ -108,8 +111,11 @@ class Server:
 
     def close(self) -> None:
         """Publish what is waiting, for a second at most, and undeclare everything."""
+        if self._closing.is_set():
+            return
         self._jobs.put(None)
-        self._thread.join(1.0)
+        self._thread.join(_LAST_ROWS_S)
+        self._closing.set()
         undeclare_all(self._entities, self._status_publishers.values(), self._log_publishers.values())
         for streams in self._streams:
             streams.close()
@@ -139,6 +145,10 @@ class Server:
         for pending in [p for p in self._pending if now - p.asked > _ANSWER_S]:
             self._pending.remove(pending)
             pending.refuse(f"not at a point yet: {self._status(pending.instance).activity}")
+        for streams in self._streams:
+            if dropped := streams.take_dropped():
+                text = f"{dropped} points were not published: the run is faster than samples can be sent"
+                self._publish_log(LogLine(streams.runner.name, "warning", "stream", text, streams.runner.point))
         for name, publisher in self._status_publishers.items():
             if matches(publisher):
                 publisher.put(msgspec.json.encode(self._status(name)))
@@ -410,12 +420,20 @@ class Server:
     # --- publishing
 
     def _streams_changed(self, streams: InstanceStreams) -> None:
-        self._inbox.post(streams.update)
+        def update() -> None:
+            self.stepped()  # what was stepped before belongs to the old set of variables
+            streams.update()
+
+        self._inbox.post(update)
 
     def _publish_rows(self, rows: int, batch: Batch) -> None:
-        streams, first, values = batch
+        streams, first, columns = batch
+        started = time.monotonic()
+        streams.publish(first, columns)
         self._waiting_rows -= rows
-        streams.publish(first, values)
+        if self._waiting_rows > MAX_WAITING_ROWS // 2:
+            # Subscribers cannot keep up with this run: they get a share of the node's time, and samples are left out.
+            self._closing.wait(_STREAM_SHARE * (time.monotonic() - started))
 
     def _publish_log(self, line: LogLine) -> None:
         self._log_publishers[line.instance].put(msgspec.json.encode(line))

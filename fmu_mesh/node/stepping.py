@@ -64,9 +64,8 @@ class Runner:
 
     def bind(self) -> None:
         """Let the instance work on the rings, and read the current outputs. Call after Initialization Mode."""
-        step_size = self._grid.step_size * self.plan.step_points
         outputs = (self.outputs,) if self.watched is None else (self.outputs, self.watched)
-        self.instance.bind(self.inputs, outputs, self._grid.start_time, step_size, self.step)
+        self.instance.bind(self.inputs, outputs, self._grid, self.plan.step_points, self.step)
 
     def watch(self, names: Sequence[str]) -> None:
         """From now on also read these outputs after every step; they are not among the plan's columns."""

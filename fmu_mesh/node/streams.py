@@ -6,10 +6,12 @@ the server's thread. A subscriber that stops loses samples (their points tell wh
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import zenoh
+from numpy.typing import NDArray
 
 from ..model.description import Value, Variable
 from ..simtime import TimeGrid
@@ -18,11 +20,11 @@ from ..wire.session import matches, undeclare_all
 from ..wire.values import attachment, encode_value, json_encoding
 from .stepping import Runner
 
-__all__ = ["Batch", "InstanceStreams", "kind_of"]
+__all__ = ["MAX_WAITING_ROWS", "Batch", "InstanceStreams", "kind_of"]
 
-MAX_WAITING_ROWS = 1 << 16
+MAX_WAITING_ROWS = 1 << 14
 
-Batch = tuple["InstanceStreams", int, dict[str, list[Value]]]
+Batch = tuple["InstanceStreams", int, dict[str, NDArray[Any]]]
 """Streams, first own step, and the values by variable name."""
 
 
@@ -57,10 +59,11 @@ class InstanceStreams:
         changed: Callable[[InstanceStreams], None],
     ) -> None:
         self.runner = runner
-        self.dropped = 0
+        self._dropped = 0
         self._grid = grid
         self._next = 0
         self._active: tuple[str, ...] = ()
+        self._booleans = {v.name for v in runner.instance.description.variables if v.type == "Boolean"}
         self._publishers: dict[str, zenoh.Publisher] = {}
         self._listeners: list[zenoh.MatchingListener[Any]] = []
         for variable in runner.instance.description.variables:
@@ -100,31 +103,37 @@ class InstanceStreams:
             return None
         self._next = end
         if waiting_rows > MAX_WAITING_ROWS:
-            self.dropped += end - first
+            self._dropped += end - first
             return None
-        values = {name: self._column(name, first, end) for name in self._active}
-        return end - first, (self, first, values)
+        steps = np.arange(first, end)
+        return end - first, (self, first, {name: self._column(name, steps) for name in self._active})
 
-    def _column(self, name: str, first: int, end: int) -> list[Value]:
+    def _column(self, name: str, steps: NDArray[np.intp]) -> NDArray[Any]:
         ring = self.runner.outputs
         if name not in ring.layout.names and self.runner.watched is not None:
             ring = self.runner.watched
-        return [ring.value(row, name) for row in range(first, end)]
+        part, column = ring.layout.place(name)
+        values: NDArray[Any] = ring.parts()[part][steps & ring.mask, column]
+        return values
 
-    def publish(self, first: int, values: dict[str, list[Value]]) -> None:
+    def publish(self, first: int, columns: dict[str, NDArray[Any]]) -> None:
         """On the server's thread: publish what `collect` returned."""
         points = self.runner.plan.step_points
-        for offset, stamp in enumerate(self._stamps(first, points)):
-            if offset >= len(next(iter(values.values()))):
-                return
-            for name, column in values.items():
-                self._publishers[name].put(encode_value(column[offset]), attachment=stamp)
+        lists = [(self._publishers[name].put, self._values(name, column)) for name, column in columns.items()]
+        for offset in range(len(next(iter(columns.values())))):
+            point = (first + offset) * points
+            stamp = attachment(point, self._grid.time(point))
+            for put, values in lists:
+                put(encode_value(values[offset]), attachment=stamp)
 
-    def _stamps(self, first: int, points: int) -> Iterator[bytes]:
-        step = first
-        while True:
-            yield attachment(step * points, self._grid.time(step * points))
-            step += 1
+    def _values(self, name: str, column: NDArray[Any]) -> list[Value]:
+        values: list[Value] = column.tolist()
+        return [bool(value) for value in values] if name in self._booleans else values
+
+    def take_dropped(self) -> int:
+        """How many rows were left out since the last call."""
+        dropped, self._dropped = self._dropped, 0
+        return dropped
 
     def close(self) -> None:
         """Undeclare all publishers."""

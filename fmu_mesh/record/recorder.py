@@ -12,6 +12,7 @@ import socket
 import threading
 import time
 from pathlib import Path
+from types import TracebackType
 from typing import Any, Self
 
 import msgspec
@@ -19,17 +20,18 @@ import numpy as np
 import zenoh
 from numpy.typing import NDArray
 
-from ..errors import DeadlineExceeded, FmuMeshError, from_report
+from ..errors import ConfigurationError, DeadlineExceeded, FmuMeshError, from_report
 from ..model.description import VariableType
 from ..model.plan import RECORDER, NodePlan
 from ..wire.frames import FrameReceiver
 from ..wire.inbox import Inbox, Message
 from ..wire.keys import Keys
-from ..wire.messages import ABORT, FINISH, FRAME, HEADER, PROGRESS, NodeReport, Registration, decode_abort
+from ..wire.messages import ABORT, FINISH, FRAME, HEADER, PROGRESS, NodeReport, Registration, decode_abort, decode_json
+from ..wire.profile import Welcome
 from ..wire.session import ask
 from .csv_file import CsvFile
 
-__all__ = ["Recorder"]
+__all__ = ["Recorder", "unwritable"]
 
 log = logging.getLogger(__name__)
 
@@ -84,13 +86,26 @@ class Recorder:
         self._thread.start()
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
         if self._thread.is_alive():
             self._inbox.post(self._end)
         self._thread.join(5.0)
-        self._write_complete_rows()
-        self._file.close()
-        self._inbox.close()
+        try:
+            self._finish_file()
+        except OSError as failure:
+            # A failure during the run is what the master has ended with; this one came after the last point.
+            if error is None:
+                raise unwritable(self._file.path, failure) from failure
+        finally:
+            self._inbox.close()
+
+    def _finish_file(self) -> None:
+        try:
+            self._write_complete_rows()
+        finally:
+            self._file.close()
 
     def _end(self) -> None:
         self._finished = True
@@ -98,14 +113,26 @@ class Recorder:
     def _run(self) -> None:
         try:
             with self._session.liveliness().declare_token(self._keys.node_token(RECORDER)):
-                self._meet()
+                self._meet_in_time()
                 self._record()
                 self._report(None)
         except _Ended:
             log.info("recording_ended_early", extra={"rows": self._written})
+        except OSError as error:
+            self._try_to_report(unwritable(self._file.path, error))
         except Exception as error:  # noqa: BLE001 whatever it is, the master must know that nothing is recorded any more
             known = error if isinstance(error, FmuMeshError) else FmuMeshError(f"recording failed: {error!r}")
             self._try_to_report(known)
+
+    def _meet_in_time(self) -> None:
+        try:
+            self._meet()
+        except DeadlineExceeded as error:
+            # The master meets the same deadline, and names all nodes that are missing; it must not miss this one, too.
+            end = time.monotonic() + self._plan.timeouts.stop
+            while not self._finished and time.monotonic() < end:
+                self._inbox.wait(_LOOK_S)
+            raise _Ended(error) from error
 
     def _meet(self) -> None:
         deadline_s = self._plan.timeouts.start
@@ -113,7 +140,8 @@ class Recorder:
             ask(self._session, self._keys.hello(node), b"", deadline_s, f"node '{node}'")
         registration = Registration(RECORDER, self._plan.digest, os.getpid(), socket.gethostname())
         payload = msgspec.json.encode(registration)
-        self._number = int(ask(self._session, self._keys.register, payload, deadline_s, "the master"))
+        answer = ask(self._session, self._keys.register, payload, deadline_s, "the master")
+        self._number = decode_json(answer, Welcome).number
 
     def _record(self) -> None:
         """Take what comes, write rows when they are many or nothing more is there, and tell the progress."""
@@ -185,7 +213,15 @@ class Recorder:
         try:
             self._report(error)
         except FmuMeshError as unreachable:
-            log.warning("failure_not_reported", extra={"error": str(unreachable)})
+            log.info("failure_not_reported", extra={"error": str(unreachable)})
+
+
+def unwritable(path: Path, error: OSError) -> ConfigurationError:
+    """What to tell when a result file could be opened, but not be written to its end."""
+    return ConfigurationError(
+        f"the result file '{path}' cannot be written: {error.strerror}",
+        hint="The run has ended there. Make room, or choose another file with --output.",
+    )
 
 
 class _Ended(FmuMeshError):

@@ -6,7 +6,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from ..errors import FrameGap
+from ..errors import FmuMeshError, FrameGap
 from ..model.plan import Link
 from ..model.ring import Ring
 from .messages import Rows, decode_rows
@@ -41,8 +41,12 @@ class FrameReceiver:
 
         Raises:
             FrameGap: rows are missing before it, or a row came twice with other values.
+            FmuMeshError: it is no frame of this link, or larger than any.
         """
         rows = decode_rows(data, count, self.link.layout)
+        if count > self.kept.rows:
+            text = f"a frame of '{self.link.source}' holds {count} points where {self.kept.rows} are the most"
+            raise FmuMeshError(text, instance=self.link.source, point=first * self.link.step_points)
         if first > self.received:
             missing, last = self.received * self.link.step_points, first * self.link.step_points - 1
             text = f"points {missing} to {last} of '{self.link.source}' never reached {self._target}"

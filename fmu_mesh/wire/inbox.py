@@ -61,7 +61,9 @@ class Inbox:
     def post(self, action: Callable[[], None]) -> None:
         """From any thread: let the main thread run ``action`` when it next looks into the inbox."""
         self._posted.append(action)
-        self._waker.put(_WAKE)
+        with self._condition:
+            if not self._closed:
+                self._waker.put(_WAKE)
 
     def poll(self) -> Message | None:
         """The next message if one is there; runs posted actions on the way."""

@@ -8,7 +8,7 @@ follows with an `ErrorReport` as JSON. Every decoder checks sizes before it touc
 from __future__ import annotations
 
 import struct
-from typing import Final
+from typing import Final, TypeVar
 
 import msgspec
 import numpy as np
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from ..errors import ErrorReport, FmuMeshError
 from ..model.ring import Layout
+from .profile import NodeProfile
 
 __all__ = [
     "ABORT",
@@ -31,6 +32,7 @@ __all__ = [
     "Registration",
     "Rows",
     "decode_abort",
+    "decode_json",
     "decode_rows",
     "encode_abort",
     "encode_rows",
@@ -47,6 +49,8 @@ WAKE: Final = 7
 
 MAX_MESSAGE_SIZE: Final = 64 * 2**20
 
+T = TypeVar("T")
+
 Rows = tuple[NDArray[np.float64], NDArray[np.int32]]
 _NO_INTEGERS: Final = np.zeros((0, 0), dtype=np.int32)
 
@@ -61,11 +65,12 @@ class Registration(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class NodeReport(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How a node ended: at which point, and with which error if any."""
+    """How a node ended: at which point, with which error if any, and its profile if the master asked for one."""
 
     node: str
     point: int
     error: ErrorReport | None = None
+    profile: NodeProfile | None = None
 
 
 def encode_rows(kind: int, link: int, first: int, reals: NDArray[np.float64], integers: NDArray[np.int32]) -> bytes:
@@ -105,4 +110,16 @@ def decode_abort(data: bytes) -> ErrorReport:
     Raises:
         msgspec.DecodeError: it is not an `ErrorReport`.
     """
-    return msgspec.json.decode(data[HEADER.size :], type=ErrorReport)
+    return decode_json(data[HEADER.size :], ErrorReport)
+
+
+def decode_json(data: bytes, type_: type[T]) -> T:
+    """JSON that came over the wire.
+
+    Raises:
+        msgspec.DecodeError: it is not JSON of that type.
+    """
+    try:
+        return msgspec.json.decode(data, type=type_)
+    except (RecursionError, UnicodeDecodeError) as error:  # msgspec lets them through
+        raise msgspec.DecodeError(str(error)) from error

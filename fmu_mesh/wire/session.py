@@ -76,6 +76,10 @@ def _configuration(wiring: Wiring) -> zenoh.Config:
         "transport/link/tx/lease": LEASE_MS,
         # A full queue blocks the producer (design, invariant 3); the default would close the link after 5 s.
         "transport/link/tx/queue/congestion_control/block/wait_before_close": NEVER_DROP_US,
+        # A subscriber that does not take its samples must not hold up what shares a link with them: they are dropped at
+        # once (the default waits a millisecond for each), and the queue for streams is as long as it may be instead.
+        "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,
+        "transport/link/tx/queue/size/data_low": 16,
         # Measured: the implicit shared memory slows Python down from 3 kB on.
         "transport/shared_memory/enabled": False,
         "adminspace/enabled": True,

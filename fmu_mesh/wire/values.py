@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import msgspec
 import zenoh
 
 from ..model.description import Value, Variable
+from .messages import decode_json
 
 __all__ = ["Stamp", "ValueRefused", "attachment", "decode_stamp", "decode_value", "encode_value", "json_encoding"]
 
@@ -40,7 +42,7 @@ def decode_stamp(data: bytes) -> Stamp:
     Raises:
         msgspec.DecodeError: it is none of ours.
     """
-    return msgspec.json.decode(data, type=Stamp)
+    return decode_json(data, Stamp)
 
 
 def encode_value(value: Value) -> bytes:
@@ -59,13 +61,13 @@ def decode_value(data: bytes, variable: Variable) -> Value:
     if len(data) > MAX_VALUE_SIZE:
         raise ValueRefused(f"{len(data)} bytes are too many for a value")
     try:
-        value = msgspec.json.decode(data)
+        value: Any = decode_json(data, object)
     except msgspec.DecodeError as error:
         raise ValueRefused(f"it is no JSON value ({error})") from error
     number = isinstance(value, int) and not isinstance(value, bool)
     match variable.type:
         case "Real" if number or isinstance(value, float) or value in _NOT_FINITE:
-            return _checked_real(float(value), variable)
+            return _checked_real(value, variable)
         case "Integer" if number and value in _INT32:
             return int(value)
         case "Boolean" | "String" if isinstance(value, bool if variable.type == "Boolean" else str):
@@ -79,7 +81,11 @@ def decode_value(data: bytes, variable: Variable) -> Value:
     raise ValueRefused(f"{data[:80].decode(errors='replace')} is no {variable.type} value for it")
 
 
-def _checked_real(value: float, variable: Variable) -> float:
+def _checked_real(number: float, variable: Variable) -> float:
+    try:
+        value = float(number)
+    except OverflowError as error:
+        raise ValueRefused("it is larger than any Real") from error
     low, high = variable.minimum, variable.maximum
     if (low is not None and value < low) or (high is not None and value > high):
         raise ValueRefused(f"{value!r} is outside its range [{low}, {high}]")

@@ -1,0 +1,97 @@
+"""An FMU through FMPy, ready to step; what all contestants but our own use."""
+
+from __future__ import annotations
+
+import shutil
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+from fmpy import extract, read_model_description
+from fmpy.fmi2 import FMU2Slave
+
+from benchmarks.contestants.entry import FMUS
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from benchmarks.task import Member, System, Task
+
+__all__ = ["Fmu", "opened", "opened_all"]
+
+
+class Fmu:
+    """One instance.
+
+    Attributes:
+        fmu: FMPy's object.
+        inputs: value references of the connected input, as FMPy's functions take them.
+        outputs: likewise of the output.
+    """
+
+    def __init__(self, member: Member, stop_time: float) -> None:
+        path = str(FMUS / f"{member.fmu}.fmu")
+        description = read_model_description(path, validate=False)
+        references = {variable.name: variable.valueReference for variable in description.modelVariables}
+        self.inputs = [references[member.input]]
+        self.outputs = [references[member.output]]
+        self._folder = extract(path)
+        self.fmu: Any = FMU2Slave(
+            guid=description.guid,
+            modelIdentifier=description.coSimulation.modelIdentifier,
+            unzipDirectory=self._folder,
+            instanceName=member.name,
+        )
+        self.fmu.instantiate(loggingOn=False)
+        self.fmu.setupExperiment(startTime=0.0, stopTime=stop_time)
+        names = list(member.start_values)
+        self.fmu.setReal([references[name] for name in names], [member.start_values[name] for name in names])
+        self.fmu.enterInitializationMode()
+
+    def set(self, value: float) -> None:
+        """Set the input."""
+        self.fmu.setReal(self.inputs, [value])
+
+    def get(self) -> float:
+        """Read the output."""
+        value: float = self.fmu.getReal(self.outputs)[0]
+        return value
+
+    def close(self) -> None:
+        """Free the instance and its files."""
+        self.fmu.terminate()
+        self.fmu.freeInstance()
+        shutil.rmtree(self._folder, ignore_errors=True)
+
+
+@contextmanager
+def opened(task: Task, index: int) -> Iterator[Fmu]:
+    """Instance ``index`` of the task's system, initialized and at point 0."""
+    fmu = Fmu(task.system.members[index], task.stop_time)
+    try:
+        value = task.initial_inputs[index]
+        if value is not None:
+            fmu.set(value)
+        fmu.fmu.exitInitializationMode()
+        yield fmu
+    finally:
+        fmu.close()
+
+
+@contextmanager
+def opened_all(system: System, stop_time: float) -> Iterator[tuple[list[Fmu], list[float | None]]]:
+    """All instances of a system in this process at point 0, and their initial inputs."""
+    fmus = [Fmu(member, stop_time) for member in system.members]
+    try:
+        inputs: list[float | None] = [None] * len(fmus)
+        for _ in fmus:  # a value needs as many rounds as there are instances on its way
+            for index, fmu in enumerate(fmus):
+                source = system.source_of(index)
+                if source is not None:
+                    inputs[index] = value = fmus[source].get()
+                    fmu.set(value)
+        for fmu in fmus:
+            fmu.fmu.exitInitializationMode()
+        yield fmus, inputs
+    finally:
+        for fmu in fmus:
+            fmu.close()

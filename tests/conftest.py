@@ -1,0 +1,29 @@
+"""What all tests share: how hypothesis runs, a place for real processes, and the FMU with faults."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from hypothesis import settings
+
+from tests.fmus.helpers import find_fmu
+from tests.helpers import Place
+
+# How long an example takes says more about the machine than about the code; a failure must be the same everywhere.
+settings.register_profile("fmu_mesh", deadline=None, derandomize=True, print_blob=True)
+settings.load_profile("fmu_mesh")
+
+
+@pytest.fixture
+def place() -> Iterator[Place]:
+    """Where a test starts processes; whatever still runs afterwards is killed."""
+    with Place() as place:
+        yield place
+
+
+@pytest.fixture(scope="session")
+def faulty(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The FMU that fails on demand, built once; without a C compiler the test is skipped."""
+    return find_fmu("Faulty", tmp_path_factory.mktemp("faulty"))

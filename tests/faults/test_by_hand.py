@@ -1,0 +1,162 @@
+"""Nodes and master that a person starts in separate terminals: the same job as `launch`, and what can go wrong."""
+
+from __future__ import annotations
+
+import signal
+from pathlib import Path
+
+import pytest
+
+from tests.helpers import Launched, Place, row_count, rows_of, wait_until, write_config
+
+
+def start(place: Place, config: Path, role: str, *options: str) -> Launched:
+    """Start the master, or the node of this name."""
+    return place.start("master", config, *options) if role == "master" else place.start("node", config, role, *options)
+
+
+def wait_until_there(place: Place, count: int) -> None:
+    """Wait until so many processes listen for others."""
+    wait_until(lambda: len(list(place.folder.rglob("*.sock"))) == count, f"{count} processes that listen")
+
+
+@pytest.mark.timeout(60)
+@pytest.mark.parametrize(
+    "order",
+    [("pendulum", "delay", "master"), ("master", "delay", "pendulum"), ("delay", "master", "pendulum")],
+    ids=", ".join,
+)
+def test_processes_started_by_hand_in_any_order_do_the_same_job_as_launch(place: Place, order: tuple[str, ...]) -> None:
+    config = write_config(place.folder)
+    result = config.with_suffix(".csv")
+    assert place.run("launch", config).wait() == 0
+    expected = result.read_bytes()
+    result.unlink()
+
+    by_hand = {}
+    for number, role in enumerate(order, 1):
+        by_hand[role] = start(place, config, role)
+        if number < len(order):
+            wait_until_there(place, number)
+
+    assert {role: launched.wait() for role, launched in by_hand.items()} == dict.fromkeys(order, 0)
+    assert result.read_bytes() == expected
+    assert "1000 points in" in by_hand["master"].output
+    place.assert_nothing_left()
+
+
+@pytest.mark.timeout(60)
+@pytest.mark.parametrize("order", [("pendulum", "master"), ("master", "pendulum")], ids=", ".join)
+def test_a_node_that_nobody_starts_is_named_after_the_deadline(place: Place, order: tuple[str, ...]) -> None:
+    config = write_config(place.folder, timeouts={"start": 2.0})
+
+    by_hand = {}
+    for number, role in enumerate(order, 1):
+        by_hand[role] = start(place, config, role)
+        if number < len(order):
+            wait_until_there(place, number)
+
+    assert {role: launched.wait() for role, launched in by_hand.items()} == dict.fromkeys(order, 4)
+    assert "node 'delay'" in by_hand["master"].message
+    assert "within 2 s" in by_hand["master"].message
+    assert "within 2 s" in by_hand["pendulum"].message
+    place.assert_nothing_left()
+
+
+@pytest.mark.timeout(60)
+def test_a_node_without_a_master_gives_up_after_the_deadline(place: Place) -> None:
+    launched = place.run("node", write_config(place.folder, timeouts={"start": 1.0}), "pendulum")
+
+    assert launched.wait() == 4
+    assert "the master" in launched.message
+    assert "within 1 s" in launched.message
+    place.assert_nothing_left()
+
+
+@pytest.mark.timeout(60)
+def test_a_second_master_of_a_mesh_is_refused_and_the_first_goes_on(place: Place) -> None:
+    config = write_config(place.folder)
+    first = start(place, config, "master")
+    place.note()
+
+    second = start(place, config, "master", "--output", "second.csv")
+
+    assert second.wait() == 2
+    assert "already" in second.message
+    nodes = [start(place, config, name) for name in ("pendulum", "delay")]
+    assert [launched.wait() for launched in (first, *nodes)] == [0, 0, 0]
+    assert len(rows_of(config.with_suffix(".csv"))) == 1001
+    place.assert_nothing_left()
+
+
+@pytest.mark.timeout(60)
+def test_a_second_process_for_a_node_is_refused_and_the_first_goes_on(place: Place) -> None:
+    config = write_config(place.folder)
+    first = start(place, config, "pendulum")
+    wait_until_there(place, 1)
+
+    second = start(place, config, "pendulum")
+
+    assert second.wait() == 2
+    assert "already" in second.message
+    others = [start(place, config, role) for role in ("delay", "master")]
+    assert [launched.wait() for launched in (first, *others)] == [0, 0, 0]
+    place.assert_nothing_left()
+
+
+@pytest.mark.timeout(60)
+def test_a_node_with_another_configuration_is_refused_with_the_reason(place: Place) -> None:
+    config = write_config(place.folder, timeouts={"start": 5.0})
+    master = start(place, config, "master")
+    place.note()
+
+    other = place.run("node", config, "pendulum", "--set", "pendulum.l=2")
+
+    assert other.wait() == 4
+    assert "node 'pendulum'" in other.message
+    assert "has another configuration, or other FMUs, than the master" in other.message
+    assert master.wait() == 4
+    assert "has another configuration, or other FMUs, than the master" in master.message
+    place.assert_nothing_left()
+
+
+@pytest.mark.timeout(60)
+@pytest.mark.parametrize("name", ["pendulun", "mesh"])
+def test_an_unknown_node_is_told_with_the_names_that_there_are(place: Place, name: str) -> None:
+    launched = place.run("node", write_config(place.folder), name)
+
+    assert launched.wait() == 2
+    assert f"there is no node '{name}'; there are: pendulum, delay" in launched.message
+    assert ("Did you mean 'pendulum'?" in launched.message) == (name == "pendulun")
+    place.assert_nothing_left()
+
+
+@pytest.mark.timeout(60)
+@pytest.mark.parametrize("victim", ["master", "pendulum"])
+def test_when_a_process_started_by_hand_is_killed_the_others_end_and_say_so(place: Place, victim: str) -> None:
+    config = write_config(place.folder, stop_time=10_000.0, simulation={"real_time_factor": 1})
+    by_hand = {role: start(place, config, role) for role in ("pendulum", "delay", "master")}
+    wait_until(lambda: row_count(config.with_suffix(".csv")) > 100, "100 rows")
+
+    by_hand.pop(victim).signal(signal.SIGKILL)
+
+    assert {launched.wait() for launched in by_hand.values()} == {4}
+    for launched in by_hand.values():
+        assert ("the master" if victim == "master" else "node 'pendulum' was lost") in launched.message
+    assert len(rows_of(config.with_suffix(".csv"))) > 100
+    assert place.processes() == []  # the files of the one that was killed have nobody who would remove them
+
+
+@pytest.mark.timeout(60)
+def test_ctrl_c_at_the_master_started_by_hand_ends_the_nodes_too(place: Place) -> None:
+    config = write_config(place.folder, stop_time=10_000.0)
+    by_hand = {role: start(place, config, role) for role in ("pendulum", "delay", "master")}
+    wait_until(lambda: row_count(config.with_suffix(".csv")) > 100, "100 rows")
+
+    by_hand["master"].signal(signal.SIGINT)
+
+    assert {launched.wait() for launched in by_hand.values()} == {130}
+    for launched in by_hand.values():
+        assert "SIGINT was received" in launched.message
+    assert rows_of(config.with_suffix(".csv"))
+    place.assert_nothing_left()

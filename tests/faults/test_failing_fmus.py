@@ -1,0 +1,126 @@
+"""An FMU that fails, crashes or hangs: which instance, at which point and time, and what it said itself."""
+
+from __future__ import annotations
+
+import json
+import signal
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zenoh
+
+from tests.helpers import Place, rows_of, wait_until, write_config
+
+
+def with_faulty(place: Place, faulty: Path, start_values: Mapping[str, float | bool], **timeouts: float) -> Path:
+    """A pendulum that feeds the FMU with faults for two seconds in steps of 1 ms."""
+    return write_config(
+        place.folder,
+        instances={
+            "pendulum": {"fmu": "DampedPendulum"},
+            "faulty": {"fmu": str(faulty), "start_values": dict(start_values)},
+        },
+        connections=["pendulum.a -> faulty.u"],
+        stop_time=2.0,
+        timeouts=timeouts,
+    )
+
+
+@pytest.mark.timeout(60)
+@pytest.mark.parametrize("options", [(), ("--local",)], ids=["distributed", "local"])
+@pytest.mark.parametrize(
+    ("fault", "status", "says"),
+    [("fail_at", "error", "the reactor is empty"), ("discard_at", "discard", "the step does not converge")],
+)
+def test_a_failed_step_is_told_with_instance_point_time_and_the_message_of_the_fmu(
+    place: Place, faulty: Path, fault: str, status: str, says: str, options: tuple[str, ...]
+) -> None:
+    config = with_faulty(place, faulty, {fault: 1.0})
+
+    launched = place.run("launch", config, *options)
+
+    assert launched.wait() == 3
+    rows = rows_of(config.with_suffix(".csv"))
+    assert launched.errors.splitlines()[-1] == (
+        f"fmu-mesh: instance faulty, point 1000, t = 1 s: fmi2DoStep returned {status}; the FMU says: {says}. "
+        f"What was recorded up to then ({len(rows)} rows) is in '{config.with_suffix('.csv')}'."
+    )
+    assert f"faulty at point 1000: {says}" in launched.errors  # as it came, too
+    assert "Traceback" not in launched.errors
+    # In one process all is there; of several, one may not have sent its last rows when it hears of the failure.
+    assert len(rows) == 1001 if options else len(rows) <= 1001
+    assert [row[0] for row in rows] == [point * 0.001 for point in range(len(rows))]
+    place.assert_nothing_left()
+
+
+@pytest.mark.timeout(60)
+@pytest.mark.parametrize("options", [(), ("--local",)], ids=["distributed", "local"])
+def test_an_fmu_that_fails_in_initialization_mode_is_told_with_its_instance(
+    place: Place, faulty: Path, options: tuple[str, ...]
+) -> None:
+    launched = place.run("launch", with_faulty(place, faulty, {"fail_in_init": True}), *options)
+
+    assert launched.wait() == 3
+    assert launched.errors.splitlines()[-1] == (
+        "fmu-mesh: instance faulty: fmi2ExitInitializationMode returned error; "
+        "the FMU says: the reactor does not start."
+    )
+    assert "Traceback" not in launched.errors
+    place.assert_nothing_left()
+
+
+@pytest.mark.timeout(60)
+def test_an_fmu_that_aborts_takes_only_its_own_process_with_it(place: Place, faulty: Path) -> None:
+    config = with_faulty(place, faulty, {"crash_at": 1.0})
+
+    launched = place.run("launch", config)
+
+    assert launched.wait() == 4
+    rows = rows_of(config.with_suffix(".csv"))
+    assert len(rows) <= 1001
+    assert "instance faulty, point " in launched.message
+    assert "its process was ended by SIGABRT" in launched.message
+    place.assert_nothing_left()
+
+
+@pytest.mark.timeout(60)
+def test_an_fmu_that_does_not_return_meets_the_deadline_of_a_step(place: Place, faulty: Path) -> None:
+    config = with_faulty(place, faulty, {"hang_at": 1.0}, step=1.0)
+
+    launched = place.run("launch", config)
+
+    assert launched.wait() == 3
+    assert launched.message.startswith(
+        "fmu-mesh: instance faulty, point 1000, t = 1 s: the FMU has not returned for 1."
+    )
+    assert "`timeouts`" in launched.message
+    place.assert_nothing_left()
+
+
+@pytest.mark.timeout(60)
+def test_status_is_answered_while_an_fmu_does_not_return(place: Place, faulty: Path) -> None:
+    launched = place.start("launch", with_faulty(place, faulty, {"hang_at": 1.0}))
+    settings = zenoh.Config()
+    settings.insert_json5("mode", '"client"')
+    settings.insert_json5("connect/endpoints", json.dumps(place.note().endpoints))
+
+    with zenoh.open(settings) as session:
+
+        def hanging(instance: str) -> dict[str, Any] | None:
+            for reply in session.get(f"fmu_mesh/pair/{instance}/status", timeout=5.0):
+                if reply.ok is not None:
+                    status: dict[str, Any] = json.loads(reply.ok.payload.to_bytes())
+                    waits = "waiting at point" in status["activity"]
+                    return status if waits or "in doStep at point 1000 for " in status["activity"] else None
+            return None
+
+        status = wait_until(lambda: hanging("faulty"), "the status of an FMU that hangs")
+        neighbour = wait_until(lambda: hanging("pendulum"), "the status of an FMU that waits")
+    launched.signal(signal.SIGINT)
+
+    assert (status["state"], status["point"], status["time"]) == ("running", 1000, 1.0)
+    assert "waiting at point" in neighbour["activity"]
+    assert launched.wait() == 130
+    place.assert_nothing_left()

@@ -1,0 +1,86 @@
+"""Ctrl-C, SIGTERM and a stop by a person: the run ends within two seconds and leaves a readable partial result."""
+
+from __future__ import annotations
+
+import signal
+from pathlib import Path
+
+import psutil
+import pytest
+
+from tests.helpers import Place, row_count, rows_of, wait_until, write_config
+
+FAR_S = 10_000.0
+SIGNALS = [signal.SIGINT, signal.SIGTERM]
+
+
+@pytest.mark.timeout(60)
+@pytest.mark.parametrize("options", [(), ("--local",)], ids=["distributed", "local"])
+@pytest.mark.parametrize("number", SIGNALS, ids=lambda number: number.name)
+def test_a_signal_ends_the_run_within_two_seconds_with_a_readable_partial_result(
+    place: Place, number: signal.Signals, options: tuple[str, ...]
+) -> None:
+    config = write_config(place.folder, stop_time=FAR_S)
+    result = config.with_suffix(".csv")
+    launched = place.start("launch", config, *options)
+    wait_until(lambda: row_count(result) > 1000, "1000 rows")
+
+    launched.signal(number)
+
+    assert launched.wait() == 130
+    assert launched.ended_after_s < 2.0
+    place.assert_nothing_left()
+    rows = rows_of(result)
+    assert f"({len(rows)} rows) is in '{result}'" in launched.message
+    assert f"point {len(rows) - 1}, t = " in launched.message
+
+
+@pytest.mark.timeout(60)
+def test_a_second_ctrl_c_waits_for_nobody(place: Place) -> None:
+    config = write_config(place.folder, stop_time=FAR_S)
+    result = config.with_suffix(".csv")
+    launched = place.start("launch", config)
+    wait_until(lambda: row_count(result) > 1000, "1000 rows")
+    launched.child("master").suspend()  # so that nothing but the second one can end the run soon
+
+    launched.signal(signal.SIGINT)
+    launched.signal(signal.SIGINT)
+
+    assert launched.wait() == 130
+    assert launched.ended_after_s < 2.0
+    assert "interrupted" in launched.message
+    place.assert_nothing_left()
+    assert rows_of(result)
+
+
+@pytest.mark.timeout(60)
+def test_ctrl_c_before_the_first_point_ends_the_run_too(place: Place) -> None:
+    launched = place.start("launch", write_config(place.folder, stop_time=FAR_S))
+    launched.child("delay")
+
+    launched.signal(signal.SIGINT)
+
+    assert launched.wait() == 130
+    assert launched.ended_after_s < 2.0
+    assert "interrupted" in launched.message
+    place.assert_nothing_left()
+
+
+@pytest.mark.timeout(60)
+def test_ctrl_c_ends_a_run_in_one_process_while_its_fmu_hangs(place: Place, faulty: Path) -> None:
+    config = write_config(
+        place.folder,
+        instances={"faulty": {"fmu": str(faulty), "start_values": {"hang_at": 0.5}}},
+        connections=[],
+        stop_time=FAR_S,
+    )
+    launched = place.start("launch", config, "--local")
+    wait_until(place.extracted, "an extracted FMU")
+    process = psutil.Process(launched.pid)
+    wait_until(lambda: process.status() == psutil.STATUS_SLEEPING, "the hang")
+
+    launched.signal(signal.SIGINT)
+
+    assert launched.wait() == 130
+    assert launched.ended_after_s < 2.0
+    place.assert_nothing_left()

@@ -1,0 +1,135 @@
+"""A process that is killed or stopped in mid-run: who notices, what is told, what is kept, and what is left."""
+
+from __future__ import annotations
+
+import re
+import signal
+from pathlib import Path
+
+import pytest
+
+from fmu_mesh.cli.main import main
+from tests.helpers import Launched, Place, row_count, rows_of, wait_until, write_config
+
+FAST = pytest.param({}, 2000, id="as fast as possible")
+PACED = pytest.param({"real_time_factor": 1}, 300, id="in real time")
+
+FAR_S = 10_000.0
+"""A stop time that no test ever reaches."""
+
+
+def started(place: Place, simulation: dict[str, float], rows: int) -> tuple[Launched, Path]:
+    """A pendulum and a delay that run, and their result file with ``rows`` rows or more."""
+    config = write_config(place.folder, stop_time=FAR_S, simulation=simulation)
+    launched = place.start("launch", config)
+    result = config.with_suffix(".csv")
+    wait_until(lambda: row_count(result) > rows, f"{rows} rows")
+    return launched, result
+
+
+def assert_is_what_one_process_calculates(place: Place, result: Path) -> None:
+    """The rows that were kept are those of a run in one process that stops at the last of them, byte for byte."""
+    rows = len(rows_of(result))
+    config = write_config(place.folder, name="local", stop_time=(rows - 1) * 0.001)
+    assert main(["launch", str(config), "--local", "--no-progress"]) == 0
+    assert result.read_bytes() == config.with_suffix(".csv").read_bytes()
+
+
+def point_in(message: str) -> int:
+    """The point that a message names; its time must be that of the point."""
+    found = re.search(r"point (\d+), t = ([\d.e+]+) s: ", message)
+    assert found is not None, message
+    assert float(found[2]) == pytest.approx(int(found[1]) * 0.001, rel=1e-11)
+    return int(found[1])
+
+
+@pytest.mark.timeout(60)
+@pytest.mark.parametrize("victim", ["pendulum", "delay", "master"])
+@pytest.mark.parametrize(("simulation", "rows"), [FAST, PACED])
+def test_a_killed_process_ends_the_run_within_two_seconds_and_the_rows_before_are_kept(
+    place: Place, victim: str, simulation: dict[str, float], rows: int
+) -> None:
+    launched, result = started(place, simulation, rows)
+
+    launched.child(victim).kill()
+
+    assert launched.wait() == 4
+    assert launched.ended_after_s < 2.0
+    place.assert_nothing_left()
+    kept = len(rows_of(result))
+    assert kept > rows
+    message = launched.message
+    who = "the master was lost" if victim == "master" else f"instance {victim}, point"
+    assert who in message
+    assert "its process was ended by SIGKILL" in message
+    assert f"({kept} rows) is in '{result}'" in message
+    assert kept - 1 <= point_in(message) <= kept - 1 + 2048
+    assert_is_what_one_process_calculates(place, result)
+
+
+@pytest.mark.timeout(60)
+@pytest.mark.parametrize(("simulation", "rows"), [FAST, PACED])
+def test_when_the_launcher_is_killed_its_children_end_by_themselves_and_remove_their_files(
+    place: Place, simulation: dict[str, float], rows: int
+) -> None:
+    launched, result = started(place, simulation, rows)
+    assert place.extracted()
+
+    launched.signal(signal.SIGKILL)
+
+    assert launched.wait() == -signal.SIGKILL
+    place.assert_nothing_left(within_s=5.0)
+    assert_is_what_one_process_calculates(place, result)
+
+
+@pytest.mark.timeout(60)
+def test_a_launcher_that_is_killed_while_the_processes_start_leaves_nothing_either(place: Place) -> None:
+    launched = place.start("launch", write_config(place.folder, stop_time=FAR_S))
+    launched.child("delay")
+
+    launched.signal(signal.SIGKILL)
+
+    launched.wait()
+    wait_until(lambda: not place.processes(), "the end of the children", 5.0)
+    # What they could not remove because nobody had told them whose it is, the next run removes.
+    assert place.run("launch", write_config(place.folder, name="next", stop_time=0.01)).wait() == 0
+    place.assert_nothing_left()
+
+
+@pytest.mark.timeout(60)
+@pytest.mark.parametrize("victim", ["pendulum", "delay", "master"])
+@pytest.mark.parametrize(("simulation", "rows"), [FAST, PACED])
+def test_a_process_that_is_stopped_is_noticed_after_its_lease_and_does_not_stay(
+    place: Place, victim: str, simulation: dict[str, float], rows: int
+) -> None:
+    launched, result = started(place, simulation, rows)
+
+    launched.child(victim).suspend()
+
+    assert launched.wait(25.0) == 4
+    place.assert_nothing_left()
+    who = "the master was lost" if victim == "master" else f"instance {victim}, point"
+    assert who in launched.message
+    assert "its process does not answer any more" in launched.message
+    assert_is_what_one_process_calculates(place, result)
+
+
+@pytest.mark.timeout(60)
+def test_a_killed_process_of_a_group_is_named_with_all_its_instances(place: Place) -> None:
+    gains = {name: {"fmu": "Gain", "group": "both"} for name in ("first", "second")}
+    config = write_config(
+        place.folder,
+        instances={"pendulum": {"fmu": "DampedPendulum"}, **gains},
+        connections=["pendulum.a -> first.u", "first.y -> second.u"],
+        stop_time=FAR_S,
+        simulation={"real_time_factor": 1},
+    )
+    launched = place.start("launch", config)
+    wait_until(lambda: row_count(config.with_suffix(".csv")) > 100, "100 rows")
+
+    launched.child("both").kill()
+
+    assert launched.wait() == 4
+    assert "instance first, second, point" in launched.message
+    assert "node 'both' was lost" in launched.message
+    place.assert_nothing_left()

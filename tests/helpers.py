@@ -1,0 +1,323 @@
+"""What tests that run real processes share: a private place, the processes started there, and a look at what is left.
+
+Nothing here waits by the clock: every wait is for a condition, and has a deadline that is only met when a test fails.
+"""
+
+from __future__ import annotations
+
+import csv
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Any, Self, TypeVar
+
+import msgspec
+import psutil
+import yaml
+
+from fmu_mesh.wire.runtime import MeshNote
+
+__all__ = [
+    "DEADLINE_S",
+    "FMUS",
+    "Launched",
+    "Place",
+    "assert_readable",
+    "row_count",
+    "rows_of",
+    "wait_until",
+    "write_config",
+]
+
+FMUS = Path(__file__).resolve().parents[1] / "fmus"
+
+DEADLINE_S = 30.0
+"""Longer than anything takes on a busy machine, shorter than the timeout of a test."""
+
+_LOOK_S = 0.01
+
+Value = TypeVar("Value")
+
+
+def wait_until(condition: Callable[[], Value | None], what: str, deadline_s: float = DEADLINE_S) -> Value:
+    """Return the first true value of ``condition``; fail after ``deadline_s`` seconds, saying ``what`` did not come."""
+    never = threading.Event()
+    end = time.monotonic() + deadline_s
+    while True:
+        if value := condition():
+            return value
+        assert time.monotonic() < end, f"not within {deadline_s:g} s: {what}"
+        never.wait(_LOOK_S)
+
+
+def write_config(
+    folder: Path,
+    *,
+    instances: Mapping[str, Mapping[str, Any]] | None = None,
+    connections: Sequence[str] = ("pendulum.a -> delay.x",),
+    name: str = "pair",
+    stop_time: float = 1.0,
+    **sections: Mapping[str, Any],
+) -> Path:
+    """Write ``<name>.yaml``, by default a pendulum and a delay with a step size of 1 ms; returns its path.
+
+    Args:
+        folder: where the file goes, and the result file ``<name>.csv`` beside it.
+        instances: by name; ``fmu`` may be the name of a kept FMU such as ``Gain``.
+        connections: in the short form.
+        name: of the mesh.
+        stop_time: in s.
+        sections: more of the file; what is in ``simulation`` comes on top of the default.
+    """
+    kept = {path.stem: str(path) for path in FMUS.glob("*.fmu")}
+    own: Mapping[str, Mapping[str, Any]] = {
+        "pendulum": {"fmu": "DampedPendulum"},
+        "delay": {"fmu": "TransportDelay", "start_values": {"d": 0.1}},
+    }
+    members = {own_name: dict(member) for own_name, member in (own if instances is None else instances).items()}
+    for member in members.values():
+        member["fmu"] = kept.get(member["fmu"], member["fmu"])
+    content = {
+        "mesh": name,
+        "record": {"file": f"{name}.csv"},
+        **sections,
+        "simulation": {"stop_time": stop_time, "step_size": 0.001, **sections.get("simulation", {})},
+        "instances": members,
+        "connections": list(connections),
+    }
+    path = folder / f"{name}.yaml"
+    path.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
+    return path
+
+
+def row_count(file: Path) -> int:
+    """Rows that a result file has by now, without the header; 0 if there is no file yet."""
+    try:
+        return max(0, file.read_bytes().count(b"\n") - 1)
+    except FileNotFoundError:
+        return 0
+
+
+def rows_of(file: Path) -> list[tuple[float, ...]]:
+    """The rows of a result file that holds numbers only; a row that is not complete fails the test."""
+    text = file.read_text(encoding="utf-8")
+    assert text.endswith("\n"), f"the last row is not complete: {text[-80:]!r}"
+    header, *lines = csv.reader(text.splitlines())
+    rows = [tuple(map(float, line)) for line in lines]
+    assert {len(row) for row in rows} <= {len(header)}
+    return rows
+
+
+def assert_readable(message: str) -> None:
+    """What a person is told when a run fails: one paragraph, without a trace of how the program is built."""
+    lines = message.splitlines()
+    assert len(lines) == 1, message
+    assert lines[0].startswith("fmu-mesh: "), message
+    for sign in ("Traceback", "Error(", "None,", "<", "  ", "..", ";;", ": :", "''"):
+        assert sign not in message, f"{sign!r} in: {message}"
+    assert message[-1] not in ":;,", message
+
+
+class Place:
+    """A private runtime folder and folder for temporary files, and everything that was started there.
+
+    Use it as a context manager; what still runs at the end is killed.
+
+    Attributes:
+        folder: for the test's own files; its path is short, because that of a socket in it is limited.
+    """
+
+    def __init__(self) -> None:
+        # The default folder for temporary files may be too long.
+        self.folder = Path(tempfile.mkdtemp(prefix="fm-", dir="/tmp"))
+        self._runtime = self.folder / "run"
+        self._temporary = self.folder / "tmp"
+        self._temporary.mkdir()
+        self._environment = os.environ | {
+            "FMU_MESH_RUNTIME_DIR": str(self._runtime),
+            "TMPDIR": str(self._temporary),
+            "COLUMNS": "1000",
+        }
+        self._started: list[Launched] = []
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        for process in self.processes():
+            process.kill()
+        for launched in self._started:
+            launched.close()
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+    def start(self, *arguments: str | Path) -> Launched:
+        """Start ``fmu-mesh`` with these arguments as a process of its own."""
+        launched = Launched([sys.executable, "-m", "fmu_mesh", *map(str, arguments)], self._environment, self.folder)
+        self._started.append(launched)
+        return launched
+
+    def run(self, *arguments: str | Path, deadline_s: float = DEADLINE_S) -> Launched:
+        """Start ``fmu-mesh`` with these arguments and wait for its end."""
+        launched = self.start(*arguments)
+        launched.wait(deadline_s)
+        return launched
+
+    def note(self) -> MeshNote:
+        """The note of the one mesh that runs here, as soon as it is there."""
+        [file] = wait_until(lambda: list(self._runtime.glob("*/mesh.json")), "the note of a running mesh")
+        return msgspec.json.decode(file.read_bytes(), type=MeshNote)
+
+    def processes(self) -> list[psutil.Process]:
+        """All processes that run here, children of children included: they inherit the environment of this place."""
+        here = []
+        for process in psutil.process_iter():
+            try:
+                if process.environ().get("FMU_MESH_RUNTIME_DIR") == str(self._runtime):
+                    here.append(process)
+            except (psutil.NoSuchProcess, psutil.AccessDenied):
+                continue
+        return here
+
+    def left(self) -> list[str]:
+        """In words what is there: processes, and files, folders and sockets of runs."""
+        found = [f"process {process.pid}: {' '.join(_command(process))}" for process in self.processes()]
+        for folder in (self._runtime, self._temporary):
+            found += [str(path) for path in sorted(folder.rglob("*"))]
+        return found
+
+    def assert_nothing_left(self, within_s: float = 0.0) -> None:
+        """Nothing may be left, ``within_s`` seconds from now."""
+        if within_s:
+            wait_until(lambda: not self.left(), "an empty place", within_s)
+        left = self.left()
+        assert not left, "\n".join(left)
+
+    def extracted(self) -> list[Path]:
+        """The folders of extracted FMUs."""
+        return [path.parent for path in self.folder.rglob("modelDescription.xml")]
+
+
+class Launched:
+    """One ``fmu-mesh`` command as a process, with what it has written so far.
+
+    Attributes:
+        ended_after_s: how long `wait` has waited.
+    """
+
+    def __init__(self, command: Sequence[str], environment: Mapping[str, str], folder: Path) -> None:
+        self._popen = subprocess.Popen(
+            command,
+            cwd=folder,
+            env=environment,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        assert self._popen.stdout is not None
+        assert self._popen.stderr is not None
+        self._output: list[str] = []
+        self._errors: list[str] = []
+        self._readers = [
+            threading.Thread(target=_read, args=(self._popen.stdout, self._output), daemon=True),
+            threading.Thread(target=_read, args=(self._popen.stderr, self._errors), daemon=True),
+        ]
+        for reader in self._readers:
+            reader.start()
+        self.ended_after_s = 0.0
+
+    @property
+    def pid(self) -> int:
+        """Its process id."""
+        return self._popen.pid
+
+    @property
+    def running(self) -> bool:
+        """Whether it has not ended yet."""
+        return self._popen.poll() is None
+
+    @property
+    def output(self) -> str:
+        """What it has written to standard output."""
+        return "".join(self._output)
+
+    @property
+    def errors(self) -> str:
+        """What it has written to standard error."""
+        return "".join(self._errors)
+
+    @property
+    def message(self) -> str:
+        """The error that it ended with: what it wrote in its own name, which must be one readable paragraph."""
+        message = "".join(line for line in self._errors if not line.startswith("mesh '")).strip()
+        assert "Traceback" not in message, message
+        message = message[max(message.find("fmu-mesh: "), 0) :]
+        assert_readable(message)
+        return message
+
+    def signal(self, number: signal.Signals) -> None:
+        """Send it a signal."""
+        self._popen.send_signal(number)
+
+    def wait(self, deadline_s: float = DEADLINE_S) -> int:
+        """Wait for its end and return its exit code; fail after ``deadline_s`` seconds."""
+        started = time.monotonic()
+        try:
+            code = self._popen.wait(deadline_s)
+        except subprocess.TimeoutExpired:
+            raise AssertionError(
+                f"it still runs after {deadline_s:g} s; it wrote:\n{self.output}{self.errors}"
+            ) from None
+        self.ended_after_s = time.monotonic() - started
+        self._join()
+        return code
+
+    def wait_for_error_line(self, text: str) -> str:
+        """The first line on standard error with ``text`` in it, as soon as it is there."""
+        return wait_until(lambda: next((line for line in self._errors if text in line), None), f"'{text}'")
+
+    def child(self, role: str) -> psutil.Process:
+        """The process of the master (``master``) or of a node by its name, as soon as it runs."""
+        return wait_until(lambda: self._child(role), f"the process of {role}")
+
+    def close(self) -> None:
+        """Kill it if it still runs, and close the pipes."""
+        if self.running:
+            self._popen.kill()
+        self._popen.wait(DEADLINE_S)
+        self._join()
+
+    def _child(self, role: str) -> psutil.Process | None:
+        for process in psutil.Process(self.pid).children():
+            command = _command(process)
+            if role in command[3:6:2] or (role == "master" and "master" in command[3:4]):
+                return process
+        return None
+
+    def _join(self) -> None:
+        for reader in self._readers:
+            reader.join(DEADLINE_S)
+        for pipe in (self._popen.stdout, self._popen.stderr):
+            if pipe is not None:
+                pipe.close()
+
+
+def _command(process: psutil.Process) -> list[str]:
+    try:
+        return process.cmdline()
+    except (psutil.NoSuchProcess, psutil.AccessDenied):
+        return []
+
+
+def _read(pipe: IO[str], lines: list[str]) -> None:
+    lines.extend(pipe)

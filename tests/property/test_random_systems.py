@@ -1,0 +1,385 @@
+"""Any system gives the reference result for any window, placement and delay of messages, in every float.
+
+The reference is a recursion written down here from the definition of a delay and of a held value; it shares nothing
+with the code of the mesh but the delays, which `tests/property/test_plan.py` looks at.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, event, given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from fmu_mesh.launch.local import LocalMesh
+from fmu_mesh.model.config import Config
+from fmu_mesh.model.connection import Connection
+from fmu_mesh.model.description import Causality, ModelDescription, Value, Variable, VariableType
+from fmu_mesh.model.plan import Plan, make_plan
+from fmu_mesh.model.ring import Ring
+from fmu_mesh.model.system import System, SystemInstance
+from fmu_mesh.simtime import TimeGrid
+from tests.scenarios.simulated import SimulatedMesh
+
+STEP_SIZE = 0.1
+LARGE = 100_003
+
+Row = tuple[float, int]
+
+
+class Pipe(msgspec.Struct, frozen=True):
+    """A connection: from an output (`y` Real, `n` Integer) of one instance to an input of its own at another."""
+
+    source: int
+    output: str
+    target: int
+    real: bool
+    factor: float
+    offset: float
+    delay: int | None
+
+
+class Drawn(msgspec.Struct, frozen=True):
+    """A random system; instances are numbers.
+
+    Attributes:
+        steps: base points per own step.
+        groups: number of the node of each instance.
+        feedthrough: whether the initial Real output depends on the inputs.
+    """
+
+    algorithm: str
+    last_point: int
+    window: int
+    steps: tuple[int, ...]
+    groups: tuple[int, ...]
+    feedthrough: tuple[bool, ...]
+    pipes: tuple[Pipe, ...]
+    recorded: bool
+    seed: int
+
+
+@st.composite
+def systems(draw: st.DrawFn) -> Drawn:
+    count = draw(st.integers(1, 12))
+    instance = st.integers(0, count - 1)
+    cyclic = draw(st.booleans())
+    pipes = []
+    for first, second in draw(st.lists(st.tuples(instance, instance), max_size=2 * count)):
+        source, target = (first, second) if cyclic else (min(first, second), max(first, second))
+        if source == target and not cyclic:
+            continue
+        output = draw(st.sampled_from("yyn"))
+        real = output == "y" or draw(st.booleans())
+        scaled = real and draw(st.booleans())
+        forward = source < target
+        pipes.append(
+            Pipe(
+                source=source,
+                output=output,
+                target=target,
+                real=real,
+                factor=draw(st.floats(-2.0, 2.0)) if scaled else 1.0,
+                offset=draw(st.floats(-1.0, 1.0)) if scaled else 0.0,
+                delay=draw(st.sampled_from([None, None, None, 1, 0] if forward else [None, None, 1])),
+            )
+        )
+    per_instance = {"min_size": count, "max_size": count}
+    return Drawn(
+        algorithm=draw(st.sampled_from(["jacobi", "gauss_seidel"])),
+        last_point=draw(st.integers(0, 24)),
+        window=draw(st.sampled_from([1, 1, 2, 3]) | st.integers(1, 64)),
+        steps=tuple(draw(st.lists(st.sampled_from([1, 1, 2, 3, 4]), **per_instance))),  # type: ignore[arg-type] # sizes
+        groups=tuple(draw(st.lists(st.integers(0, draw(instance)), **per_instance))),  # type: ignore[arg-type] # sizes
+        feedthrough=tuple(draw(st.lists(st.booleans(), **per_instance))),  # type: ignore[arg-type] # sizes
+        pipes=tuple(pipes),
+        recorded=draw(st.booleans()),
+        seed=draw(st.integers(0, 2**32)),
+    )
+
+
+# ---- the model: a step that no other order of values gives the same result for
+
+
+def start_of(number: int) -> float:
+    return math.sin(number + 1.0)
+
+
+def stepped(row: Row, step: int, reals: Sequence[float], integers: Sequence[int]) -> Row:
+    y, n = 1.7 * row[0] + 0.3 * step, 5 * row[1] + step
+    for place, value in enumerate(reals):
+        y += (0.2 + 0.1 * place) * value
+    for place, number in enumerate(integers):
+        n += (3 + place) * number
+    return math.sin(y), n % LARGE
+
+
+def initial(number: int, reals: Sequence[float], *, feedthrough: bool) -> float:
+    y = start_of(number)
+    return y + sum(0.25 * value for value in reals) if feedthrough else y
+
+
+# ---- the reference: from the definition, without the mesh
+
+
+def scaled(pipe: Pipe, row: Row) -> float | int:
+    value = row[0] if pipe.output == "y" else row[1]
+    return value if (pipe.factor, pipe.offset) == (1.0, 0.0) else value * pipe.factor + pipe.offset
+
+
+def reference(drawn: Drawn, delays: Sequence[int], held: frozenset[int]) -> list[list[Row]]:
+    """The outputs of every instance at its own points.
+
+    Args:
+        drawn: the system.
+        delays: the delay of each pipe.
+        held: the pipes that carry nothing in Initialization Mode.
+    """
+    into = [[p for p, pipe in enumerate(drawn.pipes) if pipe.target == i] for i in range(len(drawn.steps))]
+
+    @cache
+    def at_start(i: int) -> Row:
+        fed = drawn.feedthrough[i]
+        inputs = [
+            0.0 if p in held else float(scaled(drawn.pipes[p], at_start_of(drawn.pipes[p])))
+            for p in into[i]
+            if fed and drawn.pipes[p].real
+        ]
+        return initial(i, inputs, feedthrough=fed), i
+
+    def at_start_of(pipe: Pipe) -> Row:
+        return at_start(pipe.source) if pipe.output == "y" else (math.nan, pipe.source)
+
+    @cache
+    def row(i: int, step: int) -> Row:
+        if step == 0:
+            return at_start(i)
+        m = drawn.steps[i]
+        values = []
+        for p in into[i]:
+            pipe = drawn.pipes[p]
+            point = (step - 1) * m if delays[p] else step * m
+            values.append((pipe.real, scaled(pipe, row(pipe.source, point // drawn.steps[pipe.source]))))
+        reals = [float(value) for real, value in values if real]
+        integers = [int(value) for real, value in values if not real]
+        return stepped(row(i, step - 1), step - 1, reals, integers)
+
+    rows: list[list[Row]] = [[] for _ in drawn.steps]
+    for point in range(drawn.last_point + 1):  # in this order the recursion is never deep
+        for i, m in enumerate(drawn.steps):
+            if point % m == 0:
+                rows[i].append(row(i, point // m))
+    return rows
+
+
+# ---- the same system for the mesh
+
+
+def name_of(number: int) -> str:
+    return f"i{number}"
+
+
+def planned(drawn: Drawn) -> Plan:
+    count = len(drawn.steps)
+
+    def variable(name: str, kind: VariableType, causality: Causality, dependencies: tuple[str, ...] | None) -> Variable:
+        return Variable(name, 0, kind, causality, "discrete", dependencies=dependencies)
+
+    def kind(pipe: Pipe) -> VariableType:
+        return "Real" if pipe.real else "Integer"
+
+    outputs = [
+        {
+            "y": variable("y", "Real", "output", None if drawn.feedthrough[i] else ()),
+            "n": variable("n", "Integer", "output", ()),
+        }
+        for i in range(count)
+    ]
+    inputs = {p: variable(f"u{p}", kind(pipe), "input", ()) for p, pipe in enumerate(drawn.pipes)}
+    names = [name_of(i) for i in range(count)]
+    config = msgspec.convert(
+        {
+            "mesh": "random",
+            "simulation": {"stop_time": 1.0, "step_size": STEP_SIZE, "algorithm": drawn.algorithm},
+            "instances": {name: {"fmu": "none.fmu"} for name in names},
+        },
+        Config,
+    )
+    system = System(
+        config=config,
+        grid=TimeGrid(0.0, STEP_SIZE, drawn.last_point),
+        instances={
+            name: SystemInstance(
+                name=name,
+                fmu="none.fmu",
+                description=ModelDescription(
+                    model_name="Mixer",
+                    model_identifier="Mixer",
+                    fmi_version="2.0",
+                    kind="co_simulation",
+                    guid="{1}",
+                    variables=(
+                        *(inputs[p] for p, pipe in enumerate(drawn.pipes) if pipe.target == i),
+                        *outputs[i].values(),
+                    ),
+                ),
+                start_values={},
+                step_points=drawn.steps[i],
+                node=f"node{drawn.groups[i]}",
+            )
+            for i, name in enumerate(names)
+        },
+        connections=tuple(
+            Connection(
+                source_instance=name_of(pipe.source),
+                source=outputs[pipe.source][pipe.output],
+                target_instance=name_of(pipe.target),
+                target=inputs[p],
+                factor=pipe.factor,
+                offset=pipe.offset,
+                delay=pipe.delay,
+                path=f"connections[{p}]",
+            )
+            for p, pipe in enumerate(drawn.pipes)
+        ),
+        recorded=tuple((name, "y") for name in names) if drawn.recorded else (),
+        result_file="none.csv" if drawn.recorded else None,
+    )
+    return make_plan(system, window=drawn.window)
+
+
+class Mixer:
+    """A test double that computes the model above on rings, and keeps its outputs."""
+
+    def __init__(self, drawn: Drawn, plan: Plan, number: int) -> None:
+        self.rows: list[Row] = []
+        self.description = plan.system.instances[name_of(number)].description
+        self._drawn = drawn
+        self._number = number
+        self._initial: dict[str, Value] = {
+            v.name: 0.0 for v in self.description.variables if v.causality == "input" and v.type == "Real"
+        }
+        self._rings: tuple[Ring, Ring] | None = None
+
+    def enter_initialization(self, _start_time: float, _stop_time: float, _start_values: Mapping[str, Value]) -> None:
+        return
+
+    def exit_initialization(self) -> None:
+        return
+
+    def set_values(self, values: Mapping[str, Value]) -> None:
+        self._initial.update({name: value for name, value in values.items() if name in self._initial})
+
+    def get_values(self, names: Sequence[str]) -> list[Value]:
+        row = self._initial_row()
+        return [row[0] if name == "y" else row[1] for name in names]
+
+    def bind(self, inputs: Ring, outputs: Sequence[Ring], _grid: TimeGrid, _points: int, step: int = 0) -> None:
+        self._rings = inputs, outputs[0]
+        self.rows.append(self._initial_row())
+        self._write(step)
+
+    def do_step(self, step: int) -> None:
+        assert self._rings is not None
+        inputs, _ = self._rings
+        slot = step & inputs.mask
+        reals, integers = inputs.reals[slot].tolist(), inputs.integers[slot].tolist()
+        self.rows.append(stepped(self.rows[-1], step, reals, integers))
+        self._write(step + 1)
+
+    def close(self) -> None:
+        return
+
+    def _initial_row(self) -> Row:
+        values = [float(value) for value in self._initial.values()]
+        return initial(self._number, values, feedthrough=self._drawn.feedthrough[self._number]), self._number
+
+    def _write(self, step: int) -> None:
+        assert self._rings is not None
+        outputs = self._rings[1]
+        slot = step & outputs.mask
+        for column, _ in enumerate(outputs.layout.reals):
+            outputs.reals[slot, column] = self.rows[-1][0]
+        for column, _ in enumerate(outputs.layout.integers):
+            outputs.integers[slot, column] = self.rows[-1][1]
+
+
+def expected_of(drawn: Drawn, plan: Plan) -> list[list[Row]]:
+    held = frozenset(int(name[1:]) for _, name in plan.initialization.held)
+    return reference(drawn, [connection.delay or 0 for connection in plan.connections], held)
+
+
+def run(drawn: Drawn, plan: Plan, mesh: Callable[[Callable[[str], Mixer]], None]) -> list[list[Row]]:
+    mixers = [Mixer(drawn, plan, number) for number in range(len(drawn.steps))]
+    by_name = {name_of(number): mixer for number, mixer in enumerate(mixers)}
+    mesh(by_name.__getitem__)
+    return [mixer.rows for mixer in mixers]
+
+
+def bits(rows: list[list[Row]]) -> list[list[tuple[str, int]]]:
+    """Rows whose equality is that of every bit."""
+    return [[(y.hex(), n) for y, n in own] for own in rows]
+
+
+@given(systems())
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+def test_any_system_gives_the_reference_result_on_nodes(drawn: Drawn) -> None:
+    plan = planned(drawn)
+    expected = expected_of(drawn, plan)
+    meshes: list[SimulatedMesh] = []
+
+    def simulate(open_instance: Callable[[str], Mixer]) -> None:
+        meshes.append(SimulatedMesh(plan, open_instance, drawn.seed))
+        meshes[0].run()
+
+    result = run(drawn, plan, simulate)
+
+    assert bits(result) == bits(expected)
+    for name, rows in meshes[0].recorded.items():
+        assert np.array_equal(column(rows), np.array([y for y, _ in expected[int(name[1:])]])), name
+    event("cycles" if plan.cycles else "no cycle")
+
+
+@given(systems())
+@settings(max_examples=100, deadline=None)
+def test_any_system_gives_the_reference_result_in_one_process(drawn: Drawn) -> None:
+    drawn = msgspec.structs.replace(drawn, recorded=False)
+    plan = planned(drawn)
+
+    result = run(drawn, plan, lambda open_instance: LocalMesh(plan, open_instance=open_instance).run())
+
+    assert bits(result) == bits(expected_of(drawn, plan))
+
+
+@pytest.mark.parametrize("window", [1, 7, 256])
+def test_a_chain_of_eight_with_a_slow_last_node_runs_through(window: int) -> None:
+    pipes = tuple(Pipe(i, "y", i + 1, real=True, factor=1.0, offset=0.0, delay=None) for i in range(7))
+    drawn = Drawn(
+        algorithm="gauss_seidel",
+        last_point=300,
+        window=window,
+        steps=(1,) * 8,
+        groups=tuple(range(8)),
+        feedthrough=(False,) * 8,
+        pipes=pipes,
+        recorded=True,
+        seed=window,
+    )
+    plan = planned(drawn)
+
+    def simulate(open_instance: Callable[[str], Mixer]) -> None:
+        mesh = SimulatedMesh(plan, open_instance, drawn.seed)
+        mesh.slow_down("node7", 1000.0)
+        mesh.run()
+
+    assert bits(run(drawn, plan, simulate)) == bits(expected_of(drawn, plan))
+
+
+def column(rows: list[NDArray[np.float64]]) -> NDArray[np.float64]:
+    return np.array([row[0] for row in rows])

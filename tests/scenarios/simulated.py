@@ -1,0 +1,358 @@
+"""A mesh without processes: the real nodes on a wire of this module, in an order that a seed decides.
+
+Every node is the one of `fmu_mesh.node`, with its rings, links and waits; only its session, its meeting and its report
+are of here. Each runs on a thread that goes on only when the scheduler says so, one at a time, so that nothing depends
+on the machine. Messages keep their order within one key; between keys and nodes they are delayed at random.
+"""
+
+from __future__ import annotations
+
+import random
+import threading
+from collections import deque
+from collections.abc import Callable
+from typing import Any, Self, cast
+
+import numpy as np
+import zenoh
+from numpy.typing import NDArray
+
+from fmu_mesh.model.instance import Instance
+from fmu_mesh.model.plan import RECORDER, NodePlan, Plan
+from fmu_mesh.node.node import Node
+from fmu_mesh.wire.frames import FrameReceiver
+from fmu_mesh.wire.messages import FINISH, FRAME, GRANT, HEADER, PROGRESS, WAKE
+
+__all__ = ["SimulatedMesh"]
+
+_MASTER = "@mesh"
+_WAKE = HEADER.pack(WAKE, 0, 0, 0)
+_TURN_S = 30.0
+"""A node that does not come back to the scheduler within this time hangs in a loop of its own."""
+
+_QUIET_ROUNDS = 3
+"""So many times all waits time out without any message before it is called a deadlock."""
+
+
+class SimulatedMesh:
+    """Runs the nodes of a plan.
+
+    Args:
+        plan: the plan of the whole mesh.
+        open_instance: opens a test double by name.
+        seed: decides the delays of messages and the order in which nodes go on.
+
+    Attributes:
+        recorded: the rows (Real part) that reached the recorder, by instance.
+        messages: how many frames were sent.
+    """
+
+    def __init__(self, plan: Plan, open_instance: Callable[[str], Instance], seed: int = 0) -> None:
+        self.recorded: dict[str, list[NDArray[np.float64]]] = {}
+        self.messages = 0
+        self._plan = plan
+        self._random = random.Random(seed)  # noqa: S311 no secret
+        self._nodes = list(plan.nodes)
+        self._windows = [plan.nodes[node].window for node in self._nodes]
+        self._progress = [-1] * len(self._nodes)
+        self._grant = 0
+        self._finished = False
+        self._links: dict[str, deque[bytes]] = {}
+        self._pace: dict[str, float] = {}
+        self._told = -1
+        self._quiet_rounds = 0
+        self.back = threading.Semaphore(0)
+        self.stopping = False
+        self._processes = {
+            node: _Process(self, plan.nodes[node], open_instance, number)
+            for number, node in enumerate(self._nodes)
+            if node != RECORDER
+        }
+        self._receivers: dict[int, FrameReceiver] = {}
+        if RECORDER in plan.nodes:
+            recorder = plan.nodes[RECORDER]
+            for link in recorder.links_in:
+                self._receivers[link.index] = FrameReceiver(link, "the recorder", recorder.ring_rows)
+                self.recorded[link.source] = []
+
+    def run(self) -> None:
+        """Run to the last point.
+
+        Raises:
+            AssertionError: nothing can go on any more.
+            BaseException: what ended a node.
+        """
+        for process in self._processes.values():
+            process.thread.start()
+        try:
+            while any(not process.over for process in self._processes.values()):
+                self._turn()
+        finally:
+            self.stopping = True
+            for process in self._processes.values():
+                while not process.over:
+                    self._resume(process)
+                process.thread.join(_TURN_S)
+
+    def slow_down(self, node: str, times: float) -> None:
+        """Give a node its turn so many times less often than the fastest of the others. Call before `run`."""
+        self._pace[node] = 1.0 / times
+
+    def send(self, key: str, data: bytes) -> None:
+        """Put a message on its way; called by nodes."""
+        self._quiet_rounds = 0
+        self.messages += data[0] == FRAME
+        self._links.setdefault(key, deque()).append(data)
+
+    # --- one at a time
+
+    def _turn(self) -> None:
+        """Deliver one message, or let one node go on."""
+        ready: list[tuple[float, Callable[[], None]]] = []
+        for key, queue in self._links.items():
+            if queue:
+                ready.append((self._pace_of(key), lambda key=key: self._deliver(key)))  # type: ignore[misc] # a default
+        for name, process in self._processes.items():
+            if not process.over and process.can_go_on:
+                ready.append((self._pace_of(name), lambda process=process: self._resume(process)))  # type: ignore[misc] # as above
+        if not ready:
+            self._let_time_pass()
+            return
+        [chosen] = self._random.choices([act for _, act in ready], [pace for pace, _ in ready])
+        chosen()
+
+    def _pace_of(self, name: str) -> float:
+        """How often a key or a node gets its turn: some are up to a hundred times slower than others."""
+        if name not in self._pace:
+            self._pace[name] = 10.0 ** -self._random.uniform(0.0, 2.0)
+        return self._pace[name]
+
+    def _deliver(self, key: str) -> None:
+        data = self._links[key].popleft()
+        target = key.rpartition("to=")[2]
+        if target == _MASTER:
+            self._take_progress(data)
+        elif target == RECORDER:
+            self._record(data)
+        else:
+            self._processes[target].inbox.append(data)
+
+    def _resume(self, process: _Process) -> None:
+        process.turn.release()
+        assert self.back.acquire(timeout=_TURN_S), f"{process.name} does not come back"
+        if process.error is not None and not self.stopping:
+            raise process.error
+
+    def _let_time_pass(self) -> None:
+        """Everybody waits: all waits time out."""
+        self._quiet_rounds += 1
+        if self._quiet_rounds > _QUIET_ROUNDS:
+            waiting = [process.name for process in self._processes.values() if not process.over]
+            where = dict(zip(self._nodes, self._progress, strict=True))
+            raise AssertionError(f"a deadlock: {waiting} wait for ever; grant {self._grant}, progress {where}")
+        for process in self._processes.values():
+            process.inbox.append(_WAKE)
+
+    # --- master and recorder
+
+    def _take_progress(self, data: bytes) -> None:
+        """The credit rule: nobody runs more than its window ahead of the slowest."""
+        kind, number, _, point = HEADER.unpack_from(data)
+        assert kind == PROGRESS
+        self._progress[number] = max(self._progress[number], point)
+        last = self._plan.grid.last_point
+        if min(self._progress) < 0:
+            return
+        grant = min(*(p + w for p, w in zip(self._progress, self._windows, strict=True)), last)
+        if grant > self._grant:
+            self._grant = grant
+            self._tell(GRANT, grant)
+        if min(self._progress) >= last and not self._finished:
+            self._finished = True
+            self._tell(FINISH, 0)
+
+    def _tell(self, kind: int, point: int) -> None:
+        for node in self._processes:
+            self.send(f"grant/to={node}", HEADER.pack(kind, 0, 0, point))
+
+    def _record(self, data: bytes) -> None:
+        kind, number, count, first = HEADER.unpack_from(data)
+        assert kind == FRAME
+        receiver = self._receivers[number]
+        new = receiver.take(first, count, data)
+        if new is not None:
+            self.recorded[receiver.link.source] += list(new[1][0])
+        last = self._plan.grid.last_point
+        covered = [r.received * r.link.step_points for r in self._receivers.values()]
+        complete = min(last if points > last else points - 1 for points in covered)
+        number = self._nodes.index(RECORDER)
+        stride = self._plan.nodes[RECORDER].progress_stride
+        if self._told < 0 <= complete or complete >= self._told + stride or complete == last > self._told:
+            self._told = complete
+            self.send(f"progress/{RECORDER}/to={_MASTER}", HEADER.pack(PROGRESS, number, 0, complete))
+
+
+class _Process:
+    """A node's thread; it runs between `turn` and the release of the mesh's `back`."""
+
+    def __init__(
+        self, mesh: SimulatedMesh, plan: NodePlan, open_instance: Callable[[str], Instance], number: int
+    ) -> None:
+        self.name = plan.node
+        self.mesh = mesh
+        self.number = number
+        self.inbox: deque[bytes] = deque()
+        self.turn = threading.Semaphore(0)
+        self.thread = threading.Thread(target=self._live, name=f"node {plan.node}", daemon=True)
+        self.over = False
+        self.error: BaseException | None = None
+        self._waiting = False
+        self._plan = plan
+        self._open_instance = open_instance
+
+    @property
+    def can_go_on(self) -> bool:
+        """Whether it does not wait for a message, or one is there."""
+        return not self._waiting or bool(self.inbox)
+
+    def receive(self) -> bytes:
+        """The next message; lets the others go on until one is there."""
+        self._waiting = True
+        self._give_up()
+        while not self.inbox:
+            self._give_up()
+        self._waiting = False
+        return self.inbox.popleft()
+
+    def poll(self) -> bytes | None:
+        """The next message if one is there, after the others had a chance to send one."""
+        self._give_up()
+        return self.inbox.popleft() if self.inbox else None
+
+    def _give_up(self) -> None:
+        self.mesh.back.release()
+        assert self.turn.acquire(timeout=2 * _TURN_S)
+        if self.mesh.stopping:
+            raise _Stopped
+
+    def _live(self) -> None:
+        self.turn.acquire()
+        try:
+            if not self.mesh.stopping:
+                _SimulatedNode(self, self._plan, self._open_instance).run()
+        except _Stopped:
+            pass
+        except BaseException as error:  # noqa: BLE001 raised again by the scheduler
+            self.error = error
+        finally:
+            self.over = True
+            self.mesh.back.release()
+
+
+class _Stopped(BaseException):
+    """The test ends before the node does."""
+
+
+class _SimulatedNode(Node):
+    """A node whose mesh is complete from the start."""
+
+    def __init__(self, process: _Process, plan: NodePlan, open_instance: Callable[[str], Instance]) -> None:
+        super().__init__(plan, cast("zenoh.Session", _Session(process)), open_instance)
+        self._progress_number = process.number
+
+    def _meet(self) -> None:
+        return
+
+    def _report(self, *_: object, **__: object) -> None:
+        return
+
+
+class _Entity:
+    """Whatever is declared and never used: nobody is outside of the mesh."""
+
+    handler: Any = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        return
+
+    def undeclare(self) -> None:
+        return
+
+    def declare_matching_listener(self, _listener: object) -> _Entity:
+        return _Entity()
+
+    @property
+    def matching_status(self) -> _Entity:
+        return self
+
+    @property
+    def matching(self) -> bool:
+        return False
+
+
+class _Session:
+    """As much of a session as a node uses."""
+
+    def __init__(self, process: _Process) -> None:
+        self._process = process
+
+    def declare_subscriber(self, key: str, _handler: object = None, **_settings: object) -> _Entity:
+        subscriber = _Entity()
+        if key.endswith(f"/to={self._process.name}/**"):
+            subscriber.handler = _Handler(self._process)
+        return subscriber
+
+    def declare_publisher(self, key: str, **_settings: object) -> _Entity:
+        return _Publisher(self._process, key) if "/@sync/" in key else _Entity()
+
+    def declare_queryable(self, _key: str, _handler: object = None) -> _Entity:
+        return _Entity()
+
+    def liveliness(self) -> Self:
+        return self
+
+    def declare_token(self, _key: str) -> _Entity:
+        return _Entity()
+
+
+class _Publisher(_Entity):
+    def __init__(self, process: _Process, key: str) -> None:
+        self._process = process
+        self._key = key
+
+    def put(self, data: bytes) -> None:
+        if data[0] != WAKE:
+            self._process.mesh.send(f"{self._process.name}/{self._key}", data)
+        elif threading.current_thread() is self._process.thread:
+            self._process.inbox.append(data)  # of timeouts, the scheduler decides
+
+
+class _Handler:
+    """The receiving end of a node's inbox."""
+
+    def __init__(self, process: _Process) -> None:
+        self._process = process
+
+    def recv(self) -> _Sample:
+        return _Sample(self._process.receive())
+
+    def try_recv(self) -> _Sample | None:
+        data = self._process.poll()
+        return None if data is None else _Sample(data)
+
+
+class _Sample:
+    """A sample, and its payload."""
+
+    def __init__(self, data: bytes) -> None:
+        self._data = data
+
+    @property
+    def payload(self) -> Self:
+        return self
+
+    def to_bytes(self) -> bytes:
+        return self._data

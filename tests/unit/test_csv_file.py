@@ -1,0 +1,100 @@
+"""The result file."""
+
+from __future__ import annotations
+
+import csv
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fmu_mesh.errors import ConfigurationError
+from fmu_mesh.model.description import VariableType
+from fmu_mesh.record.csv_file import CsvFile
+
+COLUMNS: list[tuple[str, VariableType]] = [
+    ("p.a", "Real"),
+    ("p.n", "Integer"),
+    ("p.on", "Boolean"),
+    ("p.e", "Enumeration"),
+]
+
+
+def write(path: Path, times: list[float], reals: list[float]) -> None:
+    count = len(times)
+    integers = np.arange(count, dtype=np.int32)
+    with CsvFile(path, COLUMNS) as file:
+        file.write(np.array(times), [np.array(reals), integers, integers % 2, integers + 10])
+        assert file.rows == count
+
+
+def test_a_row_is_the_time_and_the_values_as_short_as_they_read_back(tmp_path: Path) -> None:
+    write(tmp_path / "a.csv", [0.0, 0.1, 1e-7, 1e22], [1.0, 0.1 + 0.2, -0.0, 5e-324])
+
+    assert (tmp_path / "a.csv").read_text().splitlines() == [
+        "time,p.a,p.n,p.on,p.e",
+        "0.0,1.0,0,false,10",
+        "0.1,0.30000000000000004,1,true,11",
+        "1e-7,-0.0,2,false,12",
+        "1e22,5e-324,3,true,13",
+    ]
+
+
+def test_numbers_that_json_does_not_have_are_written_as_python_reads_them(tmp_path: Path) -> None:
+    write(tmp_path / "a.csv", [0.0, 0.5, 1.0, 1.5], [math.nan, math.inf, -math.inf, 0.1])
+
+    assert (tmp_path / "a.csv").read_text().splitlines()[1:] == [
+        "0.0,nan,0,false,10",
+        "0.5,inf,1,true,11",
+        "1.0,-inf,2,false,12",
+        "1.5,0.1,3,true,13",
+    ]
+
+
+def test_a_name_with_a_comma_is_quoted(tmp_path: Path) -> None:
+    with CsvFile(tmp_path / "a.csv", [("p.der(a,2)", "Real"), ('p."x"', "Real")]):
+        pass
+
+    with (tmp_path / "a.csv").open(newline="") as file:
+        assert next(csv.reader(file)) == ["time", "p.der(a,2)", 'p."x"']
+
+
+def test_many_rows_at_once_are_all_written(tmp_path: Path) -> None:
+    times = [0.01 * point for point in range(2000)]
+
+    write(tmp_path / "a.csv", times, times)
+
+    lines = (tmp_path / "a.csv").read_text().splitlines()[1:]
+    assert [float(line.split(",")[0]) for line in lines] == times
+
+
+def test_a_result_may_hold_the_time_only(tmp_path: Path) -> None:
+    with CsvFile(tmp_path / "a.csv", []) as file:
+        file.write(np.array([0.0, 0.5]), [])
+
+    assert (tmp_path / "a.csv").read_text() == "time\n0.0\n0.5\n"
+
+
+def test_the_folder_is_made_and_an_older_file_is_replaced(tmp_path: Path) -> None:
+    path = tmp_path / "results" / "new" / "a.csv"
+    write(path, [0.0, 1.0], [0.0, 1.0])
+
+    write(path, [0.0], [0.0])
+
+    assert len(path.read_text().splitlines()) == 2
+
+
+def test_what_was_flushed_survives_the_end_of_the_process(tmp_path: Path) -> None:
+    with CsvFile(tmp_path / "a.csv", []) as file:
+        file.write(np.array([0.0]), [])
+        file.flush()
+        assert (tmp_path / "a.csv").read_text() == "time\n0.0\n"
+
+
+def test_a_file_that_cannot_be_written_is_an_error_that_says_so(tmp_path: Path) -> None:
+    with pytest.raises(ConfigurationError, match=r"the result file '.*' cannot be written: Is a directory"):
+        CsvFile(tmp_path, [])
+    (tmp_path / "file").touch()
+    with pytest.raises(ConfigurationError, match=r"cannot be written: (Not a directory|File exists)"):
+        CsvFile(tmp_path / "file" / "a.csv", [])

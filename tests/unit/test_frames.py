@@ -1,0 +1,120 @@
+"""The receiving end of a link."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from fmu_mesh.errors import FmuMeshError, FrameGap
+from fmu_mesh.model.plan import Link
+from fmu_mesh.model.ring import Layout
+from fmu_mesh.wire.frames import FrameReceiver, initial_values, needed_levels
+from fmu_mesh.wire.messages import FRAME, HEADER, INITIAL, encode_rows
+
+LAYOUT = Layout(("a", "b"), ("n",), ("Integer",))
+LINK = Link(3, "source", "left", "right", 2, LAYOUT, (0, 2, -1))
+
+
+def frame(first: int, *rows: tuple[float, float, int]) -> tuple[int, int, bytes]:
+    """The arguments of `take`: first own step, count, message."""
+    reals = np.array([row[:2] for row in rows], dtype=np.float64).reshape(len(rows), 2)
+    integers = np.array([row[2:] for row in rows], dtype=np.int32).reshape(len(rows), 1)
+    return first, len(rows), encode_rows(FRAME, LINK.index, first, reals, integers)
+
+
+@pytest.fixture
+def receiver() -> FrameReceiver:
+    return FrameReceiver(LINK, "node 'right'", 4)
+
+
+def test_a_frame_says_which_rows_of_which_link_it_holds() -> None:
+    _, _, message = frame(5, (1.0, 2.0, 3), (4.0, 5.0, 6))
+
+    assert HEADER.unpack_from(message) == (FRAME, 3, 2, 5)
+    assert len(message) == 16 + 2 * (8 + 8 + 4)
+
+
+def test_rows_are_taken_in_order(receiver: FrameReceiver) -> None:
+    first = receiver.take(*frame(0, (1.0, 2.0, 3), (4.0, 5.0, 6)))
+    second = receiver.take(*frame(2, (7.0, 8.0, 9)))
+
+    assert first is not None
+    assert second is not None
+    assert (first[0], first[1][0].tolist(), first[1][1].tolist()) == (0, [[1.0, 2.0], [4.0, 5.0]], [[3], [6]])
+    assert (second[0], second[1][0].tolist()) == (2, [[7.0, 8.0]])
+    assert receiver.received == 3
+    assert receiver.kept.value(2, "n") == 9
+
+
+def test_a_frame_that_came_before_is_dropped(receiver: FrameReceiver) -> None:
+    receiver.take(*frame(0, (1.0, 2.0, 3), (4.0, 5.0, 6)))
+
+    assert receiver.take(*frame(0, (1.0, 2.0, 3))) is None
+    assert receiver.received == 2
+
+
+def test_of_a_frame_that_overlaps_only_the_new_rows_are_taken(receiver: FrameReceiver) -> None:
+    receiver.take(*frame(0, (1.0, 2.0, 3), (4.0, 5.0, 6)))
+
+    new = receiver.take(*frame(1, (4.0, 5.0, 6), (7.0, 8.0, 9)))
+
+    assert new is not None
+    assert (new[0], new[1][0].tolist(), new[1][1].tolist()) == (2, [[7.0, 8.0]], [[9]])
+
+
+def test_a_missing_row_is_an_error_with_the_points_that_are_missing(receiver: FrameReceiver) -> None:
+    receiver.take(*frame(0, (1.0, 2.0, 3)))
+
+    with pytest.raises(FrameGap, match=r"points 2 to 5 of 'source' never reached node 'right'") as caught:
+        receiver.take(*frame(3, (7.0, 8.0, 9)))
+
+    assert (caught.value.instance, caught.value.point, caught.value.exit_code) == ("source", 2, 4)
+
+
+@pytest.mark.parametrize("other", [(1.0, 2.5, 3), (1.0, 2.0, 4), (-0.0, 2.0, 3), (float("nan"), 2.0, 3)])
+def test_a_row_that_comes_again_must_have_the_same_bits(
+    receiver: FrameReceiver, other: tuple[float, float, int]
+) -> None:
+    receiver.take(*frame(0, (1.0, 2.0, 3) if other[0] != 0 else (0.0, 2.0, 3)))
+
+    with pytest.raises(FrameGap, match="came twice and differ") as caught:
+        receiver.take(*frame(0, other))
+
+    assert (caught.value.instance, caught.value.point) == ("source", 0)
+
+
+def test_a_nan_that_comes_again_is_the_same(receiver: FrameReceiver) -> None:
+    receiver.take(*frame(0, (float("nan"), -0.0, 3)))
+
+    assert receiver.take(*frame(0, (float("nan"), -0.0, 3))) is None
+
+
+def test_rows_that_are_no_longer_kept_cannot_be_compared(receiver: FrameReceiver) -> None:
+    for step in range(6):
+        receiver.take(*frame(step, (float(step), 0.0, 0)))
+
+    assert receiver.take(*frame(1, (9.0, 9.0, 9))) is None
+    with pytest.raises(FrameGap):
+        receiver.take(*frame(2, (9.0, 9.0, 9)))
+
+
+def test_a_frame_larger_than_any_window_is_refused(receiver: FrameReceiver) -> None:
+    with pytest.raises(FmuMeshError, match="a frame of 'source' holds 5 points where 4 are the most"):
+        receiver.take(*frame(0, *[(0.0, 0.0, 0)] * 5))
+
+
+def test_a_frame_of_another_size_is_refused(receiver: FrameReceiver) -> None:
+    first, count, message = frame(0, (1.0, 2.0, 3))
+
+    for wrong in (message[:-1], message + b"\0", message[:16]):
+        with pytest.raises(FmuMeshError, match=f"a frame of 1 points has {len(wrong)} bytes where 36 are expected"):
+            receiver.take(first, count, wrong)
+
+
+def test_an_initial_message_gives_the_values_of_its_level() -> None:
+    message = encode_rows(INITIAL, 3, 2, np.array([[1.5, 2.5]]), np.array([[7]], dtype=np.int32))
+
+    assert initial_values(LINK, 0, message) == {"a": 1.5}
+    assert initial_values(LINK, 2, message) == {"b": 2.5}
+    assert initial_values(LINK, 1, message) == {}
+    assert needed_levels(LINK) == {0, 2}

@@ -1,0 +1,73 @@
+"""How keys are spelt: other programs, in any language, rely on it."""
+
+from __future__ import annotations
+
+import pytest
+import zenoh
+
+from fmu_mesh.wire.keys import Keys, escape, unescape
+
+KEYS = Keys("fmu_mesh", "pair")
+
+
+@pytest.mark.parametrize(
+    ("name", "chunk"),
+    [
+        ("a", "a"),
+        ("der(a,2)", "der(a,2)"),
+        ("body[1].x", "body[1].x"),
+        ("a/b", "a%2Fb"),
+        ("a*b$c?d#e%f", "a%2Ab%24c%3Fd%23e%25f"),
+        ("@a@b", "%40a@b"),
+        ("a b", "a%20b"),
+        ("%2F", "%252F"),
+        ("Größe", "Größe"),
+        ("*", "%2A"),
+        ("**", "%2A%2A"),
+    ],
+)
+def test_a_variable_name_is_one_chunk(name: str, chunk: str) -> None:
+    assert escape(name) == chunk
+    assert unescape(chunk) == name
+
+
+def test_public_keys_are_those_of_the_key_space() -> None:
+    assert KEYS.instance("pendulum") == "fmu_mesh/pair/pendulum"
+    assert KEYS.variable("pendulum", "out", "der(a)") == "fmu_mesh/pair/pendulum/out/der(a)"
+    assert KEYS.variable("pendulum", "param", "l") == "fmu_mesh/pair/pendulum/param/l"
+    assert KEYS.mesh_key("status") == "fmu_mesh/pair/mesh/status"
+    assert KEYS.master == "fmu_mesh/pair/mesh"
+
+
+def test_one_subscription_gets_what_is_for_a_node_and_nothing_else() -> None:
+    inbox = zenoh.KeyExpr(KEYS.inbox("delay"))
+
+    def gets(key: str) -> bool:
+        return inbox.intersects(zenoh.KeyExpr(key))
+
+    assert gets(KEYS.frames("pendulum", "delay"))
+    assert gets(KEYS.wake("delay"))
+    assert not gets(KEYS.frames("pendulum", "delay2"))
+    assert not gets(KEYS.frames("delay", "pendulum"))
+    assert not gets(KEYS.progress())
+    assert not gets(Keys("fmu_mesh", "other").frames("pendulum", "delay"))
+
+
+@pytest.mark.parametrize(("nodes", "keys"), [(1, 1), (16, 1), (17, 2), (100, 7)])
+def test_every_node_gets_each_grant_once(nodes: int, keys: int) -> None:
+    names = [f"n{number}" for number in range(nodes)]
+
+    grants = KEYS.grants(names)
+
+    assert len(grants) == keys
+    for name in names:
+        inbox = zenoh.KeyExpr(KEYS.inbox(name))
+        assert sum(inbox.intersects(zenoh.KeyExpr(key)) for key in grants) == 1
+
+
+def test_a_subscriber_of_everything_does_not_get_what_is_internal() -> None:
+    everything = zenoh.KeyExpr("fmu_mesh/**")
+
+    for key in (KEYS.frames("a", "b"), KEYS.progress(), KEYS.register, KEYS.report, *KEYS.grants(["a"])):
+        assert not everything.intersects(zenoh.KeyExpr(key))
+    assert everything.intersects(zenoh.KeyExpr(KEYS.variable("a", "out", "@y/**")))

@@ -1,0 +1,129 @@
+"""Which step of a target needs which row of its source, and what happens to the values on the way."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from fmu_mesh.model.plan import Feed
+from fmu_mesh.model.ring import Layout, Ring
+from fmu_mesh.model.transfer import Transfer
+
+RATES = [(source, target, delay) for source in range(1, 6) for target in range(1, 6) for delay in (0, 1)]
+SOURCE = Layout(("a", "b", "c"), ("n", "m"), ("Integer", "Boolean"))
+INPUTS = Layout(("x", "y", "z"), ("i", "j"), ("Integer", "Boolean"))
+PLAIN = (("c", "x", 1.0, 0.0), ("a", "z", 1.0, 0.0), ("m", "j", 1.0, 0.0))
+
+
+def transfer(
+    inputs: Ring,
+    source_points: int = 1,
+    target_points: int = 1,
+    delay: int = 1,
+    columns: tuple[tuple[str, str, float, float], ...] = PLAIN,
+) -> Transfer:
+    feed = Feed("source", delay, columns)
+    return Transfer(feed, SOURCE, inputs, source_points=source_points, target_points=target_points)
+
+
+def filled(rows: int) -> Ring:
+    ring = Ring(SOURCE, rows)
+    ring.reals[:] = np.arange(rows * 3).reshape(rows, 3) + 0.5
+    ring.integers[:] = np.arange(rows * 2).reshape(rows, 2) - 7
+    return ring
+
+
+@pytest.mark.parametrize(("source_points", "target_points", "delay"), RATES)
+def test_a_step_uses_the_last_row_of_the_source_at_or_before_the_point(
+    source_points: int, target_points: int, delay: int
+) -> None:
+    moved = transfer(Ring(INPUTS, 8), source_points, target_points, delay)
+
+    for step in range(30):
+        point = step * target_points if delay else (step + 1) * target_points
+        row = max(row for row in range(200) if row * source_points <= point)
+        assert moved.source_step(step) == row
+
+
+@pytest.mark.parametrize(("source_points", "target_points", "delay"), RATES)
+def test_as_many_steps_are_ready_as_have_their_row(source_points: int, target_points: int, delay: int) -> None:
+    moved = transfer(Ring(INPUTS, 8), source_points, target_points, delay)
+
+    for rows in range(30):
+        ready = sum(1 for step in range(200) if moved.source_step(step) < rows)
+        assert moved.ready(rows) == ready
+
+
+@pytest.mark.parametrize(("source_points", "target_points", "delay"), RATES)
+@pytest.mark.parametrize("frame", [1, 3, 7])
+def test_frames_of_any_length_feed_every_step_once(
+    source_points: int, target_points: int, delay: int, frame: int
+) -> None:
+    source, inputs = filled(64), Ring(INPUTS, 256)
+    moved = transfer(inputs, source_points, target_points, delay)
+
+    for first in range(0, 42, frame):
+        moved.from_rows(first, source.reals[first : first + frame], source.integers[first : first + frame])
+
+    for step in range(moved.ready(42)):
+        row = moved.source_step(step)
+        assert inputs.reals[step].tolist() == [source.reals[row, 2], 0.0, source.reals[row, 0]]
+        assert inputs.integers[step].tolist() == [0, source.integers[row, 1]]
+    assert not inputs.reals[moved.ready(42) :].any()
+
+
+@pytest.mark.parametrize(("source_points", "target_points", "delay"), RATES)
+def test_a_ring_feeds_as_frames_do(source_points: int, target_points: int, delay: int) -> None:
+    source = filled(64)
+    by_frame, by_ring, by_step = (Ring(INPUTS, 512) for _ in range(3))
+    low, high = 3, 9
+
+    transfer(by_frame, source_points, target_points, delay).from_rows(0, source.reals, source.integers)
+    transfer(by_ring, source_points, target_points, delay).from_ring(source, low, high)
+    for step in range(low, high):
+        transfer(by_step, source_points, target_points, delay).step_from_ring(source, step)
+
+    for ring in (by_ring, by_step):
+        assert ring.reals[low:high].tolist() == by_frame.reals[low:high].tolist()
+        assert ring.integers[low:high].tolist() == by_frame.integers[low:high].tolist()
+        assert not ring.reals[high:].any()
+
+
+def test_rows_go_around_the_end_of_a_ring() -> None:
+    source, inputs = filled(16), Ring(INPUTS, 8)
+
+    transfer(inputs).from_rows(0, source.reals[:6], source.integers[:6])
+    transfer(inputs).from_rows(6, source.reals[6:12], source.integers[6:12])
+
+    assert inputs.reals[:, 2].tolist() == source.reals[[8, 9, 10, 11, 4, 5, 6, 7], 0].tolist()
+
+
+def test_a_factor_and_an_offset_round_as_python_does() -> None:
+    source, inputs = filled(4), Ring(INPUTS, 4)
+    columns = (("a", "x", 0.1, 0.7), ("n", "y", 1.5, -0.25), ("b", "z", 1.0, 0.0))
+
+    transfer(inputs, columns=columns).from_rows(0, source.reals, source.integers)
+
+    for row in range(4):
+        a, b, _ = source.reals[row].tolist()
+        assert inputs.reals[row].tolist() == [a * 0.1 + 0.7, int(source.integers[row, 0]) * 1.5 + -0.25, b]
+
+
+def test_what_is_not_scaled_keeps_its_sign_of_zero_and_its_nan() -> None:
+    source, inputs = Ring(SOURCE, 2), Ring(INPUTS, 2)
+    source.reals[0] = -0.0
+    source.reals[1] = np.nan
+
+    transfer(inputs).from_rows(0, source.reals, source.integers)
+
+    assert inputs.reals[:, 0].tobytes() == source.reals[:, 2].tobytes()
+
+
+def test_a_frame_that_feeds_no_step_changes_nothing() -> None:
+    source, inputs = filled(4), Ring(INPUTS, 4)
+    moved = transfer(inputs, source_points=1, target_points=5, delay=0)
+
+    moved.from_rows(0, source.reals, source.integers)
+
+    assert moved.ready(4) == 0
+    assert not inputs.reals.any()

@@ -1,0 +1,118 @@
+"""Values as any Zenoh client sees and sends them."""
+
+from __future__ import annotations
+
+import math
+
+import msgspec
+import pytest
+
+from fmu_mesh.model.description import Value, Variable, VariableType
+from fmu_mesh.wire.values import (
+    MAX_VALUE_SIZE,
+    Stamp,
+    ValueRefused,
+    attachment,
+    decode_stamp,
+    decode_value,
+    encode_value,
+)
+
+
+def variable(kind: VariableType, low: float | None = None, high: float | None = None) -> Variable:
+    items = (("low", 1), ("high", 5)) if kind == "Enumeration" else ()
+    return Variable("v", 0, kind, "input", "discrete", minimum=low, maximum=high, items=items)
+
+
+@pytest.mark.parametrize(
+    ("value", "data"),
+    [
+        (1.5, b"1.5"),
+        (-0.0, b"-0.0"),
+        (math.nan, b'"NaN"'),
+        (math.inf, b'"INF"'),
+        (-math.inf, b'"-INF"'),
+        (7, b"7"),
+        (True, b"true"),
+        ('a"b', b'"a\\"b"'),
+    ],
+)
+def test_values_are_json(value: Value, data: bytes) -> None:
+    assert encode_value(value) == data
+
+
+@pytest.mark.parametrize(
+    ("kind", "data", "value"),
+    [
+        ("Real", b"1.5", 1.5),
+        ("Real", b" 2 ", 2.0),
+        ("Real", b"1e-3", 0.001),
+        ("Real", b'"INF"', math.inf),
+        ("Real", b'"-INF"', -math.inf),
+        ("Integer", b"-2147483648", -(2**31)),
+        ("Boolean", b"false", False),
+        ("String", b'"text"', "text"),
+        ("Enumeration", b'"high"', 5),
+        ("Enumeration", b"1", 1),
+    ],
+)
+def test_values_of_the_right_type_are_taken(kind: VariableType, data: bytes, value: Value) -> None:
+    taken = decode_value(data, variable(kind))
+
+    assert (taken, type(taken)) == (value, type(value))
+
+
+@pytest.mark.parametrize(
+    ("kind", "data"),
+    [
+        ("Real", b"true"),
+        ("Real", b"null"),
+        ("Real", b'"1.5"'),
+        ("Real", b"[1.5]"),
+        ("Real", b"1e999"),
+        ("Real", b"1" + b"0" * 400),
+        ("Real", b""),
+        ("Real", b"1.5 2"),
+        ("Integer", b"1.5"),
+        ("Integer", b"2147483648"),
+        ("Integer", b"true"),
+        ("Boolean", b"1"),
+        ("String", b"1"),
+        ("String", b'"\xff"'),
+        ("Enumeration", b'"middle"'),
+        ("Enumeration", b"3"),
+        ("Enumeration", b"true"),
+    ],
+)
+def test_values_of_another_type_are_refused_with_a_reason(kind: VariableType, data: bytes) -> None:
+    with pytest.raises(ValueRefused, match=r"\w+ \w+"):
+        decode_value(data, variable(kind))
+
+
+def test_a_value_outside_its_range_is_refused_with_the_range() -> None:
+    narrow = variable("Real", low=-1.0, high=1.0)
+
+    assert decode_value(b"-1.0", narrow) == -1.0
+    with pytest.raises(ValueRefused, match=r"1\.5 is outside its range \[-1\.0, 1\.0\]"):
+        decode_value(b"1.5", narrow)
+
+
+def test_a_value_that_is_too_long_is_not_even_looked_at() -> None:
+    with pytest.raises(ValueRefused, match="too many"):
+        decode_value(b" " * (MAX_VALUE_SIZE + 1), variable("Real"))
+
+
+def test_a_nested_value_is_refused() -> None:
+    with pytest.raises(ValueRefused):
+        decode_value(b"[" * 100_000, variable("Real"))
+
+
+def test_an_attachment_holds_point_and_time() -> None:
+    assert msgspec.json.decode(attachment(812, 1.624)) == {"point": 812, "time": 1.624}
+    assert decode_stamp(attachment(812, 1.624)) == Stamp(812, 1.624)
+
+
+@pytest.mark.parametrize("data", [b"", b"{}", b'{"point":"a","time":0.0}', b'{"point":1}', b"\xff", b"[" * 100_000])
+def test_another_attachment_is_refused(data: bytes) -> None:
+    with pytest.raises(msgspec.DecodeError):
+        decode_stamp(data)
