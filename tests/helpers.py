@@ -192,7 +192,9 @@ class Place:
         """In words what is there: processes, and files, folders and sockets of runs."""
         found = [f"process {process.pid}: {' '.join(_command(process))}" for process in self.processes()]
         for folder in (self._runtime, self._temporary):
-            found += [str(path) for path in sorted(folder.rglob("*"))]
+            # Unlike `Path.rglob`, this bears with folders that are removed while it looks.
+            for parent, folders, files in os.walk(folder):
+                found += [str(Path(parent, name)) for name in sorted(folders + files)]
         return found
 
     def assert_nothing_left(self, within_s: float = 0.0) -> None:

@@ -10,6 +10,7 @@ from typing import Any
 from ..launch.preparing import Options, prepare
 from ..model.description import Variable
 from ..model.findings import shown
+from ..model.grouping import automatic_nodes
 from ..model.plan import Plan
 from ..model.schema import schema_text
 from ..model.system import Connection, SystemInstance
@@ -52,6 +53,7 @@ def plan_page(plan: Plan) -> list[str]:
         ("Instances", _instances(plan)),
         ("Connections", _connections(plan)),
         ("Execution order within one point", _order(plan)),
+        ("Groups", _groups(plan)),
         ("Initialization", _initialization(plan)),
         ("Recorded", _recorded(plan)),
         ("Warnings", _warnings(plan)),
@@ -125,6 +127,31 @@ def _order(plan: Plan) -> list[str]:
     lines = [f"  {arrow.join(plan.order)}" + ("" if instant else "  (at the same time)" if len(plan.order) > 1 else "")]
     lines += [f"  cycle: {', '.join(cycle)}" for cycle in plan.cycles]
     return lines
+
+
+def _groups(plan: Plan) -> list[str]:
+    """What `group: auto` does or would do, and why, for each cycle that it concerns."""
+    config, instances = plan.system.config, plan.system.instances
+    edges = [(c.source_instance, c.target_instance) for c in plan.connections]
+    automatic = automatic_nodes(config, edges, {name: own.description for name, own in instances.items()})
+    lines = []
+    for cycle in plan.cycles:
+        names = ", ".join(sorted(cycle, key=[*instances].index))
+        now = {plan.node_of(name) for name in cycle}
+        would = {automatic.get(name, config.instances[name].group or name) for name in cycle}
+        if len(now) > 1:
+            cost = f"{names} form a cycle over {len(now)} nodes: each point costs a round trip"
+            lines.append(f"  {cost}; {_remedy(len(now), len(would))}")
+        elif config.group == "auto" and any(name in automatic for name in cycle):
+            lines.append(f"  {names} form a cycle: together in '{now.pop()}', each point costs no round trip")
+    return lines
+
+
+def _remedy(nodes: int, automatic: int) -> str:
+    if automatic == 1:
+        return "`group: auto` would put them into one"
+    apart = "groups, hosts, or FMUs that allow one instance per process keep them apart"
+    return apart if automatic >= nodes else f"`group: auto` would put them into {automatic}, since {apart}"
 
 
 def _initialization(plan: Plan) -> list[str]:

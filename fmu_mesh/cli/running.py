@@ -123,7 +123,7 @@ def _run_local(plan: Plan, display: Display) -> tuple[int, float, int]:
         display.log(line)
 
     mesh = LocalMesh(plan, log, display.progress)
-    with ended_by_signals(mesh.interrupt, lambda: None, watch_stdin=False):
+    with ended_by_signals(mesh.interrupt, mesh.clean_up, watch_stdin=False):
         mesh.run()
     return mesh.point, mesh.seconds, mesh.rows
 

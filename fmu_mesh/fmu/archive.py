@@ -23,6 +23,7 @@ def extract(path: Path, parent: Path) -> Path:
     Raises:
         LoadFailed: the archive is broken, or an entry would be written outside the folder; nothing is left behind.
     """
+    parent.mkdir(parents=True, exist_ok=True)
     folder = Path(tempfile.mkdtemp(prefix=f"{path.stem[:40]}-", dir=parent))
     try:
         with zipfile.ZipFile(path) as archive:

@@ -31,6 +31,7 @@ __all__ = ["Launcher", "Output"]
 
 _MASTER = "the master"
 _REPORT_S = 1.5
+_INTERRUPT_S = 0.9
 _KILL_S = 0.7
 _SILENCE_S = 10.0
 """The master says something ten times a second; after this time without a word it is taken for lost."""
@@ -179,7 +180,7 @@ class Launcher:
         # A node is gone: the master sees it within milliseconds and says so; if it does not, we do.
         if self._lost and now - self._lost[0][2] > _REPORT_S:
             return True
-        if self._interrupted_at is not None and now - self._interrupted_at > _REPORT_S:
+        if self._interrupted_at is not None and now - self._interrupted_at > _INTERRUPT_S:
             return True
         return silent_s > (_SILENCE_S if self._point is not None else self._timeouts.start)
 
@@ -189,7 +190,7 @@ class Launcher:
         """Wait for those that end by themselves, then ask, then kill."""
         self._ending = True
         patience = _KILL_S if self._end is not None else 0.1
-        grace_s = 0.3 if self._interrupted_at == 0.0 else _KILL_S
+        grace_s = _KILL_S if self._interrupted_at is None else 0.3
         for step in (None, signal.SIGTERM, signal.SIGKILL):
             running = [process for process in self._processes.values() if process.running]
             if not running:

@@ -189,6 +189,13 @@ class Config(Base, frozen=True, kw_only=True):
         dict[Name, InstanceConfig],
         Meta(min_length=1, description="The instances by name; `mesh` is reserved."),
     ]
+    group: Annotated[
+        Literal["auto"] | None,
+        Meta(
+            description="auto: the instances of each cycle share one node, unless they have a group of their own; "
+            "null: every instance without a group has a node of its own."
+        ),
+    ] = None
     connections: Annotated[
         list[ConnectionConfig], Meta(description="What flows from which output to which input.")
     ] = []

@@ -10,6 +10,7 @@ import math
 from collections.abc import Iterable, Mapping
 
 import msgspec
+from msgspec.structs import replace
 
 from fmu_mesh.errors import Finding
 from fmu_mesh.model.config import Config, InstanceConfig
@@ -22,6 +23,7 @@ from fmu_mesh.model.connection import (
 )
 from fmu_mesh.model.description import ModelDescription, Value
 from fmu_mesh.model.findings import Findings, nearest_file, shown
+from fmu_mesh.model.grouping import automatic_nodes
 from fmu_mesh.model.loading import LoadedConfig
 from fmu_mesh.model.start_values import resolve_start_values
 from fmu_mesh.simtime import TimeGrid, steps_between
@@ -41,7 +43,7 @@ class SystemInstance(msgspec.Struct, frozen=True):
         description: its model description.
         start_values: start values by variable name, converted to the variable's type.
         step_points: its step size as a multiple of the base step size; 1 or more.
-        node: name of the node (process) it runs in: its group, or its own name.
+        node: name of the node (process) it runs in: its group, that of its cycle (`group: auto`), or its own name.
     """
 
     name: str
@@ -104,6 +106,10 @@ def build(
         missing = [name for name in config.instances if name not in descriptions]
         raise ValueError(f"no model description and no finding for {missing}")
     collected.raise_any()
+    if config.group == "auto":
+        edges = [(c.source_instance, c.target_instance) for c in connections]
+        nodes = automatic_nodes(config, edges, descriptions)
+        instances = {name: replace(own, node=nodes.get(name, own.node)) for name, own in instances.items()}
     warnings = loaded.findings()
     unit_warnings(connections, warnings)
     return System(config, grid, instances, connections, recorded, result_file, tuple(warnings))

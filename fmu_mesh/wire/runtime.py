@@ -89,8 +89,10 @@ def leave_run_folder(folder: Path) -> None:
     for empty in (folder / "fmus", folder):
         try:
             empty.rmdir()
+        except FileNotFoundError:
+            continue
         except OSError:
-            return
+            return  # somebody still uses it
 
 
 def socket_endpoint(folder: Path, node: str) -> str:

@@ -20,8 +20,12 @@ __all__ = ["Wiring", "ask", "matches", "open_session", "own_endpoints", "undecla
 LEASE_MS = 4_000
 """A stopped (not dead) process is noticed after this time; a dead one within milliseconds."""
 
-NEVER_DROP_US = 24 * 3600 * 1_000_000
-"""How long a blocked sender waits before Zenoh would close the transport: longer than any deadline of ours."""
+STUCK_US = 1000 * LEASE_MS
+"""How long a sender stays blocked before the link is closed, and with it the peer's tokens.
+
+Credit keeps every queue of a living peer from filling up, so only a stopped process blocks a sender. While it does, the
+lease does not fire; this has to end what the lease cannot.
+"""
 
 
 class Wiring(msgspec.Struct, frozen=True):
@@ -74,8 +78,7 @@ def _configuration(wiring: Wiring) -> zenoh.Config:
         "connect/retry": {"period_init_ms": 20, "period_max_ms": 250, "period_increase_factor": 1.5},
         "listen/exit_on_failure": True,
         "transport/link/tx/lease": LEASE_MS,
-        # A full queue blocks the producer (design, invariant 3); the default would close the link after 5 s.
-        "transport/link/tx/queue/congestion_control/block/wait_before_close": NEVER_DROP_US,
+        "transport/link/tx/queue/congestion_control/block/wait_before_close": STUCK_US,
         # A subscriber that does not take its samples must not hold up what shares a link with them: they are dropped at
         # once (the default waits a millisecond for each), and the queue for streams is as long as it may be instead.
         "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,

@@ -14,6 +14,28 @@ FAR_S = 10_000.0
 SIGNALS = [signal.SIGINT, signal.SIGTERM]
 
 
+def is_pending(pid: int, number: signal.Signals) -> bool:
+    """Whether a signal waits for a process that is stopped (Linux)."""
+    status = Path(f"/proc/{pid}/status").read_text(encoding="ascii")
+    waiting = next(line.split()[1] for line in status.splitlines() if line.startswith("ShdPnd:"))
+    return bool(int(waiting, 16) >> (number - 1) & 1)
+
+
+@pytest.mark.timeout(60)
+def test_ctrl_c_ends_the_run_within_two_seconds_even_if_the_master_does_not_answer(place: Place) -> None:
+    config = write_config(place.folder, stop_time=FAR_S)
+    launched = place.start("launch", config)
+    wait_until(lambda: row_count(config.with_suffix(".csv")) > 1000, "1000 rows")
+    launched.child("master").suspend()
+
+    launched.signal(signal.SIGINT)
+
+    assert launched.wait() == 130
+    assert launched.ended_after_s < 2.0
+    assert "interrupted" in launched.message
+    place.assert_nothing_left()
+
+
 @pytest.mark.timeout(60)
 @pytest.mark.parametrize("options", [(), ("--local",)], ids=["distributed", "local"])
 @pytest.mark.parametrize("number", SIGNALS, ids=lambda number: number.name)
@@ -36,14 +58,17 @@ def test_a_signal_ends_the_run_within_two_seconds_with_a_readable_partial_result
 
 
 @pytest.mark.timeout(60)
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="looks into /proc")
 def test_a_second_ctrl_c_waits_for_nobody(place: Place) -> None:
     config = write_config(place.folder, stop_time=FAR_S)
     result = config.with_suffix(".csv")
     launched = place.start("launch", config)
     wait_until(lambda: row_count(result) > 1000, "1000 rows")
-    launched.child("master").suspend()  # so that nothing but the second one can end the run soon
+    master = launched.child("master")
+    master.suspend()  # so that it cannot do what the first one asks for
 
     launched.signal(signal.SIGINT)
+    wait_until(lambda: is_pending(master.pid, signal.SIGTERM), "what the launcher makes of the first one")
     launched.signal(signal.SIGINT)
 
     assert launched.wait() == 130

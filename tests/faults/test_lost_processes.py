@@ -78,7 +78,7 @@ def test_when_the_launcher_is_killed_its_children_end_by_themselves_and_remove_t
     launched.signal(signal.SIGKILL)
 
     assert launched.wait() == -signal.SIGKILL
-    place.assert_nothing_left(within_s=5.0)
+    place.assert_nothing_left(within_s=15.0)
     assert_is_what_one_process_calculates(place, result)
 
 
@@ -90,7 +90,7 @@ def test_a_launcher_that_is_killed_while_the_processes_start_leaves_nothing_eith
     launched.signal(signal.SIGKILL)
 
     launched.wait()
-    wait_until(lambda: not place.processes(), "the end of the children", 5.0)
+    wait_until(lambda: not place.processes(), "the end of the children", 15.0)
     # What they could not remove because nobody had told them whose it is, the next run removes.
     assert place.run("launch", write_config(place.folder, name="next", stop_time=0.01)).wait() == 0
     place.assert_nothing_left()
