@@ -15,7 +15,6 @@ The master never sees a value. Its work per grant depends on the number of nodes
 from __future__ import annotations
 
 import logging
-import math
 import operator
 import os
 import socket
@@ -44,6 +43,7 @@ from ..wire.profile import TIME_LINE_ENTRIES, MeshProfile, Welcome
 from ..wire.session import matches, undeclare_all
 from ..wire.values import json_encoding
 from ..wire.views import Command, CommandAnswer, LogLine, MeshInfo, MeshState, MeshStatus
+from .pacing import Clock, Pacer
 from .profiling import CLOCK, PAUSE, GrantWatch
 
 __all__ = ["Events", "Master"]
@@ -106,8 +106,8 @@ class Master:
         self._hold: int | None = None
         self._stop_asked = False
         self.watch: GrantWatch | None = None
-        self._pacer = _Pacer(plan, config.simulation.real_time_factor)
-        self._clock = _Clock()
+        self._pacer = Pacer(plan, config.simulation.real_time_factor)
+        self._clock = Clock()
         self._published = 0.0
         self._status_published = 0.0
         self._moved = time.monotonic()
@@ -447,49 +447,6 @@ class Master:
     def _close(self) -> None:
         undeclare_all(self._entities, self._grants, [self._status_publisher])
         self._inbox.close()
-
-
-class _Clock:
-    """Wall-clock time since the first point, pauses left out."""
-
-    def __init__(self) -> None:
-        self._before = 0.0
-        self._since: float | None = None
-
-    def start(self) -> None:
-        if self._since is None:
-            self._since = time.perf_counter()
-
-    def stop(self) -> None:
-        self._before = self.elapsed()
-        self._since = None
-
-    def elapsed(self) -> float:
-        return self._before + (time.perf_counter() - self._since if self._since is not None else 0.0)
-
-
-class _Pacer:
-    """Holds the grant back to the wall clock; a real-time factor of 0 never does."""
-
-    def __init__(self, plan: Plan, real_time_factor: float) -> None:
-        self._rate = real_time_factor / plan.grid.step_size
-        self._origin = 0
-        self._started = 0.0
-
-    def start(self, point: int) -> None:
-        """The wall clock and ``point`` belong together now."""
-        self._origin = point
-        self._started = time.perf_counter()
-
-    def limit(self, wanted: int) -> tuple[int, float]:
-        """The point that may be granted now, and how long until ``wanted`` may be, in s."""
-        if self._rate <= 0:
-            return wanted, math.inf
-        due = self._origin + (time.perf_counter() - self._started) * self._rate
-        allowed = math.floor(due) + 1
-        if allowed >= wanted:
-            return wanted, math.inf
-        return allowed, max(0.0005, (allowed - due) / self._rate)
 
 
 def _spoken(node: str) -> str:

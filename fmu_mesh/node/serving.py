@@ -8,9 +8,7 @@ waits for a query, and `status` answers while an FMU hangs.
 from __future__ import annotations
 
 import logging
-import os
 import queue
-import socket
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -23,11 +21,13 @@ from ..errors import FmuMeshError, InitializationFailed, StepFailed
 from ..model.description import Value, Variable
 from ..model.plan import NodePlan
 from ..wire.inbox import Inbox
-from ..wire.keys import Keys, escape, unescape
+from ..wire.keys import Keys
 from ..wire.messages import NodeReport
 from ..wire.session import ask, matches, undeclare_all
-from ..wire.values import ValueRefused, attachment, decode_value, encode_value, json_encoding
-from ..wire.views import ConnectionView, InstanceInfo, InstanceStatus, LogLine, SetAnswer, VariableView
+from ..wire.values import ValueRefused, attachment, encode_value, json_encoding
+from ..wire.views import InstanceStatus, LogLine, SetAnswer
+from .info import instance_info
+from .settings import checked_setting
 from .stepping import Runner
 from .streams import MAX_WAITING_ROWS, Batch, InstanceStreams, kind_of
 
@@ -213,7 +213,9 @@ class Server:
                 if what == "status":
                     query.reply(f"{root}/status", msgspec.json.encode(self._status(name)), encoding=json_encoding)
                 elif runner is not None:
-                    query.reply(f"{root}/info", msgspec.json.encode(self._info(runner)), encoding=json_encoding)
+                    query.reply(
+                        f"{root}/info", msgspec.json.encode(instance_info(self._plan, runner)), encoding=json_encoding
+                    )
         wanted = self._variables_matching(runner, asked) if runner is not None else []
         if runner is None or not wanted:
             query.drop()
@@ -280,7 +282,7 @@ class Server:
 
     def _take_put(self, runner: Runner, key: str, data: bytes) -> None:
         try:
-            variable, value = self._checked_setting(runner, key, data)
+            variable, value = checked_setting(runner, self._keys.instance(runner.name), key, data)
         except ValueRefused as refused:
             self._publish_log(LogLine(runner.name, "warning", "set", str(refused), runner.point))
             return
@@ -295,7 +297,9 @@ class Server:
             query.drop()
             return
         try:
-            variable, value = self._checked_setting(runner, key, query.payload.to_bytes() if query.payload else b"")
+            variable, value = checked_setting(
+                runner, self._keys.instance(runner.name), key, query.payload.to_bytes() if query.payload else b""
+            )
         except ValueRefused as refused:
             query.reply_err(str(refused))
             query.drop()
@@ -315,78 +319,7 @@ class Server:
 
         self._inbox.post(take)
 
-    def _checked_setting(self, runner: Runner, key: str, data: bytes) -> tuple[Variable, Value]:
-        """The variable and value of a setting.
-
-        Raises:
-            ValueRefused: with the reason.
-        """
-        parts = key.removeprefix(self._keys.instance(runner.name) + "/").split("/")
-        if len(parts) != 2 or "*" in key:
-            raise ValueRefused(f"'{key}' is not the key of one variable")
-        kind, name = parts[0], unescape(parts[1])
-        variable = runner.instance.description.variable(name)
-        if variable is None or kind_of(variable) != kind:
-            raise ValueRefused(f"'{runner.name}' has no variable '{name}' under '{kind}'")
-        if kind == "in" and name in runner.plan.inputs.names:
-            feed = next(feed for feed in runner.plan.feeds if name in {column[1] for column in feed.columns})
-            raise ValueRefused(
-                f"'{runner.name}.{name}' is connected to '{feed.source}'; only unconnected inputs can be set"
-            )
-        if kind == "param" and variable.variability != "tunable":
-            raise ValueRefused(
-                f"'{runner.name}.{name}' is a {variable.variability} parameter; only tunable ones can be set"
-            )
-        if kind not in ("in", "param"):
-            raise ValueRefused(f"'{runner.name}.{name}' is no input and no parameter, so it cannot be set")
-        try:
-            return variable, decode_value(data, variable)
-        except ValueRefused as refused:
-            raise ValueRefused(f"'{runner.name}.{name}': {refused}") from refused
-
     # --- views
-
-    def _info(self, runner: Runner) -> InstanceInfo:
-        description = runner.instance.description
-        return InstanceInfo(
-            instance=runner.name,
-            model_name=description.model_name,
-            description=description.description,
-            fmi_version=description.fmi_version,
-            kind=description.kind,
-            fmu=runner.plan.fmu,
-            generation_tool=description.generation_tool,
-            capabilities={
-                "can_handle_variable_step_size": description.can_handle_variable_step_size,
-                "can_get_and_set_state": description.can_get_and_set_state,
-                "can_serialize_state": description.can_serialize_state,
-            },
-            default_experiment=description.default_experiment,
-            step_size=self._plan.grid.step_size * runner.plan.step_points,
-            variables=tuple(
-                VariableView(
-                    v.name,
-                    f"{kind}/{escape(v.name)}",
-                    v.type,
-                    v.causality,
-                    v.variability,
-                    v.unit,
-                    v.start,
-                    v.description,
-                )
-                for v in description.variables
-                if (kind := kind_of(v)) is not None
-            ),
-            connections=tuple(
-                ConnectionView(f"{feed.source}.{source}", f"{runner.name}.{target}", feed.delay, factor, offset)
-                for feed in runner.plan.feeds
-                for source, target, factor, offset in feed.columns
-            ),
-            node=self._plan.node,
-            pid=os.getpid(),
-            host=socket.gethostname(),
-            problems=description.problems,
-        )
 
     def _status(self, name: str) -> InstanceStatus:
         runner = self._runners.get(name)

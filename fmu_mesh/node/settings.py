@@ -1,0 +1,47 @@
+"""What may be set from outside while a node runs: unconnected inputs and tunable parameters; all else with a reason."""
+
+from __future__ import annotations
+
+from ..model.description import Value, Variable
+from ..wire.keys import unescape
+from ..wire.values import ValueRefused, decode_value
+from .stepping import Runner
+from .streams import kind_of
+
+__all__ = ["checked_setting"]
+
+
+def checked_setting(runner: Runner, root: str, key: str, data: bytes) -> tuple[Variable, Value]:
+    """The variable and value of a setting that arrived for an instance.
+
+    Args:
+        runner: the instance.
+        root: what its keys start with.
+        key: the key that the value was sent to.
+        data: the value as JSON.
+
+    Raises:
+        ValueRefused: with the reason.
+    """
+    parts = key.removeprefix(root + "/").split("/")
+    if len(parts) != 2 or "*" in key:
+        raise ValueRefused(f"'{key}' is not the key of one variable")
+    kind, name = parts[0], unescape(parts[1])
+    variable = runner.instance.description.variable(name)
+    if variable is None or kind_of(variable) != kind:
+        raise ValueRefused(f"'{runner.name}' has no variable '{name}' under '{kind}'")
+    if kind == "in" and name in runner.plan.inputs.names:
+        feed = next(feed for feed in runner.plan.feeds if name in {column[1] for column in feed.columns})
+        raise ValueRefused(
+            f"'{runner.name}.{name}' is connected to '{feed.source}'; only unconnected inputs can be set"
+        )
+    if kind == "param" and variable.variability != "tunable":
+        raise ValueRefused(
+            f"'{runner.name}.{name}' is a {variable.variability} parameter; only tunable ones can be set"
+        )
+    if kind not in ("in", "param"):
+        raise ValueRefused(f"'{runner.name}.{name}' is no input and no parameter, so it cannot be set")
+    try:
+        return variable, decode_value(data, variable)
+    except ValueRefused as refused:
+        raise ValueRefused(f"'{runner.name}.{name}': {refused}") from refused
