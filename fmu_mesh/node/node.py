@@ -29,7 +29,7 @@ from ..errors import DeadlineExceeded, FmuMeshError, Interrupted, MeshLost, Step
 from ..model.instance import Instance
 from ..model.plan import NodePlan
 from ..model.transfer import Transfer
-from ..wire.frames import FrameReceiver, initial_values, needed_levels
+from ..wire.frames import FrameReceiver
 from ..wire.inbox import Inbox, Message
 from ..wire.keys import Keys
 from ..wire.messages import (
@@ -47,6 +47,7 @@ from ..wire.messages import (
 )
 from ..wire.profile import Welcome
 from ..wire.session import ask
+from .initialization import Initialization
 from .links import OutLink
 from .profiling import Profiler
 from .serving import Server
@@ -57,7 +58,7 @@ __all__ = ["Node"]
 log = logging.getLogger(__name__)
 
 _LOOK_S = 0.5
-_LAZY_S = 0.02
+_LAZY_S = 0.05
 _TELL_S = 0.1
 _LAST_WORD_S = 0.3
 _NO_MASTER_S = 1.0
@@ -97,8 +98,7 @@ class Node:
         self._runners: dict[str, Runner] = {}
         self._units: list[Unit] = []
         self._remote: dict[int, tuple[FrameReceiver, list[RemoteFeed]]] = {}
-        self._initial: dict[tuple[str, str], float | int] = {}
-        self._initial_seen: set[tuple[int, int]] = set()
+        self._initialization = Initialization(plan, self._wait_for_initial_value)
         capacity = sum(plan.window + 8 for _ in plan.links_in) + 4096
         self._inbox = Inbox(session, self._keys.inbox(plan.node), self._keys.wake(plan.node), capacity)
         self._progress_number = 0
@@ -225,14 +225,7 @@ class Node:
         grid = self._plan.grid
         for runner in self._runners.values():
             runner.instance.enter_initialization(grid.start_time, grid.stop_time, runner.plan.start_values)
-        levels = sorted({level for runner in self._runners.values() for level in runner.plan.initialization.values()})
-        for level in levels:
-            for runner in self._runners.values():
-                if level in runner.plan.initialization.values():
-                    self._set_initial_inputs(runner, below=level)
-                    self._get_initial_outputs(runner, level)
-        for runner in self._runners.values():
-            self._set_initial_inputs(runner, below=None)
+        self._initialization.run(self._runners.values())
         for runner in self._runners.values():
             runner.instance.exit_initialization()
             runner.bind()
@@ -240,50 +233,9 @@ class Node:
         self.server.started()
         self._tell_progress()
 
-    def _set_initial_inputs(self, runner: Runner, below: int | None) -> None:
-        """Set the inputs whose sources are known below a level (None: all); waits for those of other nodes."""
-        values: dict[str, float | int | bool | str] = {}
-        for feed in runner.plan.feeds:
-            for source, target, factor, offset in feed.columns:
-                level = self._level_of(feed.source, source)
-                if target in runner.plan.held or (below is not None and level >= below):
-                    continue
-                value = self._initial_value(feed.source, source)
-                values[target] = value if (factor, offset) == (1.0, 0.0) else value * factor + offset
-        if values:
-            runner.instance.set_values(values)
-
-    def _level_of(self, instance: str, variable: str) -> int:
-        if instance in self._runners:
-            return self._runners[instance].plan.initialization[variable]
-        link = next(receiver.link for receiver, _ in self._remote.values() if receiver.link.source == instance)
-        return link.levels[link.layout.names.index(variable)]
-
-    def _get_initial_outputs(self, runner: Runner, level: int) -> None:
-        names = [name for name, own in runner.plan.initialization.items() if own == level]
-        numbers: dict[str, float | int] = {
-            name: value
-            for name, value in zip(names, runner.instance.get_values(names), strict=True)
-            if not isinstance(value, str)
-        }
-        self._initial.update({(runner.name, name): value for name, value in numbers.items()})
-        for link in runner.out_links:
-            if level in needed_levels(link.link):
-                link.send_initial(level, numbers)
-
-    def _initial_value(self, instance: str, variable: str) -> float | int:
-        deadline = time.monotonic() + self._plan.timeouts.initialize
-        while (instance, variable) not in self._initial:
-            left = deadline - time.monotonic()
-            if left <= 0:
-                raise DeadlineExceeded(
-                    f"its initial value did not come within {self._plan.timeouts.initialize:g} s",
-                    instance=instance,
-                    variable=variable,
-                )
-            if (message := self._inbox.wait(left)) is not None:
-                self._take(message)
-        return self._initial[(instance, variable)]
+    def _wait_for_initial_value(self, left_s: float) -> None:
+        if (message := self._inbox.wait(left_s)) is not None:
+            self._take(message)
 
     # --- from point to point
 
@@ -310,7 +262,7 @@ class Node:
                 self._wait()
 
     def _flush_before_waiting(self) -> None:
-        """Send what a consumer could be waiting for; rows that are only recorded at least every 20 ms."""
+        """Send what a consumer could be waiting for; rows that are only recorded at least every 50 ms."""
         now = time.monotonic()
         lazy = self._waited_long or now - self._lazy_flushed > _LAZY_S
         if lazy:
@@ -351,9 +303,7 @@ class Node:
             self._heard = time.monotonic()
             self._grant = max(self._grant, min(point, self._plan.grid.last_point))
         elif kind == INITIAL:
-            link = self._remote[number][0].link
-            for name, value in initial_values(link, point, data).items():
-                self._initial[(link.source, name)] = value
+            self._initialization.take(self._remote[number][0].link, point, data)
         elif kind == FINISH:
             self._finished = True
         elif kind == ABORT:

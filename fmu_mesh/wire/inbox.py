@@ -25,7 +25,7 @@ Message = tuple[int, int, int, int, bytes]
 """Kind, link or node, count, point, and the whole message."""
 
 _WAKE: Final = HEADER.pack(WAKE, 0, 0, 0)
-_TIMER_PERIOD_S: Final = 0.1
+_TIMER_PERIOD_S: Final = 0.05
 
 
 class Inbox:
