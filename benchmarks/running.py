@@ -169,10 +169,10 @@ class Bench:
         file.write_text(task.to_json())
         python = sys.executable if module == OURS else str(self._peers.python)
         command = [python, "-m", f"benchmarks.contestants.{module}", str(file), *arguments]
-        environment = None if module == OURS else self._peers.variables()
+        environment = None if module == OURS else {**self._peers.variables(), "PYTHONPATH": str(ROOT)}
         with subprocess.Popen(
             command,
-            cwd=ROOT,
+            cwd=ROOT if module == OURS else self._folder,  # proxyfmu leaves its logs where it was started
             env=environment,
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,

@@ -69,9 +69,7 @@ def build(model_dir: Path, output_dir: Path) -> Path:
     """
     description = model_dir / "modelDescription.xml"
     if not description.is_file():
-        raise BuildError(
-            f"{description} is missing: a model's folder holds its modelDescription.xml and C files"
-        )
+        raise BuildError(f"{description} is missing: a model's folder holds its modelDescription.xml and C files")
     template = description.read_text(encoding="utf-8")
     identifier, source_names = read_code_names(template, description)
     sources = collect_sources(model_dir, source_names)

@@ -1,0 +1,1 @@
+"""Tests; the folders are not packages but for what others import."""

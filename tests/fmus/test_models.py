@@ -136,9 +136,7 @@ def failing_start(unit: Unit, values: dict[str, float]) -> Message:
 # ---- TransportDelay ----
 
 
-def delayed(
-    unit: Unit, d: float, x: Callable[[float], float], steps: Sequence[float]
-) -> list[tuple[float, float]]:
+def delayed(unit: Unit, d: float, x: Callable[[float], float], steps: Sequence[float]) -> list[tuple[float, float]]:
     """Run with x as the value at the end of each step (as Gauss-Seidel sets it); return rows of (time, y)."""
     unit.start({"d": d, "x": x(0.0)})
     reached, rows = 0.0, []
@@ -158,9 +156,7 @@ def delayed(
         pytest.param(varying_steps(6.0, 0.2), id="varying steps"),
     ],
 )
-def test_a_ramp_comes_out_exactly_d_later_whatever_the_steps(
-    steps: list[float], d: float, folder: Find
-) -> None:
+def test_a_ramp_comes_out_exactly_d_later_whatever_the_steps(steps: list[float], d: float, folder: Find) -> None:
     with Unit(folder("TransportDelay")) as unit:
         rows = delayed(unit, d, lambda t: 3.0 + 2.0 * t, steps)
 

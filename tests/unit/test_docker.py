@@ -130,9 +130,7 @@ def test_the_router_is_the_official_image_of_the_series_that_the_nodes_speak(com
     assert f"eclipse-zenoh=={version.rpartition('.')[0]}." in pins
 
 
-def test_every_process_meets_the_others_at_the_router(
-    compose: dict[str, Any], mesh_config: dict[str, Any]
-) -> None:
+def test_every_process_meets_the_others_at_the_router(compose: dict[str, Any], mesh_config: dict[str, Any]) -> None:
     listening = compose["services"]["router"]["command"]
     port = listening[listening.index("--listen") + 1].rpartition(":")[2]
     own = {name: service for name, service in compose["services"].items() if name != "router"}

@@ -44,9 +44,7 @@ def test_a_module_has_what_it_says_it_exports(name: str) -> None:
 def test_importing_the_whole_package_prints_nothing() -> None:
     program = "import importlib, sys\nfor name in sys.argv[1:]: importlib.import_module(name)"
 
-    done = subprocess.run(
-        [sys.executable, "-W", "error", "-c", program, *MODULES], capture_output=True, check=True
-    )
+    done = subprocess.run([sys.executable, "-W", "error", "-c", program, *MODULES], capture_output=True, check=True)
 
     assert (done.stdout, done.stderr) == (b"", b"")
 
@@ -74,9 +72,7 @@ def test_the_source_distribution_has_the_tests_and_what_they_need(tmp_path: Path
 
 
 def test_every_rule_that_is_switched_off_says_why() -> None:
-    lists = re.findall(
-        r'^(?:ignore|"[\w*/]+") = \[\n(.*?)^\]', text("pyproject.toml"), re.MULTILINE | re.DOTALL
-    )
+    lists = re.findall(r'^(?:ignore|"[\w*/]+") = \[\n(.*?)^\]', text("pyproject.toml"), re.MULTILINE | re.DOTALL)
     rules = [line for entries in lists for line in entries.splitlines()]
 
     assert rules
@@ -85,9 +81,7 @@ def test_every_rule_that_is_switched_off_says_why() -> None:
 
 def test_every_check_that_a_line_switches_off_says_why() -> None:
     switch = re.compile(r"#\s*(noqa|type: ignore|pragma: no)\b")
-    with_reason = re.compile(
-        r"#\s*(noqa: [A-Z0-9, ]+|type: ignore\[[\w, -]+\]|pragma: no (cover|branch))\W+\w"
-    )
+    with_reason = re.compile(r"#\s*(noqa: [A-Z0-9, ]+|type: ignore\[[\w, -]+\]|pragma: no (cover|branch))\W+\w")
     silent = [
         f"{path.relative_to(ROOT)}:{number}: {line.strip()}"
         for folder in ("fmu_mesh", "tests")
