@@ -186,7 +186,7 @@ class Master:
             self._turn(0.25)
         entries = TIME_LINE_ENTRIES // len(self._nodes) if self.watch is not None else 0
         for number, node in enumerate(self._nodes):
-            query = self._registered[node]
+            query = self._registered.pop(node)
             query.reply(query.key_expr, msgspec.json.encode(Welcome(number, entries)))
             query.drop()
 
@@ -277,6 +277,10 @@ class Master:
         """Tell the nodes why the run ends, and give them the time to end by themselves."""
         for publisher in self._grants:
             publisher.put(encode_abort(error.report()))
+        for query in self._registered.values():  # nodes that still wait to be let in
+            query.reply_err(str(error))
+            query.drop()
+        self._registered.clear()
 
     def _fail(self, error: FmuMeshError) -> None:
         if self._failure is None:
@@ -315,7 +319,7 @@ class Master:
             query.reply_err(
                 f"node '{registration.node}' ({where}) has another configuration, or other FMUs, than the master"
             )
-        elif registration.node in self._registered:
+        elif registration.node in self._registered or self._state != "starting":
             query.reply_err(f"node '{registration.node}' is there already; two processes run it")
         else:
             self._registered[registration.node] = query

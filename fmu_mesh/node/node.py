@@ -204,7 +204,7 @@ class Node:
             ask(self._session, self._keys.hello(node), b"", deadline_s, f"node '{node}'")
         registration = Registration(self._plan.node, self._plan.digest, os.getpid(), socket.gethostname())
         payload = msgspec.json.encode(registration)
-        answer = ask(self._session, self._keys.register, payload, deadline_s, "the master, with all other nodes there")
+        answer = ask(self._session, self._keys.register, payload, deadline_s, "the master", 2 * deadline_s)
         welcome = decode_json(answer, Welcome)
         self._progress_number = welcome.number
         self._heard = time.monotonic()

@@ -140,7 +140,7 @@ class Recorder:
             ask(self._session, self._keys.hello(node), b"", deadline_s, f"node '{node}'")
         registration = Registration(RECORDER, self._plan.digest, os.getpid(), socket.gethostname())
         payload = msgspec.json.encode(registration)
-        answer = ask(self._session, self._keys.register, payload, deadline_s, "the master")
+        answer = ask(self._session, self._keys.register, payload, deadline_s, "the master", 2 * deadline_s)
         self._number = decode_json(answer, Welcome).number
 
     def _record(self) -> None:

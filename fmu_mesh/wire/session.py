@@ -118,7 +118,9 @@ def undeclare_all(*entities: Iterable[_Declared]) -> None:
         entity.undeclare()
 
 
-def ask(session: zenoh.Session, key: str, payload: bytes, deadline_s: float, what: str) -> bytes:
+def ask(  # noqa: PLR0913, PLR0917  the parts of one question
+    session: zenoh.Session, key: str, payload: bytes, deadline_s: float, what: str, answer_s: float | None = None
+) -> bytes:
     """Query ``key`` until somebody is there to answer, and return the answer's payload.
 
     A query sent before the queryable is known gets no reply at all, so this waits until a queryable matches, and asks
@@ -130,6 +132,7 @@ def ask(session: zenoh.Session, key: str, payload: bytes, deadline_s: float, wha
         payload: what goes with the query.
         deadline_s: how long to wait for an answer, in s.
         what: what is being waited for, for the error.
+        answer_s: how long somebody who is there may take to answer, in s, if that is longer.
 
     Raises:
         DeadlineExceeded: nobody answered within ``deadline_s`` seconds.
@@ -137,7 +140,7 @@ def ask(session: zenoh.Session, key: str, payload: bytes, deadline_s: float, wha
     """
     end = time.monotonic() + deadline_s
     changed = threading.Event()
-    with session.declare_querier(key, timeout=deadline_s) as querier:
+    with session.declare_querier(key, timeout=answer_s or deadline_s) as querier:
         listener = querier.declare_matching_listener(lambda _status: changed.set())
         try:
             while (left := end - time.monotonic()) > 0:

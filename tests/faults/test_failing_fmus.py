@@ -108,16 +108,16 @@ def test_status_is_answered_while_an_fmu_does_not_return(place: Place, faulty: P
 
     with zenoh.open(settings) as session:
 
-        def hanging(instance: str) -> dict[str, Any] | None:
+        def status_of(instance: str, activity: str) -> dict[str, Any] | None:
             for reply in session.get(f"fmu_mesh/pair/{instance}/status", timeout=5.0):
                 if reply.ok is not None:
                     status: dict[str, Any] = json.loads(reply.ok.payload.to_bytes())
-                    waits = "waiting at point" in status["activity"]
-                    return status if waits or "in doStep at point 1000 for " in status["activity"] else None
+                    return status if activity in status["activity"] else None
             return None
 
-        status = wait_until(lambda: hanging("faulty"), "the status of an FMU that hangs")
-        neighbour = wait_until(lambda: hanging("pendulum"), "the status of an FMU that waits")
+        hanging = "in doStep at point 1000 for "
+        status = wait_until(lambda: status_of("faulty", hanging), "the status of an FMU that hangs")
+        neighbour = wait_until(lambda: status_of("pendulum", "waiting at point"), "the status of an FMU that waits")
     launched.signal(signal.SIGINT)
 
     assert (status["state"], status["point"], status["time"]) == ("running", 1000, 1.0)

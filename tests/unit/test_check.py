@@ -68,6 +68,9 @@ Execution order within one point
   pendulum -> sum -> loop -> inner -> outer
   cycle: sum, loop
 
+Groups
+  sum, loop form a cycle over 2 nodes: each point costs a round trip; `group: auto` would put them into one
+
 Initialization
   level 0: pendulum.a
   level 1: sum.y

@@ -249,8 +249,8 @@ TEXTS = [
     ),
     pytest.param(
         "- 1\n",
-        "mesh.yaml:1: a list; expected a mapping with mesh, simulation, instances, connections, record, zenoh, "
-        "timeouts, version",
+        "mesh.yaml:1: a list; expected a mapping with mesh, simulation, instances, group, connections, record, "
+        "zenoh, timeouts and 1 more",
         id="a list",
     ),
     pytest.param(
