@@ -14,6 +14,7 @@ from ..model.grouping import automatic_nodes
 from ..model.plan import Plan
 from ..model.schema import schema_text
 from ..model.system import Connection, SystemInstance
+from .display import say
 from .tables import pairs, table
 
 __all__ = ["add_commands", "plan_page"]
@@ -35,7 +36,7 @@ def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.Arg
 
 
 def _check(arguments: argparse.Namespace) -> int:
-    plan = prepare(arguments.config, Options(start_values=tuple(arguments.set), window=arguments.window))
+    plan = prepare(arguments.config, Options(start_values=tuple(arguments.set), window=arguments.window), say)
     print("\n".join(plan_page(plan)))
     print(f"\nOK: {arguments.config} can run.")
     return 0

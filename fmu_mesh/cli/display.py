@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import ctypes
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -14,7 +19,7 @@ from ..launch.events import End, Event, Log, Ready, Status
 from ..model.plan import Plan
 from ..wire.views import LogLine, MeshStatus
 
-__all__ = ["Display", "summary"]
+__all__ = ["Display", "say", "stdout_as_stderr", "summary"]
 
 _STYLES = {"ok": "dim", "warning": "yellow", "discard": "yellow", "error": "red", "fatal": "red"}
 
@@ -75,7 +80,8 @@ class Display:
     def output(self, name: str, text: str) -> None:
         """Show a line that a process wrote by itself."""
         if text:
-            self._console.print(f"[dim]{escape(name)} |[/] {escape(text)}")
+            shown = "".join(c if c.isprintable() or c == "\t" else "\N{REPLACEMENT CHARACTER}" for c in text)
+            self._console.print(f"[dim]{escape(name)} |[/] {escape(shown)}")
 
     def _status(self, status: MeshStatus) -> None:
         text: str = status.state
@@ -85,6 +91,25 @@ class Display:
                 f"real-time factor {status.real_time_factor:.3g}" + ("  paused" if status.state == "paused" else "")
             )
         self._progress.update(self._task, completed=status.point, text=text)
+
+
+def say(text: str) -> None:
+    """Tell what takes its time before a run, on standard error."""
+    print(f"fmu-mesh: {text}", file=sys.stderr, flush=True)
+
+
+@contextmanager
+def stdout_as_stderr() -> Iterator[None]:
+    """While inside, what an FMU in this process prints goes to standard error: standard output is for results."""
+    sys.stdout.flush()
+    stdout = os.dup(1)
+    os.dup2(2, 1)
+    try:
+        yield
+    finally:
+        ctypes.CDLL(None).fflush(None)  # what the FMU printed may still be in the buffer of the C library
+        os.dup2(stdout, 1)
+        os.close(stdout)
 
 
 def summary(plan: Plan, *, point: int, seconds: float, rows: int, result_file: str | None) -> list[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import signal
 import sys
 import threading
@@ -10,7 +11,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from ..errors import ConfigurationError, FmuMeshError
+from ..errors import ConfigurationError, FmuError, FmuMeshError
 from ..fmu import LogMessage
 from ..launch.events import End, Event, EventWriter
 from ..launch.launcher import Launcher
@@ -22,7 +23,7 @@ from ..model.plan import Plan
 from ..wire.profile import MeshProfile
 from ..wire.router import run_router
 from ..wire.views import LogLine
-from .display import Display, summary
+from .display import Display, say, stdout_as_stderr, summary
 from .plotting import plot_results, require_matplotlib
 from .profiling import add_profile, show_profile
 
@@ -88,7 +89,7 @@ def _launch(arguments: argparse.Namespace) -> int:
     options = _options(arguments)
     if arguments.local and options.profile:
         raise ConfigurationError("--profile measures nodes, and --local has none", hint="Leave one of them out.")
-    plan = prepare(arguments.config, options)
+    plan = prepare(arguments.config, options, say)
     profile: MeshProfile | None = None
     with Display(plan, show_progress=not arguments.no_progress) as display:
         if arguments.local:
@@ -122,8 +123,14 @@ def _run_local(plan: Plan, display: Display) -> tuple[int, float, int]:
         line = LogLine(message.instance, message.status, message.category, message.message, mesh.point)
         display.log(line)
 
-    mesh = LocalMesh(plan, log, display.progress)
-    with ended_by_signals(mesh.interrupt, mesh.clean_up, watch_stdin=False):
+    def end(error: FmuError) -> None:
+        """The thread in the FMU cannot be got back."""
+        mesh.clean_up()
+        print(f"fmu-mesh: {error}", file=sys.stderr, flush=True)
+        os._exit(error.exit_code)
+
+    mesh = LocalMesh(plan, log, display.progress, on_hang=end)
+    with stdout_as_stderr(), ended_by_signals(mesh.interrupt, mesh.clean_up, watch_stdin=False):
         mesh.run()
     return mesh.point, mesh.seconds, mesh.rows
 
@@ -153,7 +160,7 @@ def _master(arguments: argparse.Namespace) -> int:
         return 0
     if arguments.plot is not None:
         require_matplotlib()
-    plan = prepare(arguments.config, options)
+    plan = prepare(arguments.config, options, say)
     ends: list[End] = []
 
     def show(event: Event) -> None:

@@ -28,7 +28,8 @@ from ..errors import InitializationFailed, LoadFailed, StepFailed
 from ..model.description import ModelDescription, Value, Variable, VariableType
 from ..model.ring import Layout, Ring
 from ..simtime import TimeGrid
-from .archive import extract
+from .archive import Terms
+from .sources import extract
 
 __all__ = ["Fmi2Instance", "LogMessage"]
 
@@ -102,6 +103,7 @@ class Fmi2Instance:
         description: what `read_description` returned for it.
         folder: an existing private folder to extract into.
         log: called with every log message, on the thread that calls the FMU.
+        terms: what the FMU has to keep to.
 
     Raises:
         LoadFailed: the FMU cannot be extracted, loaded or instantiated.
@@ -114,6 +116,7 @@ class Fmi2Instance:
         description: ModelDescription,
         folder: Path,
         log: LogSink = lambda _message: None,
+        terms: Terms = Terms(),  # noqa: B008 a frozen Struct
     ) -> None:
         self.name = name
         self._description = description
@@ -124,7 +127,7 @@ class Fmi2Instance:
         self._state: Literal["instantiated", "initialization", "stepping", "failed", "closed"] = "instantiated"
         self._hot: _HotLoop | None = None
         self._fmu: FMU2Slave | None = None
-        self._extracted = extract(path, folder)
+        self._extracted = extract(path, folder, terms)
         key = name.encode()
         if key in _instances:
             msg = f"two instances of one process have the name '{name}'"

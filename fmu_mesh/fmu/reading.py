@@ -6,7 +6,6 @@ that a strict validator finds are kept in `ModelDescription.problems`, and the F
 
 from __future__ import annotations
 
-import zipfile
 from pathlib import Path
 from typing import cast
 
@@ -17,63 +16,29 @@ from fmpy.model_description import ValidationError as FmpyValidationError
 
 from ..errors import LoadFailed
 from ..model.description import DefaultExperiment, ModelDescription, Value, Variable, VariableType
+from .archive import Terms
+from .examining import examine, require_library
 
 __all__ = ["read_description"]
 
-_MAX_DESCRIPTION_SIZE = 64 * 2**20
 _TYPES: tuple[VariableType, ...] = ("Real", "Integer", "Boolean", "String", "Enumeration")
 
 
-def read_description(path: Path) -> ModelDescription:
+def read_description(path: Path, terms: Terms = Terms()) -> ModelDescription:  # noqa: B008 a frozen Struct
     """Read the model description of the FMU at ``path``.
 
     Raises:
         LoadFailed: it is no FMU, or one that cannot run here; the message says which and what would help.
     """
-    names = _archive_names(path)
-    if "modelDescription.xml" not in names:
-        raise LoadFailed(
-            f"'{path}' is a ZIP archive, but has no modelDescription.xml at its root, so it is no FMU.",
-            hint="An FMU that was zipped inside a folder of its own must be zipped again without that folder.",
-        )
+    contents = examine(path, terms)
     source, problems = _parse(path)
     if source.fmiVersion is None or not source.fmiVersion.startswith("2."):
         raise LoadFailed(f"'{path}' is an FMI {source.fmiVersion} FMU; FMI 2.0 co-simulation is what can run today.")
     if source.coSimulation is None:
         raise LoadFailed(f"'{path}' is for model exchange only; export it for co-simulation.")
     platforms = tuple(fmpy.supported_platforms(str(path)))
-    if fmpy.platform not in platforms:
-        there = ", ".join(platforms) or "no platform at all"
-        raise LoadFailed(
-            f"'{path}' has no binary for this platform ({fmpy.platform}); it has: {there}.",
-            hint="Export it for this platform, or compile its sources into it if it has some.",
-        )
-    library = f"binaries/{fmpy.platform}/{source.coSimulation.modelIdentifier}{fmpy.sharedLibraryExtension}"
-    if library not in names:
-        raise LoadFailed(
-            f"'{path}' has no '{library}', although its model identifier is "
-            f"'{source.coSimulation.modelIdentifier}' (FMI 2.0, 2.3: the library must have that name)."
-        )
+    require_library(path, contents.names, source.coSimulation.modelIdentifier or "", source.fmiVersion)
     return _convert(source, platforms, problems)
-
-
-def _archive_names(path: Path) -> frozenset[str]:
-    """Names of all files in the archive."""
-    try:
-        with zipfile.ZipFile(path) as archive:
-            for entry in archive.infolist():
-                if entry.filename == "modelDescription.xml" and entry.file_size > _MAX_DESCRIPTION_SIZE:
-                    raise LoadFailed(
-                        f"the modelDescription.xml of '{path}' has {entry.file_size} bytes; "
-                        f"the limit is {_MAX_DESCRIPTION_SIZE}."
-                    )
-            return frozenset(archive.namelist())
-    except FileNotFoundError as error:
-        raise LoadFailed(f"'{path}' does not exist.") from error
-    except zipfile.BadZipFile as error:
-        raise LoadFailed(f"'{path}' is no ZIP archive, so it is no FMU.") from error
-    except OSError as error:
-        raise LoadFailed(f"'{path}' cannot be read: {error.strerror}.") from error
 
 
 def _parse(path: Path) -> tuple[FmpyDescription, tuple[str, ...]]:

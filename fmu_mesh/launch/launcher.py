@@ -21,7 +21,7 @@ from typing import IO
 
 import msgspec
 
-from ..errors import FmuMeshError, Interrupted, MeshLost, from_report
+from ..errors import FmuError, FmuMeshError, Interrupted, MeshLost, from_report
 from ..model.plan import RECORDER, Plan
 from ..wire.runtime import MeshNote, remove_run_folder, remove_stale_folders, run_folder, runtime_folder, write_note
 from .events import End, Event, Ready, Status, decode_event
@@ -31,8 +31,11 @@ __all__ = ["Launcher", "Output"]
 
 _MASTER = "the master"
 _REPORT_S = 1.5
+_TOLD_S = 8.0
 _INTERRUPT_S = 0.9
 _KILL_S = 0.7
+_SHOWN_LINES = 200
+_LINE_BYTES = 1000
 _SILENCE_S = 10.0
 """The master says something ten times a second; after this time without a word it is taken for lost."""
 
@@ -121,7 +124,7 @@ class Launcher:
         if name == _MASTER:
             process.start(lambda line: self._take_event(line, folder), self._take_output, self._take_exit)
         else:
-            process.start(lambda line: self._take_output(name, line), self._take_output, self._take_exit)
+            process.start(lambda line: self._take_output(name, line), self._take_output, self._take_exit, limited=True)
 
     # --- what happens; all on the thread that called `run`
 
@@ -178,7 +181,9 @@ class Launcher:
         if any(name == _MASTER for name, _, _ in self._lost):
             return True
         # A node is gone: the master sees it within milliseconds and says so; if it does not, we do.
-        if self._lost and now - self._lost[0][2] > _REPORT_S:
+        # One that ended because of its FMU has told the master, which may have to wait for its recorder before it ends.
+        told = bool(self._lost) and self._lost[0][1] == FmuError.exit_code
+        if self._lost and now - self._lost[0][2] > (_TOLD_S if told else _REPORT_S):
             return True
         if self._interrupted_at is not None and now - self._interrupted_at > _INTERRUPT_S:
             return True
@@ -285,8 +290,13 @@ class _Process:
         on_line: Callable[[bytes], None],
         on_error_line: Callable[[str, bytes], None],
         on_exit: Callable[[str, int], None],
+        *,
+        limited: bool = False,
     ) -> None:
-        """Start it in a session of its own, so that Ctrl-C reaches only the launcher."""
+        """Start it in a session of its own, so that Ctrl-C reaches only the launcher.
+
+        Where it is ``limited``, it may hold an FMU that writes without end: all is read, and the beginning handed on.
+        """
         self._popen = popen = subprocess.Popen(
             self._command,
             stdin=subprocess.PIPE,
@@ -296,11 +306,10 @@ class _Process:
         )
         assert popen.stdout is not None
         assert popen.stderr is not None
+        read = self._read_beginning if limited else self._read
         readers = [
-            threading.Thread(target=self._read, args=(popen.stdout, on_line), daemon=True),
-            threading.Thread(
-                target=self._read, args=(popen.stderr, lambda line: on_error_line(self.name, line)), daemon=True
-            ),
+            threading.Thread(target=read, args=(popen.stdout, on_line), daemon=True),
+            threading.Thread(target=read, args=(popen.stderr, lambda line: on_error_line(self.name, line)), daemon=True),
         ]
         waiter = threading.Thread(target=self._wait, args=(readers, on_exit), daemon=True)
         self._threads = [*readers, waiter]
@@ -329,6 +338,16 @@ class _Process:
     def _read(self, pipe: IO[bytes], on_line: Callable[[bytes], None]) -> None:
         for line in pipe:
             self._post(partial(on_line, line))
+
+    def _read_beginning(self, pipe: IO[bytes], on_line: Callable[[bytes], None]) -> None:
+        """Read all of it, so that the process never waits, but hand on `_SHOWN_LINES` lines only."""
+        count = 0
+        while line := pipe.readline(_LINE_BYTES):
+            count += 1
+            if count <= _SHOWN_LINES:
+                self._post(partial(on_line, line))
+            elif count == _SHOWN_LINES + 1:
+                self._post(partial(on_line, b"(it writes a lot; nothing more of it is shown)"))
 
     def _wait(self, readers: Sequence[threading.Thread], on_exit: Callable[[str, int], None]) -> None:
         assert self._popen is not None

@@ -6,16 +6,19 @@ a distributed run must equal in every float.
 
 from __future__ import annotations
 
+import logging
 import shutil
 import tempfile
 import time
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
 
-from ..errors import FmuMeshError, Interrupted, StepFailed
-from ..fmu import Fmi2Instance, LogMessage
+from ..errors import FmuError, FmuMeshError, Interrupted, StepFailed
+from ..fmu import Fmi2Instance, LogMessage, Terms
+from ..fmu.guard import CallWatch, Guarded, floating_point_changed, restore_floating_point
 from ..model.description import Value
 from ..model.instance import Instance
 from ..model.plan import Plan
@@ -25,6 +28,8 @@ from ..record.recorder import unwritable
 from ..simtime import TimeGrid
 
 __all__ = ["LocalMesh"]
+
+log = logging.getLogger(__name__)
 
 _ROWS = 1024
 
@@ -37,6 +42,8 @@ class LocalMesh:
         log: called with every log message of an FMU.
         progress: called with the point now and then.
         open_instance: opens an instance by name, where it is not the FMU of the plan; this closes it.
+        on_hang: called on another thread when an FMU does not return in time, with what was recorded up to then in the
+            result file; the thread in the FMU cannot be got back, so only the end of the process is left to do.
 
     Attributes:
         point: the last point reached.
@@ -50,6 +57,7 @@ class LocalMesh:
         log: Callable[[LogMessage], None] = lambda _message: None,
         progress: Callable[[int], None] = lambda _point: None,
         open_instance: Callable[[str], Instance] | None = None,
+        on_hang: Callable[[FmuError], None] = lambda error: log.error("%s", error),
     ) -> None:
         self.point = 0
         self.rows = 0
@@ -58,6 +66,9 @@ class LocalMesh:
         self._log = log
         self._progress = progress
         self._open_instance = open_instance
+        self._on_hang = on_hang
+        self._stepping = ""
+        self._save: Callable[[], None] = lambda: None
         self._stop: str | None = None
         self._folder: Path | None = None
 
@@ -89,30 +100,45 @@ class LocalMesh:
         types = {name: {v.name: v.type for v in i.description.variables} for name, i in plan.system.instances.items()}
         columns = [(f"{instance}.{variable}", types[instance][variable]) for instance, variable in recorded]
         members: dict[str, _Member] = {}
-        with tempfile.TemporaryDirectory(prefix="fmu_mesh-") as folder:
+        watch = CallWatch(self._take_hang)
+        with tempfile.TemporaryDirectory(prefix="fmu_mesh-") as folder, closing(watch):
             self._folder = Path(folder)
             file = CsvFile(Path(plan.system.result_file), columns) if plan.system.result_file is not None else None
             try:
                 for name in plan.order:
-                    members[name] = _Member(plan, name, self._open(name, Path(folder)))
+                    members[name] = _Member(plan, name, self._guarded(name, Path(folder), watch))
                 self._initialize(members)
                 started = time.perf_counter()
                 try:
-                    self._loop(members, file)
+                    with watch.stepping(lambda: (self._stepping, self.point), plan.system.config.timeouts.step):
+                        self._loop(members, file)
                 finally:
                     self.seconds = time.perf_counter() - started
             finally:
-                for member in members.values():
-                    member.instance.close()
                 if file is not None:
                     self.rows = file.rows
                     _close(file)
+                for member in members.values():
+                    member.instance.close()
 
     def _open(self, name: str, folder: Path) -> Instance:
         if self._open_instance is not None:
             return self._open_instance(name)
         system = self._plan.system.instances[name]
-        return Fmi2Instance(Path(system.fmu), name, system.description, folder, self._log)
+        terms = Terms(self._plan.system.config.limits, self._plan.system.config.instances[name].sha256)
+        return Fmi2Instance(Path(system.fmu), name, system.description, folder, self._log, terms)
+
+    def _guarded(self, name: str, folder: Path, watch: CallWatch) -> Guarded:
+        return Guarded(name, lambda: self._open(name, folder), watch, self._plan.system.config.timeouts)
+
+    def _take_hang(self, error: FmuError) -> None:
+        """From the watching thread: the main thread is in an FMU, and nothing of this object changes any more."""
+        if self._stepping:
+            error.point, error.time = self.point, self._plan.grid.time(self.point)
+        self._save()
+        if self.rows:
+            error.hint = f"{error.hint} What was recorded ({self.rows} rows) is in '{self._plan.system.result_file}'."
+        self._on_hang(error)
 
     def _initialize(self, members: dict[str, _Member]) -> None:
         grid = self._plan.grid
@@ -134,6 +160,15 @@ class LocalMesh:
         recorded = [(members[instance], variable) for instance, variable in plan.system.recorded]
         buffer: list[list[Value]] = []
         first = 0
+
+        def save() -> None:
+            if file is not None:
+                if buffer:
+                    _write(file, grid, first, buffer)
+                self.rows = file.rows
+                _close(file)
+
+        self._save = save
         try:
             for point in range(grid.last_point + 1):
                 self.point = point
@@ -147,12 +182,13 @@ class LocalMesh:
                     raise Interrupted(self._stop, point=point, time=grid.time(point))
                 if point == grid.last_point:
                     break
-                for member in members.values():
+                for self._stepping, member in members.items():
                     member.step_from(point, members)
         except StepFailed as error:
             error.point, error.time = self.point, grid.time(self.point)
             raise
         finally:
+            self._save = lambda: None
             if file is not None and buffer:
                 _write(file, grid, first, buffer)
         self._progress(self.point)
@@ -203,6 +239,8 @@ class _Member:
             else:
                 self._inputs.integers[0, layout.integers.index(c.target.name)] = value
         self.instance.do_step(self.step)
+        if floating_point_changed():
+            restore_floating_point()
         self.step += 1
 
 

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 import msgspec
 from msgspec.structs import replace
 
 from ..errors import ConfigurationError, Finding, LoadFailed
-from ..fmu import read_description
-from ..model.config import ZenohConfig
+from ..fmu import PLATFORM, Terms, compile_sources, read_description
+from ..model.config import InstanceConfig, ZenohConfig
 from ..model.description import ModelDescription
 from ..model.findings import nearest_file
 from ..model.loading import LoadedConfig, examine
@@ -38,15 +38,24 @@ class Options(msgspec.Struct, frozen=True):
     profile: bool = False
 
 
-def prepare(path: Path, options: Options = Options()) -> Plan:  # noqa: B008 a frozen Struct
+def prepare(
+    path: Path,
+    options: Options = Options(),  # noqa: B008 a frozen Struct
+    tell: Callable[[str], None] = lambda _text: None,
+) -> Plan:
     """Read, check and plan the configuration at ``path``.
+
+    Args:
+        path: the YAML file.
+        options: what the command line changes.
+        tell: called with what takes its time, such as compiling an FMU, before it begins.
 
     Raises:
         ConfigurationError: with everything that is wrong with it or its FMUs.
     """
     loaded, findings = examine(path, options.start_values)
     loaded = _with_options(loaded, options)
-    descriptions, unreadable = _descriptions(loaded)
+    descriptions, unreadable = _descriptions(loaded, tell)
     findings.merge(unreadable)
     system = build(loaded, descriptions, tuple(findings))
     return make_plan(system, window=options.window, file=str(path))
@@ -67,28 +76,50 @@ def _with_options(loaded: LoadedConfig, options: Options) -> LoadedConfig:
     return replace(loaded, config=config)
 
 
-def _descriptions(loaded: LoadedConfig) -> tuple[dict[str, ModelDescription], Sequence[Finding]]:
+def _descriptions(
+    loaded: LoadedConfig, tell: Callable[[str], None]
+) -> tuple[dict[str, ModelDescription], Sequence[Finding]]:
     """The description of every instance whose FMU can be read, and a finding for every other."""
-    cache: dict[Path, ModelDescription | LoadFailed] = {}
+    cache: dict[tuple[Path, Terms], ModelDescription | LoadFailed] = {}
     descriptions: dict[str, ModelDescription] = {}
     findings = []
     for name, instance in loaded.config.instances.items():
         if not instance.fmu:
             continue  # what stands there instead is a finding already
-        path = loaded.resolve(instance.fmu)
-        if path not in cache:
-            try:
-                cache[path] = read_description(path)
-            except LoadFailed as error:
-                cache[path] = error
-        found = cache[path]
+        path, terms = loaded.resolve(instance.fmu), Terms(loaded.config.limits, instance.sha256)
+        if (path, terms) not in cache:
+            cache[path, terms] = _description(path, terms, tell)
+        found = cache[path, terms]
         if isinstance(found, LoadFailed):
             text = found.message.rstrip(".") + (f" ({found.hint.rstrip('.')})" if found.hint else "")
             expected = "an FMI 2.0 co-simulation FMU for this platform"
             findings.append(loaded.finding(f"instances.{name}.fmu", text, expected, _similar(path)))
         else:
             descriptions[name] = found
+            findings += _strict_findings(loaded, name, instance, found)
     return descriptions, findings
+
+
+def _description(path: Path, terms: Terms, tell: Callable[[str], None]) -> ModelDescription | LoadFailed:
+    """The description of an FMU that can run here, once its sources are compiled if it has no binary; or why not."""
+    try:
+        description = read_description(path, terms)
+        if PLATFORM not in description.platforms:
+            tell(f"'{path}' has no binary for this platform ({PLATFORM}): its sources are compiled, unless they were")
+            compile_sources(path, terms)
+    except LoadFailed as error:
+        return error
+    return description
+
+
+def _strict_findings(
+    loaded: LoadedConfig, name: str, instance: InstanceConfig, description: ModelDescription
+) -> Iterable[Finding]:
+    """The problems of an FMU, where the configuration says that they are errors."""
+    strict = instance.strict if instance.strict is not None else loaded.config.strict
+    for problem in description.problems if strict else ():
+        text = " ".join(problem.split())
+        yield loaded.finding(f"instances.{name}.fmu", text, "an FMU without problems, or `strict: false`")
 
 
 def _similar(path: Path) -> str | None:

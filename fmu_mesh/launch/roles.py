@@ -5,17 +5,19 @@ The same functions serve `launch`, which starts these processes, and a person wh
 
 from __future__ import annotations
 
+import logging
 import os
 import socket
 import sys
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from pathlib import Path
 
 import msgspec
 
-from ..errors import ConfigurationError, FmuMeshError, StepFailed
-from ..fmu import Fmi2Instance, LogMessage, read_description
+from ..errors import ConfigurationError, FmuError, FmuMeshError, StepFailed
+from ..fmu import Fmi2Instance, LogMessage, Terms, read_description
+from ..fmu.guard import CallWatch, Guarded
 from ..master.master import Master
 from ..master.profiling import GrantWatch
 from ..model.findings import listed, nearest
@@ -23,7 +25,16 @@ from ..model.loading import load
 from ..model.plan import RECORDER, NodePlan, Plan
 from ..node.node import Node
 from ..record.recorder import Recorder
-from ..wire.runtime import MeshNote, leave_run_folder, run_folder, socket_endpoint, write_note
+from ..wire.runtime import (
+    MeshNote,
+    enter_run_folder,
+    fmu_folder,
+    leave_run_folder,
+    run_folder,
+    socket_endpoint,
+    tidy_run_folder,
+    write_note,
+)
 from ..wire.session import open_session, own_endpoints
 from ..wire.views import LogLine, MeshStatus
 from .events import End, Event, Log, Ready, Status
@@ -32,6 +43,8 @@ from .process import die_with_parent, ended_by_signals
 from .wiring import MASTER, wiring
 
 __all__ = ["BY_HAND", "run_master", "run_node"]
+
+log = logging.getLogger(__name__)
 
 BY_HAND = "hand"
 """Name of the run whose processes were started by hand."""
@@ -72,21 +85,27 @@ class _NodeProcess:
         self._zenoh = zenoh_section(load(config_file), options)
         self._folder = folder
         self._instances: list[Fmi2Instance] = []
+        self._guarded: list[Guarded] = []
+        self._child = False
         self._node: Node | None = None
         self._interrupted: str | None = None
 
     def run(self, *, child: bool) -> None:
         """Run the node; ``child`` tells whether a launcher watches this process."""
+        self._child = child
         with ended_by_signals(self._interrupt, self._clean_up, watch_stdin=child), ExitStack() as stack:
             stack.callback(leave_run_folder, self._folder)
+            tidy_run_folder(self._folder)
             _refuse_second(self._folder, self._plan.node, f"node '{self._plan.node}' of mesh '{self._plan.mesh}'")
+            enter_run_folder(self._folder, self._plan.node)
             session = open_session(
                 wiring(self._zenoh, self._config_file, self._folder, self._plan.node, self._plan.peers())
             )
             stack.callback(session.close)
+            self._watch = stack.enter_context(closing(CallWatch(self._take_hang)))
             stack.callback(self._close_instances)
             self._node = node = Node(self._plan, session, self._open)
-            node.server.on_hang = self._exit_hung
+            node.server.on_hang = self._take_hang
             if self._interrupted is not None:
                 node.interrupt(self._interrupted)
             try:
@@ -96,12 +115,18 @@ class _NodeProcess:
                 error.told = child and node.failure_is_known
                 raise
 
-    def _open(self, name: str) -> Fmi2Instance:
+    def _open(self, name: str) -> Guarded:
         item = self._plan.instance(name)
-        path = Path(item.fmu)
-        instance = Fmi2Instance(path, name, read_description(path), self._folder / "fmus", self._log)
-        self._instances.append(instance)
-        return instance
+        path, terms = Path(item.fmu), Terms(self._plan.limits, item.sha256)
+        description = read_description(path, terms)
+
+        def instantiate() -> Fmi2Instance:
+            instance = Fmi2Instance(path, name, description, fmu_folder(self._folder), self._log, terms)
+            self._instances.append(instance)
+            return instance
+
+        self._guarded.append(Guarded(name, instantiate, self._watch, self._plan.timeouts))
+        return self._guarded[-1]
 
     def _log(self, message: LogMessage) -> None:
         point = max(message.step, 0) * self._plan.instance(message.instance).step_points
@@ -110,7 +135,7 @@ class _NodeProcess:
             self._node.server.log_message(line)
 
     def _close_instances(self) -> None:
-        for instance in self._instances:
+        for instance in self._guarded:
             instance.close()
 
     def _interrupt(self, reason: str) -> None:
@@ -124,7 +149,11 @@ class _NodeProcess:
             instance.remove_files()
         leave_run_folder(self._folder)
 
-    def _exit_hung(self) -> None:
+    def _take_hang(self, error: FmuError) -> None:
+        """From a watching thread: an FMU has not returned in time, and only the end of the process gets it back."""
+        known = self._node is not None and self._node.server.report_hang(error)
+        if not (self._child and known):
+            log.error("%s", error)
         self._clean_up()
         sys.stderr.flush()
         os._exit(StepFailed.exit_code)
@@ -161,7 +190,9 @@ def run_master(
 
     with ended_by_signals(interrupt, lambda: leave_run_folder(folder), watch_stdin=child), ExitStack() as stack:
         stack.callback(leave_run_folder, folder)
+        tidy_run_folder(folder)
         _refuse_second(folder, MASTER, f"the master of mesh '{config.mesh}'")
+        enter_run_folder(folder, MASTER)
         session = open_session(wiring(config.zenoh, config_file, folder, MASTER, ()))
         stack.callback(session.close)
         endpoints = own_endpoints(session) if config.zenoh.mode == "peer" else tuple(config.zenoh.connect)

@@ -138,8 +138,11 @@ class Master:
             self._grant_to_the_end()
             self._state = "stopping"
             self._send(FINISH, 0)
+            most_instances = max(len(node.instances) for node in self._plan.nodes.values())
             self._wait_for(
-                lambda: len(self._reports) == len(self._nodes), self._timeouts.stop, "the end was not reported by"
+                lambda: len(self._reports) == len(self._nodes),
+                self._timeouts.stop + self._timeouts.terminate * most_instances,
+                "the end was not reported by",
             )
             self._state = "done"
         except FmuMeshError as error:

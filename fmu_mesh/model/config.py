@@ -17,6 +17,7 @@ __all__ = [
     "Config",
     "ConnectionConfig",
     "InstanceConfig",
+    "LimitsConfig",
     "RecordConfig",
     "SimulationConfig",
     "TimeoutsConfig",
@@ -24,11 +25,19 @@ __all__ = [
 ]
 
 NAME_PATTERN = r"^[A-Za-z_][A-Za-z0-9_-]*$"
+SHA256_PATTERN = r"^[0-9A-Fa-f]{64}$"
 KEY_PREFIX_PATTERN = r"^[^/*$?#@\s]+(/[^/*$?#@\s]+)*$"
 ENDPOINT_PATTERN = r"^[a-z0-9_-]+/\S+$"
 
 Name = Annotated[
     str, Meta(pattern=NAME_PATTERN, title="a name of letters, digits, _ and - that starts with a letter or _")
+]
+Sha256 = Annotated[
+    str,
+    Meta(
+        pattern=SHA256_PATTERN,
+        title="a SHA-256 as 64 hexadecimal digits, as `sha256sum` or `fmu-mesh inspect` prints it",
+    ),
 ]
 Endpoint = Annotated[str, Meta(pattern=ENDPOINT_PATTERN, title="a Zenoh endpoint such as tcp/192.168.1.2:7447")]
 DeadlineSeconds = Annotated[float, Meta(gt=0)]
@@ -81,7 +90,7 @@ class SimulationConfig(Base, frozen=True, kw_only=True):
 class InstanceConfig(Base, frozen=True, kw_only=True):
     """One instance of an FMU."""
 
-    fmu: Annotated[str, Meta(description="Path of the .fmu file, relative to this file.")]
+    fmu: Annotated[str, Meta(description="Path of the .fmu file, or of an unpacked one, relative to this file.")]
     start_values: Annotated[
         dict[str, Value],
         Meta(
@@ -97,9 +106,28 @@ class InstanceConfig(Base, frozen=True, kw_only=True):
         ),
     ] = None
     group: Annotated[Name | None, Meta(description="Instances of one group share one node (one process).")] = None
+    sha256: Annotated[
+        Sha256 | None, Meta(description="SHA-256 that the .fmu file must have; any other is refused.")
+    ] = None
+    strict: Annotated[
+        bool | None,
+        Meta(description="Whether problems that a strict validation finds in the FMU are errors (default: top level)."),
+    ] = None
     host: Annotated[
         str | None, Meta(description="Host the node is meant to run on; `launch` starts those without.")
     ] = None
+
+
+class LimitsConfig(Base, frozen=True, kw_only=True):
+    """How large an FMU may be before it is taken for an attack; no tool comes near the defaults."""
+
+    unpacked_bytes: Annotated[int, Meta(ge=1, description="All files of an FMU together, unpacked, in bytes.")] = 2**32
+    ratio: Annotated[
+        float,
+        Meta(gt=0, description="Size unpacked / size packed, of an FMU that is larger than 64 MiB when it is unpacked."),
+    ] = 200.0
+    entries: Annotated[int, Meta(ge=1, description="Files and folders in an FMU.")] = 100_000
+    description_bytes: Annotated[int, Meta(ge=1, description="A modelDescription.xml, in bytes.")] = 64 * 2**20
 
 
 class ConnectionConfig(Base, frozen=True, kw_only=True):
@@ -174,10 +202,24 @@ class TimeoutsConfig(Base, frozen=True, kw_only=True):
     step: Annotated[
         DeadlineSeconds, Meta(description="Without any progress of an instance while it may step, in s.")
     ] = 60.0
+    call: Annotated[
+        DeadlineSeconds,
+        Meta(
+            description="For each call into an FMU before the first communication point, such as fmi2Instantiate, "
+            "in s; less than start and initialize, so that the FMU is named and not only who waits for it."
+        ),
+    ] = 45.0
     stop: Annotated[
         DeadlineSeconds,
-        Meta(description="From the last communication point to the end of all processes, in s."),
+        Meta(
+            description="From the last communication point to the end of all processes, in s, "
+            "besides what FMUs take to terminate."
+        ),
     ] = 10.0
+    terminate: Annotated[
+        DeadlineSeconds,
+        Meta(description="For terminating and freeing an FMU, in s."),
+    ] = 30.0
 
 
 class Config(Base, frozen=True, kw_only=True):
@@ -202,4 +244,9 @@ class Config(Base, frozen=True, kw_only=True):
     record: RecordConfig = RecordConfig()
     zenoh: ZenohConfig = ZenohConfig()
     timeouts: TimeoutsConfig = TimeoutsConfig()
+    limits: LimitsConfig = LimitsConfig()
+    strict: Annotated[
+        bool,
+        Meta(description="Whether problems that a strict validation finds in an FMU are errors instead of warnings."),
+    ] = False
     version: Annotated[Literal[1], Meta(description="Version of this file format.")] = 1

@@ -14,7 +14,7 @@ from msgspec.structs import replace
 
 from ..errors import ConfigurationError, Finding
 from ..simtime import TimeGrid
-from .config import TimeoutsConfig
+from .config import LimitsConfig, TimeoutsConfig
 from .description import Value
 from .graph import cycle_through, feedback_edges, strongly_connected, topological_order
 from .initialization import InitializationPlan, plan_initialization
@@ -69,6 +69,7 @@ class InstancePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     feeds: tuple[Feed, ...]
     initialization: dict[str, int]
     held: tuple[str, ...] = ()
+    sha256: str | None = None
 
 
 class Link(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -118,6 +119,7 @@ class NodePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     links_out: tuple[Link, ...]
     result_file: str | None = None
     recorded: tuple[tuple[str, str], ...] = ()
+    limits: LimitsConfig = LimitsConfig()
 
     def instance(self, name: str) -> InstancePlan:
         """The plan of one of its instances."""
@@ -204,8 +206,10 @@ def _digest(system: System, nodes: dict[str, NodePlan]) -> str:
         replace(
             node,
             result_file=None,
+            limits=LimitsConfig(),
             instances=tuple(
-                replace(instance, fmu=system.instances[instance.name].description.guid) for instance in node.instances
+                replace(instance, fmu=system.instances[instance.name].description.guid, sha256=None)
+                for instance in node.instances
             ),
         )
         for node in nodes.values()
@@ -326,6 +330,7 @@ def _node(
         links_out=tuple(link for link in links if link.source_node == node),
         result_file=plan.system.result_file if node == RECORDER else None,
         recorded=plan.system.recorded if node == RECORDER else (),
+        limits=config.limits,
     )
 
 
@@ -357,6 +362,7 @@ def _instance_plan(plan: Plan, instance: SystemInstance, outputs: Layout) -> Ins
         feeds=tuple(Feed(source=s, delay=d, columns=tuple(columns)) for (s, d), columns in sorted(feeds.items())),
         initialization={variable: level for (owner, variable), level in levels.items() if owner == instance.name},
         held=tuple(variable for owner, variable in plan.initialization.held if owner == instance.name),
+        sha256=plan.system.config.instances[instance.name].sha256,
     )
 
 

@@ -128,6 +128,8 @@ class Node:
                 self._initialize()
                 self._step_to_the_end()
                 self.server.close()  # the last samples, while the master is there to bring them to clients
+                for runner in self._runners.values():
+                    runner.instance.close()  # before the report, so that what fails in it can be told
                 self._report(None, self._plan.timeouts.stop)
                 del tokens
         except FmuMeshError as error:

@@ -17,7 +17,7 @@ from functools import partial
 import msgspec
 import zenoh
 
-from ..errors import FmuMeshError, InitializationFailed, StepFailed
+from ..errors import FmuError, FmuMeshError, StepFailed
 from ..model.description import Value, Variable
 from ..model.plan import NodePlan
 from ..wire.inbox import Inbox
@@ -55,7 +55,7 @@ class Server:
         self.state = "starting"
         self.waiting = False
         self.waited_s = 0.0
-        self.on_hang: Callable[[], None] = lambda: None
+        self.on_hang: Callable[[FmuError], None] = lambda _error: None
         self._plan = plan
         self._session = session
         self._keys = keys
@@ -69,7 +69,6 @@ class Server:
         self._status_publishers: dict[str, zenoh.Publisher] = {}
         self._log_publishers: dict[str, zenoh.Publisher] = {}
         self._stalled_since: dict[str, tuple[int, float]] = {}
-        self._state_since = ("", time.monotonic())
         for instance in plan.instances:
             self._declare_early(instance.name)
         self._closing = threading.Event()
@@ -155,36 +154,35 @@ class Server:
         self._look_for_hang(now)
 
     def _look_for_hang(self, now: float) -> None:
-        """An FMU call that meets its deadline ends the process: nothing else can get the main thread back."""
-        if self.state != self._state_since[0]:
-            self._state_since = (self.state, now)
-        limits = self._plan.timeouts
-        limit = {"loading": limits.start, "initializing": 2 * limits.initialize, "running": limits.step}.get(self.state)
-        if limit is None or self.waiting:
+        """A step that meets its deadline; other calls of an FMU are watched by `fmu_mesh.fmu.guard.CallWatch`."""
+        if self.state != "running" or self.waiting:
             return
-        for name in self._runners or [instance.name for instance in self._plan.instances]:
-            stalled_s = now - (self._stalled(name, now) if self.state == "running" else self._state_since[1])
-            if stalled_s > limit:
-                self._report_hang(name, stalled_s)
+        for name, runner in self._runners.items():
+            stalled_s = now - self._stalled(name, now)
+            if stalled_s > self._plan.timeouts.step:
+                self.on_hang(
+                    StepFailed(
+                        f"the FMU has not returned for {stalled_s:.1f} s from doStep; its process is ended",
+                        instance=name,
+                        point=runner.point,
+                        time=self._plan.grid.time(runner.point),
+                        hint="If it needs that long, raise `timeouts.step` in the configuration.",
+                    )
+                )
                 return
 
-    def _report_hang(self, name: str, stalled_s: float) -> None:
-        kind = StepFailed if self.state == "running" else InitializationFailed
-        runner = self._runners.get(name)
-        point = runner.point if runner is not None else None
-        error = kind(
-            f"the FMU has not returned for {stalled_s:.1f} s while {self.state}; its process is ended",
-            instance=name,
-            point=point,
-            time=self._plan.grid.time(point) if point is not None else None,
-            hint="If it needs that long, raise `timeouts` in the configuration.",
-        )
-        report = NodeReport(self._plan.node, point or 0, error.report())
+    def report_hang(self, error: FmuError) -> bool:
+        """From a watching thread: tell the master that an FMU does not return; whether it knows now."""
+        runner = self._runners.get(error.instance or "")
+        if runner is not None and self.state != "initializing":
+            error.point, error.time = runner.point, self._plan.grid.time(runner.point)
+        report = NodeReport(self._plan.node, error.point or 0, error.report())
         try:
             ask(self._session, self._keys.report, msgspec.json.encode(report), 2.0, "the master")
         except FmuMeshError as unreachable:
             log.warning("hang_not_reported", extra={"error": str(unreachable)})
-        self.on_hang()
+            return False
+        return True
 
     # --- queries
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from time import perf_counter
 
+from ..fmu.guard import DEFAULT_MODE, floating_point_changed, restore_floating_point
 from ..model.instance import Instance
 from ..model.plan import InstancePlan
 from ..model.ring import Layout, Ring
@@ -162,8 +163,11 @@ class Unit:
         for feed in runner.local_feeds:
             feed.transfer.from_ring(feed.source.outputs, first, end)
         do_step = runner.instance.do_step
+        one, half_ulp, quarter_ulp, tiny = DEFAULT_MODE
         for step in range(first, end):
             do_step(step)
+            if one + half_ulp - quarter_ulp != one or not tiny + tiny:  # as `floating_point_changed`, without a call
+                restore_floating_point()
             runner.step = step + 1
         return end - first
 
@@ -179,6 +183,8 @@ class Unit:
                 for feed in runner.local_feeds:
                     feed.transfer.step_from_ring(feed.source.outputs, step)
                 runner.instance.do_step(step)
+                if floating_point_changed():
+                    restore_floating_point()
                 runner.step = step + 1
         self._point = max(first, end)
         return max(0, end - first)

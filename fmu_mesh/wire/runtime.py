@@ -11,6 +11,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import msgspec
@@ -19,6 +20,8 @@ from ..errors import ConfigurationError
 
 __all__ = [
     "MeshNote",
+    "enter_run_folder",
+    "fmu_folder",
     "leave_run_folder",
     "meshes",
     "remove_run_folder",
@@ -26,6 +29,7 @@ __all__ = [
     "run_folder",
     "runtime_folder",
     "socket_endpoint",
+    "tidy_run_folder",
     "write_note",
 ]
 
@@ -80,8 +84,42 @@ def remove_run_folder(folder: Path) -> None:
     shutil.rmtree(folder, ignore_errors=True)
 
 
+def fmu_folder(folder: Path) -> Path:
+    """Where this process extracts FMUs in the folder of a run."""
+    return folder / "fmus" / str(os.getpid())
+
+
+def enter_run_folder(folder: Path, node: str) -> None:
+    """Note that this process is the node ``node`` of a run, so that others can tidy up for it if it is killed."""
+    own = folder / f"{os.getpid()}.pid"
+    own.write_text(_socket_name(node), encoding="utf-8")
+
+
+def tidy_run_folder(folder: Path) -> None:
+    """Remove what processes that were killed have left in the folder of a run."""
+    for file in folder.glob("*.pid"):
+        pid = file.stem
+        if pid.isdigit() and not _is_alive(int(pid)):
+            _remove_traces(folder, pid)
+
+
+def _remove_traces(folder: Path, pid: str) -> None:
+    """Remove the socket and the extracted FMUs of a process."""
+    note = folder / f"{pid}.pid"
+    shutil.rmtree(folder / "fmus" / pid, ignore_errors=True)
+    try:
+        socket = note.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        return
+    if socket.endswith(".sock") and "/" not in socket:
+        (folder / socket).unlink(missing_ok=True)
+    note.unlink(missing_ok=True)
+
+
 def leave_run_folder(folder: Path) -> None:
     """Remove the folder of a run if nobody uses it any more; called by every process on its way out."""
+    _remove_traces(folder, str(os.getpid()))
+    tidy_run_folder(folder)
     note = _read_note(folder / "mesh.json")
     if note is not None and not _is_alive(note.pid):
         remove_run_folder(folder)  # the launcher was killed
@@ -101,13 +139,17 @@ def socket_endpoint(folder: Path, node: str) -> str:
     Raises:
         ConfigurationError: the path is too long for a Unix socket.
     """
-    path = folder / f"{hashlib.sha256(node.encode()).hexdigest()[:8]}.sock"
+    path = folder / _socket_name(node)
     if len(os.fsencode(path)) > _SOCKET_PATH_LIMIT:
         raise ConfigurationError(
             f"'{path}' is too long for a socket ({_SOCKET_PATH_LIMIT} bytes)",
             hint="Set FMU_MESH_RUNTIME_DIR to a shorter path.",
         )
     return f"unixsock-stream/{path}"
+
+
+def _socket_name(node: str) -> str:
+    return f"{hashlib.sha256(node.encode()).hexdigest()[:8]}.sock"
 
 
 def write_note(folder: Path, note: MeshNote) -> None:
@@ -131,6 +173,11 @@ def remove_stale_folders() -> None:
     """Remove the folders of runs whose launcher is gone and whose processes could not do it themselves."""
     for _ in meshes():
         continue
+    for folder in runtime_folder().glob("*.hand"):
+        tidy_run_folder(folder)
+        for empty in (folder / "fmus", folder):
+            with suppress(OSError):  # somebody uses it
+                empty.rmdir()
 
 
 def _read_note(file: Path) -> MeshNote | None:

@@ -95,7 +95,7 @@ def test_an_fmu_that_does_not_return_meets_the_deadline_of_a_step(place: Place, 
     assert launched.message.startswith(
         "fmu-mesh: instance faulty, point 1000, t = 1 s: the FMU has not returned for 1."
     )
-    assert "`timeouts`" in launched.message
+    assert "`timeouts.step`" in launched.message
     place.assert_nothing_left()
 
 

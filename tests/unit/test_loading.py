@@ -179,7 +179,7 @@ STRUCTURE = [
     ),
     pytest.param(
         changed("{fmu: delay.fmu}", "delay.fmu"),
-        "mesh.yaml:5: instances.delay: 'delay.fmu'; expected a mapping with fmu, start_values, step_size, group, host",
+        "mesh.yaml:5: instances.delay: 'delay.fmu'; expected a mapping with fmu, start_values, step_size, group, sha256, strict and 1 more",
         id="text for a mapping",
     ),
     pytest.param(
@@ -250,7 +250,7 @@ TEXTS = [
     pytest.param(
         "- 1\n",
         "mesh.yaml:1: a list; expected a mapping with mesh, simulation, instances, group, connections, record, "
-        "zenoh, timeouts and 1 more",
+        "zenoh, timeouts and 3 more",
         id="a list",
     ),
     pytest.param(
