@@ -24,8 +24,18 @@ __all__ = ["read_description"]
 _TYPES: tuple[VariableType, ...] = ("Real", "Integer", "Boolean", "String", "Enumeration")
 
 
-def read_description(path: Path, terms: Terms = Terms()) -> ModelDescription:  # noqa: B008 a frozen Struct
+def read_description(
+    path: Path,
+    terms: Terms = Terms(),  # noqa: B008 a frozen Struct
+    *,
+    to_run: bool = True,
+) -> ModelDescription:
     """Read the model description of the FMU at ``path``.
+
+    Args:
+        path: the .fmu file, or the folder of an unpacked one.
+        terms: what it has to keep to.
+        to_run: whether it must be able to run on this platform.
 
     Raises:
         LoadFailed: it is no FMU, or one that cannot run here; the message says which and what would help.
@@ -37,7 +47,8 @@ def read_description(path: Path, terms: Terms = Terms()) -> ModelDescription:  #
     if source.coSimulation is None:
         raise LoadFailed(f"'{path}' is for model exchange only; export it for co-simulation.")
     platforms = tuple(fmpy.supported_platforms(str(path)))
-    require_library(path, contents.names, source.coSimulation.modelIdentifier or "", source.fmiVersion)
+    if to_run:
+        require_library(path, contents.names, source.coSimulation.modelIdentifier or "", source.fmiVersion)
     return _convert(source, platforms, problems)
 
 

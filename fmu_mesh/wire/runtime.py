@@ -91,6 +91,7 @@ def fmu_folder(folder: Path) -> Path:
 
 def enter_run_folder(folder: Path, node: str) -> None:
     """Note that this process is the node ``node`` of a run, so that others can tidy up for it if it is killed."""
+    folder.mkdir(mode=0o700, exist_ok=True)  # whoever left it last may just have removed it
     own = folder / f"{os.getpid()}.pid"
     own.write_text(_socket_name(node), encoding="utf-8")
 

@@ -179,7 +179,8 @@ STRUCTURE = [
     ),
     pytest.param(
         changed("{fmu: delay.fmu}", "delay.fmu"),
-        "mesh.yaml:5: instances.delay: 'delay.fmu'; expected a mapping with fmu, start_values, step_size, group, sha256, strict and 1 more",
+        "mesh.yaml:5: instances.delay: 'delay.fmu'; expected a mapping with fmu, start_values, step_size, group, "
+        "sha256, strict, host",
         id="text for a mapping",
     ),
     pytest.param(

@@ -128,6 +128,7 @@ fmi2Component fmi2Instantiate(fmi2String instanceName, fmi2Type fmuType, fmi2Str
 
     (void)fmuType, (void)fmuResourceLocation, (void)functions, (void)visible, (void)loggingOn;
     if (hostile == NULL || strcmp(fmuGUID, FMU_GUID) != 0) return NULL;
+    hostile->values[U] = 1.0;
     snprintf(hostile->name, sizeof hostile->name, "%s", instanceName);
     CALLED(hostile);
     return hostile;

@@ -1,0 +1,244 @@
+"""`inspect`: what one FMU is, without running anything of it."""
+
+from __future__ import annotations
+
+import argparse
+import fnmatch
+import shutil
+import sys
+import textwrap
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import msgspec
+
+from ..errors import ConfigurationError, LoadFailed
+from ..fmu import read_description, sha256_of
+from ..model.description import Causality, ModelDescription, Variable
+from ..model.findings import nearest, nearest_file, shown
+from .tables import pairs
+
+__all__ = ["Inspection", "add_commands", "inspect_fmu", "inspection_page"]
+
+_SHOWN_VARIABLES: Final = 20
+"""Variables of one causality that a page lists by itself."""
+
+_NARROWEST: Final = 60
+_WIDE: Final = 120
+_CAUSALITIES: Final[tuple[tuple[Causality, str], ...]] = (
+    ("input", "Inputs"),
+    ("output", "Outputs"),
+    ("parameter", "Parameters"),
+    ("calculatedParameter", "Calculated parameters"),
+    ("independent", "Independent variable"),
+    ("local", "Local variables"),
+)
+_CAPABILITIES: Final = (
+    ("can_handle_variable_step_size", "variable step size"),
+    ("can_get_and_set_state", "get and set its state"),
+    ("can_serialize_state", "serialize its state"),
+)
+
+
+class Inspection(msgspec.Struct, frozen=True, omit_defaults=False):
+    """What `inspect --json` prints; documented in `docs/commands.md`.
+
+    Attributes:
+        file: the path as it was given.
+        sha256: of the archive, as hexadecimal digits; null for a folder.
+        bytes: size of the archive; null for a folder.
+        runs_here: whether it can run on this platform.
+        problems: what is wrong or odd, in words; the first says why it cannot run here, if it cannot.
+        description: the model description.
+    """
+
+    file: str
+    sha256: str | None
+    bytes: int | None
+    runs_here: bool
+    problems: tuple[str, ...]
+    description: ModelDescription
+
+
+def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.ArgumentParser) -> None:
+    """Add the commands of this module."""
+    inspect = commands.add_parser("inspect", parents=[common], help="show what an FMU is; run nothing")
+    inspect.add_argument("fmu", type=Path, metavar="MODEL.fmu", help="the FMU, or the folder of an unpacked one")
+    inspect.add_argument(
+        "variables", nargs="*", metavar="VARIABLE", help="only these variables, all of them; * stands for any characters"
+    )
+    inspect.add_argument("--all", action="store_true", help=f"all variables, not {_SHOWN_VARIABLES} of each causality")
+    inspect.add_argument("--json", action="store_true", help="print everything as JSON")
+    inspect.set_defaults(run_command=_inspect)
+
+
+def inspect_fmu(path: Path) -> Inspection:
+    """Read everything that can be known of an FMU without loading it.
+
+    Raises:
+        ConfigurationError: it cannot be read; says why.
+    """
+    reasons: tuple[str, ...] = ()
+    try:
+        try:
+            description = read_description(path)
+        except LoadFailed as error:
+            description = read_description(path, to_run=False)  # if it can be read, the page says why it cannot run
+            reasons = (str(error),)
+    except LoadFailed as error:
+        near = None if path.exists() else nearest_file(path)
+        raise ConfigurationError(error.message, hint=f"Did you mean '{near}'?" if near else error.hint) from error
+    return Inspection(
+        file=str(path),
+        sha256=sha256_of(path),
+        bytes=None if path.is_dir() else path.stat().st_size,
+        runs_here=not reasons,
+        problems=(*reasons, *description.problems),
+        description=description,
+    )
+
+
+def inspection_page(
+    inspection: Inspection, width: int, patterns: Sequence[str] = (), *, everything: bool = False
+) -> list[str]:
+    """The page about an FMU, in lines of at most ``width`` columns unless a name is longer.
+
+    Args:
+        inspection: what was found.
+        width: in columns.
+        patterns: names of variables, with `*` for any characters; if there are some, only these are shown.
+        everything: whether all variables are listed.
+    """
+    description = inspection.description
+    chosen = [v for v in description.variables if not patterns or any(_fits(v.name, pattern) for pattern in patterns)]
+    lines = [] if patterns else [*_facts(inspection, width), *_problems(inspection, width)]
+    for causality, title in _CAUSALITIES:
+        members = [variable for variable in chosen if variable.causality == causality]
+        if members:
+            lines += ([""] if lines else []) + [f"{title} ({len(members)})"]
+            limit = None if everything or patterns else _SHOWN_VARIABLES
+            lines += _variables(members[:limit], width)
+            if limit is not None and len(members) > limit:
+                lines.append(f"  ... and {len(members) - limit} more: --all lists them, a name such as 'x*' some")
+    return lines
+
+
+def _inspect(arguments: argparse.Namespace) -> int:
+    inspection = inspect_fmu(arguments.fmu)
+    if arguments.json:
+        sys.stdout.buffer.write(msgspec.json.format(msgspec.json.encode(inspection)) + b"\n")
+        return 0
+    names = [variable.name for variable in inspection.description.variables]
+    for pattern in arguments.variables:
+        if not any(_fits(name, pattern) for name in names):
+            near = nearest(pattern, names)
+            hint = f"Did you mean '{near}'?" if near else None
+            raise ConfigurationError(f"'{arguments.fmu}' has no variable '{pattern}'", hint=hint)
+    width = max(_NARROWEST, shutil.get_terminal_size((_WIDE, 0)).columns)
+    print("\n".join(inspection_page(inspection, width, arguments.variables, everything=arguments.all)))
+    return 0
+
+
+def _fits(name: str, pattern: str) -> bool:
+    """Whether a name is the pattern, in which only `*` is special: brackets belong to names."""
+    return name == pattern or fnmatch.fnmatchcase(name, pattern.replace("[", "[[]").replace("?", "[?]"))
+
+
+def _facts(inspection: Inspection, width: int) -> list[str]:
+    description = inspection.description
+    experiment = description.default_experiment
+    can = [words for field, words in _CAPABILITIES if getattr(description, field)]
+    needs = ["one process for each instance"] if description.only_once_per_process else []
+    needs += ["the tool that made it"] if description.needs_execution_tool else []
+    counts = [
+        f"{count} {title.lower()}"
+        for causality, title in _CAUSALITIES
+        if (count := len(description.with_causality(causality)))
+    ]
+    times = [
+        f"{what} {_number(value)} s"
+        for what, value in (
+            ("start", experiment.start_time),
+            ("stop", experiment.stop_time),
+            ("step", experiment.step_size),
+        )
+        if value is not None
+    ]
+    times += [f"tolerance {_number(experiment.tolerance)}"] if experiment.tolerance is not None else []
+    size = f" ({inspection.bytes} bytes)" if inspection.bytes is not None else " (a folder)"
+    facts = [
+        ("File", f"{inspection.file}{size}"),
+        ("SHA-256", inspection.sha256 or ""),
+        ("Model", description.model_name),
+        ("Description", description.description or ""),
+        ("Kind", f"FMI {description.fmi_version} {description.kind.replace('_', '-')}"),
+        ("Identifier", description.model_identifier),
+        ("GUID", description.guid),
+        ("Made by", description.generation_tool or ""),
+        ("Platforms", ", ".join(_PLATFORM_WORDS.get(name, name) for name in description.platforms) or "none"),
+        ("Runs here", "yes" if inspection.runs_here else "no, see Problems"),
+        ("Can", ", ".join(can)),
+        ("Needs", ", ".join(needs)),
+        ("Experiment", ", ".join(times)),
+        ("Variables", ", ".join(counts) or "none"),
+    ]
+    lines = pairs((name, " ".join(value.split())) for name, value in facts)
+    indent = " " * (2 + max(len(name) for name, value in facts if value))
+    return [part for line in lines for part in _wrapped(line, width, indent)]
+
+
+_PLATFORM_WORDS: Final = {"c-code": "C sources"}
+
+
+def _problems(inspection: Inspection, width: int) -> list[str]:
+    if not inspection.problems:
+        return []
+    lines = ["", f"Problems ({len(inspection.problems)})"]
+    for problem in inspection.problems:
+        lines += _wrapped("  " + " ".join(problem.split()), width, "    ")
+    return lines
+
+
+def _wrapped(line: str, width: int, indent: str) -> list[str]:
+    """Paths and hashes stay in one piece, so that they can be copied."""
+    return textwrap.wrap(
+        line,
+        width,
+        subsequent_indent=indent,
+        break_long_words=False,
+        break_on_hyphens=False,
+        drop_whitespace=True,
+        replace_whitespace=False,
+    )
+
+
+def _variables(variables: Sequence[Variable], width: int) -> list[str]:
+    """One line for each: name, type, variability, start value with unit; then what fits of the description."""
+    rows = [[v.name, v.type, v.variability, _start(v), " ".join((v.description or "").split())] for v in variables]
+    widest = [max(len(row[column]) for row in rows) for column in range(4)]
+    # One very long name does not push everything else off the page.
+    widest[0] = min(widest[0], width // 2)
+    lines = []
+    for row in rows:
+        cells = "  ".join(cell.ljust(size) for cell, size in zip(row, widest, strict=False) if size)
+        line = f"  {cells.rstrip()}" if not row[4] else f"  {cells}  {row[4]}"
+        lines.append(line if len(line) <= width or not row[4] else _cut(line, width, 2 + len(cells)))
+    return lines
+
+
+def _cut(line: str, width: int, least: int) -> str:
+    """The line without the end of its description, or without all of it if there is no room."""
+    return f"{line[: width - 3].rstrip()}..." if width - 3 > least + 10 else line[:least].rstrip()
+
+
+def _start(variable: Variable) -> str:
+    """The start value with its unit; only the unit if there is none."""
+    unit = variable.unit or ""
+    if variable.start is None:
+        return f"[{unit}]" if unit else ""
+    return f"= {shown(variable.start)} {unit}".rstrip()
+
+
+def _number(value: float) -> str:
+    return f"{value:.12g}"
