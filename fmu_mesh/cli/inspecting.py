@@ -66,7 +66,10 @@ def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.Arg
     inspect = commands.add_parser("inspect", parents=[common], help="show what an FMU is; run nothing")
     inspect.add_argument("fmu", type=Path, metavar="MODEL.fmu", help="the FMU, or the folder of an unpacked one")
     inspect.add_argument(
-        "variables", nargs="*", metavar="VARIABLE", help="only these variables, all of them; * stands for any characters"
+        "variables",
+        nargs="*",
+        metavar="VARIABLE",
+        help="only these variables, all of them; * stands for any characters",
     )
     inspect.add_argument("--all", action="store_true", help=f"all variables, not {_SHOWN_VARIABLES} of each causality")
     inspect.add_argument("--json", action="store_true", help="print everything as JSON")

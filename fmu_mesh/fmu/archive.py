@@ -18,8 +18,9 @@ import zipfile
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
+from io import BufferedReader
 from pathlib import Path, PurePosixPath
-from typing import IO, Final
+from typing import Final
 
 import msgspec
 
@@ -33,8 +34,7 @@ _HARMLESS_BYTES: Final = 64 * 2**20
 
 _CHUNK: Final = 2**20
 _ENCRYPTED: Final = 0x1
-_XML_FILES: Final = ("modelDescription.xml", "sources/buildDescription.xml")
-_BROKEN = (OSError, zipfile.BadZipFile, zlib.error, lzma.LZMAError, EOFError, RuntimeError, ValueError)
+_XML_FILES: tuple[str, ...] = ("modelDescription.xml", "sources/buildDescription.xml")
 
 
 class Terms(msgspec.Struct, frozen=True):
@@ -141,13 +141,15 @@ def _opened(path: Path, terms: Terms) -> Iterator[zipfile.ZipFile]:
         is_zip = path.is_file() and zipfile.is_zipfile(path)
         what = f"is a damaged ZIP archive: {error}" if is_zip else "is no ZIP archive, so it is no FMU."
         raise LoadFailed(f"'{path}' {what}") from error
+    except (zlib.error, lzma.LZMAError, EOFError) as error:
+        raise LoadFailed(f"'{path}' is a damaged ZIP archive: {error}") from error
     except OSError as error:
         raise LoadFailed(f"'{path}' cannot be read: {error.strerror or error}.") from error
-    except _BROKEN as error:
+    except (RuntimeError, ValueError) as error:  # what `zipfile` has for entries that it does not know how to read
         raise LoadFailed(f"'{path}' cannot be extracted: {error}") from error
 
 
-def _verify(path: Path, file: IO[bytes], expected: str | None) -> None:
+def _verify(path: Path, file: BufferedReader, expected: str | None) -> None:
     if expected is None:
         return
     found = hashlib.file_digest(file, "sha256").hexdigest()

@@ -170,6 +170,8 @@ def _illegal_values(root: Any, generation: str) -> Iterable[str]:  # noqa: ANN40
         match = _ATTRIBUTE.search(error.message)
         if error.type_name in _ILLEGAL and match is not None and _DECIDING.fullmatch(match[1]):
             found = root.getroottree().xpath(error.path)
-            element = next((one for node in found[:1] for one in (node, *node.iterancestors()) if one.get("name")), None)
+            element = next(
+                (one for node in found[:1] for one in (node, *node.iterancestors()) if one.get("name")), None
+            )
             owner = f"variable '{element.get('name')}'" if element is not None else error.path.rpartition("/")[2]
             yield f"{owner} (line {error.line}): {match[1]}: {match[2].rstrip('.')}"

@@ -109,7 +109,7 @@ class Fmi2Instance:
         LoadFailed: the FMU cannot be extracted, loaded or instantiated.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913, PLR0917  what an FMU is opened with
         self,
         path: Path,
         name: str,

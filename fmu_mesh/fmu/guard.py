@@ -2,8 +2,8 @@
 
 Owns the deadline of every call outside the hot loop, and the state of the process that a call could change: working
 directory, locale, floating-point environment, and the signal handlers that end a run. A `Guarded` instance sees to both
-and hands `do_step` through as it is; the hot loop looks for a changed floating-point mode itself (`floating_point_changed`). What a
-call that met its deadline means for the process is decided by who owns the process.
+and hands `do_step` through as it is; the hot loop looks for a changed floating-point mode itself. What a call that met
+its deadline means for the process is decided by who owns the process.
 """
 
 from __future__ import annotations
@@ -157,7 +157,7 @@ class CallWatch:
                     return
                 call, position = self._call, self._position
                 self._changed.wait(self._patience(call, position))
-                if self._closed or call is not self._call:
+                if call is not self._call:
                     continue
             now = time.monotonic()
             if call is not None:
@@ -213,9 +213,7 @@ class Guarded:
         do_step: that of the instance, without anything around it.
     """
 
-    def __init__(
-        self, name: str, open_: Callable[[], Instance], watch: CallWatch, timeouts: TimeoutsConfig
-    ) -> None:
+    def __init__(self, name: str, open_: Callable[[], Instance], watch: CallWatch, timeouts: TimeoutsConfig) -> None:
         self._name = name
         self._watch = watch
         self._timeouts = timeouts

@@ -309,7 +309,9 @@ class _Process:
         read = self._read_beginning if limited else self._read
         readers = [
             threading.Thread(target=read, args=(popen.stdout, on_line), daemon=True),
-            threading.Thread(target=read, args=(popen.stderr, lambda line: on_error_line(self.name, line)), daemon=True),
+            threading.Thread(
+                target=read, args=(popen.stderr, lambda line: on_error_line(self.name, line)), daemon=True
+            ),
         ]
         waiter = threading.Thread(target=self._wait, args=(readers, on_exit), daemon=True)
         self._threads = [*readers, waiter]

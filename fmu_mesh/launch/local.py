@@ -160,15 +160,7 @@ class LocalMesh:
         recorded = [(members[instance], variable) for instance, variable in plan.system.recorded]
         buffer: list[list[Value]] = []
         first = 0
-
-        def save() -> None:
-            if file is not None:
-                if buffer:
-                    _write(file, grid, first, buffer)
-                self.rows = file.rows
-                _close(file)
-
-        self._save = save
+        self._save = lambda: self._save_rows(file, first, buffer)
         try:
             for point in range(grid.last_point + 1):
                 self.point = point
@@ -192,6 +184,14 @@ class LocalMesh:
             if file is not None and buffer:
                 _write(file, grid, first, buffer)
         self._progress(self.point)
+
+    def _save_rows(self, file: CsvFile | None, first: int, rows: list[list[Value]]) -> None:
+        """From the watching thread: bring to the file what the main thread cannot any more."""
+        if file is not None:
+            if rows:
+                _write(file, self._plan.grid, first, rows)
+            self.rows = file.rows
+            _close(file)
 
 
 class _Member:

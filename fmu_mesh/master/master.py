@@ -341,7 +341,7 @@ class Master:
         node = str(sample.key_expr).rsplit("/", 1)[1]
         if sample.kind == zenoh.SampleKind.PUT:
             self._present.add(node)
-        elif node in self._plan.nodes and node not in self._reports and self._state != "stopping":
+        elif node in self._plan.nodes and node not in self._reports:
             self._fail(self._lost(node))
 
     def _lost(self, node: str) -> MeshLost:

@@ -124,7 +124,9 @@ class LimitsConfig(Base, frozen=True, kw_only=True):
     unpacked_bytes: Annotated[int, Meta(ge=1, description="All files of an FMU together, unpacked, in bytes.")] = 2**32
     ratio: Annotated[
         float,
-        Meta(gt=0, description="Size unpacked / size packed, of an FMU that is larger than 64 MiB when it is unpacked."),
+        Meta(
+            gt=0, description="Size unpacked / size packed, of an FMU that is larger than 64 MiB when it is unpacked."
+        ),
     ] = 200.0
     entries: Annotated[int, Meta(ge=1, description="Files and folders in an FMU.")] = 100_000
     description_bytes: Annotated[int, Meta(ge=1, description="A modelDescription.xml, in bytes.")] = 64 * 2**20

@@ -6,6 +6,7 @@ by whoever made it, whatever becomes of the processes that used it.
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import os
 import shutil
@@ -13,6 +14,7 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
+from typing import TextIO
 
 import msgspec
 
@@ -34,6 +36,9 @@ __all__ = [
 ]
 
 _SOCKET_PATH_LIMIT = 100
+
+_held: list[TextIO] = []
+"""The open notes of this process, which hold their locks."""
 
 
 class MeshNote(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -92,16 +97,24 @@ def fmu_folder(folder: Path) -> Path:
 def enter_run_folder(folder: Path, node: str) -> None:
     """Note that this process is the node ``node`` of a run, so that others can tidy up for it if it is killed."""
     folder.mkdir(mode=0o700, exist_ok=True)  # whoever left it last may just have removed it
-    own = folder / f"{os.getpid()}.pid"
-    own.write_text(_socket_name(node), encoding="utf-8")
+    draft = folder / f"{os.getpid()}.new"
+    file = draft.open("w", encoding="utf-8")
+    _held.append(file)
+    file.write(_socket_name(node))
+    file.flush()
+    fcntl.flock(file, fcntl.LOCK_EX)  # gone with the process, however it ends
+    draft.rename(folder / f"{os.getpid()}.pid")
 
 
 def tidy_run_folder(folder: Path) -> None:
     """Remove what processes that were killed have left in the folder of a run."""
-    for file in folder.glob("*.pid"):
-        pid = file.stem
-        if pid.isdigit() and not _is_alive(int(pid)):
-            _remove_traces(folder, pid)
+    for note in folder.glob("*.pid"):
+        try:
+            with note.open(encoding="utf-8") as file:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:  # its process holds it, or somebody else was faster
+            continue
+        _remove_traces(folder, note.stem)
 
 
 def _remove_traces(folder: Path, pid: str) -> None:
@@ -113,7 +126,8 @@ def _remove_traces(folder: Path, pid: str) -> None:
     except FileNotFoundError:
         return
     if socket.endswith(".sock") and "/" not in socket:
-        (folder / socket).unlink(missing_ok=True)
+        for name in (socket, f"{socket}.lock"):  # Zenoh locks its sockets by a file beside them
+            (folder / name).unlink(missing_ok=True)
     note.unlink(missing_ok=True)
 
 

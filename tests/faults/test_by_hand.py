@@ -144,7 +144,7 @@ def test_when_a_process_started_by_hand_is_killed_the_others_end_and_say_so(plac
     for launched in by_hand.values():
         assert ("the master" if victim == "master" else "node 'pendulum' was lost") in launched.message
     assert len(rows_of(config.with_suffix(".csv"))) > 100
-    assert place.processes() == []  # the files of the one that was killed have nobody who would remove them
+    place.assert_nothing_left()  # the others have tidied up for the one that was killed
 
 
 @pytest.mark.timeout(60)
@@ -159,4 +159,23 @@ def test_ctrl_c_at_the_master_started_by_hand_ends_the_nodes_too(place: Place) -
     for launched in by_hand.values():
         assert "SIGINT was received" in launched.message
     assert rows_of(config.with_suffix(".csv"))
+    place.assert_nothing_left()
+
+
+@pytest.mark.timeout(60)
+@pytest.mark.parametrize("next_start", ["launch", "node"])
+def test_what_a_killed_process_has_left_is_removed_by_the_next_start(place: Place, next_start: str) -> None:
+    config = write_config(place.folder, timeouts={"start": 20.0})
+    killed = start(place, config, "pendulum")
+    wait_until(place.extracted, "an FMU that is extracted")
+    killed.signal(signal.SIGKILL)
+    killed.wait()
+    assert place.extracted()
+
+    if next_start == "launch":
+        assert place.run("launch", config).wait() == 0
+    else:
+        by_hand = [start(place, config, role) for role in ("pendulum", "delay", "master")]
+        assert [launched.wait() for launched in by_hand] == [0, 0, 0]
+
     place.assert_nothing_left()

@@ -108,9 +108,11 @@ static void called(const char *name, const char *function)
 static void look_around(Hostile *hostile)
 {
     const char *language = setlocale(LC_NUMERIC, NULL);
-    volatile double u = hostile->values[U], three = 3.0, small = 1e-310;
+    volatile double u = hostile->values[U], three = 3.0, small = 1e-310, zero = 0.0, nothing;
     struct stat folder;
 
+    nothing = zero / zero; /* ends the process where traps are enabled */
+    (void)nothing;
     hostile->values[THIRD] = u / three;
     hostile->values[SUBNORMAL] = (u + 1.0) * small;
     hostile->values[PLAIN_LOCALE] = language != NULL && strcmp(language, "C") == 0;
@@ -156,8 +158,8 @@ fmi2Status fmi2EnterInitializationMode(fmi2Component c)
 
 fmi2Status fmi2ExitInitializationMode(fmi2Component c)
 {
-    CALLED(c);
     look_around(c);
+    CALLED(c);
     return fmi2OK;
 }
 

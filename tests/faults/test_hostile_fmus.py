@@ -1,0 +1,141 @@
+"""FMUs that hang in any call, or do to their process what a library must not do: nobody else is hurt."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Sequence
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+
+from fmus.build import build
+from tests.fmus.helpers import NO_COMPILER
+from tests.helpers import Place, row_count, rows_of, wait_until, write_config
+
+pytestmark = pytest.mark.timeout(60)
+
+SHORT = {"call": 1.0, "step": 1.0, "terminate": 1.0, "start": 15.0, "initialize": 15.0}
+STATE_FAULTS = (
+    "chdir_fmi2Instantiate",
+    "chdir_fmi2ExitInitializationMode",
+    "locale_fmi2SetupExperiment",
+    "rounding_fmi2Instantiate",
+    "rounding_fmi2DoStep",
+    "flushing_fmi2EnterInitializationMode",
+    "flushing_fmi2DoStep",
+    "traps_fmi2Instantiate",
+    "leak_fmi2Instantiate",
+)
+
+
+@pytest.fixture(scope="module")
+def hostile(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The FMU that does what its instance name says."""
+    if NO_COMPILER is not None:
+        pytest.skip(NO_COMPILER)
+    return build(Path(__file__).parent / "fmus" / "Hostile", tmp_path_factory.mktemp("hostile"))
+
+
+def mesh_of(place: Place, hostile: Path, names: Sequence[str], *, group: str | None = None, **more: object) -> Path:
+    """A chain of instances, each the third of the one before, for ten points; the last one is polite."""
+    everyone = [*names, "polite"]
+    return write_config(
+        place.folder,
+        instances={name: {"fmu": str(hostile)} | ({"group": group} if group else {}) for name in everyone},
+        connections=[f"{a}.third -> {b}.u" for a, b in pairwise(everyone)],
+        stop_time=float(str(more.pop("stop_time", 0.01))),
+        **more,  # type: ignore[arg-type]  # sections of the file
+    )
+
+
+@pytest.mark.parametrize(
+    ("function", "said", "setting", "point"),
+    [
+        ("fmi2Instantiate", "fmi2Instantiate", "call", ""),
+        ("fmi2ExitInitializationMode", "fmi2ExitInitializationMode", "call", ""),
+        ("fmi2DoStep", "doStep", "step", ", point 4, t = 0.004 s"),
+        ("fmi2Terminate", "fmi2Terminate", "terminate", ", point 10, t = 0.01 s"),
+        ("fmi2FreeInstance", "fmi2FreeInstance", "terminate", ", point 10, t = 0.01 s"),
+    ],
+)
+@pytest.mark.parametrize("options", [(), ("--local",)], ids=["distributed", "local"])
+def test_an_fmu_that_hangs_in_a_call_is_ended_with_its_name_the_call_and_the_point(
+    place: Place, hostile: Path, function: str, said: str, setting: str, point: str, options: tuple[str, ...]
+) -> None:
+    name = f"hang_{function}"
+    config = mesh_of(place, hostile, [name], timeouts=SHORT)
+
+    launched = place.run("launch", config, *options)
+
+    assert launched.wait() == 3
+    assert launched.message.startswith(f"fmu-mesh: instance {name}{point}: the FMU has not returned for 1.")
+    assert f" s from {said}; its process is ended. " in launched.message
+    assert f"`timeouts.{setting}`" in launched.message
+    if setting == "terminate":
+        assert len(rows_of(config.with_suffix(".csv"))) == 11
+    place.assert_nothing_left()
+
+
+@pytest.mark.parametrize(
+    ("fault", "says"),
+    [
+        ("segfault_fmi2DoStep", "was ended by SIGSEGV"),
+        ("segfault_fmi2Instantiate", "was ended by SIGSEGV"),
+        ("abort_fmi2Terminate", "was ended by SIGABRT"),
+        ("exit_fmi2DoStep", "ended with exit code 0"),
+    ],
+)
+def test_an_fmu_that_ends_its_process_ends_no_other(place: Place, hostile: Path, fault: str, says: str) -> None:
+    launched = place.run("launch", mesh_of(place, hostile, [fault]))
+
+    assert launched.wait() == 4
+    assert f"instance {fault}, point " in launched.message
+    assert f"node '{fault}' was lost: its process {says}" in launched.message
+    place.assert_nothing_left()
+
+
+@pytest.mark.parametrize("options", [(), ("--local",)], ids=["distributed", "local"])
+def test_what_an_fmu_does_to_folder_locale_memory_and_floating_point_mode_changes_no_result(
+    place: Place, hostile: Path, options: tuple[str, ...]
+) -> None:
+    peaceful = [f"peaceful{number}" for number in range(len(STATE_FAULTS))]
+    config = mesh_of(place, hostile, peaceful, group="together")
+    assert place.run("launch", config, *options).wait() == 0
+    expected = rows_of(config.with_suffix(".csv"))
+    assert expected[-1][1:5] == (1 / 3, 2e-310, 1.0, float(place.folder.stat().st_ino))
+
+    config = mesh_of(place, hostile, STATE_FAULTS, group="together")
+    assert place.run("launch", config, *options).wait() == 0
+
+    assert rows_of(config.with_suffix(".csv")) == expected
+    place.assert_nothing_left()
+
+
+@pytest.mark.parametrize("options", [(), ("--local",)], ids=["distributed", "local"])
+def test_an_fmu_that_fills_standard_output_neither_blocks_nor_garbles_the_launcher(
+    place: Place, hostile: Path, options: tuple[str, ...]
+) -> None:
+    config = mesh_of(place, hostile, ["flood_fmi2DoStep"])
+
+    launched = place.run("launch", config, *options)
+
+    assert launched.wait() == 0
+    assert [line.split(" ")[0] for line in launched.output.splitlines()] == ["result:", "10"]
+    if not options:
+        assert "flood_fmi2DoStep | the flood begins" in launched.errors
+        assert "(it writes a lot; nothing more of it is shown)" in launched.errors
+        assert len(launched.errors) < 500_000
+        assert "\033" not in launched.errors
+
+
+def test_an_fmu_that_ignores_signals_does_not_take_ctrl_c_away(place: Place, hostile: Path) -> None:
+    config = mesh_of(place, hostile, ["handlers_fmi2Instantiate"], stop_time=1000.0)
+    launched = place.start("launch", config, "--local")
+    wait_until(lambda: row_count(config.with_suffix(".csv")) > 100, "100 rows")
+
+    launched.signal(signal.SIGINT)
+
+    assert launched.wait() == 130
+    assert "SIGINT was received" in launched.message
+    place.assert_nothing_left()

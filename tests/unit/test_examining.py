@@ -1,0 +1,156 @@
+"""XML that must not be read, descriptions that cannot run, and those that are odd but can."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import yaml
+
+from fmu_mesh.errors import ConfigurationError, LoadFailed
+from fmu_mesh.fmu import read_description
+from fmu_mesh.launch.preparing import prepare
+from tests.fmus.packing import repacked
+
+
+def with_document_type(declaration: str, inside: str) -> Callable[[str], str]:
+    """A description with a document type, and something of it in an attribute."""
+
+    def change(text: str) -> str:
+        head, body = text.split("?>", 1)
+        body = body.replace("author=", f'author="{inside}" x=')
+        return f"{head}?><!DOCTYPE fmiModelDescription {declaration}>{body}"
+
+    return change
+
+
+LAUGHS = "".join(f"<!ENTITY l{n} '" + 10 * f"&l{n - 1};" + "'>" for n in range(1, 12))
+HOSTILE_XML = [
+    pytest.param(with_document_type(f'[<!ENTITY l0 "ha">{LAUGHS}]', "&l11;"), id="entities that expand without end"),
+    pytest.param(
+        with_document_type("[<!ENTITY a '" + 50_000 * "ha" + "'>]", "&a;" * 1000), id="one large entity, often"
+    ),
+    pytest.param(with_document_type('[<!ENTITY a SYSTEM "file:///etc/passwd">]', ""), id="an external entity"),
+    pytest.param(with_document_type('SYSTEM "http://127.0.0.1:9/fmi.dtd"', ""), id="an external document type"),
+]
+
+
+@pytest.mark.timeout(10)
+@pytest.mark.parametrize("change", HOSTILE_XML)
+def test_a_description_with_a_document_type_is_refused_before_it_is_read(
+    change: Callable[[str], str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        "fmu_mesh.fmu.reading.read_model_description", lambda *_, **__: pytest.fail("FMPy read what is not safe")
+    )
+    path = repacked(tmp_path / "hostile.fmu", description=change)
+
+    with pytest.raises(LoadFailed, match=r"modelDescription.xml of '.*hostile.fmu' declares a document type"):
+        read_description(path)
+
+
+def test_a_build_description_with_a_document_type_is_refused(tmp_path: Path) -> None:
+    xml = b'<!DOCTYPE x [<!ENTITY a "b">]><fmiBuildDescription fmiVersion="3.0"/>'
+    path = repacked(tmp_path / "hostile.fmu", add={"sources/buildDescription.xml": xml})
+
+    with pytest.raises(LoadFailed, match=r"sources/buildDescription.xml of '.*hostile.fmu' declares a document type"):
+        read_description(path)
+
+
+CANNOT_RUN = [
+    pytest.param(("<?xml", "<<?xml"), "cannot be read: ", id="XML that is not well-formed"),
+    pytest.param(('fmiVersion="2.0"', 'fmiVersion="3.0-beta.2"'), "is for FMI 3.0-beta.2, a version before", id="beta"),
+    pytest.param(('fmiVersion="2.0"', 'fmiVersion="9"'), "is for FMI '9'; there are FMI 1.0, 2.0 and 3.0", id="FMI 9"),
+    pytest.param(
+        ('causality="input"', 'causality="inptu"'),
+        "variable 'u' (line 27): causality: The value 'inptu' is not an element of the set",
+        id="an illegal causality",
+    ),
+    pytest.param(
+        ('valueReference="1"', 'valueReference="-1"'),
+        "variable 'y' (line 32): valueReference: '-1' is not a valid value",
+        id="an illegal value reference",
+    ),
+    pytest.param(
+        ('canHandleVariableCommunicationStepSize="true"', 'canHandleVariableCommunicationStepSize="perhaps"'),
+        "CoSimulation (line 8): canHandleVariableCommunicationStepSize: 'perhaps' is not",
+        id="an illegal capability",
+    ),
+    pytest.param(
+        ('modelIdentifier="Gain"', 'modelIdentifier="Other"'),
+        "has no 'binaries/linux64/Other.so', although its model identifier is 'Other'; it has "
+        "'binaries/linux64/Gain.so'",
+        id="a library with another name",
+    ),
+    pytest.param(
+        ('modelIdentifier="Gain"', 'modelIdentifier="../../Gain"'),
+        "which cannot be the name of a library",
+        id="an identifier that leaves the folder",
+    ),
+    pytest.param(("CoSimulation", "ModelExchange"), "model exchange only", id="model exchange only"),
+]
+
+
+@pytest.mark.parametrize(("change", "says"), CANNOT_RUN)
+def test_what_cannot_run_is_refused_with_the_reason(change: tuple[str, str], says: str, tmp_path: Path) -> None:
+    path = repacked(tmp_path / "odd.fmu", description=lambda text: text.replace(*change))
+
+    with pytest.raises(LoadFailed) as caught:
+        read_description(path)
+
+    assert says in str(caught.value)
+    assert "odd.fmu" in str(caught.value)
+
+
+ODD = [
+    pytest.param(('author="', 'colour="red" author="'), "attribute 'colour'", id="an unknown attribute"),
+    pytest.param(("<DefaultExperiment", "<Vendor/><DefaultExperiment"), "Element 'Vendor'", id="an unknown element"),
+    pytest.param(
+        ('author="', 'generationDateAndTime="today" author="'), "generationDateAndTime", id="a date that is none"
+    ),
+    pytest.param(('<Real start="1"', '<Real start="1,0"'), "attribute 'start'", id="a start value that is none"),
+]
+
+
+def config_with(path: Path, **more: object) -> Path:
+    file = path.with_suffix(".yaml")
+    content = {
+        "mesh": "one",
+        "simulation": {"stop_time": 1, "step_size": 0.1},
+        "instances": {"gain": {"fmu": path.name, **more}},
+    }
+    file.write_text(yaml.safe_dump(content), encoding="utf-8")
+    return file
+
+
+@pytest.mark.parametrize(("change", "says"), ODD)
+def test_what_is_odd_is_a_problem_of_the_description_and_an_error_where_the_configuration_is_strict(
+    change: tuple[str, str], says: str, tmp_path: Path
+) -> None:
+    def changed(text: str) -> str:
+        assert change[0] in text
+        return text.replace(*change)
+
+    path = repacked(tmp_path / "odd.fmu", description=changed)
+
+    plan = prepare(config_with(path))
+
+    (problem,) = plan.system.instances["gain"].description.problems
+    assert says in problem
+    with pytest.raises(ConfigurationError, match="strict: false") as caught:
+        prepare(config_with(path, strict=True))
+    assert "instances.gain.fmu" in str(caught.value)
+    assert says in str(caught.value)
+
+
+def test_an_instance_may_be_bearable_where_the_whole_configuration_is_strict(tmp_path: Path) -> None:
+    path = repacked(tmp_path / "odd.fmu", description=lambda text: text.replace('author="', 'colour="red" author="'))
+    strict, bearable = config_with(path), config_with(path, strict=False)
+    bearable.write_text(bearable.read_text() + "strict: true\n")
+
+    prepare(bearable)
+
+    strict.write_text(config_with(path).read_text() + "strict: true\n")
+    with pytest.raises(ConfigurationError, match="colour"):
+        prepare(strict)

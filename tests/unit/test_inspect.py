@@ -1,0 +1,129 @@
+"""`inspect`: what a page about an FMU says, and that it stays readable."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+
+import pytest
+
+from fmu_mesh.cli.main import main
+from tests.fmus.helpers import FMUS
+from tests.fmus.packing import repacked, unpacked
+
+PENDULUM = FMUS / "DampedPendulum.fmu"
+
+
+def inspected(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
+    assert main(["inspect", *map(str, arguments)]) == 0
+    said = capsys.readouterr()
+    assert said.err == ""
+    return said.out
+
+
+def many_variables(path: Path, count: int) -> Path:
+    """An FMU with many local variables, some with names and descriptions of a length that tools really make."""
+
+    def change(text: str) -> str:
+        more = "".join(
+            f'<ScalarVariable name="plant.body[{n}].{"joint." * (n % 12)}x" valueReference="{100 + n}" '
+            f'causality="local" description="{"Position in the world frame, " * (n % 5)}x"><Real unit="m"/>'
+            "</ScalarVariable>"
+            for n in range(count)
+        )
+        return text.replace("</ModelVariables>", f"{more}</ModelVariables>")
+
+    return repacked(path, source=PENDULUM, description=change)
+
+
+def test_the_page_says_what_an_fmu_is(capsys: pytest.CaptureFixture[str]) -> None:
+    page = inspected(capsys, PENDULUM)
+
+    assert f"SHA-256      {hashlib.sha256(PENDULUM.read_bytes()).hexdigest()}\n" in page
+    for line in (
+        "Kind         FMI 2.0 co-simulation",
+        "Platforms    C sources, linux64",
+        "Runs here    yes",
+        "Can          variable step size, get and set its state, serialize its state",
+        "Experiment   start 0 s, stop 40 s, step 0.002 s",
+        "Variables    3 outputs, 3 parameters",
+        "  der(a,2)  Real  continuous  [rad/s2]     Angular acceleration",
+        "  l  Real  fixed  = 1.0 m      Length, greater than 0",
+    ):
+        assert f"{line}\n" in page
+
+
+def test_the_json_has_everything(capsys: pytest.CaptureFixture[str]) -> None:
+    told = json.loads(inspected(capsys, PENDULUM, "--json"))
+
+    assert list(told) == ["file", "sha256", "bytes", "runs_here", "problems", "description"]
+    assert (told["bytes"], told["runs_here"], told["problems"]) == (PENDULUM.stat().st_size, True, [])
+    assert [variable["name"] for variable in told["description"]["variables"]] == ["a", "der(a)", "der(a,2)", *"ldg"]
+
+
+@pytest.mark.parametrize("width", [80, 120])
+def test_a_page_about_a_thousand_variables_is_short_and_keeps_to_the_width(
+    width: int, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", str(width))
+    path = many_variables(tmp_path / "many.fmu", 1000)
+
+    page = inspected(capsys, path)
+
+    lines = page.splitlines()
+    assert len(lines) < 60
+    assert "Local variables (1000)" in lines
+    assert "  ... and 980 more: --all lists them, a name such as 'x*' some" in lines
+    for line in lines:
+        assert len(line) <= width or line.split()[0].startswith(("plant.", "File")) or str(tmp_path) in line
+    assert len(inspected(capsys, path, "--all").splitlines()) > 1000
+
+
+def test_variables_are_found_by_name_and_an_unknown_one_is_told_with_the_nearest(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = many_variables(tmp_path / "many.fmu", 30)
+
+    page = inspected(capsys, path, "plant.body[2].*", "der(a)")
+
+    assert [line.split()[0] for line in page.splitlines() if line.startswith("  ")] == [
+        "der(a)",
+        "plant.body[2].joint.joint.x",
+    ]
+    assert main(["inspect", str(path), "der(aa)"]) == 2
+    assert "has no variable 'der(aa)'. Did you mean 'der(a)'?" in capsys.readouterr().err
+
+
+def test_an_fmu_that_cannot_run_here_is_shown_with_the_reason(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = repacked(
+        tmp_path / "elsewhere.fmu",
+        keep=lambda name: name == "modelDescription.xml",
+        description=lambda text: text.replace('author="', 'colour="red" author="'),
+        add={"binaries/win64/Gain.dll": b""},
+    )
+
+    page = inspected(capsys, path)
+
+    assert "Runs here    no, see Problems" in page
+    assert "Problems (2)" in page
+    assert "has no binary for this platform (linux64); it has: win64." in " ".join(page.split())
+    assert "attribute 'colour'" in " ".join(page.split())
+
+
+def test_an_unpacked_fmu_is_shown_too(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    page = inspected(capsys, unpacked(tmp_path / "gain"))
+
+    assert "gain (a folder)" in page
+    assert "SHA-256" not in page
+
+
+@pytest.mark.parametrize(
+    ("name", "says"), [("DampedPendulun.fmu", "does not exist. Did you mean"), ("build.py", "is no ZIP archive")]
+)
+def test_what_is_no_fmu_is_refused(name: str, says: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["inspect", str(FMUS / name)]) == 2
+
+    assert says in capsys.readouterr().err
