@@ -117,12 +117,13 @@ class CallWatch:
     @contextmanager
     def calling(self, instance: str, kind: type[FmuError], setting: str, limit_s: float) -> Iterator[None]:
         """While inside, an FMU may be called, for ``limit_s`` at most; ``setting`` is where the limit comes from."""
-        self._set(_Call(instance, kind, setting, limit_s, time.monotonic()))
+        self._call = _Call(instance, kind, setting, limit_s, time.monotonic())
+        self._notify()
         try:
             with kept_state():
                 yield
         finally:
-            self._set(None)
+            self._call = None  # the thread finds out when it looks
 
     @contextmanager
     def stepping(self, position: Callable[[], tuple[str, int]], limit_s: float) -> Iterator[None]:
@@ -140,10 +141,6 @@ class CallWatch:
         self._notify()
         if threading.current_thread() is not self._thread:
             self._thread.join()
-
-    def _set(self, call: _Call | None) -> None:
-        self._call = call
-        self._notify()
 
     def _notify(self) -> None:
         with self._changed:

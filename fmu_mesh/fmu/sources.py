@@ -14,7 +14,7 @@ import shlex
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Final
 
@@ -53,7 +53,12 @@ class _Build(msgspec.Struct, frozen=True):
     options: tuple[str, ...]
 
 
-def extract(path: Path, parent: Path, terms: Terms = Terms()) -> Path:  # noqa: B008 a frozen Struct
+def extract(
+    path: Path,
+    parent: Path,
+    terms: Terms = Terms(),  # noqa: B008 a frozen Struct
+    tell: Callable[[str], None] = log.info,
+) -> Path:
     """Unpack the FMU at ``path`` into a new private folder below ``parent`` and return it, ready to be loaded.
 
     Without a binary for this platform its sources are compiled, or what was compiled before is used again.
@@ -64,18 +69,18 @@ def extract(path: Path, parent: Path, terms: Terms = Terms()) -> Path:  # noqa: 
     with unpack(path, parent, terms) as folder:
         names = {file.relative_to(folder).as_posix() for file in folder.glob("binaries/*/*")}
         if not any(name.endswith(fmpy.sharedLibraryExtension) for name in names & _own(names)):
-            _add_library(path, folder)
+            _add_library(path, folder, tell)
     return folder.with_suffix("")
 
 
-def compile_sources(path: Path, terms: Terms = Terms()) -> None:  # noqa: B008 a frozen Struct
-    """Compile the sources of the FMU at ``path`` into the cache, if they are not there yet.
+def compile_sources(path: Path, terms: Terms, tell: Callable[[str], None]) -> None:
+    """Compile the sources of the FMU at ``path`` into the cache, if they are not there yet; ``tell`` before it begins.
 
     Raises:
         LoadFailed: there is no compiler, or they do not compile; the message has the compiler's first lines.
     """
     with tempfile.TemporaryDirectory(prefix="fmu_mesh-") as folder:
-        extract(path, Path(folder), terms)
+        extract(path, Path(folder), terms, tell)
 
 
 def cache_folder() -> Path:
@@ -92,14 +97,14 @@ def _own(names: set[str]) -> set[str]:
     return {name for name in names if any(name.startswith(folder) for folder in folders)}
 
 
-def _add_library(path: Path, folder: Path) -> None:
+def _add_library(path: Path, folder: Path, tell: Callable[[str], None]) -> None:
     """Put the compiled library of an FMU where its binary would be."""
     names = [file.relative_to(folder).as_posix() for file in folder.glob("sources/**/*") if file.is_file()]
     if not source_names(names):
         return  # loading it says what is missing
     description = read_model_description(str(folder), validate=False)
     build = _build(path, description, names)
-    library = _compiled(path, folder / "sources", build)
+    library = _compiled(path, folder / "sources", build, tell)
     target = folder / library_names(build.identifier, description.fmiVersion)[0]
     target.parent.mkdir(parents=True, exist_ok=True)
     shutil.copyfile(library, target)
@@ -140,7 +145,7 @@ def _build(path: Path, description: FmpyDescription, names: Sequence[str]) -> _B
     return _Build(identifier, tuple(sources), tuple(includes), tuple(options))
 
 
-def _compiled(path: Path, sources: Path, build: _Build) -> Path:
+def _compiled(path: Path, sources: Path, build: _Build, tell: Callable[[str], None]) -> Path:
     """The library that was made of these sources, from the cache if it is there."""
     plus = any(not name.endswith(".c") for name in build.sources)
     compiler = _compiler(path, plus=plus)
@@ -148,7 +153,7 @@ def _compiled(path: Path, sources: Path, build: _Build) -> Path:
     target = cache_folder() / "sources" / _key(sources, build, own) / f"{build.identifier}{fmpy.sharedLibraryExtension}"
     if target.is_file():
         return target
-    log.info("compiling_sources", extra={"fmu": str(path), "library": str(target)})
+    tell(f"'{path}' has no binary for this platform ({fmpy.platform}): compiling its sources into '{target.parent}'")
     try:
         target.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix="build-", dir=target.parent) as scratch:

@@ -105,8 +105,7 @@ def _description(path: Path, terms: Terms, tell: Callable[[str], None]) -> Model
     try:
         description = read_description(path, terms)
         if PLATFORM not in description.platforms:
-            tell(f"'{path}' has no binary for this platform ({PLATFORM}): its sources are compiled, unless they were")
-            compile_sources(path, terms)
+            compile_sources(path, terms, tell)
     except LoadFailed as error:
         return error
     return description

@@ -20,7 +20,7 @@ import numpy as np
 import zenoh
 from numpy.typing import NDArray
 
-from ..errors import ConfigurationError, DeadlineExceeded, FmuMeshError, from_report
+from ..errors import ConfigurationError, DeadlineExceeded, FmuMeshError, MeshLost, from_report
 from ..model.description import VariableType
 from ..model.plan import RECORDER, NodePlan
 from ..wire.frames import FrameReceiver
@@ -127,9 +127,10 @@ class Recorder:
     def _meet_in_time(self) -> None:
         try:
             self._meet()
-        except DeadlineExceeded as error:
+        except MeshLost as error:
             # The master meets the same deadline, and names all nodes that are missing; it must not miss this one, too.
-            end = time.monotonic() + self._plan.timeouts.stop
+            patience_s = self._plan.timeouts.stop if isinstance(error, DeadlineExceeded) else 0.0
+            end = time.monotonic() + patience_s
             while not self._finished and time.monotonic() < end:
                 self._inbox.wait(_LOOK_S)
             raise _Ended(error) from error

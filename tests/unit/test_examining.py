@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from fmu_mesh.errors import ConfigurationError, LoadFailed
-from fmu_mesh.fmu import read_description
+from fmu_mesh.fmu import read_description, sha256_of
 from fmu_mesh.launch.preparing import prepare
 from tests.fmus.packing import repacked
 
@@ -154,3 +154,28 @@ def test_an_instance_may_be_bearable_where_the_whole_configuration_is_strict(tmp
     strict.write_text(config_with(path).read_text() + "strict: true\n")
     with pytest.raises(ConfigurationError, match="colour"):
         prepare(strict)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"sha256": "0" * 64}, "has the SHA-256 "),
+        ({"sha256": "abc"}, "expected a SHA-256 as 64 hexadecimal digits"),
+    ],
+)
+def test_a_checksum_in_the_configuration_is_checked(change: dict[str, str], says: str, tmp_path: Path) -> None:
+    path = repacked(tmp_path / "gain.fmu")
+
+    with pytest.raises(ConfigurationError) as caught:
+        prepare(config_with(path, **change))
+
+    assert says in str(caught.value)
+    prepare(config_with(path, sha256=sha256_of(path)))
+
+
+def test_the_limits_of_the_configuration_hold(tmp_path: Path) -> None:
+    file = config_with(repacked(tmp_path / "gain.fmu"))
+    file.write_text(file.read_text() + "limits: {entries: 3}\n")
+
+    with pytest.raises(ConfigurationError, match=r"instances\.gain\.fmu: .* entries; the limit is 3"):
+        prepare(file)

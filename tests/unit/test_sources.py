@@ -56,12 +56,13 @@ def test_a_source_fmu_is_compiled_once_told_and_gives_the_same_result(
 
     assert main(["launch", "--local", str(config)]) == 0
 
-    assert "sources.fmu' has no binary for this platform (linux64): its sources are compiled" in capsys.readouterr().err
+    assert "sources.fmu' has no binary for this platform (linux64): compiling its sources" in capsys.readouterr().err
     assert (tmp_path / "one.csv").read_bytes() == expected
     (library,) = libraries(cache)
     assert library.name == "Gain.so"
     made = library.stat().st_mtime_ns
     assert main(["launch", "--local", str(config)]) == 0
+    assert "compiling" not in capsys.readouterr().err
     assert [one.stat().st_mtime_ns for one in libraries(cache)] == [made]
     assert [one.name for one in library.parent.iterdir()] == ["Gain.so"]
 
@@ -86,6 +87,16 @@ def test_an_unpacked_source_fmu_is_compiled_into_the_cache_and_not_into_its_fold
     assert (folder / "binaries/linux64/Gain.so").is_file()
     assert sorted(source.rglob("*")) == before
     assert len(libraries(cache)) == 1
+
+
+def test_an_unpacked_folder_runs_and_stays_as_it_is(tmp_path: Path) -> None:
+    source = unpacked(tmp_path / "gain")
+    before = {path: path.stat().st_mtime_ns for path in source.rglob("*")}
+
+    assert main(["launch", "--local", str(config_with(source))]) == 0
+
+    assert (tmp_path / "one.csv").read_text().splitlines()[-1] == "1.0,0.30000000000000004"
+    assert {path: path.stat().st_mtime_ns for path in source.rglob("*")} == before
 
 
 def test_functions_with_a_prefix_get_their_plain_names_in_the_library(tmp_path: Path) -> None:

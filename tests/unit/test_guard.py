@@ -1,0 +1,114 @@
+"""Calls of an FMU have deadlines, and leave the state of the process alone."""
+
+from __future__ import annotations
+
+import ctypes
+import locale
+import os
+import signal
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from fmu_mesh.errors import FmuError, InitializationFailed, StepFailed
+from fmu_mesh.fmu.guard import CallWatch, floating_point_changed, kept_state, restore_floating_point
+
+DEADLINE_S = 20.0
+UPWARD, DOWNWARD, TOWARD_ZERO = 0x800, 0x400, 0xC00  # of x86; other processors have other numbers
+
+libc = ctypes.CDLL(None)
+x86 = pytest.mark.skipif(os.uname().machine != "x86_64", reason="the numbers of the rounding modes are those of x86")
+
+
+class Overruns:
+    """What a watch has found."""
+
+    def __init__(self) -> None:
+        self.found: list[FmuError] = []
+        self.there = threading.Event()
+
+    def take(self, error: FmuError) -> None:
+        self.found.append(error)
+        self.there.set()
+
+
+@pytest.fixture
+def overruns() -> Overruns:
+    return Overruns()
+
+
+@pytest.fixture
+def watch(overruns: Overruns) -> Iterator[CallWatch]:
+    watch = CallWatch(overruns.take)
+    yield watch
+    watch.close()
+
+
+def test_a_call_that_meets_its_deadline_is_told_with_the_function_on_the_stack(
+    watch: CallWatch, overruns: Overruns
+) -> None:
+    def _call(fname: str) -> None:  # as FMPy names it
+        assert overruns.there.wait(DEADLINE_S), fname
+
+    with watch.calling("plant", InitializationFailed, "call", 0.05):
+        _call("fmi2EnterInitializationMode")
+
+    (error,) = overruns.found
+    assert type(error) is InitializationFailed
+    assert error.instance == "plant"
+    assert error.message.endswith("s from fmi2EnterInitializationMode; its process is ended")
+    assert error.hint is not None
+    assert "`timeouts.call`" in error.hint
+
+
+def test_calls_in_time_are_not_told_however_many_they_are(watch: CallWatch, overruns: Overruns) -> None:
+    for _ in range(200):
+        with watch.calling("plant", InitializationFailed, "call", DEADLINE_S):
+            pass
+
+    assert overruns.found == []
+
+
+def test_a_step_that_meets_its_deadline_is_told(watch: CallWatch, overruns: Overruns) -> None:
+    with watch.stepping(lambda: ("plant", 7), 0.05):
+        assert overruns.there.wait(DEADLINE_S)
+
+    (error,) = overruns.found
+    assert type(error) is StepFailed
+    assert error.instance == "plant"
+
+
+@x86
+@pytest.mark.parametrize("mode", [UPWARD, DOWNWARD, TOWARD_ZERO])
+def test_another_rounding_mode_is_seen_and_restored(mode: int) -> None:
+    assert not floating_point_changed()
+
+    libc.fesetround(mode)
+    seen = floating_point_changed()
+    restore_floating_point()
+
+    assert seen
+    assert not floating_point_changed()
+
+
+@x86
+def test_folder_locale_rounding_and_signal_handlers_are_kept(tmp_path: Path) -> None:
+    folder, language = Path.cwd(), locale.setlocale(locale.LC_ALL)
+    interrupts: list[int] = []
+    before = signal.signal(signal.SIGTERM, lambda number, _frame: interrupts.append(number))
+    try:
+        with kept_state():
+            os.chdir(tmp_path)
+            locale.setlocale(locale.LC_NUMERIC, "C.UTF-8")
+            libc.fesetround(UPWARD)
+            libc.signal(signal.SIGTERM, ctypes.c_void_p(1))  # SIG_IGN, as C code would
+
+        assert Path.cwd() == folder
+        assert locale.setlocale(locale.LC_ALL) == language
+        assert not floating_point_changed()
+        os.kill(os.getpid(), signal.SIGTERM)
+        assert interrupts == [signal.SIGTERM]
+    finally:
+        signal.signal(signal.SIGTERM, before)
