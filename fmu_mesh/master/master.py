@@ -99,6 +99,7 @@ class Master:
         self._slowest = -1
         self._registered: dict[str, tuple[Registration, zenoh.Query]] = {}
         self._outlets: dict[str, SharedOutlet] = {}
+        self._shared: tuple[str, ...] = ()
         self._present: set[str] = set()
         self._reports: dict[str, NodeReport] = {}
         self._failure: FmuMeshError | None = None
@@ -204,10 +205,11 @@ class Master:
         if offer is not None:
             self._inbox.share()
             shared.append(MASTER)
+        self._shared = tuple(shared)
         entries = TIME_LINE_ENTRIES // len(self._nodes) if self.watch is not None else 0
         for number, node in enumerate(self._nodes):
             _, query = self._registered.pop(node)
-            query.reply(query.key_expr, msgspec.json.encode(Welcome(number, entries, tuple(shared), offer)))
+            query.reply(query.key_expr, msgspec.json.encode(Welcome(number, entries, self._shared, offer)))
             query.drop()
 
     def _grant_to_the_end(self) -> None:
@@ -443,6 +445,7 @@ class Master:
             endpoints=self._endpoints,
             pid=os.getpid(),
             host=socket.gethostname(),
+            shared_memory=self._shared,
         )
 
     def last_status(self) -> MeshStatus:

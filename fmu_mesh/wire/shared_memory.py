@@ -30,6 +30,7 @@ from .messages import ABORT, MAX_MESSAGE_SIZE
 
 __all__ = ["Offer", "SharedInbox", "SharedOutlet", "available"]
 
+_NAME: Final = "fmu_mesh"
 _TOKEN_SIZE: Final = 16
 _DOORBELL: Final = 64
 _CHANNELS: Final = 128
@@ -126,7 +127,7 @@ class SharedInbox:
             channels[sender] = (end, size)
             end += _DATA + size
         token = secrets.token_bytes(_TOKEN_SIZE)
-        self._descriptor = os.memfd_create("fmu_mesh", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
+        self._descriptor = os.memfd_create(_NAME, os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
         os.ftruncate(self._descriptor, end)
         # A sender cannot make the mapping of the others shorter.
         fcntl.fcntl(self._descriptor, fcntl.F_ADD_SEALS, fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL)
@@ -369,7 +370,11 @@ def _open(offer: Offer) -> _Memory:
         OSError: it cannot be opened from here.
         ValueError: it is not the memory that was offered.
     """
-    descriptor = os.open(f"/proc/{offer.pid}/fd/{offer.descriptor}", os.O_RDWR | os.O_CLOEXEC)
+    path = Path(f"/proc/{offer.pid}/fd/{offer.descriptor}")
+    if not str(path.readlink()).startswith(f"/memfd:{_NAME}"):  # opening a device could do something
+        msg = f"descriptor {offer.descriptor} of process {offer.pid} is no such memory"
+        raise ValueError(msg)
+    descriptor = os.open(path, os.O_RDWR | os.O_CLOEXEC)
     try:
         if os.fstat(descriptor).st_size != offer.size or os.pread(descriptor, _TOKEN_SIZE, 0).hex() != offer.token:
             msg = f"descriptor {offer.descriptor} of process {offer.pid} is something else"
