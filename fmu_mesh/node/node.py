@@ -359,6 +359,7 @@ class Node:
         self.server.state = "failed"
         if self._master_is_gone:
             return True
+        self.server.say_everything()
         timeout_s = self._plan.timeouts.stop
         try:
             self._report(error, timeout_s if self._master_was_there else min(timeout_s, _NO_MASTER_S))
