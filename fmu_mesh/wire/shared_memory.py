@@ -27,6 +27,7 @@ import msgspec
 
 from ..errors import DeadlineExceeded, FmuMeshError
 from .messages import ABORT, MAX_MESSAGE_SIZE
+from .runtime import is_alive
 
 __all__ = ["Offer", "SharedInbox", "SharedOutlet", "available"]
 
@@ -346,7 +347,7 @@ class SharedOutlet:
                 return True
             if self._clockwait(self._spaces, time.CLOCK_MONOTONIC, ctypes.byref(_after(_LOOK_S))) == 0:
                 self._free += self._sent.popleft()
-            elif (self._own is not None and self._own()) or not _lives(self._pid):
+            elif (self._own is not None and self._own()) or not is_alive(self._pid):
                 return False
             elif time.monotonic() - started > self._deadline_s:
                 raise DeadlineExceeded(f"{self._target} has taken no message for {self._deadline_s:g} s")
@@ -382,11 +383,3 @@ def _open(offer: Offer) -> _Memory:
         return _Memory(descriptor, offer.size)
     finally:
         os.close(descriptor)
-
-
-def _lives(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    return True
