@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from ..errors import FmuMeshError
 from ..model.plan import LAZY_ROWS, RECORDER, Link
 from ..model.ring import Ring
 from ..wire.messages import FRAME, INITIAL, encode_rows
@@ -43,6 +44,10 @@ class OutLink:
         if first >= end:
             return
         ring = self._outputs
+        if end - first > ring.rows:
+            lost = end - ring.rows - first
+            text = f"{lost} rows for {self.link.target_node} were overwritten before they were sent"
+            raise FmuMeshError(text, instance=self.link.source, point=first * self.link.step_points)
         while first < end:
             start = first & ring.mask
             cut = min(end - first, ring.rows - start)

@@ -149,10 +149,10 @@ class Unit:
             runner.step_seconds += elapsed
             if elapsed >= _BURST_S:
                 runner.flush()
-            elif self._starved:
+                continue
+            if self._starved:
                 runner.flush(lazy=False)
-            else:
-                runner.flush_full()
+            runner.flush_full()
         return True
 
     def _advance_single(self, runner: Runner, grant: int) -> int:
