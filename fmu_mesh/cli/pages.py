@@ -72,6 +72,9 @@ def instance_status(status: InstanceStatus) -> list[str]:
     )
 
 
+_PARTS = {"@record": "the recorder", "@mesh": "the master"}
+
+
 def mesh_info(info: MeshInfo) -> list[str]:
     """What a mesh is."""
     return pairs(
@@ -89,6 +92,7 @@ def mesh_info(info: MeshInfo) -> list[str]:
             ("nodes", ", ".join(info.nodes)),
             ("result file", info.result_file or "none"),
             ("endpoints", ", ".join(info.endpoints)),
+            ("shared memory", ", ".join(_PARTS.get(name, name) for name in info.shared_memory) or "not used"),
             ("master", f"process {info.pid} on {info.host}, fmu_mesh {info.version}"),
         ]
     )

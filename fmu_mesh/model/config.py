@@ -185,6 +185,13 @@ class ZenohConfig(Base, frozen=True, kw_only=True):
         Meta(description="Endpoints where the master can be reached; default: a free loopback port."),
     ] = []
     connect: Annotated[list[Endpoint], Meta(description="Endpoints of a router or of another host's mesh.")] = []
+    shared_memory: Annotated[
+        bool,
+        Meta(
+            description="Whether processes of one host exchange frames and grants through shared memory; false: "
+            "through Zenoh, as those of different hosts do."
+        ),
+    ] = True
     config: Annotated[
         str | None,
         Meta(description="A Zenoh configuration file (JSON5), relative to this file, to start from."),

@@ -102,6 +102,7 @@ class NodePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         links_in: links that end here.
         links_out: links that start here.
         result_file: absolute path of the result CSV (for the recorder).
+        shared_memory: whether processes of one host exchange messages through shared memory.
     """
 
     mesh: str
@@ -120,6 +121,7 @@ class NodePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     result_file: str | None = None
     recorded: tuple[tuple[str, str], ...] = ()
     limits: LimitsConfig = LimitsConfig()
+    shared_memory: bool = True
 
     def instance(self, name: str) -> InstancePlan:
         """The plan of one of its instances."""
@@ -331,6 +333,7 @@ def _node(
         result_file=plan.system.result_file if node == RECORDER else None,
         recorded=plan.system.recorded if node == RECORDER else (),
         limits=config.limits,
+        shared_memory=config.zenoh.shared_memory,
     )
 
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-import numpy as np
-import zenoh
+from collections.abc import Callable
 
+import numpy as np
+
+from ..errors import FmuMeshError
 from ..model.plan import LAZY_ROWS, RECORDER, Link
 from ..model.ring import Ring
 from ..wire.messages import FRAME, INITIAL, encode_rows
@@ -24,7 +26,7 @@ class OutLink:
         lazy: whether nobody steps on these rows, so that they may wait a little when others are sent.
     """
 
-    def __init__(self, link: Link, outputs: Ring, publisher: zenoh.Publisher, window: int) -> None:
+    def __init__(self, link: Link, outputs: Ring, put: Callable[[bytes], None], window: int) -> None:
         self.link = link
         self.sent = 0
         self.lazy = link.target_node == RECORDER
@@ -32,8 +34,7 @@ class OutLink:
         by_window = LAZY_ROWS // 2 if self.lazy else max(1, window // (4 * link.step_points))
         self.capacity = max(1, min(_FRAME_POINTS, _FRAME_BYTES // max(link.layout.row_size, 1), by_window))
         self._outputs = outputs
-        self.publisher = publisher
-        self._put = publisher.put
+        self.put = put
         self._reals = _columns(outputs.layout.reals, link.layout.reals)
         self._integers = _columns(outputs.layout.integers, link.layout.integers)
 
@@ -43,12 +44,16 @@ class OutLink:
         if first >= end:
             return
         ring = self._outputs
+        if end - first > ring.rows:
+            lost = end - ring.rows - first
+            text = f"{lost} rows for {self.link.target_node} were overwritten before they were sent"
+            raise FmuMeshError(text, instance=self.link.source, point=first * self.link.step_points)
         while first < end:
             start = first & ring.mask
             cut = min(end - first, ring.rows - start)
             reals = ring.reals[start : start + cut]
             integers = ring.integers[start : start + cut]
-            self._put(
+            self.put(
                 encode_rows(
                     FRAME,
                     self.link.index,
@@ -65,11 +70,7 @@ class OutLink:
         layout = self.link.layout
         reals = np.array([[values.get(name, 0.0) for name in layout.reals]], dtype=np.float64)
         integers = np.array([[values.get(name, 0) for name in layout.integers]], dtype=np.int32)
-        self._put(encode_rows(INITIAL, self.link.index, level, reals, integers))
-
-    def close(self) -> None:
-        """Undeclare the publisher."""
-        self.publisher.undeclare()
+        self.put(encode_rows(INITIAL, self.link.index, level, reals, integers))
 
 
 def _columns(have: tuple[str, ...], want: tuple[str, ...]) -> list[int] | None:

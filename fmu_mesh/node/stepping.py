@@ -133,6 +133,7 @@ class Unit:
         self._inner = frozenset(runner.name for runner in runners)
         self._point = 0
         self._burst = 1
+        self._starved = False
 
     def advance(self, grant: int) -> bool:
         """Step as far as inputs and ``grant`` allow, for one burst at most; whether anything was stepped."""
@@ -149,13 +150,16 @@ class Unit:
             runner.step_seconds += elapsed
             if elapsed >= _BURST_S:
                 runner.flush()
-            else:
-                runner.flush_full()
+                continue
+            if self._starved:
+                runner.flush(lazy=False)
+            runner.flush_full()
         return True
 
     def _advance_single(self, runner: Runner, grant: int) -> int:
         first = runner.step
-        end = min(runner.limit(grant), first + self._burst)
+        limit = runner.limit(grant)
+        end = min(limit, first + self._burst)
         if end <= first:
             return 0
         for link in runner.out_links:
@@ -169,11 +173,13 @@ class Unit:
             if one + half_ulp - quarter_ulp != one or not tiny + tiny:  # as `floating_point_changed`, without a call
                 restore_floating_point()
             runner.step = step + 1
+        self._starved = end == limit
         return end - first
 
     def _advance_cycle(self, grant: int) -> int:
         first = self._point
-        end = min(self._cycle_limit(grant), first + self._burst)
+        limit = self._cycle_limit(grant)
+        end = min(limit, first + self._burst)
         for point in range(first, end):
             for runner in self.runners:
                 # A slower instance steps when the end of its step is reached: only then all its inputs can be there.
@@ -187,6 +193,7 @@ class Unit:
                     restore_floating_point()
                 runner.step = step + 1
         self._point = max(first, end)
+        self._starved = end == limit
         return max(0, end - first)
 
     def _cycle_limit(self, grant: int) -> int:

@@ -29,7 +29,6 @@ __all__ = [
     "PROGRESS",
     "WAKE",
     "NodeReport",
-    "Registration",
     "Rows",
     "decode_abort",
     "decode_json",
@@ -53,15 +52,6 @@ T = TypeVar("T")
 
 Rows = tuple[NDArray[np.float64], NDArray[np.int32]]
 _NO_INTEGERS: Final = np.zeros((0, 0), dtype=np.int32)
-
-
-class Registration(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a node says about itself when it is ready for Initialization Mode."""
-
-    node: str
-    digest: str
-    pid: int
-    host: str
 
 
 class NodeReport(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
