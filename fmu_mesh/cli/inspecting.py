@@ -29,6 +29,7 @@ _WIDE: Final = 120
 _CAUSALITIES: Final[tuple[tuple[Causality, str], ...]] = (
     ("input", "Inputs"),
     ("output", "Outputs"),
+    ("structuralParameter", "Structural parameters"),
     ("parameter", "Parameters"),
     ("calculatedParameter", "Calculated parameters"),
     ("independent", "Independent variable"),
@@ -218,7 +219,7 @@ def _wrapped(line: str, width: int, indent: str) -> list[str]:
 
 def _variables(variables: Sequence[Variable], width: int) -> list[str]:
     """One line for each: name, type, variability, start value with unit; then what fits of the description."""
-    rows = [[v.name, v.type, v.variability, _start(v), " ".join((v.description or "").split())] for v in variables]
+    rows = [[v.name, v.type_name, v.variability, _start(v), " ".join((v.description or "").split())] for v in variables]
     widest = [max(len(row[column]) for row in rows) for column in range(4)]
     # One very long name does not push everything else off the page.
     widest[0] = min(widest[0], width // 2)
@@ -240,7 +241,9 @@ def _start(variable: Variable) -> str:
     unit = variable.unit or ""
     if variable.start is None:
         return f"[{unit}]" if unit else ""
-    return f"= {shown(variable.start)} {unit}".rstrip()
+    start = variable.start
+    text = shown(msgspec.json.encode(start).decode() if isinstance(start, list | bytes) else start)
+    return f"= {text} {unit}".rstrip()
 
 
 def _number(value: float) -> str:

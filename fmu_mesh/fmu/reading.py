@@ -7,7 +7,6 @@ that a strict validator finds are kept in `ModelDescription.problems`, and the F
 from __future__ import annotations
 
 from pathlib import Path
-from typing import cast
 
 import fmpy
 from fmpy.model_description import ModelDescription as FmpyDescription
@@ -21,7 +20,13 @@ from .examining import examine, require_library
 
 __all__ = ["read_description"]
 
-_TYPES: tuple[VariableType, ...] = ("Real", "Integer", "Boolean", "String", "Enumeration")
+_TYPES: dict[str, VariableType] = {
+    "Real": "Float64",
+    "Integer": "Int32",
+    "Boolean": "Boolean",
+    "String": "String",
+    "Enumeration": "Enumeration",
+}
 
 
 def read_description(
@@ -104,15 +109,16 @@ def _convert(source: FmpyDescription, platforms: tuple[str, ...], problems: tupl
 
 
 def _variable(source: ModelVariable, dependencies: dict[str, tuple[str, ...] | None]) -> Variable:
-    type_ = cast("VariableType", source.type)
+    type_ = _TYPES[source.type]
     declared = source.declaredType
     items = tuple((item.name, int(item.value)) for item in declared.items) if declared and declared.items else ()
     return Variable(
         name=source.name,
         value_reference=int(source.valueReference),
         type=type_,
+        declared_type=source.type,
         causality=source.causality or "local",
-        variability=source.variability or ("continuous" if type_ == "Real" else "discrete"),
+        variability=source.variability or ("continuous" if type_ == "Float64" else "discrete"),
         initial=source.initial,
         start=_start(type_, source.start),
         unit=source.unit or (declared.unit if declared is not None else None),
@@ -130,7 +136,8 @@ def _number(text: str | float | None) -> float | None:
     try:
         return float(text)
     except ValueError:
-        return None
+        pass
+    return None
 
 
 def _start(type_: VariableType, text: str | None) -> Value | None:
@@ -139,13 +146,14 @@ def _start(type_: VariableType, text: str | None) -> Value | None:
         return None
     try:
         match type_:
-            case "Real":
+            case "Float64":
                 return float(text)
-            case "Integer" | "Enumeration":
+            case "Int32" | "Enumeration":
                 return int(text)
             case "Boolean":
                 return text in ("true", "1")
             case "String":
                 return text
     except ValueError:
-        return None
+        pass
+    return None
