@@ -185,7 +185,7 @@ class LocalMesh:
             raise
         finally:
             self._save = lambda: None
-            if file is not None and buffer:
+            if file is not None:
                 _write(file, grid, first, buffer, types)
         self._progress(self.point)
 
@@ -270,6 +270,8 @@ def _at(value: Value, index: tuple[int, ...]) -> Value:
 
 
 def _write(file: CsvFile, grid: TimeGrid, first: int, rows: list[list[Value]], types: Sequence[VariableType]) -> None:
+    if not rows:
+        return
     times = grid.times(first, first + len(rows))
     try:
         columns = zip(zip(*rows, strict=True), types, strict=True)
