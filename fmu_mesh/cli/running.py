@@ -22,6 +22,7 @@ from ..launch.roles import BY_HAND, run_master, run_node
 from ..model.plan import Plan
 from ..wire.profile import MeshProfile
 from ..wire.router import run_router
+from ..wire.runtime import enter_run_folder, fmu_folder, leave_run_folder, remove_stale_folders, run_folder
 from ..wire.views import LogLine
 from .display import Display, say, stdout_as_stderr, summary
 from .plotting import plot_results, require_matplotlib
@@ -123,15 +124,27 @@ def _run_local(plan: Plan, display: Display) -> tuple[int, float, int]:
         line = LogLine(message.instance, message.status, message.category, message.message, mesh.point)
         display.log(line)
 
+    def clean_up() -> None:
+        mesh.clean_up()
+        leave_run_folder(folder)
+
     def end(error: FmuError) -> None:
         """The thread in the FMU cannot be got back."""
-        mesh.clean_up()
+        clean_up()
         print(f"fmu-mesh: {error}", file=sys.stderr, flush=True)
         os._exit(error.exit_code)
 
-    mesh = LocalMesh(plan, log, display.progress, on_hang=end)
-    with stdout_as_stderr(), ended_by_signals(mesh.interrupt, mesh.clean_up, watch_stdin=False):
-        mesh.run()
+    remove_stale_folders()
+    folder = run_folder(plan.system.config.mesh, BY_HAND)
+    enter_run_folder(folder, f"local {os.getpid()}")
+    fmus = fmu_folder(folder)
+    fmus.mkdir(parents=True, exist_ok=True)
+    mesh = LocalMesh(plan, log, display.progress, on_hang=end, parent=fmus)
+    try:
+        with stdout_as_stderr(), ended_by_signals(mesh.interrupt, clean_up, watch_stdin=False):
+            mesh.run()
+    finally:
+        leave_run_folder(folder)
     return mesh.point, mesh.seconds, mesh.rows
 
 

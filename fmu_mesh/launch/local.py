@@ -45,6 +45,7 @@ class LocalMesh:
         open_instance: opens an instance by name, where it is not the FMU of the plan; this closes it.
         on_hang: called on another thread when an FMU does not return in time, with what was recorded up to then in the
             result file; the thread in the FMU cannot be got back, so only the end of the process is left to do.
+        parent: an existing folder to extract FMUs into; by default that for temporary files.
 
     Attributes:
         point: the last point reached.
@@ -52,13 +53,14 @@ class LocalMesh:
         seconds: wall-clock time of the loop.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913, PLR0917  what a caller may want to hear of
         self,
         plan: Plan,
         log: Callable[[LogMessage], None] = lambda _message: None,
         progress: Callable[[int], None] = lambda _point: None,
         open_instance: Callable[[str], Instance] | None = None,
         on_hang: Callable[[FmuError], None] = lambda error: log.error("%s", error),
+        parent: Path | None = None,
     ) -> None:
         self.point = 0
         self.rows = 0
@@ -68,6 +70,7 @@ class LocalMesh:
         self._progress = progress
         self._open_instance = open_instance
         self._on_hang = on_hang
+        self._parent = parent
         self._stepping = ""
         self._save: Callable[[], None] = lambda: None
         self._stop: str | None = None
@@ -102,7 +105,7 @@ class LocalMesh:
         columns = [(f"{instance}.{name}", layouts[instance].column(name).type) for instance, name in recorded]
         members: dict[str, _Member] = {}
         watch = CallWatch(self._take_hang)
-        with tempfile.TemporaryDirectory(prefix="fmu_mesh-") as folder, closing(watch):
+        with tempfile.TemporaryDirectory(prefix="fmu_mesh-", dir=self._parent) as folder, closing(watch):
             self._folder = Path(folder)
             file = CsvFile(Path(plan.system.result_file), columns) if plan.system.result_file is not None else None
             try:

@@ -179,3 +179,17 @@ def test_what_a_killed_process_has_left_is_removed_by_the_next_start(place: Plac
         assert [launched.wait() for launched in by_hand] == [0, 0, 0]
 
     place.assert_nothing_left()
+
+
+@pytest.mark.timeout(60)
+def test_what_a_killed_run_in_one_process_has_left_is_removed_by_the_next_start(place: Place) -> None:
+    config = write_config(place.folder, stop_time=10_000.0)
+    killed = place.start("launch", config, "--local")
+    wait_until(lambda: row_count(config.with_suffix(".csv")) > 100, "100 rows")
+    killed.signal(signal.SIGKILL)
+    killed.wait()
+    assert place.extracted()
+
+    assert place.run("launch", write_config(place.folder), "--local").wait() == 0
+
+    place.assert_nothing_left()
