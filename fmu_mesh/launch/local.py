@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import FmuMeshError, Interrupted, StepFailed
-from ..fmu import Fmi2Instance, LogMessage
+from ..fmu import LogMessage, open_instance
 from ..model.elements import scaled
 from ..model.instance import Instance
 from ..model.plan import Plan
@@ -113,7 +113,7 @@ class LocalMesh:
         if self._open_instance is not None:
             return self._open_instance(name)
         system = self._plan.system.instances[name]
-        return Fmi2Instance(Path(system.fmu), name, system.description, folder, self._log)
+        return open_instance(Path(system.fmu), name, system.description, folder, self._log)
 
     def _initialize(self, members: dict[str, _Member]) -> None:
         grid = self._plan.grid
