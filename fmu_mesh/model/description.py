@@ -13,7 +13,7 @@ from typing import Literal
 import msgspec
 from msgspec.structs import replace
 
-from .types import PlainValue, Value, VariableType, element_names, flattened, nested, split_element
+from .types import MAX_ELEMENTS, PlainValue, Value, VariableType, element_names, flattened, nested, split_element
 
 __all__ = [
     "Causality",
