@@ -252,7 +252,8 @@ def test_a_beta_version_of_fmi_3_is_refused(folder: Path, tmp_path: Path) -> Non
 def test_the_library_steps_fmus_of_fmi_3_with_arrays(folder: Path) -> None:
     with FMIAdapter(build_test_fmu("AllTypes3", folder), step_size=0.5) as adapter:
         adapter.set_initial_value("columns", 2)
-        adapter.set_initial_value("int16_array_in", np.array([[1, 2], [3, 4]]))
+        matrix: Any = np.array([[1, 2], [3, 4]])
+        adapter.set_initial_value("int16_array_in", matrix)
         adapter.exit_initialization_mode(0.0)
         adapter.set_input_value("float64_array_in", 1.0, [[1.0, 2.0], [3.0, 4.0]])
         adapter.do_step()
