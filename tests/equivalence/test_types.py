@@ -6,12 +6,15 @@ import base64
 import csv
 import io
 import json
+import signal
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
 
+from fmu_mesh.cli.main import main
 from fmu_mesh.launch.local import LocalMesh
 from fmu_mesh.launch.preparing import Options, prepare
 from tests.fmus.helpers import NO_COMPILER, build_test_fmu
@@ -87,6 +90,73 @@ def written(folder: Path) -> Path:
     path = folder / "mesh.yaml"
     path.write_text(yaml.safe_dump(content, sort_keys=False, allow_unicode=True), encoding="utf-8")
     return path
+
+
+@pytest.fixture
+def looked_at(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Iterator[Callable[..., Any]]:
+    """A function that runs a command on a mesh of one FMU of FMI 3.0, and returns its lines of JSON or its error."""
+    with Place() as place:
+        fmu = build_test_fmu("AllTypes3", place.folder)
+        config = place.folder / "mesh.yaml"
+        config.write_text(
+            "mesh: types\nsimulation: {stop_time: 600, step_size: 0.01, real_time_factor: 1}\n"
+            f"instances: {{it: {{fmu: {fmu}, start_values: {{columns: 1}}}}}}\nrecord: {{file: null}}\n"
+        )
+        launched = place.start("launch", config, "--no-progress")
+        place.note()
+        monkeypatch.setenv("FMU_MESH_RUNTIME_DIR", str(place.folder / "run"))
+
+        def call(*arguments: str) -> Any:  # noqa: ANN401 JSON, or text
+            code = main(arguments)
+            captured = capsys.readouterr()
+            return [json.loads(line) for line in captured.out.splitlines()] if code == 0 else captured.err
+
+        yield call
+        launched.signal(signal.SIGTERM)
+        launched.wait()
+
+
+def test_every_type_can_be_asked_for_set_and_watched(looked_at: Callable[..., Any]) -> None:
+    given = {
+        "uint64_in": "18446744073709551615",
+        "int64_array_in": "[[-9223372036854775808], [9223372036854775807]]",
+        "float32_parameter": "0.1",
+        "float64_array_in": '[["-INF"], [-0.0]]',
+        "boolean_array_in": "[[true], [false]]",
+        "string_in": "5",
+        "string_array_in": '[["a\\nb"], [""]]',
+        "binary_in": "1234",
+        "enumeration_in": "high",
+    }
+    for name, text in given.items():
+        (answer,) = looked_at("set", f"it.{name}", text, "--json")
+        assert answer["point"] > 0, answer
+
+    read = {r["variable"]: r["value"] for r in looked_at("get", *(f"it.{name}" for name in given), "--json")}
+    names = ["it.string_array_out", "it.uint64_out", "it.binary_out"]
+    watched = {r["variable"]: r["value"] for r in looked_at("watch", *names, "--count", "9", "--json")}
+
+    assert repr(read) == repr(
+        {
+            "uint64_in": 2**64 - 1,
+            "int64_array_in": [[-(2**63)], [2**63 - 1]],
+            "float32_parameter": 0.10000000149011612,
+            "float64_array_in": [["-INF"], [-0.0]],
+            "boolean_array_in": [[True], [False]],
+            "string_in": "5",
+            "string_array_in": [["a\nb"], [""]],
+            "binary_in": "1234",
+            "enumeration_in": 2**63 - 1,
+        }
+    )
+    assert watched == {"string_array_out": [["a\nb"], [""]], "uint64_out": 2**64 - 1, "binary_out": "1234"}
+    views = {view["name"]: view for view in looked_at("info", "it", "--json")[0]["variables"]}
+    assert (views["int8_array_in"]["type"], views["int8_array_in"]["shape"]) == ("Int8", [2, 1])
+    assert views["int8_array_in"]["start"] == [[0], [0]]
+    assert "it.int8_in': 128 is no Int8 value for it; expected a whole number from -128 to 127" in looked_at(
+        "set", "it.int8_in", "128"
+    )
+    assert "expected a list of 2 x 1 values" in looked_at("set", "it.int8_array_in", "[1, 2]")
 
 
 def cell(value: Any) -> str:  # noqa: ANN401 of any type
