@@ -2,16 +2,24 @@
 
 from .archive import Terms, sha256_of
 from .examining import PLATFORM
-from .fmi2 import Fmi2Instance, LogMessage
+from .fmi1 import Fmi1Instance
+from .fmi2 import Fmi2Instance
+from .fmi3 import Fmi3Instance
+from .instance import FmuInstance, LogMessage
+from .opening import open_instance
 from .reading import read_description
 from .sources import compile_sources
 
 __all__ = [
     "PLATFORM",
+    "Fmi1Instance",
     "Fmi2Instance",
+    "Fmi3Instance",
+    "FmuInstance",
     "LogMessage",
     "Terms",
     "compile_sources",
+    "open_instance",
     "read_description",
     "sha256_of",
 ]

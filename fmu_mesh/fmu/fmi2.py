@@ -11,25 +11,19 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final
 
-import fmpy
 import numpy as np
 from fmpy.fmi1 import FMICallException
-from fmpy.fmi2 import (
-    FMU2Slave,
-    fmi2CallbackAllocateMemoryTYPE,
-    fmi2CallbackFreeMemoryTYPE,
-    fmi2CallbackFunctions,
-    fmi2CallbackLoggerTYPE,
-)
-from fmpy.logging import addLoggerProxy
+from fmpy.fmi2 import FMU2Slave
 
 from ..model.description import Variable
-from ..model.ring import Part
+from ..model.ring import Part, Ring
 from ..model.types import Value, VariableType
+from ..simtime import TimeGrid
 from .buffers import Buffer, NumberBuffer, StringBuffer
-from .instance import STATUS_NAMES, WARNING, FmuInstance, LogMessage, Verb
+from .callbacks import FMI2_CALLBACKS, register, unregister
+from .instance import STATUS_NAMES, WARNING, FmuInstance, Verb
 
-__all__ = ["Fmi2Instance", "LogMessage"]
+__all__ = ["Fmi2Instance"]
 
 _GET_OR_SET = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_size_t, ctypes.c_void_p)
 _DO_STEP = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_double, ctypes.c_double, ctypes.c_int)
@@ -43,53 +37,48 @@ _SUFFIX: Final[dict[VariableType, str]] = {
 _DIRECT: Final = ("Float64", "Int32")
 """The types that lie in a ring as in C; a Boolean and an Enumeration are an `int` in FMI 2.0 (2.1.2)."""
 
-_instances: dict[bytes, Fmi2Instance] = {}
-
-
-def _log(_environment: int | None, name: bytes, status: int, category: bytes, message: bytes) -> None:
-    instance = _instances.get(name or b"")
-    if instance is not None:
-        instance.logged(status, category or b"", message or b"")
-
-
-def _callbacks() -> fmi2CallbackFunctions:
-    """One set of callbacks for the process: FMPy's proxy, which formats variadic messages, has one logger only."""
-    callbacks = fmi2CallbackFunctions()
-    callbacks.logger = fmi2CallbackLoggerTYPE(_log)
-    callbacks.allocateMemory = fmi2CallbackAllocateMemoryTYPE(fmpy.calloc)
-    callbacks.freeMemory = fmi2CallbackFreeMemoryTYPE(fmpy.free)
-    addLoggerProxy(ctypes.byref(callbacks))
-    return callbacks
-
-
-_CALLBACKS = _callbacks()
-
 
 class Fmi2Instance(FmuInstance):
     """One instance of an FMI 2.0 co-simulation FMU."""
 
+    def bind(self, inputs: Ring, outputs: Sequence[Ring], grid: TimeGrid, points: int, step: int = 0) -> None:
+        """Let `do_step` work on these rings, ``points`` of ``grid`` each; write the current outputs as row ``step``."""
+        super().bind(inputs, outputs, grid, points, step)
+        # One look-up for all that a step needs: it is a part of the time of a small FMU.
+        self._hot = (
+            self._component,
+            self._do_step,
+            self._input_mask,
+            self._output_mask,
+            [call[:4] for call in self._direct_setters],
+            [call[:4] for call in self._direct_getters],
+            bool(self._setters or self._getters),
+        )
+
     def do_step(self, step: int) -> None:
         """Set the inputs of row ``step``, advance to own step ``step + 1``, write the outputs to row ``step + 1``."""
-        component = self._component
-        slot = step & self._input_mask
-        for function, references, count, rows, _ in self._direct_setters:
+        component, do_step, input_mask, output_mask, setters, getters, has_buffers = self._hot
+        slot = step & input_mask
+        for function, references, count, rows in setters:
             status = function(component, references, count, rows[slot])
             if status > WARNING:
                 raise self._failed(f"setting the inputs returned {STATUS_NAMES[status]}")
-        for set_row in self._setters:
-            set_row(slot)
+        if has_buffers:
+            for set_row in self._setters:
+                set_row(slot)
         time = self._start_time + step * self._points * self._base_step_size  # `grid.time`, without a call
-        status = self._do_step(component, time, self._step_size, 1)
+        status = do_step(component, time, self._step_size, 1)
         if status > WARNING:
             raise self._failed(f"fmi2DoStep returned {STATUS_NAMES[status]}")
         self._step = step + 1
-        slot = (step + 1) & self._output_mask
-        for function, references, count, rows, _ in self._direct_getters:
+        slot = (step + 1) & output_mask
+        for function, references, count, rows in getters:
             status = function(component, references, count, rows[slot])
             if status > WARNING:
                 raise self._failed(f"reading the outputs returned {STATUS_NAMES[status]}")
-        for get_row in self._getters:
-            get_row(slot)
+        if has_buffers:
+            for get_row in self._getters:
+                get_row(slot)
 
     def advance(self, time: float, step_size: float) -> None:
         """One step of ``step_size`` from ``time`` (both in s) without rings, for callers with their own time base."""
@@ -102,22 +91,17 @@ class Fmi2Instance(FmuInstance):
     def close(self) -> None:
         """Terminate if allowed, free the instance and remove its files. Never raises; may be called twice."""
         super().close()
-        if _instances.get(self.name.encode()) is self:
-            del _instances[self.name.encode()]
+        unregister(self.name, self)
 
     def _instantiate(self, folder: Path) -> None:
-        key = self.name.encode()
-        if key in _instances:
-            msg = f"two instances of one process have the name '{self.name}'"
-            raise ValueError(msg)
-        _instances[key] = self
+        register(self.name, self)
         fmu = FMU2Slave(
             guid=self._description.guid,
             modelIdentifier=self._description.model_identifier,
             unzipDirectory=str(folder),
             instanceName=self.name,
         )
-        fmu.instantiate(callbacks=_CALLBACKS, loggingOn=False)
+        fmu.instantiate(callbacks=FMI2_CALLBACKS, loggingOn=False)
         self._fmu = fmu
         self._component = fmu.component
         self._do_step = _DO_STEP(("fmi2DoStep", fmu.dll))

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import FmuError, FmuMeshError, Interrupted, StepFailed
-from ..fmu import Fmi2Instance, LogMessage, Terms
+from ..fmu import LogMessage, Terms, open_instance
 from ..fmu.guard import CallWatch, Guarded, floating_point_changed, restore_floating_point
 from ..model.elements import scaled
 from ..model.instance import Instance
@@ -130,7 +130,7 @@ class LocalMesh:
             return self._open_instance(name)
         system = self._plan.system.instances[name]
         terms = Terms(self._plan.system.config.limits, self._plan.system.config.instances[name].sha256)
-        return Fmi2Instance(Path(system.fmu), name, system.description, folder, self._log, terms)
+        return open_instance(Path(system.fmu), name, system.description, folder, self._log, terms)
 
     def _guarded(self, name: str, folder: Path, watch: CallWatch) -> Guarded:
         return Guarded(name, lambda: self._open(name, folder), watch, self._plan.system.config.timeouts)

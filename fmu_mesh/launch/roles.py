@@ -16,7 +16,7 @@ from pathlib import Path
 import msgspec
 
 from ..errors import ConfigurationError, FmuError, FmuMeshError, StepFailed
-from ..fmu import Fmi2Instance, LogMessage, Terms, read_description
+from ..fmu import FmuInstance, LogMessage, Terms, open_instance, read_description
 from ..fmu.guard import CallWatch, Guarded
 from ..master.master import Master
 from ..master.profiling import GrantWatch
@@ -84,7 +84,7 @@ class _NodeProcess:
         self._plan = plan
         self._zenoh = zenoh_section(load(config_file), options)
         self._folder = folder
-        self._instances: list[Fmi2Instance] = []
+        self._instances: list[FmuInstance] = []
         self._guarded: list[Guarded] = []
         self._child = False
         self._node: Node | None = None
@@ -120,8 +120,8 @@ class _NodeProcess:
         path, terms = Path(item.fmu), Terms(self._plan.limits, item.sha256)
         description = read_description(path, terms)
 
-        def instantiate() -> Fmi2Instance:
-            instance = Fmi2Instance(path, name, description, fmu_folder(self._folder), self._log, terms)
+        def instantiate() -> FmuInstance:
+            instance = open_instance(path, name, description, fmu_folder(self._folder), self._log, terms)
             self._instances.append(instance)
             return instance
 

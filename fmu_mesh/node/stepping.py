@@ -40,6 +40,7 @@ class LocalFeed:
     def __init__(self, source: Runner, transfer: Transfer) -> None:
         self.source = source
         self.transfer = transfer
+        self.step = transfer.stepper(source.outputs)
 
 
 class Runner:
@@ -66,9 +67,8 @@ class Runner:
 
     def bind(self) -> None:
         """Let the instance work on the rings, and read the current outputs. Call after Initialization Mode."""
-        if self.step == 0 and self.watched is None:
-            connected = [target for feed in self.plan.feeds for _, target, _, _ in feed.columns]
-            fill_unconnected(self.inputs, connected, self.instance.get_values)
+        connected = [target for feed in self.plan.feeds for _, target, _, _ in feed.columns]
+        fill_unconnected(self.inputs, connected, self.instance.get_values)
         outputs = (self.outputs,) if self.watched is None else (self.outputs, self.watched)
         self.instance.bind(self.inputs, outputs, self._grid, self.plan.step_points, self.step)
 
@@ -135,6 +135,7 @@ class Unit:
         self.runners = runners
         self._single = runners[0] if len(runners) == 1 else None
         self._inner = frozenset(runner.name for runner in runners)
+        self._one_rate = all(runner.plan.step_points == 1 for runner in runners)
         self._point = 0
         self._burst = 1
         self._starved = False
@@ -184,6 +185,23 @@ class Unit:
         first = self._point
         limit = self._cycle_limit(grant)
         end = min(limit, first + self._burst)
+        if self._one_rate:
+            self._step_together(first, end)
+        else:
+            self._step_at_own_rates(first, end)
+        self._point = max(first, end)
+        self._starved = end == limit
+        return max(0, end - first)
+
+    def _step_together(self, first: int, end: int) -> None:
+        for point in range(first, end):
+            for runner in self.runners:
+                for feed in runner.local_feeds:
+                    feed.step(point)
+                runner.instance.do_step(point)
+                runner.step = point + 1
+
+    def _step_at_own_rates(self, first: int, end: int) -> None:
         for point in range(first, end):
             for runner in self.runners:
                 # A slower instance steps when the end of its step is reached: only then all its inputs can be there.
@@ -191,14 +209,11 @@ class Unit:
                 if rest:
                     continue
                 for feed in runner.local_feeds:
-                    feed.transfer.step_from_ring(feed.source.outputs, step)
+                    feed.step(step)
                 runner.instance.do_step(step)
                 if floating_point_changed():
                     restore_floating_point()
                 runner.step = step + 1
-        self._point = max(first, end)
-        self._starved = end == limit
-        return max(0, end - first)
 
     def _cycle_limit(self, grant: int) -> int:
         """The point up to which the whole cycle may step: bounded by the grant and by what comes from outside."""
