@@ -17,6 +17,8 @@ from fmpy.model_description import ValidationError as FmpyValidationError
 
 from ..errors import LoadFailed
 from ..model.description import DefaultExperiment, ModelDescription, Value, Variable, VariableType
+from ..model.units import BaseUnit
+from .units import base_units, is_relative, unit_of
 
 __all__ = ["read_description"]
 
@@ -100,6 +102,7 @@ def _convert(source: FmpyDescription, platforms: tuple[str, ...], problems: tupl
         for unknown in source.initialUnknowns
         if unknown.variable is not None
     }
+    units = base_units(source)
     return ModelDescription(
         model_name=source.modelName or "",
         model_identifier=co_simulation.modelIdentifier,
@@ -107,7 +110,7 @@ def _convert(source: FmpyDescription, platforms: tuple[str, ...], problems: tupl
         kind="co_simulation",
         guid=source.guid or "",
         variables=tuple(
-            _variable(variable, dependencies) for variable in source.modelVariables if variable.type in _TYPES
+            _variable(variable, dependencies, units) for variable in source.modelVariables if variable.type in _TYPES
         ),
         description=source.description,
         generation_tool=source.generationTool,
@@ -127,7 +130,9 @@ def _convert(source: FmpyDescription, platforms: tuple[str, ...], problems: tupl
     )
 
 
-def _variable(source: ModelVariable, dependencies: dict[str, tuple[str, ...] | None]) -> Variable:
+def _variable(
+    source: ModelVariable, dependencies: dict[str, tuple[str, ...] | None], units: dict[str, BaseUnit]
+) -> Variable:
     type_ = cast("VariableType", source.type)
     declared = source.declaredType
     items = tuple((item.name, int(item.value)) for item in declared.items) if declared and declared.items else ()
@@ -139,12 +144,14 @@ def _variable(source: ModelVariable, dependencies: dict[str, tuple[str, ...] | N
         variability=source.variability or ("continuous" if type_ == "Real" else "discrete"),
         initial=source.initial,
         start=_start(type_, source.start),
-        unit=source.unit or (declared.unit if declared is not None else None),
+        unit=unit_of(source),
         description=source.description,
         minimum=_number(source.min),
         maximum=_number(source.max),
         dependencies=dependencies.get(source.name, ()),
         items=items,
+        base_unit=units.get(unit_of(source) or ""),
+        relative_quantity=is_relative(source),
     )
 
 

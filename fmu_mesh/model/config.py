@@ -16,6 +16,7 @@ from fmu_mesh.model.description import Value
 __all__ = [
     "Config",
     "ConnectionConfig",
+    "InitializationConfig",
     "InstanceConfig",
     "RecordConfig",
     "SimulationConfig",
@@ -111,12 +112,44 @@ class ConnectionConfig(Base, frozen=True, kw_only=True):
     target: Annotated[str, Meta(description="`instance.variable` of an input.", examples=["delay.x"])] = msgspec.field(
         name="to"
     )
-    factor: Annotated[float, Meta(description="The input is factor * output + offset; Real inputs only.")] = 1.0
-    offset: Annotated[float, Meta(description="The input is factor * output + offset; Real inputs only.")] = 0.0
+    factor: Annotated[
+        float,
+        Meta(description="The input is factor * output + offset, in the input's unit; Real inputs only."),
+    ] = 1.0
+    offset: Annotated[
+        float,
+        Meta(description="The input is factor * output + offset, in the input's unit; Real inputs only."),
+    ] = 0.0
     delay: Annotated[
         Literal[0, 1] | None,
         Meta(description="0: value at the end of the target's step; 1: at its start. Default: see algorithm."),
     ] = None
+    ignore_units: Annotated[bool, Meta(description="true: neither convert nor compare the units of the two ends.")] = (
+        False
+    )
+
+
+class InitializationConfig(Base, frozen=True, kw_only=True):
+    """How the algebraic loops at the start are iterated: fixed point with under-relaxation."""
+
+    tolerance: Annotated[
+        float,
+        Meta(
+            ge=0,
+            description="A loop is consistent when each of its inputs is off what feeds it by at most this, or by "
+            "this times the value where that is above 1.",
+        ),
+    ] = 1e-9
+    relaxation: Annotated[
+        float,
+        Meta(
+            gt=0,
+            le=1,
+            description="How far an input goes towards what feeds it in one iteration; 1: all the way. Lower it for "
+            "a loop that does not converge.",
+        ),
+    ] = 1.0
+    iterations: Annotated[int, Meta(ge=1, description="After so many iterations the run ends with an error.")] = 1000
 
 
 class RecordConfig(Base, frozen=True, kw_only=True):
@@ -199,6 +232,7 @@ class Config(Base, frozen=True, kw_only=True):
     connections: Annotated[
         list[ConnectionConfig], Meta(description="What flows from which output to which input.")
     ] = []
+    initialization: InitializationConfig = InitializationConfig()
     record: RecordConfig = RecordConfig()
     zenoh: ZenohConfig = ZenohConfig()
     timeouts: TimeoutsConfig = TimeoutsConfig()

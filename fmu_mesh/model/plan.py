@@ -14,10 +14,10 @@ from msgspec.structs import replace
 
 from ..errors import ConfigurationError, Finding
 from ..simtime import TimeGrid
-from .config import TimeoutsConfig
+from .config import InitializationConfig, TimeoutsConfig
 from .description import Value
 from .graph import cycle_through, feedback_edges, strongly_connected, topological_order
-from .initialization import InitializationPlan, plan_initialization
+from .initialization import InitializationPlan, Loop, plan_initialization
 from .ring import Layout, rows_for
 from .system import Connection, System, SystemInstance
 
@@ -56,8 +56,6 @@ class InstancePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         outputs: the columns read after every step: connected or recorded outputs.
         inputs: the connected inputs, set before every step.
         initialization: the levels at which connected outputs become known in Initialization Mode, by name.
-        held: connected inputs that keep their start value in Initialization Mode, because their connection closes a
-            loop there.
     """
 
     name: str
@@ -68,7 +66,6 @@ class InstancePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     inputs: Layout
     feeds: tuple[Feed, ...]
     initialization: dict[str, int]
-    held: tuple[str, ...] = ()
 
 
 class Link(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -77,6 +74,8 @@ class Link(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     Attributes:
         index: number of the link in the mesh; stands in every frame.
         levels: initialization level of each column, in the order of `layout.names`; -1 for one that is not needed then.
+        initial_only: whether it carries nothing after Initialization Mode: a node that takes part in the iteration of a
+            loop has to see what the torn connections of others bring.
     """
 
     index: int
@@ -86,6 +85,7 @@ class Link(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     step_points: int
     layout: Layout
     levels: tuple[int, ...]
+    initial_only: bool = False
 
 
 class NodePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -98,6 +98,8 @@ class NodePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         progress_stride: points after which the master is told; a quarter of the window, or every point where a single
             step is as long as that.
         ring_rows: rows of every ring; a power of two.
+        loops: the algebraic loops at the start that instances of this node are part of.
+        initialization: how they are iterated.
         links_in: links that end here.
         links_out: links that start here.
         result_file: absolute path of the result CSV (for the recorder).
@@ -116,6 +118,8 @@ class NodePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     units: tuple[tuple[str, ...], ...]
     links_in: tuple[Link, ...]
     links_out: tuple[Link, ...]
+    loops: tuple[Loop, ...] = ()
+    initialization: InitializationConfig = InitializationConfig()
     result_file: str | None = None
     recorded: tuple[tuple[str, str], ...] = ()
 
@@ -180,7 +184,7 @@ def make_plan(system: System, *, window: int | None = None, file: str = "") -> P
     edges = [(c.source_instance, c.target_instance) for c in connections]
     order = topological_order(system.instances, instant)
     cycles = tuple(tuple(part) for part in strongly_connected(system.instances, edges) if _is_cycle(part, edges))
-    initialization = plan_initialization(connections)
+    initialization = plan_initialization(system, connections)
     points = window if window is not None else _window(system)
     plan = Plan(
         system=system,
@@ -324,6 +328,8 @@ def _node(
         units=units,
         links_in=tuple(link for link in links if link.target_node == node),
         links_out=tuple(link for link in links if link.source_node == node),
+        loops=tuple(loop for loop in plan.initialization.loops if node in loop.nodes),
+        initialization=config.initialization,
         result_file=plan.system.result_file if node == RECORDER else None,
         recorded=plan.system.recorded if node == RECORDER else (),
     )
@@ -356,12 +362,11 @@ def _instance_plan(plan: Plan, instance: SystemInstance, outputs: Layout) -> Ins
         inputs=Layout.of([(v.name, v.type) for v in instance.description.variables if v.name in connected]),
         feeds=tuple(Feed(source=s, delay=d, columns=tuple(columns)) for (s, d), columns in sorted(feeds.items())),
         initialization={variable: level for (owner, variable), level in levels.items() if owner == instance.name},
-        held=tuple(variable for owner, variable in plan.initialization.held if owner == instance.name),
     )
 
 
 def _links(plan: Plan) -> tuple[Link, ...]:
-    """One link per source instance and other node that needs some of its outputs, recorder last."""
+    """One link per source instance and other node that needs some of its outputs, recorder last, initial ones after."""
     needed: dict[tuple[str, str], set[str]] = {}
     for c in plan.connections:
         target_node = plan.node_of(c.target_instance)
@@ -372,8 +377,9 @@ def _links(plan: Plan) -> tuple[Link, ...]:
             needed.setdefault((name, RECORDER), set()).add(variable)
     links = []
     ends = sorted(needed, key=lambda end: (end[0], end[1] == RECORDER, end[1]))
-    for index, (source, target_node) in enumerate(ends):
-        names = needed[source, target_node]
+    initial = _needed_initially(plan, needed)
+    for index, (source, target_node) in enumerate([*ends, *sorted(initial)]):
+        names = needed[source, target_node] if index < len(ends) else initial[source, target_node]
         instance = plan.system.instances[source]
         layout = Layout.of([(v.name, v.type) for v in instance.description.variables if v.name in names])
         levels = plan.initialization.levels
@@ -388,6 +394,18 @@ def _links(plan: Plan) -> tuple[Link, ...]:
                 levels=tuple(
                     -1 if target_node == RECORDER else levels.get((source, name), -1) for name in layout.names
                 ),
+                initial_only=index >= len(ends),
             )
         )
     return tuple(links)
+
+
+def _needed_initially(plan: Plan, needed: dict[tuple[str, str], set[str]]) -> dict[tuple[str, str], set[str]]:
+    """Outputs by (instance, node) that decide whether a loop is consistent, and come over no other link."""
+    initial: dict[tuple[str, str], set[str]] = {}
+    for loop in plan.initialization.loops:
+        for node in loop.nodes:
+            for tear in loop.tears:
+                if node != plan.node_of(tear.source) and tear.output not in needed.get((tear.source, node), ()):
+                    initial.setdefault((tear.source, node), set()).add(tear.output)
+    return initial

@@ -60,12 +60,12 @@ class OutLink:
             first += cut
         self.sent = end
 
-    def send_initial(self, level: int, values: dict[str, float | int]) -> None:
-        """Send the values that became known at one level of Initialization Mode; other columns are zero."""
+    def send_initial(self, tag: int, values: dict[str, float | int]) -> None:
+        """Send the values of one level of Initialization Mode, which ``tag`` tells; other columns are zero."""
         layout = self.link.layout
         reals = np.array([[values.get(name, 0.0) for name in layout.reals]], dtype=np.float64)
         integers = np.array([[values.get(name, 0) for name in layout.integers]], dtype=np.int32)
-        self._put(encode_rows(INITIAL, self.link.index, level, reals, integers))
+        self._put(encode_rows(INITIAL, self.link.index, tag, reals, integers))
 
     def close(self) -> None:
         """Undeclare the publisher."""

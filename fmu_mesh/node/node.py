@@ -138,6 +138,7 @@ class Node:
             if watcher is not None:
                 watcher.undeclare()
             self.server.close()
+            self._initialization.close()
             for runner in self._runners.values():
                 for link in runner.out_links:
                     link.close()
@@ -162,7 +163,11 @@ class Node:
             self._runners[item.name] = Runner(item, instance, plan.grid, plan.ring_rows)
         for link in plan.links_in:
             self._remote[link.index] = (FrameReceiver(link, f"node '{plan.node}'", plan.ring_rows), [])
-        receivers = {receiver.link.source: (receiver, feeds) for receiver, feeds in self._remote.values()}
+        receivers = {
+            receiver.link.source: (receiver, feeds)
+            for receiver, feeds in self._remote.values()
+            if not receiver.link.initial_only
+        }
         for runner in self._runners.values():
             for feed in runner.plan.feeds:
                 points = runner.plan.step_points
@@ -189,7 +194,8 @@ class Node:
             publisher = self._session.declare_publisher(
                 self._keys.frames(link.source, link.target_node), congestion_control=_BLOCK, express=True
             )
-            runner.out_links.append(OutLink(link, runner.outputs, publisher, plan.window))
+            out_links = self._initialization.out_links if link.initial_only else runner.out_links
+            out_links.append(OutLink(link, runner.outputs, publisher, plan.window))
         self._units = [Unit([self._runners[name] for name in names]) for names in plan.units]
         self.server.serve(self._runners)
 
