@@ -70,7 +70,8 @@ def _head(plan: Plan) -> list[str]:
     simulation, grid = plan.system.config.simulation, plan.grid
     factor = simulation.real_time_factor
     window = f"{plan.window} points" if plan.window > 1 else "1 point: lockstep"
-    times = f"{_number(grid.start_time)} s to {_number(grid.stop_time)} s in {grid.last_point} steps of"
+    end = f"{_number(grid.stop_time)} s in {grid.last_point}" if grid.stop_time is not None else "an open end in"
+    times = f"{_number(grid.start_time)} s to {end} steps of"
     return pairs(
         [
             ("Mesh", plan.system.config.mesh),

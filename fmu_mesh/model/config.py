@@ -48,8 +48,11 @@ class SimulationConfig(Base, frozen=True, kw_only=True):
 
     start_time: Annotated[float, Meta(description="Time of communication point 0 in s.")] = 0.0
     stop_time: Annotated[
-        float,
-        Meta(description="Time of the last communication point in s: start_time plus a multiple of step_size."),
+        float | None,
+        Meta(
+            description="Time of the last communication point in s: start_time plus a multiple of step_size; "
+            "null: it runs until it is stopped."
+        ),
     ]
     step_size: Annotated[
         float,
@@ -77,6 +80,21 @@ class SimulationConfig(Base, frozen=True, kw_only=True):
             extra_json_schema=_NOT_NEGATIVE,
         ),
     ] = 0.0
+    update_period: Annotated[
+        float,
+        Meta(
+            ge=0,
+            description="With a real_time_factor: wall-clock time in s after which the points that have become due are "
+            "taken together; 0: each as it becomes due.",
+        ),
+    ] = 0.0
+    catch_up: Annotated[
+        Annotated[float, Meta(ge=0)] | None,
+        Meta(
+            description="With a real_time_factor: how far in s a run may fall behind the wall clock before it gives up "
+            "what it lost, which `status` counts as overruns; null: it catches up however long that takes."
+        ),
+    ] = None
 
 
 class InstanceConfig(Base, frozen=True, kw_only=True):
@@ -95,6 +113,14 @@ class InstanceConfig(Base, frozen=True, kw_only=True):
         Meta(
             description="Step size of this instance in s: a whole multiple of the base step size (default).",
             extra_json_schema=_POSITIVE,
+        ),
+    ] = None
+    interpolation: Annotated[
+        Literal["hold", "linear"] | None,
+        Meta(
+            description="How a value that is sent to an unconnected input with a time in its attachment is used: it "
+            "holds from that time on, or Reals go to it linearly; null: the time is ignored, and it holds from the "
+            "next point on."
         ),
     ] = None
     group: Annotated[Name | None, Meta(description="Instances of one group share one node (one process).")] = None

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable
+from typing import Literal
 
 import msgspec
 from msgspec.structs import replace
@@ -56,6 +57,7 @@ class InstancePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         outputs: the columns read after every step: connected or recorded outputs.
         inputs: the connected inputs, set before every step.
         initialization: the levels at which connected outputs become known in Initialization Mode, by name.
+        interpolation: what the time of a value that is sent to an unconnected input means; None: nothing.
     """
 
     name: str
@@ -66,6 +68,7 @@ class InstancePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     inputs: Layout
     feeds: tuple[Feed, ...]
     initialization: dict[str, int]
+    interpolation: Literal["hold", "linear"] | None = None
 
 
 class Link(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -362,6 +365,7 @@ def _instance_plan(plan: Plan, instance: SystemInstance, outputs: Layout) -> Ins
         inputs=Layout.of([(v.name, v.type) for v in instance.description.variables if v.name in connected]),
         feeds=tuple(Feed(source=s, delay=d, columns=tuple(columns)) for (s, d), columns in sorted(feeds.items())),
         initialization={variable: level for (owner, variable), level in levels.items() if owner == instance.name},
+        interpolation=plan.system.config.instances[instance.name].interpolation,
     )
 
 

@@ -48,6 +48,7 @@ from ..wire.messages import (
 from ..wire.profile import Welcome
 from ..wire.session import ask
 from .initialization import Initialization
+from .inputs import TimedInputs
 from .links import OutLink
 from .profiling import Profiler
 from .serving import Server
@@ -160,6 +161,8 @@ class Node:
         self.server.state = "loading"
         for item in plan.instances:
             instance = self._open_instance(item.name)
+            if item.interpolation is not None:
+                instance = TimedInputs(instance, item.interpolation)
             self._runners[item.name] = Runner(item, instance, plan.grid, plan.ring_rows)
         for link in plan.links_in:
             self._remote[link.index] = (FrameReceiver(link, f"node '{plan.node}'", plan.ring_rows), [])

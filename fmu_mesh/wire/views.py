@@ -117,7 +117,7 @@ class MeshInfo(msgspec.Struct, frozen=True):
     version: str
     config: str
     start_time: float
-    stop_time: float
+    stop_time: float | None
     step_size: float
     algorithm: str
     window: int
@@ -137,6 +137,7 @@ class MeshStatus(msgspec.Struct, frozen=True):
         point: the last point that every instance has reached; ``time`` is its time in s.
         points_per_second: since the first point, or since the last pause.
         real_time_factor: simulated over wall-clock time since the first point.
+        overruns: points of the wall clock that were given up, because the run was too far behind it.
         progress: last point of every node.
     """
 
@@ -149,6 +150,7 @@ class MeshStatus(msgspec.Struct, frozen=True):
     real_time_factor: float
     progress: dict[str, int]
     error: ErrorReport | None = None
+    overruns: int = 0
 
 
 class Command(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -313,7 +313,9 @@ class Mixer:
         }
         self._rings: tuple[Ring, Ring] | None = None
 
-    def enter_initialization(self, _start_time: float, _stop_time: float, _start_values: Mapping[str, Value]) -> None:
+    def enter_initialization(
+        self, _start_time: float, _stop_time: float | None, _start_values: Mapping[str, Value]
+    ) -> None:
         return
 
     def exit_initialization(self) -> None:
