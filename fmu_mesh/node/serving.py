@@ -56,6 +56,7 @@ class Server:
         self.state = "starting"
         self.waiting = False
         self.waited_s = 0.0
+        self._started: float | None = None
         self.on_hang: Callable[[], None] = lambda: None
         self._plan = plan
         self._session = session
@@ -102,6 +103,7 @@ class Server:
 
     def started(self) -> None:
         """All streams begin at the first point: subscriptions made before it are looked at now."""
+        self._started = time.monotonic()
         for streams in self._streams:
             streams.update()
         self.stepped()
@@ -348,6 +350,7 @@ class Server:
             time=self._plan.grid.time(runner.point),
             step_time=runner.step_seconds / runner.step if runner.step else 0.0,
             wait_time=self.waited_s,
+            running_time=time.monotonic() - self._started if self._started is not None else 0.0,
         )
 
     def _activity(self, runner: Runner) -> str:

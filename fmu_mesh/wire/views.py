@@ -79,6 +79,7 @@ class InstanceStatus(msgspec.Struct, frozen=True):
         time: simulation time in s.
         step_time: mean wall-clock time of a step in s.
         wait_time: wall-clock time spent waiting since the first point in s.
+        running_time: wall-clock time since the first point in s.
     """
 
     instance: str
@@ -90,6 +91,7 @@ class InstanceStatus(msgspec.Struct, frozen=True):
     wait_time: float
     overruns: int = 0
     restarts: int = 0
+    running_time: float = 0.0
 
 
 class LogLine(msgspec.Struct, frozen=True):
