@@ -117,10 +117,10 @@ def _arithmetic(c: Connection) -> str:
     """What a connection calculates; empty if it hands the value on as it is."""
     if (c.factor, c.offset) == (1.0, 0.0):
         return ""
-    product = f"{_number(c.factor)} * {c.source.name}" if c.factor != 1.0 else c.source.name
+    product = f"{_number(c.factor)} * {c.source_name}" if c.factor != 1.0 else c.source_name
     sign = "-" if c.offset < 0.0 else "+"
     sum_ = f"{product} {sign} {_number(abs(c.offset))}" if c.offset else product
-    return f"{c.target.name} = {sum_}"
+    return f"{c.target_name} = {sum_}"
 
 
 def _order(plan: Plan) -> list[str]:
@@ -175,7 +175,7 @@ def _initialization(plan: Plan) -> list[str]:
 
 def _assumed(plan: Plan, loop: Loop) -> list[str]:
     """The torn inputs of a loop, each with the value that is assumed at first."""
-    described = {tear: plan.system.instances[tear.target].description.variable(tear.input) for tear in loop.tears}
+    described = {tear: plan.system.instances[tear.target].description.variable_of(tear.input) for tear in loop.tears}
     return [f"{t.target}.{t.input} = {shown(t.start)}{_unit(variable)}" for t, variable in described.items()]
 
 
@@ -185,8 +185,9 @@ def _recorded(plan: Plan) -> list[str]:
     instances = plan.system.instances
     rows = []
     for name, variable in plan.system.recorded:
-        described = instances[name].description.variable(variable)
-        rows.append([f"{name}.{variable}", described.type if described else "", _unit(described).strip()])
+        described = instances[name].description.variable_of(variable)
+        type_ = described.type_name.partition("[")[0] if described is not None else ""
+        rows.append([f"{name}.{variable}", type_, _unit(described).strip()])
     return [*table(rows, indent=2), f"  into {_short(plan.system.result_file)}"]
 
 

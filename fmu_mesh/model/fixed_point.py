@@ -11,8 +11,9 @@ from collections.abc import Sequence
 
 from ..errors import LoopNotConverged
 from .config import InitializationConfig
-from .description import Value
-from .initialization import Loop
+from .description import Value, Variable
+from .initialization import Loop, Tear
+from .values import to_value
 
 __all__ = ["FixedPoint"]
 
@@ -28,8 +29,9 @@ class FixedPoint:
         residual = |new - assumed|, which must be at most tolerance * max(1, |new|)
         assumed  = assumed + relaxation * (new - assumed)          (new itself where the relaxation is 1)
 
-    Other types than Real have to be equal, and take the new value as it is. When all agree, the torn inputs keep what
-    was assumed: then every other connection is exact, and only these are off, by their residual at most.
+    Of an array, each element. Other types than Float64 and Float32 have to be equal, and take the new value as it is.
+    When all agree, the torn inputs keep what was assumed: then every other connection is exact, and only these are off,
+    by their residual at most.
 
     Args:
         loop: the loop.
@@ -41,7 +43,7 @@ class FixedPoint:
     """
 
     def __init__(self, loop: Loop, settings: InitializationConfig) -> None:
-        self.assumed: dict[tuple[str, str], Value] = {(tear.target, tear.input): tear.start for tear in loop.tears}
+        self.assumed: dict[tuple[str, str], Value] = {(tear.target, tear.input): _start(tear) for tear in loop.tears}
         self.sweeps = 0
         self._loop = loop
         self._settings = settings
@@ -65,11 +67,15 @@ class FixedPoint:
         return False
 
     def _agree(self, old: Value, new: Value) -> bool:
+        if isinstance(old, list) and isinstance(new, list):
+            return all(self._agree(one, other) for one, other in zip(old, new, strict=True))
         if isinstance(old, float) and isinstance(new, float):
             return _finite(new) and abs(new - old) <= self._settings.tolerance * max(1.0, abs(new))
         return old == new
 
     def _relaxed(self, old: Value, new: Value) -> Value:
+        if isinstance(old, list) and isinstance(new, list):
+            return [self._relaxed(one, other) for one, other in zip(old, new, strict=True)]
         relaxation = self._settings.relaxation
         if relaxation != 1.0 and isinstance(old, float) and isinstance(new, float):
             return old + relaxation * (new - old)
@@ -93,11 +99,19 @@ class FixedPoint:
         )
 
 
+def _start(tear: Tear) -> Value:
+    return to_value(tear.start, Variable(tear.input, 0, tear.type, "input", "discrete", shape=tear.shape))
+
+
 def _finite(value: Value) -> bool:
+    if isinstance(value, list):
+        return all(map(_finite, value))
     return not isinstance(value, float) or math.isfinite(value)
 
 
 def _residual(old: Value, new: Value) -> str:
     if isinstance(old, float) and isinstance(new, float):
         return f"{abs(new - old):.6g} (from {old:.12g} to {new:.12g})"
+    if isinstance(old, list) and isinstance(new, list) and all(isinstance(one, float) for one in [*old, *new]):
+        return f"{max(abs(two - one) for one, two in zip(old, new, strict=True)):.6g} (the largest of its elements)"
     return f"(from {old!r} to {new!r})"

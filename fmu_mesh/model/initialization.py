@@ -12,9 +12,11 @@ from collections.abc import Mapping, Sequence
 
 import msgspec
 
-from .description import Value, Variable
+from .description import Variable
 from .graph import reaches, strongly_connected
 from .system import Connection, System
+from .types import PlainValue, Value, VariableType, nested, zero
+from .values import to_plain
 
 __all__ = ["InitializationPlan", "Loop", "Tear", "plan_initialization"]
 
@@ -25,6 +27,9 @@ class Tear(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A connection at which a loop is torn: the input has an assumed value, which the source has to confirm.
 
     Attributes:
+        output: as `y`, or an element of it as `y[2]`; ``input`` likewise.
+        type: the type of the input, or of the element.
+        shape: the sizes of its dimensions.
         start: what is assumed at first: the start value of the input.
     """
 
@@ -34,7 +39,9 @@ class Tear(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     input: str
     factor: float
     offset: float
-    start: Value
+    type: VariableType
+    start: PlainValue
+    shape: tuple[int, ...] = ()
 
     def __str__(self) -> str:
         return f"{self.source}.{self.output} -> {self.target}.{self.input}"
@@ -121,19 +128,23 @@ def _torn(
 
 def _tear(system: System, connection: Connection) -> Tear:
     instance, variable = system.instances[connection.target_instance], connection.target
-    start = instance.start_values.get(variable.name, variable.start)
+    start: Value | None = instance.start_values.get(variable.name, variable.start)
+    if start is None:  # an input must have one (FMI 2.0, 2.2.7)
+        start = nested([zero(variable.type)] * variable.size, variable.shape)
+    for number in connection.target_index:
+        assert isinstance(start, list)
+        start = start[number]
     return Tear(
         source=connection.source_instance,
-        output=connection.source.name,
+        output=connection.source_name,
         target=connection.target_instance,
-        input=variable.name,
+        input=connection.target_name,
         factor=connection.factor,
         offset=connection.offset,
-        start=start if start is not None else _ZERO[variable.type],  # an input must have one (FMI 2.0, 2.2.7)
+        type=variable.type,
+        start=to_plain(start),
+        shape=() if connection.target_index else variable.shape,
     )
-
-
-_ZERO: dict[str, Value] = {"Real": 0.0, "Integer": 0, "Boolean": False, "Enumeration": 1, "String": ""}
 
 
 def _reached(connections: Sequence[Connection]) -> dict[int, list[Key]]:

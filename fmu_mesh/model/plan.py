@@ -16,11 +16,12 @@ from msgspec.structs import replace
 from ..errors import ConfigurationError, Finding
 from ..simtime import TimeGrid
 from .config import InitializationConfig, TimeoutsConfig
-from .description import Value
 from .graph import cycle_through, feedback_edges, strongly_connected, topological_order
 from .initialization import InitializationPlan, Loop, plan_initialization
 from .ring import Layout, rows_for
 from .system import Connection, System, SystemInstance
+from .types import PlainValue
+from .values import to_plain
 
 __all__ = ["RECORDER", "Feed", "InstancePlan", "Link", "NodePlan", "Plan", "make_plan"]
 
@@ -41,7 +42,7 @@ class Feed(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """How one source instance feeds one instance, all connections with the same delay together.
 
     Attributes:
-        columns: (source variable, target variable, factor, offset) of each connection.
+        columns: (source, target, factor, offset) of each connection; an end is a variable, or an element as `y[2]`.
     """
 
     source: str
@@ -62,7 +63,7 @@ class InstancePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     name: str
     fmu: str
-    start_values: dict[str, Value]
+    start_values: dict[str, PlainValue]
     step_points: int
     outputs: Layout
     inputs: Layout
@@ -265,7 +266,7 @@ def _window(system: System) -> int:
     configured = system.config.simulation.window
     if configured != "auto":
         return configured
-    widest = max(8 * len(instance.description.variables) for instance in system.instances.values())
+    widest = max(Layout.of(instance.description.variables).row_size for instance in system.instances.values())
     return max(16, min(AUTO_WINDOW_POINTS, AUTO_WINDOW_BYTES // max(widest, 1)))
 
 
@@ -342,9 +343,9 @@ def _output_layout(plan: Plan, name: str) -> Layout:
     """Connected and recorded outputs of an instance, in the order of its model description."""
     wanted = {c.source.name for c in plan.connections if c.source_instance == name}
     if plan.system.result_file is not None:
-        wanted |= {variable for instance, variable in plan.system.recorded if instance == name}
+        wanted |= {_base(plan, instance, variable) for instance, variable in plan.system.recorded if instance == name}
     variables = plan.system.instances[name].description.variables
-    return Layout.of([(v.name, v.type) for v in variables if v.name in wanted])
+    return Layout.of(v for v in variables if v.name in wanted)
 
 
 def _instance_plan(plan: Plan, instance: SystemInstance, outputs: Layout) -> InstancePlan:
@@ -352,17 +353,17 @@ def _instance_plan(plan: Plan, instance: SystemInstance, outputs: Layout) -> Ins
     feeds: dict[tuple[str, int], list[tuple[str, str, float, float]]] = {}
     for c in incoming:
         feeds.setdefault((c.source_instance, c.delay or 0), []).append(
-            (c.source.name, c.target.name, c.factor, c.offset)
+            (c.source_name, c.target_name, c.factor, c.offset)
         )
     connected = {c.target.name for c in incoming}
     levels = plan.initialization.levels
     return InstancePlan(
         name=instance.name,
         fmu=instance.fmu,
-        start_values=instance.start_values,
+        start_values={variable: to_plain(value) for variable, value in instance.start_values.items()},
         step_points=instance.step_points,
         outputs=outputs,
-        inputs=Layout.of([(v.name, v.type) for v in instance.description.variables if v.name in connected]),
+        inputs=Layout.of(v for v in instance.description.variables if v.name in connected),
         feeds=tuple(Feed(source=s, delay=d, columns=tuple(columns)) for (s, d), columns in sorted(feeds.items())),
         initialization={variable: level for (owner, variable), level in levels.items() if owner == instance.name},
         interpolation=plan.system.config.instances[instance.name].interpolation,
@@ -378,14 +379,14 @@ def _links(plan: Plan) -> tuple[Link, ...]:
             needed.setdefault((c.source_instance, target_node), set()).add(c.source.name)
     if plan.system.result_file is not None:
         for name, variable in plan.system.recorded:
-            needed.setdefault((name, RECORDER), set()).add(variable)
+            needed.setdefault((name, RECORDER), set()).add(_base(plan, name, variable))
     links = []
     ends = sorted(needed, key=lambda end: (end[0], end[1] == RECORDER, end[1]))
     initial = _needed_initially(plan, needed)
     for index, (source, target_node) in enumerate([*ends, *sorted(initial)]):
         names = needed[source, target_node] if index < len(ends) else initial[source, target_node]
         instance = plan.system.instances[source]
-        layout = Layout.of([(v.name, v.type) for v in instance.description.variables if v.name in names])
+        layout = Layout.of(v for v in instance.description.variables if v.name in names)
         levels = plan.initialization.levels
         links.append(
             Link(
@@ -410,6 +411,13 @@ def _needed_initially(plan: Plan, needed: dict[tuple[str, str], set[str]]) -> di
     for loop in plan.initialization.loops:
         for node in loop.nodes:
             for tear in loop.tears:
-                if node != plan.node_of(tear.source) and tear.output not in needed.get((tear.source, node), ()):
-                    initial.setdefault((tear.source, node), set()).add(tear.output)
+                output = _base(plan, tear.source, tear.output)
+                if node != plan.node_of(tear.source) and output not in needed.get((tear.source, node), ()):
+                    initial.setdefault((tear.source, node), set()).add(output)
     return initial
+
+
+def _base(plan: Plan, instance: str, name: str) -> str:
+    """The name of the variable that a column or an end of a connection is, or is an element of."""
+    variable = plan.system.instances[instance].description.variable_of(name)
+    return variable.name if variable is not None else name

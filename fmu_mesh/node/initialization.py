@@ -10,10 +10,12 @@ import time
 from collections.abc import Callable, Collection, Sequence
 
 from ..errors import DeadlineExceeded
-from ..model.description import Value
+from ..model.elements import element_of, merged, scaled
 from ..model.fixed_point import FixedPoint
 from ..model.initialization import Loop
 from ..model.plan import Link, NodePlan
+from ..model.ring import Column
+from ..model.types import Value, split_element
 from ..wire.frames import initial_values, needed_levels
 from .links import OutLink
 from .stepping import Runner
@@ -24,7 +26,6 @@ _SWEEP = 1 << 32
 """In an INITIAL message, the level plus so many times the sweep."""
 
 Key = tuple[str, str]
-Number = float | int
 
 
 class Initialization:
@@ -42,17 +43,18 @@ class Initialization:
         self.out_links: list[OutLink] = []
         self._plan = plan
         self._wait = wait
-        self._levels = {
-            (link.source, name): level
-            for link in plan.links_in
-            for name, level in zip(link.layout.names, link.levels, strict=True)
-        }
-        self._levels |= {
-            (own.name, name): level for own in plan.instances for name, level in own.initialization.items()
-        }
-        self._known: dict[Key, Number] = {}
+        self._columns: dict[Key, Column] = {}
+        self._levels: dict[Key, int] = {}
+        for link in plan.links_in:
+            for column, level in zip(link.layout.columns, link.levels, strict=True):
+                self._columns[link.source, column.name] = column
+                self._levels[link.source, column.name] = level
+        for own in plan.instances:
+            self._columns |= {(own.name, column.name): column for column in own.outputs.columns}
+            self._levels |= {(own.name, name): level for name, level in own.initialization.items()}
+        self._known: dict[Key, Value] = {}
         self._settled: set[Key] = set()
-        self._sweeps: dict[tuple[str, str, int], Number] = {}
+        self._sweeps: dict[tuple[str, str, int], Value] = {}
         self._end = 0.0
 
     def take(self, link: Link, tag: int, data: bytes) -> None:
@@ -116,11 +118,11 @@ class Initialization:
                 self._sweeps.update({(runner.name, name, sweep): value for name, value in values.items()})
                 self._send(runner, level, values, loop, sweep)
             consistent = point.update(
-                [_scaled(self._value_in(t.source, t.output, sweep), t.factor, t.offset) for t in loop.tears]
+                [scaled(self._element(t.source, t.output, sweep), t.factor, t.offset) for t in loop.tears]
             )
             if consistent:
                 for key in members & self._levels.keys():
-                    self._known[key] = self._value_in(*key, sweep)
+                    self._known[key] = self._value(*key, sweep)
             self._sweeps = {
                 k: v for k, v in self._sweeps.items() if k[:2] not in members or (k[2] > sweep and not consistent)
             }
@@ -133,33 +135,46 @@ class Initialization:
         values: dict[str, Value] = {}
         for feed in runner.plan.feeds:
             for source, target, factor, offset in feed.columns:
-                early = below is None or self._levels[feed.source, source] < below
+                early = below is None or self._level_of(feed.source, source) < below
                 if early and (runner.name, target) not in self._settled:
-                    values[target] = _scaled(self._value(feed.source, source), factor, offset)
+                    values[target] = scaled(self._element(feed.source, source), factor, offset)
         if values:
-            runner.instance.set_values(values)
+            runner.instance.set_values(merged(values, runner.plan.inputs, runner.instance.get_values))
 
     def _set_inputs_of_loop(self, runner: Runner, level: int, sweep: int, point: FixedPoint, loop: Loop) -> None:
         """Set the assumed inputs, and those whose sources are known below a level of a loop in a sweep."""
         values: dict[str, Value] = {}
         for feed in runner.plan.feeds:
             for source, target, factor, offset in feed.columns:
-                own_level = self._levels[feed.source, source]
+                own_level = self._level_of(feed.source, source)
                 if (runner.name, target) in point.assumed:
                     values[target] = point.assumed[runner.name, target]
                 elif own_level < loop.first and (runner.name, target) not in self._settled:
-                    values[target] = _scaled(self._value(feed.source, source), factor, offset)
+                    values[target] = scaled(self._element(feed.source, source), factor, offset)
                 elif loop.first <= own_level < level:
-                    values[target] = _scaled(self._value_in(feed.source, source, sweep), factor, offset)
+                    values[target] = scaled(self._element(feed.source, source, sweep), factor, offset)
         if values:
-            runner.instance.set_values(values)
+            runner.instance.set_values(merged(values, runner.plan.inputs, runner.instance.get_values))
 
-    def _value(self, instance: str, variable: str) -> Number:
-        while (instance, variable) not in self._known:
-            self._wait_for(instance, variable)
-        return self._known[instance, variable]
+    def _column(self, instance: str, name: str) -> Column:
+        """The column of an output, or of the array that ``name`` is an element of."""
+        if (instance, name) not in self._columns and (parts := split_element(name)) is not None:
+            return self._columns[instance, parts[0]]
+        return self._columns[instance, name]
 
-    def _value_in(self, instance: str, variable: str, sweep: int) -> Number:
+    def _level_of(self, instance: str, name: str) -> int:
+        return self._levels[instance, self._column(instance, name).name]
+
+    def _element(self, instance: str, name: str, sweep: int | None = None) -> Value:
+        """The initial value of an output, or of an element of it; in a sweep of a loop, that of the sweep."""
+        column = self._column(instance, name)
+        return element_of(self._value(instance, column.name, sweep), column, name)
+
+    def _value(self, instance: str, variable: str, sweep: int | None = None) -> Value:
+        if sweep is None:
+            while (instance, variable) not in self._known:
+                self._wait_for(instance, variable)
+            return self._known[instance, variable]
         while (instance, variable, sweep) not in self._sweeps:
             self._wait_for(instance, variable)
         return self._sweeps[instance, variable, sweep]
@@ -171,13 +186,12 @@ class Initialization:
             raise DeadlineExceeded(text, instance=instance, variable=variable)
         self._wait(left_s)
 
-    def _get_outputs(self, runner: Runner, names: Sequence[str]) -> dict[str, Number]:
+    def _get_outputs(self, runner: Runner, names: Sequence[str]) -> dict[str, Value]:
         """Get outputs of an instance."""
-        values = zip(names, runner.instance.get_values(names), strict=True)
-        return {name: value for name, value in values if not isinstance(value, str)}
+        return dict(zip(names, runner.instance.get_values(names), strict=True))
 
     def _send(
-        self, runner: Runner, level: int, values: dict[str, Number], loop: Loop | None = None, sweep: int | None = None
+        self, runner: Runner, level: int, values: dict[str, Value], loop: Loop | None = None, sweep: int | None = None
     ) -> None:
         """Send the outputs of a level to the nodes that need them; in a sweep of a loop, to those that take part."""
         for link in (*runner.out_links, *self.out_links):
@@ -189,7 +203,3 @@ class Initialization:
 
 def _outputs_at(runner: Runner, level: int) -> list[str]:
     return [name for name, own in runner.plan.initialization.items() if own == level]
-
-
-def _scaled(value: Number, factor: float, offset: float) -> Number:
-    return value if (factor, offset) == (1.0, 0.0) else value * factor + offset

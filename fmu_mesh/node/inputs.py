@@ -14,6 +14,7 @@ from ..model.description import ModelDescription, Value
 from ..model.instance import Instance
 from ..model.ring import Ring
 from ..model.trajectory import Trajectory
+from ..model.types import is_float
 from ..simtime import TimeGrid
 from ..wire.values import ValueRefused
 
@@ -103,7 +104,7 @@ class TimedInputs:
         when = now if time is None else time
         if name not in self._trajectories:
             variable = self.description.variable(name)
-            linear = self._linear and variable is not None and variable.type == "Real"
+            linear = self._linear and variable is not None and is_float(variable.type)
             trajectory = Trajectory(linear=linear)
             if when > now:
                 trajectory.add(now, self._instance.get_values([name])[0])

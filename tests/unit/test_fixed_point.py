@@ -11,13 +11,17 @@ from hypothesis import strategies as st
 
 from fmu_mesh.errors import InitializationFailed, LoopNotConverged, from_report
 from fmu_mesh.model.config import InitializationConfig
-from fmu_mesh.model.description import Value
+from fmu_mesh.model.description import PlainValue, VariableType
 from fmu_mesh.model.fixed_point import FixedPoint
 from fmu_mesh.model.initialization import Loop, Tear
 
+_TYPES: dict[type, VariableType] = {float: "Float64", int: "Int32", bool: "Boolean"}
 
-def loop(starts: list[Value]) -> Loop:
-    tears = tuple(Tear("b", f"y{n}", "a", f"u{n}", 1.0, 0.0, start) for n, start in enumerate(starts))
+
+def loop(starts: list[PlainValue]) -> Loop:
+    tears = tuple(
+        Tear("b", f"y{n}", "a", f"u{n}", 1.0, 0.0, _TYPES[type(start)], start) for n, start in enumerate(starts)
+    )
     return Loop(0, 1, tears, (("a", "x"), ("b", "y0")), ("a", "b"))
 
 

@@ -107,7 +107,7 @@ STRUCTURE = [
     pytest.param(
         changed("step_size", "step_sise"),
         "mesh.yaml:2: simulation.step_sise: the unknown key 'step_sise'; expected one of start_time, stop_time, "
-        "step_size, algorithm, window, real_time_factor. Did you mean 'step_size'?",
+        "step_size, algorithm, window, real_time_factor, update_period, catch_up. Did you mean 'step_size'?",
         id="an unknown key suggests the nearest and hides that this one is missing",
     ),
     pytest.param(
@@ -117,27 +117,27 @@ STRUCTURE = [
     ),
     pytest.param(
         changed("stop_time: 1", 'stop_time: "1"'),
-        "mesh.yaml:2: simulation.stop_time: '1'; expected a finite number",
+        "mesh.yaml:2: simulation.stop_time: '1'; expected a finite number or null",
         id="text is no number",
     ),
     pytest.param(
         changed("stop_time: 1", "stop_time: true"),
-        "mesh.yaml:2: simulation.stop_time: true; expected a finite number",
+        "mesh.yaml:2: simulation.stop_time: true; expected a finite number or null",
         id="a truth value is no number",
     ),
     pytest.param(
         changed("stop_time: 1", "stop_time: .nan"),
-        "mesh.yaml:2: simulation.stop_time: nan; expected a finite number",
+        "mesh.yaml:2: simulation.stop_time: nan; expected a finite number or null",
         id="NaN",
     ),
     pytest.param(
         changed("stop_time: 1", "stop_time: 1e999"),
-        "mesh.yaml:2: simulation.stop_time: inf; expected a finite number",
+        "mesh.yaml:2: simulation.stop_time: inf; expected a finite number or null",
         id="an overflow",
     ),
     pytest.param(
         changed("a: 1,", "a: -.inf,"),
-        "mesh.yaml:4: instances.pendulum.start_values.a: -inf; expected a finite number, true or false or text",
+        "mesh.yaml:4: instances.pendulum.start_values.a: -inf; expected a finite number, true or false, text or a list",
         id="an infinite start value",
     ),
     pytest.param(
@@ -179,7 +179,8 @@ STRUCTURE = [
     ),
     pytest.param(
         changed("{fmu: delay.fmu}", "delay.fmu"),
-        "mesh.yaml:5: instances.delay: 'delay.fmu'; expected a mapping with fmu, start_values, step_size, group, host",
+        "mesh.yaml:5: instances.delay: 'delay.fmu'; "
+        "expected a mapping with fmu, start_values, step_size, interpolation, group, host",
         id="text for a mapping",
     ),
     pytest.param(
@@ -249,8 +250,8 @@ TEXTS = [
     ),
     pytest.param(
         "- 1\n",
-        "mesh.yaml:1: a list; expected a mapping with mesh, simulation, instances, group, connections, record, "
-        "zenoh, timeouts and 1 more",
+        "mesh.yaml:1: a list; expected a mapping with mesh, simulation, instances, group, connections, initialization, "
+        "record, zenoh and 2 more",
         id="a list",
     ),
     pytest.param(
@@ -380,10 +381,10 @@ def test_an_override_takes_the_place_of_a_start_value() -> None:
                 "Did you mean 'pendulum'?"
             ),
         ),
-        ("delay.d=", "--set delay.d=: the value ''; expected a number, text, true or false"),
-        ("delay.d=[1]", "--set delay.d=[1]: the value '[1]'; expected a number, text, true or false"),
-        ("delay.d=[", "--set delay.d=[: the value '['; expected a number, text, true or false"),
-        ("delay.d=.nan", "--set delay.d=.nan: nan; expected a finite number, true or false or text"),
+        ("delay.d=", "--set delay.d=: the value ''; expected a number, text, true or false, or a list"),
+        ("delay.d={}", "--set delay.d={}: the value '{}'; expected a number, text, true or false, or a list"),
+        ("delay.d=[", "--set delay.d=[: the value '['; expected a number, text, true or false, or a list"),
+        ("delay.d=.nan", "--set delay.d=.nan: nan; expected a finite number, true or false, text or a list"),
     ],
 )
 def test_a_wrong_override_is_told_by_its_option(override: str, expected: str) -> None:

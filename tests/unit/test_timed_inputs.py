@@ -24,7 +24,7 @@ class Steps:
     def __init__(self, folder: Path, interpolation: Literal["hold", "linear"]) -> None:
         path = FMUS / "Gain.fmu"
         self.inputs = TimedInputs(Fmi2Instance(path, "gain", read_description(path), folder), interpolation)
-        self.rings = Ring(Layout.of([]), 64), Ring(Layout.of([("y", "Real")]), 64)
+        self.rings = Ring(Layout.of([]), 64), Ring(Layout.of([("y", "Float64")]), 64)
         self.inputs.enter_initialization(1.0, None, {"u": 5.0})
         self.inputs.exit_initialization()
         self.step = 0
@@ -37,7 +37,7 @@ class Steps:
         for step in range(self.step, self.step + steps):
             self.inputs.do_step(step)
         self.step += steps
-        values: list[float] = self.rings[1].reals[self.step - steps + 1 : self.step + 1, 0].tolist()
+        values: list[float] = self.rings[1].part("Float64")[self.step - steps + 1 : self.step + 1, 0].tolist()
         return values
 
 
