@@ -157,6 +157,13 @@ def test_the_page_is_the_same_on_a_narrow_terminal(
     assert capsys.readouterr().out == LOOP_PAGE
 
 
+def test_a_run_without_an_end_is_shown_as_one(tmp_path: Path) -> None:
+    plan = prepare(write(tmp_path, JACOBI.replace("stop_time: 1,", "stop_time: null,")))
+
+    assert plan_page(plan)[1] == "Simulation  0 s to an open end in steps of 0.5 s"
+    assert plan.grid.stop_time is None
+
+
 def test_options_change_the_plan(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = write(tmp_path, JACOBI)
 

@@ -100,3 +100,16 @@ def test_the_error_crosses_a_process_boundary() -> None:
     again = from_report(caught.value.report())
     assert isinstance(again, LoopNotConverged)
     assert isinstance(again, InitializationFailed)
+
+
+def test_an_array_agrees_when_all_its_elements_do() -> None:
+    tear = Tear("b", "y", "a", "u", 1.0, 0.0, "Float64", [1.0, "INF"], (2,))
+    point = FixedPoint(Loop(0, 0, (tear,), (("b", "y"),), ("b",)), InitializationConfig(relaxation=0.5, iterations=3))
+    assert point.assumed == {("a", "u"): [1.0, math.inf]}
+
+    point.assumed["a", "u"] = [1.0, 0.0]
+    assert not point.update([[1.0, 4.0]])
+    assert point.assumed == {("a", "u"): [1.0, 2.0]}
+    assert point.update([[1.0, 2.0]])
+    with pytest.raises(LoopNotConverged, match=r"residuals: b.y -> a.u 6 \(the largest of its elements\)"):
+        point.update([[3.0, 8.0]])
