@@ -11,25 +11,18 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final
 
-import fmpy
 import numpy as np
 from fmpy.fmi1 import FMICallException
-from fmpy.fmi2 import (
-    FMU2Slave,
-    fmi2CallbackAllocateMemoryTYPE,
-    fmi2CallbackFreeMemoryTYPE,
-    fmi2CallbackFunctions,
-    fmi2CallbackLoggerTYPE,
-)
-from fmpy.logging import addLoggerProxy
+from fmpy.fmi2 import FMU2Slave
 
 from ..model.description import Variable
 from ..model.ring import Part
 from ..model.types import Value, VariableType
 from .buffers import Buffer, NumberBuffer, StringBuffer
-from .instance import STATUS_NAMES, WARNING, FmuInstance, LogMessage, Verb
+from .callbacks import FMI2_CALLBACKS, register, unregister
+from .instance import STATUS_NAMES, WARNING, FmuInstance, Verb
 
-__all__ = ["Fmi2Instance", "LogMessage"]
+__all__ = ["Fmi2Instance"]
 
 _GET_OR_SET = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_size_t, ctypes.c_void_p)
 _DO_STEP = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_double, ctypes.c_double, ctypes.c_int)
@@ -42,27 +35,6 @@ _SUFFIX: Final[dict[VariableType, str]] = {
 }
 _DIRECT: Final = ("Float64", "Int32")
 """The types that lie in a ring as in C; a Boolean and an Enumeration are an `int` in FMI 2.0 (2.1.2)."""
-
-_instances: dict[bytes, Fmi2Instance] = {}
-
-
-def _log(_environment: int | None, name: bytes, status: int, category: bytes, message: bytes) -> None:
-    instance = _instances.get(name or b"")
-    if instance is not None:
-        instance.logged(status, category or b"", message or b"")
-
-
-def _callbacks() -> fmi2CallbackFunctions:
-    """One set of callbacks for the process: FMPy's proxy, which formats variadic messages, has one logger only."""
-    callbacks = fmi2CallbackFunctions()
-    callbacks.logger = fmi2CallbackLoggerTYPE(_log)
-    callbacks.allocateMemory = fmi2CallbackAllocateMemoryTYPE(fmpy.calloc)
-    callbacks.freeMemory = fmi2CallbackFreeMemoryTYPE(fmpy.free)
-    addLoggerProxy(ctypes.byref(callbacks))
-    return callbacks
-
-
-_CALLBACKS = _callbacks()
 
 
 class Fmi2Instance(FmuInstance):
@@ -102,22 +74,17 @@ class Fmi2Instance(FmuInstance):
     def close(self) -> None:
         """Terminate if allowed, free the instance and remove its files. Never raises; may be called twice."""
         super().close()
-        if _instances.get(self.name.encode()) is self:
-            del _instances[self.name.encode()]
+        unregister(self.name, self)
 
     def _instantiate(self, folder: Path) -> None:
-        key = self.name.encode()
-        if key in _instances:
-            msg = f"two instances of one process have the name '{self.name}'"
-            raise ValueError(msg)
-        _instances[key] = self
+        register(self.name, self)
         fmu = FMU2Slave(
             guid=self._description.guid,
             modelIdentifier=self._description.model_identifier,
             unzipDirectory=str(folder),
             instanceName=self.name,
         )
-        fmu.instantiate(callbacks=_CALLBACKS, loggingOn=False)
+        fmu.instantiate(callbacks=FMI2_CALLBACKS, loggingOn=False)
         self._fmu = fmu
         self._component = fmu.component
         self._do_step = _DO_STEP(("fmi2DoStep", fmu.dll))

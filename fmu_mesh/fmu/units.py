@@ -5,12 +5,17 @@ Owns which of them can be used. FMI 1.0 names base units and gives no exponents,
 
 from __future__ import annotations
 
+import xml.etree.ElementTree as ET
+from collections.abc import Mapping
+
 from fmpy.model_description import ModelDescription as FmpyDescription
 from fmpy.model_description import ModelVariable
+from msgspec.structs import replace
 
+from ..model.description import Variable
 from ..model.units import BaseUnit
 
-__all__ = ["base_units", "is_relative", "unit_of"]
+__all__ = ["base_units", "with_unit"]
 
 _EXPONENTS = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
 
@@ -32,17 +37,29 @@ def base_units(source: FmpyDescription) -> dict[str, BaseUnit]:
     return units
 
 
-def unit_of(source: ModelVariable) -> str | None:
-    """The unit of a variable: its own, or that of its declared type."""
-    declared = source.declaredType
-    unit: str | None = source.unit or (declared.unit if declared is not None else None)
-    return unit
+def with_unit(
+    variable: Variable, source: ModelVariable, element: ET.Element, units: Mapping[str, BaseUnit]
+) -> Variable:
+    """A variable with its unit in base units, if that is defined.
 
-
-def is_relative(source: ModelVariable) -> bool:
-    """Whether a variable is a difference (relativeQuantity: FMI 2.0, 2.2.7).
-
-    FMPy 0.3.32 hands on that of a declared type, and not that of the variable itself.
+    Args:
+        variable: the variable, with the name of its unit.
+        source: the same as FMPy reads it.
+        element: the same in the XML.
+        units: what `base_units` returned.
     """
-    own = source.relativeQuantity
-    return bool(own if own is not None else source.declaredType is not None and source.declaredType.relativeQuantity)
+    base = units.get(variable.unit or "")
+    if base is None:
+        return variable
+    return replace(variable, base_unit=base, relative_quantity=_is_relative(source, element))
+
+
+def _is_relative(source: ModelVariable, element: ET.Element) -> bool:
+    """Whether a variable is a difference: relativeQuantity of its own (FMI 2.0, 2.2.7), or of its declared type.
+
+    FMPy 0.3.32 does not read that of the variable.
+    """
+    own = (child.get("relativeQuantity") for child in (element, *element))
+    declared = source.declaredType.relativeQuantity if source.declaredType is not None else None
+    value = next((text for text in own if text is not None), declared)
+    return value in (True, "true", "1")

@@ -16,7 +16,7 @@ from types import MappingProxyType
 import numpy as np
 
 from ..errors import FmuMeshError, Interrupted, StepFailed
-from ..fmu import Fmi2Instance, LogMessage
+from ..fmu import LogMessage, open_instance
 from ..model.elements import scaled
 from ..model.fixed_point import FixedPoint
 from ..model.initialization import Loop, Tear
@@ -116,7 +116,7 @@ class LocalMesh:
         if self._open_instance is not None:
             return self._open_instance(name)
         system = self._plan.system.instances[name]
-        return Fmi2Instance(Path(system.fmu), name, system.description, folder, self._log)
+        return open_instance(Path(system.fmu), name, system.description, folder, self._log)
 
     def _initialize(self, members: dict[str, _Member]) -> None:
         grid = self._plan.grid

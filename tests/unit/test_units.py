@@ -187,10 +187,12 @@ def test_a_temperature_is_shifted_and_a_difference_is_not(tmp_path: Path) -> Non
     types = '</UnitDefinitions><TypeDefinitions><SimpleType name="Difference"><Real unit="K" relativeQuantity="true"/>'
     definitions = f"{CELSIUS_AND_KELVIN}{types}</SimpleType></TypeDefinitions><UnitDefinitions>"
     third = gain_with_units(tmp_path, "third", definitions, u='K" declaredType="Difference')
-    instances = {name: {"fmu": str(path)} for name, path in (("a", first), ("b", second), ("c", third))}
-    path = write_config(tmp_path, instances=instances, connections=["a.y -> b.u", "a.y -> c.u"])
+    fourth = gain_with_units(tmp_path, "fourth", CELSIUS_AND_KELVIN, u='K" relativeQuantity="true')
+    paths = {"a": first, "b": second, "c": third, "d": fourth}
+    instances = {name: {"fmu": str(path)} for name, path in paths.items()}
+    path = write_config(tmp_path, instances=instances, connections=["a.y -> b.u", "a.y -> c.u", "a.y -> d.u"])
 
-    shifted, difference = prepare(path).connections
+    shifted, *differences = prepare(path).connections
 
     assert (shifted.factor, shifted.offset) == (1.0, 273.15)
-    assert (difference.factor, difference.offset) == (1.0, 0.0)
+    assert [(c.factor, c.offset) for c in differences] == [(1.0, 0.0), (1.0, 0.0)]
