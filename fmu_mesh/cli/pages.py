@@ -8,7 +8,7 @@ import msgspec
 
 from ..simtime import ENDLESS
 from ..wire.readings import Reading
-from ..wire.views import InstanceInfo, InstanceStatus, MeshInfo, MeshStatus
+from ..wire.views import InstanceInfo, InstanceStatus, MeshInfo, MeshStatus, VariableView
 from .tables import pairs, table
 
 __all__ = [
@@ -27,7 +27,7 @@ __all__ = [
 def variables(info: InstanceInfo) -> list[str]:
     """One line for each variable of an instance."""
     rows = [
-        [v.key, v.type, v.variability, v.unit or "", "" if v.start is None else _text(v.start), v.description or ""]
+        [v.key, _type(v), v.variability, v.unit or "", "" if v.start is None else _text(v.start), v.description or ""]
         for v in info.variables
     ]
     return table(rows, heading=["variable", "type", "variability", "unit", "start", "description"], indent=2)
@@ -74,6 +74,9 @@ def instance_status(status: InstanceStatus) -> list[str]:
     )
 
 
+_PARTS = {"@record": "the recorder", "@mesh": "the master"}
+
+
 def mesh_info(info: MeshInfo) -> list[str]:
     """What a mesh is."""
     return pairs(
@@ -91,6 +94,7 @@ def mesh_info(info: MeshInfo) -> list[str]:
             ("nodes", ", ".join(info.nodes)),
             ("result file", info.result_file or "none"),
             ("endpoints", ", ".join(info.endpoints)),
+            ("shared memory", ", ".join(_PARTS.get(name, name) for name in info.shared_memory) or "not used"),
             ("master", f"process {info.pid} on {info.host}, fmu_mesh {info.version}"),
         ]
     )
@@ -138,6 +142,11 @@ def seconds(time: float) -> str:
 
 def _end(stop_time: float | None) -> str:
     return seconds(stop_time) if stop_time is not None else "an open end"
+
+
+def _type(view: VariableView) -> str:
+    """The type, with the sizes of an array's dimensions."""
+    return f"{view.type}[{','.join(map(str, view.shape))}]" if view.shape else view.type
 
 
 def _text(value: object) -> str:

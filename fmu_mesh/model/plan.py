@@ -107,6 +107,7 @@ class NodePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         links_in: links that end here.
         links_out: links that start here.
         result_file: absolute path of the result CSV (for the recorder).
+        shared_memory: whether processes of one host exchange messages through shared memory.
     """
 
     mesh: str
@@ -126,6 +127,7 @@ class NodePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     initialization: InitializationConfig = InitializationConfig()
     result_file: str | None = None
     recorded: tuple[tuple[str, str], ...] = ()
+    shared_memory: bool = True
 
     def instance(self, name: str) -> InstancePlan:
         """The plan of one of its instances."""
@@ -336,6 +338,7 @@ def _node(
         initialization=config.initialization,
         result_file=plan.system.result_file if node == RECORDER else None,
         recorded=plan.system.recorded if node == RECORDER else (),
+        shared_memory=config.zenoh.shared_memory,
     )
 
 

@@ -91,12 +91,6 @@ class Initialization:
                         self._send(runner, level, values)
         for runner in runners:
             self._set_inputs(runner, None)
-        self.close()
-
-    def close(self) -> None:
-        """Undeclare what is used in Initialization Mode only."""
-        for link in self.out_links:
-            link.close()
         self.out_links.clear()
 
     def _iterate(self, loop: Loop, runners: Collection[Runner]) -> None:
