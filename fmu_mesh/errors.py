@@ -7,6 +7,7 @@ FmuMeshError                     1   an internal error
 ├── FmuError                     3   an FMU failed
 │   ├── LoadFailed                   it cannot be extracted, loaded or instantiated
 │   ├── InitializationFailed         a call in or around Initialization Mode failed
+│   │   └── LoopNotConverged         an algebraic loop has no consistent values at the start
 │   └── StepFailed                   fmi2DoStep, or a get or set at a point, failed
 ├── MeshLost                     4   a node, the master or the recorder is gone or silent
 │   ├── DeadlineExceeded             a wait met its deadline
@@ -36,6 +37,7 @@ __all__ = [
     "InitializationFailed",
     "Interrupted",
     "LoadFailed",
+    "LoopNotConverged",
     "MeshLost",
     "StepFailed",
 ]
@@ -177,6 +179,10 @@ class InitializationFailed(FmuError):
     """A call in or around Initialization Mode failed (FMI 2.0, 4.2.1 and 2.1.6)."""
 
 
+class LoopNotConverged(InitializationFailed):
+    """Outputs that depend on each other came to no consistent values at the start; names them and the residuals."""
+
+
 class StepFailed(FmuError):
     """`fmi2DoStep`, or a get or set at a point, failed; only closing the instance is allowed now."""
 
@@ -207,6 +213,7 @@ _BY_KIND: dict[str, type[FmuMeshError]] = {
         FmuError,
         LoadFailed,
         InitializationFailed,
+        LoopNotConverged,
         StepFailed,
         MeshLost,
         DeadlineExceeded,

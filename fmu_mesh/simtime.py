@@ -11,7 +11,10 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["TimeGrid", "steps_between"]
+__all__ = ["ENDLESS", "TimeGrid", "steps_between"]
+
+ENDLESS = 2**53
+"""The last point of a run without an end; above it, the product of a point and the step size is no longer exact."""
 
 
 class TimeGrid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -20,7 +23,7 @@ class TimeGrid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     Attributes:
         start_time: time of point 0 in s.
         step_size: base communication step size in s, greater than 0.
-        last_point: index of the last communication point.
+        last_point: index of the last communication point; `ENDLESS` for a run that goes on until it is stopped.
     """
 
     start_time: float
@@ -37,9 +40,9 @@ class TimeGrid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return times
 
     @property
-    def stop_time(self) -> float:
-        """The time of the last point in s."""
-        return self.time(self.last_point)
+    def stop_time(self) -> float | None:
+        """The time of the last point in s; None for a run without an end."""
+        return self.time(self.last_point) if self.last_point < ENDLESS else None
 
 
 def steps_between(duration: float, step_size: float) -> int | None:

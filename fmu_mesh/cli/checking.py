@@ -11,6 +11,7 @@ from ..launch.preparing import Options, prepare
 from ..model.description import Variable
 from ..model.findings import shown
 from ..model.grouping import automatic_nodes
+from ..model.initialization import Loop
 from ..model.plan import Plan
 from ..model.schema import schema_text
 from ..model.system import Connection, SystemInstance
@@ -70,7 +71,8 @@ def _head(plan: Plan) -> list[str]:
     simulation, grid = plan.system.config.simulation, plan.grid
     factor = simulation.real_time_factor
     window = f"{plan.window} points" if plan.window > 1 else "1 point: lockstep"
-    times = f"{_number(grid.start_time)} s to {_number(grid.stop_time)} s in {grid.last_point} steps of"
+    end = f"{_number(grid.stop_time)} s in {grid.last_point}" if grid.stop_time is not None else "an open end in"
+    times = f"{_number(grid.start_time)} s to {end} steps of"
     return pairs(
         [
             ("Mesh", plan.system.config.mesh),
@@ -108,7 +110,7 @@ def _connections(plan: Plan) -> list[str]:
     for c in plan.connections:
         what = "value at the start of the step" if c.delay else "value at the end of the step"
         closing = "closes a cycle" if c in plan.closing else ""
-        rows.append([str(c), f"delay {c.delay}", what, _arithmetic(c), closing])
+        rows.append([str(c), f"delay {c.delay}", what, _arithmetic(c), closing, c.units])
     return table(rows, indent=2)
 
 
@@ -156,18 +158,26 @@ def _remedy(nodes: int, automatic: int) -> str:
 
 
 def _initialization(plan: Plan) -> list[str]:
+    """What becomes known when, and which outputs are iterated together."""
+    loops = {loop.first: loop for loop in plan.initialization.loops}
     levels: dict[int, list[str]] = {}
     by_order = sorted(plan.initialization.levels.items(), key=lambda item: plan.order.index(item[0][0]))
     for (name, variable), level in by_order:
         levels.setdefault(level, []).append(f"{name}.{variable}")
-    lines = [f"  level {level}: {', '.join(names)}" for level, names in sorted(levels.items())]
-    for name, variable in plan.initialization.held:
-        instance = plan.system.instances[name]
-        described = instance.description.variable_of(variable)
-        start = instance.start_values.get(variable, described.start if described is not None else None)
-        value = f" {shown(start)}{_unit(described)}" if start is not None else ""
-        lines.append(f"  {name}.{variable} keeps its start value{value} until the first step")
+    lines = []
+    for level, names in sorted(levels.items()):
+        lines.append(f"  level {level}: {', '.join(names)}")
+        if level in loops:
+            last = loops[level].last
+            until = f"levels {level} to {last} are" if last > level else f"level {level} is"
+            lines[-1:-1] = [f"  {until} iterated, beginning with {', '.join(_assumed(plan, loops[level]))}"]
     return lines
+
+
+def _assumed(plan: Plan, loop: Loop) -> list[str]:
+    """The torn inputs of a loop, each with the value that is assumed at first."""
+    described = {tear: plan.system.instances[tear.target].description.variable_of(tear.input) for tear in loop.tears}
+    return [f"{t.target}.{t.input} = {shown(t.start)}{_unit(variable)}" for t, variable in described.items()]
 
 
 def _recorded(plan: Plan) -> list[str]:

@@ -43,7 +43,8 @@ class Display:
             disable=not show_progress or not self._console.is_terminal,
             transient=True,
         )
-        self._task = self._progress.add_task(plan.system.config.mesh, total=plan.grid.last_point, text="starting")
+        total = plan.grid.last_point if plan.grid.stop_time is not None else None
+        self._task = self._progress.add_task(plan.system.config.mesh, total=total, text="starting")
 
     def __enter__(self) -> Self:
         self._progress.start()

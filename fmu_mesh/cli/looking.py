@@ -31,7 +31,7 @@ from .pages import (
 )
 from .tables import table
 
-__all__ = ["add_commands"]
+__all__ = ["add_commands", "positive_seconds", "reaching"]
 
 _TIMEOUT_S = 5.0
 _REFERENCE = "`instance.variable` (with `*` for any characters), or a key (with the wildcards of Zenoh)"
@@ -41,20 +41,9 @@ Run = Callable[[argparse.Namespace, Meshes], int]
 
 def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.ArgumentParser) -> None:
     """Add the commands of this module."""
-    reaching = argparse.ArgumentParser(add_help=False)
-    reaching.add_argument(
-        "--connect",
-        action="append",
-        default=[],
-        metavar="ENDPOINT",
-        help="Zenoh endpoint of a mesh or a router; repeatable; default: the meshes of this user on this host",
-    )
-    reaching.add_argument(
-        "--timeout", type=_seconds, default=_TIMEOUT_S, metavar="S", help="deadline of every question in s (5)"
-    )
 
     def add(name: str, run: Run, text: str, *, json: bool = True) -> argparse.ArgumentParser:
-        parser: argparse.ArgumentParser = commands.add_parser(name, parents=[common, reaching], help=text)
+        parser: argparse.ArgumentParser = commands.add_parser(name, parents=[common, reaching()], help=text)
         if json:
             parser.add_argument("--json", action="store_true", help="JSON, one object per line")
         parser.set_defaults(run_command=lambda arguments: _with_meshes(arguments, run))
@@ -89,12 +78,29 @@ def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.Arg
             parser.add_argument("points", nargs="?", type=_positive, default=1, metavar="N", help="points (1)")
 
 
+def reaching() -> argparse.ArgumentParser:
+    """The options of all commands that reach running meshes."""
+    options = argparse.ArgumentParser(add_help=False)
+    options.add_argument(
+        "--connect",
+        action="append",
+        default=[],
+        metavar="ENDPOINT",
+        help="Zenoh endpoint of a mesh or a router; repeatable; default: the meshes of this user on this host",
+    )
+    options.add_argument(
+        "--timeout", type=positive_seconds, default=_TIMEOUT_S, metavar="S", help="deadline of every question in s (5)"
+    )
+    return options
+
+
 def _with_meshes(arguments: argparse.Namespace, run: Run) -> int:
     with Meshes(arguments.connect, arguments.timeout) as meshes:
         return run(arguments, meshes)
 
 
-def _seconds(text: str) -> float:
+def positive_seconds(text: str) -> float:
+    """A time in s of the command line."""
     value = float(text)
     if not (math.isfinite(value) and value > 0.0):
         raise argparse.ArgumentTypeError(f"{text} is not a time above 0")

@@ -6,6 +6,7 @@ from collections.abc import Iterable
 
 import msgspec
 
+from ..simtime import ENDLESS
 from ..wire.readings import Reading
 from ..wire.views import InstanceInfo, InstanceStatus, MeshInfo, MeshStatus, VariableView
 from .tables import pairs, table
@@ -50,6 +51,7 @@ def mesh_status(status: MeshStatus) -> list[str]:
             ("point", progress(status)),
             ("time", seconds(status.time)),
             ("speed", f"{status.points_per_second:.0f} points/s, real-time factor {status.real_time_factor:.3g}"),
+            ("overruns", str(status.overruns or "")),
             ("error", status.error.message if status.error is not None else ""),
         ]
     )
@@ -83,7 +85,7 @@ def mesh_info(info: MeshInfo) -> list[str]:
             ("configuration", info.config),
             (
                 "simulation",
-                f"{seconds(info.start_time)} to {seconds(info.stop_time)} in steps of {seconds(info.step_size)}",
+                f"{seconds(info.start_time)} to {_end(info.stop_time)} in steps of {seconds(info.step_size)}",
             ),
             ("algorithm", info.algorithm),
             ("window", f"{info.window} points"),
@@ -129,13 +131,17 @@ def cells(reading: Reading) -> list[str]:
 
 
 def progress(status: MeshStatus) -> str:
-    """The point of a mesh and the last one."""
-    return f"{status.point} of {status.last_point}"
+    """The point of a mesh, and the last one if there is one."""
+    return f"{status.point} of {status.last_point}" if status.last_point < ENDLESS else str(status.point)
 
 
 def seconds(time: float) -> str:
     """A time in s."""
     return f"{time:.12g} s"
+
+
+def _end(stop_time: float | None) -> str:
+    return seconds(stop_time) if stop_time is not None else "an open end"
 
 
 def _type(view: VariableView) -> str:

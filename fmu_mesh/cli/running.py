@@ -28,7 +28,7 @@ from .display import Display, say, stdout_as_stderr, summary
 from .plotting import plot_results, require_matplotlib
 from .profiling import add_profile, show_profile
 
-__all__ = ["add_commands"]
+__all__ = ["add_commands", "close", "run_launcher"]
 
 
 def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.ArgumentParser) -> None:
@@ -97,15 +97,15 @@ def _launch(arguments: argparse.Namespace) -> int:
             point, seconds, rows = _run_local(plan, display)
         else:
             launcher = Launcher(plan, arguments.config, options, display.event, display.output)
-            end = _run_launcher(launcher)
+            end = run_launcher(launcher)
             point, seconds, rows, profile = end.status.point, end.seconds, end.rows, end.profile
     if profile is not None:
         show_profile(plan, profile, seconds, arguments.profile)
-    _close(plan, point, seconds, rows, arguments.plot)
+    close(plan, point, seconds, rows, arguments.plot)
     return 0
 
 
-def _run_launcher(launcher: Launcher) -> End:
+def run_launcher(launcher: Launcher) -> End:
     """Run it; Ctrl-C and SIGTERM end the run instead of this process."""
 
     def interrupt(_number: int, _frame: FrameType | None) -> None:
@@ -148,7 +148,7 @@ def _run_local(plan: Plan, display: Display) -> tuple[int, float, int]:
     return mesh.point, mesh.seconds, mesh.rows
 
 
-def _close(plan: Plan, point: int, seconds: float, rows: int, plot: Path | None) -> None:
+def close(plan: Plan, point: int, seconds: float, rows: int, plot: Path | None) -> None:
     """Plot if wanted, and print the summary."""
     result = plan.system.result_file
     if plot is not None and result is not None:
@@ -185,7 +185,7 @@ def _master(arguments: argparse.Namespace) -> int:
         run_master(arguments.config, options, show, plan=plan)
     if ends[0].profile is not None:
         show_profile(plan, ends[0].profile, ends[0].seconds, arguments.profile)
-    _close(plan, ends[0].status.point, ends[0].seconds, ends[0].rows, arguments.plot)
+    close(plan, ends[0].status.point, ends[0].seconds, ends[0].rows, arguments.plot)
     return 0
 
 

@@ -224,7 +224,9 @@ class Guarded:
         """The model description."""
         return self.instance.description
 
-    def enter_initialization(self, start_time: float, stop_time: float, start_values: Mapping[str, Value]) -> None:
+    def enter_initialization(
+        self, start_time: float, stop_time: float | None, start_values: Mapping[str, Value]
+    ) -> None:
         """Set ``start_values`` and enter Initialization Mode."""
         with self._calling():
             self.instance.enter_initialization(start_time, stop_time, start_values)

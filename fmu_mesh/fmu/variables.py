@@ -15,6 +15,7 @@ from fmpy.model_description import ModelVariable
 
 from ..model.description import Causality, Initial, Value, Variable, VariableType
 from ..model.types import FMI2_TYPES, INTEGERS, MAX_ELEMENTS, TYPES, nested
+from .units import base_units, with_unit
 
 __all__ = ["variables_of"]
 
@@ -37,10 +38,12 @@ def variables_of(source: FmpyDescription, root: ET.Element) -> tuple[Variable, .
     else:
         convert = _fmi3 if source.fmiVersion.startswith("3.") else _fmi2
         dependencies = _initial_unknowns(source)
+    units = base_units(source)
     return tuple(
-        convert(variable, elements[(variable.alias or variable).name], dependencies)
+        with_unit(convert(variable, element, dependencies), variable, element, units)
         for variable in source.modelVariables
         if variable.type in FMI2_TYPES or variable.type in TYPES
+        for element in (elements[(variable.alias or variable).name],)
     )
 
 

@@ -10,9 +10,10 @@ import logging
 import shutil
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 
@@ -20,6 +21,8 @@ from ..errors import FmuError, FmuMeshError, Interrupted, StepFailed
 from ..fmu import LogMessage, Terms, open_instance
 from ..fmu.guard import CallWatch, Guarded, floating_point_changed, restore_floating_point
 from ..model.elements import scaled
+from ..model.fixed_point import FixedPoint
+from ..model.initialization import Loop, Tear
 from ..model.instance import Instance
 from ..model.plan import Plan
 from ..model.ring import Layout, Ring
@@ -150,14 +153,39 @@ class LocalMesh:
             member.instance.enter_initialization(grid.start_time, grid.stop_time, member.plan.start_values)
         levels = self._plan.initialization.levels
         known: dict[tuple[str, str], Value] = {}
-        for (name, variable), _ in sorted(levels.items(), key=lambda item: item[1]):
-            members[name].set_initial_inputs(known)
-            known[(name, variable)] = members[name].instance.get_values([variable])[0]
+        loops = iter((*self._plan.initialization.loops, None))
+        loop = next(loops)
+        for (name, variable), level in sorted(levels.items(), key=lambda item: item[1]):
+            if loop is not None and level >= loop.first:
+                self._iterate(loop, members, known)
+                loop = next(loops)
+            if (name, variable) not in known:
+                members[name].set_initial_inputs(known)
+                known[(name, variable)] = members[name].instance.get_values([variable])[0]
         for member in members.values():
             member.set_initial_inputs(known)
         for member in members.values():
             member.instance.exit_initialization()
             member.bind(grid)
+
+    def _iterate(self, loop: Loop, members: dict[str, _Member], known: dict[tuple[str, str], Value]) -> None:
+        """Bring an algebraic loop to consistent values, which are known then."""
+        point = FixedPoint(loop, self._plan.system.config.initialization)
+        before = dict(known)
+        consistent = False
+        while not consistent:
+            known.clear()
+            known.update(before)
+            for name, variable in loop.outputs:
+                members[name].set_initial_inputs(known, point.assumed)
+                known[(name, variable)] = members[name].instance.get_values([variable])[0]
+            consistent = point.update([self._brought(tear, known) for tear in loop.tears])
+        for name, variable in point.assumed:
+            members[name].settled.add(variable)
+
+    def _brought(self, tear: Tear, known: dict[tuple[str, str], Value]) -> Value:
+        c = next(c for c in self._plan.connections if (c.target_instance, c.target_name) == (tear.target, tear.input))
+        return scaled(_at(known[c.source_instance, c.source.name], c.source_index), c.factor, c.offset)
 
     def _loop(self, members: dict[str, _Member], file: CsvFile | None) -> None:
         plan, grid = self._plan, self._plan.grid
@@ -201,7 +229,11 @@ class LocalMesh:
 
 
 class _Member:
-    """One instance of a `LocalMesh`."""
+    """One instance of a `LocalMesh`.
+
+    Attributes:
+        settled: inputs that keep what was found for them in the iteration of a loop at the start.
+    """
 
     def __init__(self, plan: Plan, name: str, instance: Instance) -> None:
         node = plan.nodes[plan.node_of(name)]
@@ -213,15 +245,22 @@ class _Member:
         oldest = max(instance.step_points for instance in plan.system.instances.values())
         self._outputs = Ring(self.plan.outputs, 1 << (2 * oldest).bit_length())
         self.step = 0
+        self.settled: set[str] = set()
 
-    def set_initial_inputs(self, known: dict[tuple[str, str], Value]) -> None:
-        """Set every connected input whose source is known."""
+    def set_initial_inputs(
+        self, known: Mapping[tuple[str, str], Value], assumed: Mapping[tuple[str, str], Value] = MappingProxyType({})
+    ) -> None:
+        """Set every connected input whose source is known, or which has an assumed value."""
         values: dict[str, Value] = {}
         for c in self.connections:
             key = (c.source_instance, c.source.name)
-            if key not in known or c.target_name in self.plan.held:
+            own = (c.target_instance, c.target_name)
+            if own in assumed:
+                value = assumed[own]
+            elif key in known and c.target_name not in self.settled:
+                value = scaled(_at(known[key], c.source_index), c.factor, c.offset)
+            else:
                 continue
-            value = scaled(_at(known[key], c.source_index), c.factor, c.offset)
             if not c.target_index:
                 values[c.target.name] = value
                 continue

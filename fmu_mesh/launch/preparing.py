@@ -12,12 +12,12 @@ from ..errors import ConfigurationError, Finding, LoadFailed
 from ..fmu import PLATFORM, Terms, compile_sources, read_description
 from ..model.config import InstanceConfig, ZenohConfig
 from ..model.description import ModelDescription
-from ..model.findings import nearest_file
+from ..model.findings import Findings, nearest_file
 from ..model.loading import LoadedConfig, examine
 from ..model.plan import Plan, make_plan
 from ..model.system import build
 
-__all__ = ["Options", "prepare", "zenoh_section"]
+__all__ = ["Options", "planned", "prepare", "zenoh_section"]
 
 
 class Options(msgspec.Struct, frozen=True):
@@ -54,11 +54,22 @@ def prepare(
         ConfigurationError: with everything that is wrong with it or its FMUs.
     """
     loaded, findings = examine(path, options.start_values)
+    return planned(loaded, findings, options, tell)
+
+
+def planned(
+    loaded: LoadedConfig, findings: Findings, options: Options, tell: Callable[[str], None] = lambda _text: None
+) -> Plan:
+    """Check and plan a configuration whose structure was examined; ``findings`` are those of its structure.
+
+    Raises:
+        ConfigurationError: with everything that is wrong with it or its FMUs.
+    """
     loaded = _with_options(loaded, options)
     descriptions, unreadable = _descriptions(loaded, tell)
     findings.merge(unreadable)
     system = build(loaded, descriptions, tuple(findings))
-    return make_plan(system, window=options.window, file=str(path))
+    return make_plan(system, window=options.window, file=str(loaded.file))
 
 
 def zenoh_section(loaded: LoadedConfig, options: Options) -> ZenohConfig:

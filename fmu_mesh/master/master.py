@@ -242,7 +242,7 @@ class Master:
         grant = min(credit, self._plan.grid.last_point)
         if self._hold is not None:
             grant = min(grant, self._hold)
-        paced, pause = self._pacer.limit(grant)
+        paced, pause = self._pacer.limit(grant, self._slowest)
         grant = min(grant, paced)
         if self.watch is not None:
             self.watch.look(self._holder(credit, grant))
@@ -467,6 +467,7 @@ class Master:
             real_time_factor=rate * self._plan.grid.step_size,
             progress={node: max(progress, 0) for node, progress in zip(self._nodes, self._progress, strict=True)},
             error=failure,
+            overruns=self._pacer.overruns,
         )
 
     def _publish_status(self, *, final: bool = False) -> None:

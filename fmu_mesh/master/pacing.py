@@ -33,10 +33,18 @@ class Clock:
 
 
 class Pacer:
-    """Holds the grant back to the wall clock; a real-time factor of 0 never does."""
+    """Holds the grant back to the wall clock; a real-time factor of 0 never does.
+
+    Attributes:
+        overruns: points that were given up, because the run was too far behind the wall clock.
+    """
 
     def __init__(self, plan: Plan, real_time_factor: float) -> None:
+        simulation = plan.system.config.simulation
+        self.overruns = 0
         self._rate = real_time_factor / plan.grid.step_size
+        self._period = simulation.update_period
+        self._catch_up = simulation.catch_up
         self._origin = 0
         self._started = 0.0
 
@@ -45,12 +53,27 @@ class Pacer:
         self._origin = point
         self._started = time.perf_counter()
 
-    def limit(self, wanted: int) -> tuple[int, float]:
-        """The point that may be granted now, and how long until ``wanted`` may be, in s."""
+    def limit(self, wanted: int, reached: int) -> tuple[int, float]:
+        """The point that may be granted now, and how long until ``wanted`` may be, in s; all are at ``reached``."""
         if self._rate <= 0:
             return wanted, math.inf
-        due = self._origin + (time.perf_counter() - self._started) * self._rate
+        elapsed = time.perf_counter() - self._started
+        elapsed -= self._give_up(self._origin + elapsed * self._rate - reached)
+        update = math.floor(elapsed / self._period) * self._period if self._period else elapsed
+        due = self._origin + update * self._rate
         allowed = math.floor(due) + 1
         if allowed >= wanted:
             return wanted, math.inf
-        return allowed, max(0.0005, (allowed - due) / self._rate)
+        next_update = update + self._period if self._period else elapsed + (allowed - due) / self._rate
+        return allowed, max(0.0005, next_update - elapsed)
+
+    def _give_up(self, behind: float) -> float:
+        """The wall-clock time in s that is given up, because the run is ``behind`` by so many points."""
+        if self._catch_up is None:
+            return 0.0
+        lost = math.floor(behind - (self._catch_up + self._period) * self._rate) - 1  # one point is on its way
+        if lost <= 0:
+            return 0.0
+        self.overruns += lost
+        self._started += lost / self._rate
+        return lost / self._rate

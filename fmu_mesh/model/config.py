@@ -16,6 +16,7 @@ from fmu_mesh.model.types import PlainValue
 __all__ = [
     "Config",
     "ConnectionConfig",
+    "InitializationConfig",
     "InstanceConfig",
     "LimitsConfig",
     "RecordConfig",
@@ -56,8 +57,11 @@ class SimulationConfig(Base, frozen=True, kw_only=True):
 
     start_time: Annotated[float, Meta(description="Time of communication point 0 in s.")] = 0.0
     stop_time: Annotated[
-        float,
-        Meta(description="Time of the last communication point in s: start_time plus a multiple of step_size."),
+        float | None,
+        Meta(
+            description="Time of the last communication point in s: start_time plus a multiple of step_size; "
+            "null: it runs until it is stopped."
+        ),
     ]
     step_size: Annotated[
         float,
@@ -85,6 +89,21 @@ class SimulationConfig(Base, frozen=True, kw_only=True):
             extra_json_schema=_NOT_NEGATIVE,
         ),
     ] = 0.0
+    update_period: Annotated[
+        float,
+        Meta(
+            ge=0,
+            description="With a real_time_factor: wall-clock time in s after which the points that have become due are "
+            "taken together; 0: each as it becomes due.",
+        ),
+    ] = 0.0
+    catch_up: Annotated[
+        Annotated[float, Meta(ge=0)] | None,
+        Meta(
+            description="With a real_time_factor: how far in s a run may fall behind the wall clock before it gives up "
+            "what it lost, which `status` counts as overruns; null: it catches up however long that takes."
+        ),
+    ] = None
 
 
 class InstanceConfig(Base, frozen=True, kw_only=True):
@@ -103,6 +122,14 @@ class InstanceConfig(Base, frozen=True, kw_only=True):
         Meta(
             description="Step size of this instance in s: a whole multiple of the base step size (default).",
             extra_json_schema=_POSITIVE,
+        ),
+    ] = None
+    interpolation: Annotated[
+        Literal["hold", "linear"] | None,
+        Meta(
+            description="How a value that is sent to an unconnected input with a time in its attachment is used: it "
+            "holds from that time on, or Reals go to it linearly; null: the time is ignored, and it holds from the "
+            "next point on."
         ),
     ] = None
     group: Annotated[Name | None, Meta(description="Instances of one group share one node (one process).")] = None
@@ -148,12 +175,44 @@ class ConnectionConfig(Base, frozen=True, kw_only=True):
             description="`instance.variable` of an input, or an element of an array as `b.u[3]`.", examples=["delay.x"]
         ),
     ] = msgspec.field(name="to")
-    factor: Annotated[float, Meta(description="The input is factor * output + offset; Real inputs only.")] = 1.0
-    offset: Annotated[float, Meta(description="The input is factor * output + offset; Real inputs only.")] = 0.0
+    factor: Annotated[
+        float,
+        Meta(description="The input is factor * output + offset, in the input's unit; Real inputs only."),
+    ] = 1.0
+    offset: Annotated[
+        float,
+        Meta(description="The input is factor * output + offset, in the input's unit; Real inputs only."),
+    ] = 0.0
     delay: Annotated[
         Literal[0, 1] | None,
         Meta(description="0: value at the end of the target's step; 1: at its start. Default: see algorithm."),
     ] = None
+    ignore_units: Annotated[bool, Meta(description="true: neither convert nor compare the units of the two ends.")] = (
+        False
+    )
+
+
+class InitializationConfig(Base, frozen=True, kw_only=True):
+    """How the algebraic loops at the start are iterated: fixed point with under-relaxation."""
+
+    tolerance: Annotated[
+        float,
+        Meta(
+            ge=0,
+            description="A loop is consistent when each of its inputs is off what feeds it by at most this, or by "
+            "this times the value where that is above 1.",
+        ),
+    ] = 1e-9
+    relaxation: Annotated[
+        float,
+        Meta(
+            gt=0,
+            le=1,
+            description="How far an input goes towards what feeds it in one iteration; 1: all the way. Lower it for "
+            "a loop that does not converge.",
+        ),
+    ] = 1.0
+    iterations: Annotated[int, Meta(ge=1, description="After so many iterations the run ends with an error.")] = 1000
 
 
 class RecordConfig(Base, frozen=True, kw_only=True):
@@ -257,6 +316,7 @@ class Config(Base, frozen=True, kw_only=True):
     connections: Annotated[
         list[ConnectionConfig], Meta(description="What flows from which output to which input.")
     ] = []
+    initialization: InitializationConfig = InitializationConfig()
     record: RecordConfig = RecordConfig()
     zenoh: ZenohConfig = ZenohConfig()
     timeouts: TimeoutsConfig = TimeoutsConfig()

@@ -10,11 +10,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import msgspec
+from msgspec.structs import replace
 
 from fmu_mesh.model.config import ConnectionConfig
 from fmu_mesh.model.description import Variable
 from fmu_mesh.model.findings import Findings, listed, nearest
 from fmu_mesh.model.types import FMI2_TYPES, TYPES, VariableType, element_name, is_float, split_element, takes
+from fmu_mesh.model.units import Linear, conversion
 
 __all__ = ["Connection", "Variables", "resolve_connections", "resolve_variable", "unit_warnings"]
 
@@ -26,10 +28,12 @@ class Connection(msgspec.Struct, frozen=True):
     """One connection: `target = factor * source + offset`.
 
     Attributes:
+        factor: that of the file after that of the unit conversion; so is the offset.
         source_index: the element of the source array that is connected, counted from 0; empty for all of it.
         target_index: as ``source_index``, for the target.
         delay: 0, 1, or None where the algorithm decides.
         path: its place in the configuration file, such as `connections[2]`.
+        units: in words what was done about units; empty if nothing was to do.
     """
 
     source_instance: str
@@ -42,6 +46,7 @@ class Connection(msgspec.Struct, frozen=True):
     path: str
     source_index: tuple[int, ...] = ()
     target_index: tuple[int, ...] = ()
+    units: str = ""
 
     @property
     def source_name(self) -> str:
@@ -88,7 +93,7 @@ def resolve_connections(
         if _causality_is_right(connection, findings):
             _check_types(connection, findings)
             _check_delay(connection, findings)
-            connections.append(connection)
+            connections.append(_with_units(connection, config, findings))
     return tuple(connections)
 
 
@@ -131,15 +136,52 @@ def resolve_variable(
 
 
 def unit_warnings(connections: Sequence[Connection], findings: Findings) -> None:
-    """Note the connections between different units that neither factor nor offset convert.
+    """Note the connections between different units that nothing converts, because one of them is not defined.
 
-    Units are compared as they are written; a model may write one unit in several ways, so this is a warning.
+    Such units are compared as they are written; a model may write one unit in several ways, so this is a warning.
     """
     for connection in connections:
         source, target = connection.source.unit, connection.target.unit
-        if source and target and source != target and _is_identity(connection):
+        defined = connection.source.base_unit is not None and connection.target.base_unit is not None
+        if source and target and source != target and not defined and not connection.units and _is_identity(connection):
             found = f"{connection} connects the unit '{source}' to the unit '{target}'"
             findings.add(connection.path, found, "the same unit, or a factor that converts it")
+
+
+def _with_units(connection: Connection, config: ConnectionConfig, findings: Findings) -> Connection:
+    """The connection with the conversion between the units of its ends.
+
+    The conversion comes first and the factor and offset of the file after it, so they are in the unit of the target
+    (SSP 1.0, LinearTransformation of a connection; `ignore_units` is suppressUnitConversion).
+    """
+    source, target = connection.source, connection.target
+    if config.ignore_units:
+        return replace(connection, units="units ignored")
+    if source.base_unit is None or target.base_unit is None:
+        without = [f"{owner}.{end.name}" for owner, end in _ends(connection) if end.unit is None]
+        return (
+            replace(connection, units=f"not converted: {without[0]} has no unit") if len(without) == 1 else connection
+        )
+    relative = source.relative_quantity or target.relative_quantity
+    change = conversion(source.base_unit, target.base_unit, relative=relative)
+    if change is None:
+        found = (
+            f"{connection} connects the unit '{source.unit}' ({source.base_unit}) "
+            f"to the unit '{target.unit}' ({target.base_unit})"
+        )
+        findings.add(connection.path, found, "units of one dimension, or `ignore_units: true` on the connection")
+        return connection
+    if change.identity:
+        return connection
+    own = Linear(connection.factor, connection.offset)
+    both = change.then(own)
+    after = "" if own.identity else f", then factor {own.factor:.12g} and offset {own.offset:.12g}"
+    units = f"{source.unit} to {target.unit}{after}"
+    return replace(connection, factor=both.factor, offset=both.offset, units=units)
+
+
+def _ends(connection: Connection) -> tuple[tuple[str, Variable], tuple[str, Variable]]:
+    return (connection.source_instance, connection.source), (connection.target_instance, connection.target)
 
 
 def _taken(reference: str, target: tuple[Variable, tuple[int, ...]] | None) -> tuple[str, str]:

@@ -14,6 +14,7 @@ import msgspec
 from msgspec.structs import replace
 
 from .types import MAX_ELEMENTS, PlainValue, Value, VariableType, element_names, flattened, nested, split_element
+from .units import BaseUnit
 
 __all__ = [
     "Causality",
@@ -47,6 +48,8 @@ class Variable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         dependencies: names of the knowns an output depends on in Initialization Mode; None if it may depend on all
             (FMI 2.0, 2.2.8, InitialUnknowns). Empty for a variable that is not an initial unknown.
         items: item names and values of an Enumeration.
+        base_unit: its unit in SI base units, if the model description defines it.
+        relative_quantity: whether it is a difference, to which the offset of a unit does not apply.
     """
 
     name: str
@@ -62,6 +65,8 @@ class Variable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     maximum: float | None = None
     dependencies: tuple[str, ...] | None = None
     items: tuple[tuple[str, int], ...] = ()
+    base_unit: BaseUnit | None = None
+    relative_quantity: bool = False
     declared_type: str | None = None
     dimensions: tuple[int | str, ...] = ()
     shape: tuple[int, ...] = ()

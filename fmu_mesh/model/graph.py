@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from typing import TypeVar
 
-__all__ = ["cycle_through", "feedback_edges", "strongly_connected", "topological_order"]
+__all__ = ["cycle_through", "feedback_edges", "reaches", "strongly_connected", "topological_order"]
 
 V = TypeVar("V", bound=Hashable)
 
@@ -89,14 +89,15 @@ def feedback_edges(vertices: Iterable[V], edges: Sequence[tuple[V, V, bool]]) ->
             successors[source].append(target)
     taken = []
     for index, (source, target, free) in enumerate(edges):
-        if free and _reaches(successors, target, source):
+        if free and reaches(successors, target, source):
             taken.append(index)
         elif free:
             successors[source].append(target)
     return taken
 
 
-def _reaches(successors: Mapping[V, Sequence[V]], start: V, goal: V) -> bool:
+def reaches(successors: Mapping[V, Sequence[V]], start: V, goal: V) -> bool:
+    """Whether a way leads from ``start`` to ``goal``; from every vertex one leads to itself."""
     seen = {start}
     stack = [start]
     while stack:

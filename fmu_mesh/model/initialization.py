@@ -1,8 +1,9 @@
-"""In which order connected values become known in Initialization Mode.
+"""In which order connected values become known in Initialization Mode, and which of them have to be iterated.
 
 Each connected output gets a level: 0 if it depends on no connected input there, otherwise one more than the highest
-level among the outputs that feed the inputs it depends on (FMI 2.0, 2.2.8, InitialUnknowns). A loop among them is
-opened at its delayed connections: those inputs keep their start value until the first step, and `check` shows it.
+level among the outputs that feed the inputs it depends on (FMI 2.0, 2.2.8, InitialUnknowns). Outputs that depend on
+each other form a loop (docs/adr/0013): it is torn at some of its connections, its outputs have levels of their own in
+the torn graph, and these levels are gone through until the torn connections bring what was assumed.
 """
 
 from __future__ import annotations
@@ -12,71 +13,175 @@ from collections.abc import Mapping, Sequence
 import msgspec
 
 from .description import Variable
-from .graph import strongly_connected
-from .system import Connection
+from .graph import reaches, strongly_connected
+from .system import Connection, System
+from .types import PlainValue, Value, VariableType, nested, zero
+from .values import to_plain
 
-__all__ = ["InitializationPlan", "plan_initialization"]
+__all__ = ["InitializationPlan", "Loop", "Tear", "plan_initialization"]
 
 Key = tuple[str, str]
 
 
-class InitializationPlan(msgspec.Struct, frozen=True):
-    """Levels of connected outputs, and the inputs that keep their start value.
+class Tear(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A connection at which a loop is torn: the input has an assumed value, which the source has to confirm.
 
     Attributes:
-        levels: level by (instance, output).
-        held: (instance, input, or element of an input) of connections that are not propagated in Initialization Mode.
+        output: as `y`, or an element of it as `y[2]`; ``input`` likewise.
+        type: the type of the input, or of the element.
+        shape: the sizes of its dimensions.
+        start: what is assumed at first: the start value of the input.
     """
 
+    source: str
+    output: str
+    target: str
+    input: str
+    factor: float
+    offset: float
+    type: VariableType
+    start: PlainValue
+    shape: tuple[int, ...] = ()
+
+    def __str__(self) -> str:
+        return f"{self.source}.{self.output} -> {self.target}.{self.input}"
+
+
+class Loop(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """An algebraic loop in Initialization Mode.
+
+    Attributes:
+        first: its first level; no other output has a level of the loop.
+        last: its last level.
+        tears: where it is torn; without them it has no cycle.
+        outputs: (instance, output) of all its outputs, in the order of their levels.
+        nodes: the nodes that have these outputs.
+    """
+
+    first: int
+    last: int
+    tears: tuple[Tear, ...]
+    outputs: tuple[Key, ...]
+    nodes: tuple[str, ...]
+
+
+class InitializationPlan(msgspec.Struct, frozen=True):
+    """Levels of connected outputs by (instance, output), and the loops among them in the order of their levels."""
+
     levels: dict[Key, int]
-    held: tuple[Key, ...]
+    loops: tuple[Loop, ...]
 
 
-def plan_initialization(
-    connections: Sequence[Connection],
-) -> InitializationPlan:
-    """Levels of all connected outputs. Every loop must contain a connection with delay 1."""
-    outputs: dict[Key, Variable] = {(c.source_instance, c.source.name): c.source for c in connections}
-    held: list[Key] = []
-    used = list(connections)
-    while True:
-        edges = _edges(outputs, used)
-        loops = [part for part in strongly_connected(outputs, edges) if len(part) > 1 or (part[0], part[0]) in edges]
-        if not loops:
-            break
-        looping = {key: number for number, part in enumerate(loops) for key in part}
-        cut = [c for c in used if c.delay == 1 and _inside(c, looping, edges)]
-        held += [(c.target_instance, c.target_name) for c in cut]
-        used = [c for c in used if c not in cut]
+def plan_initialization(system: System, connections: Sequence[Connection]) -> InitializationPlan:
+    """Levels of all connected outputs, and the loops.
+
+    Args:
+        system: where the start values of inputs are.
+        connections: all connections, with their delays. A delay means nothing in Initialization Mode, but a connection
+            that has one is torn rather than one that has none: values go the way that steps go.
+    """
+    outputs = tuple(dict.fromkeys((c.source_instance, c.source.name) for c in connections))
+    reached = _reached(connections)
+    edges = [(_source(c), target) for c in connections for target in reached[id(c)]]
     levels: dict[Key, int] = {}
-    predecessors: dict[Key, list[Key]] = {key: [] for key in outputs}
-    for source, target in edges:
-        predecessors[target].append(source)
-    for part in strongly_connected(outputs, edges):
-        key = part[0]
-        levels[key] = 1 + max((levels[source] for source in predecessors[key]), default=-1)
-    return InitializationPlan(levels=levels, held=tuple(held))
+    loops: list[Loop] = []
+    level = 0
+    for parts in _by_depth(outputs, edges):
+        single = [part[0] for part in parts if not _is_loop(part, edges)]
+        levels.update(dict.fromkeys(single, level))
+        level += bool(single)
+        for part in parts:
+            if _is_loop(part, edges):
+                members = [key for key in outputs if key in set(part)]
+                torn, kept = _torn(members, connections, reached)
+                depths = {key: depth for depth, own in enumerate(_by_depth(members, kept)) for (key,) in own}
+                levels.update({key: level + depth for key, depth in depths.items()})
+                last = level + max(depths.values())
+                ordered = tuple(sorted(members, key=depths.__getitem__))
+                nodes = tuple(dict.fromkeys(system.instances[name].node for name, _ in members))
+                loops.append(Loop(level, last, tuple(_tear(system, c) for c in torn), ordered, nodes))
+                level = last + 1
+    return InitializationPlan(levels=levels, loops=tuple(loops))
 
 
-def _edges(outputs: Mapping[Key, Variable], connections: Sequence[Connection]) -> list[tuple[Key, Key]]:
-    """Edges from an output to the outputs that depend on it through one connection."""
-    edges = []
-    for c in connections:
-        for instance, name in outputs:
-            if instance != c.target_instance:
-                continue
-            known = outputs[(instance, name)].dependencies
-            if known is None or c.target.name in known:
-                edges.append(((c.source_instance, c.source.name), (instance, name)))
-    return edges
+def _torn(
+    members: Sequence[Key], connections: Sequence[Connection], reached: Mapping[int, Sequence[Key]]
+) -> tuple[list[Connection], list[tuple[Key, Key]]]:
+    """The connections at which a loop is torn, in the order of the file, and the edges that are left.
+
+    As with the delays of Gauss-Seidel, it is the connection written last that closes a cycle.
+    """
+    own = set(members)
+    torn: set[int] = set()
+    kept: list[tuple[Key, Key]] = []
+    successors: dict[Key, list[Key]] = {key: [] for key in members}
+    for connection in sorted(connections, key=lambda c: c.delay or 0):
+        source = _source(connection)
+        targets = [key for key in reached[id(connection)] if key in own] if source in own else []
+        if any(reaches(successors, target, source) for target in targets):
+            torn.add(id(connection))
+        else:
+            kept += [(source, target) for target in targets]
+            successors.get(source, []).extend(targets)
+    return [c for c in connections if id(c) in torn], kept
 
 
-def _inside(connection: Connection, looping: Mapping[Key, int], edges: Sequence[tuple[Key, Key]]) -> bool:
-    """Whether a connection lies on a loop: its source and an output that depends on its target are in one component."""
-    source = (connection.source_instance, connection.source.name)
-    if source not in looping:
-        return False
-    return any(
-        first == source and second[0] == connection.target_instance and looping.get(second) == looping[source]
-        for first, second in edges
+def _tear(system: System, connection: Connection) -> Tear:
+    instance, variable = system.instances[connection.target_instance], connection.target
+    start: Value | None = instance.start_values.get(variable.name, variable.start)
+    if start is None:  # an input must have one (FMI 2.0, 2.2.7)
+        start = nested([zero(variable.type)] * variable.size, variable.shape)
+    for number in connection.target_index:
+        assert isinstance(start, list)
+        start = start[number]
+    return Tear(
+        source=connection.source_instance,
+        output=connection.source_name,
+        target=connection.target_instance,
+        input=connection.target_name,
+        factor=connection.factor,
+        offset=connection.offset,
+        type=variable.type,
+        start=to_plain(start),
+        shape=() if connection.target_index else variable.shape,
     )
+
+
+def _reached(connections: Sequence[Connection]) -> dict[int, list[Key]]:
+    """By the id of each connection: the connected outputs that depend on its target."""
+    own: dict[str, dict[str, Variable]] = {}
+    for c in connections:
+        own.setdefault(c.source_instance, {})[c.source.name] = c.source
+    return {
+        id(c): [
+            (c.target_instance, name)
+            for name, output in own.get(c.target_instance, {}).items()
+            if output.dependencies is None or c.target.name in output.dependencies
+        ]
+        for c in connections
+    }
+
+
+def _by_depth(vertices: Sequence[Key], edges: Sequence[tuple[Key, Key]]) -> list[list[list[Key]]]:
+    """The strongly connected components, by how many others lie before them on the longest way to them."""
+    parts = strongly_connected(vertices, edges)
+    part_of = {key: number for number, part in enumerate(parts) for key in part}
+    before: list[set[int]] = [set() for _ in parts]
+    for source, target in edges:
+        if part_of[source] != part_of[target]:
+            before[part_of[target]].add(part_of[source])
+    depths: list[int] = []
+    for others in before:  # sources stand before their targets
+        depths.append(1 + max((depths[other] for other in others), default=-1))
+    return [
+        [part for part, own in zip(parts, depths, strict=True) if own == depth]
+        for depth in range(max(depths, default=-1) + 1)
+    ]
+
+
+def _source(connection: Connection) -> Key:
+    return connection.source_instance, connection.source.name
+
+
+def _is_loop(part: Sequence[Key], edges: Sequence[tuple[Key, Key]]) -> bool:
+    return len(part) > 1 or (part[0], part[0]) in edges

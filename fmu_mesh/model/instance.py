@@ -28,8 +28,10 @@ class Instance(Protocol):
         """The model description."""
         ...
 
-    def enter_initialization(self, start_time: float, stop_time: float, start_values: Mapping[str, Value]) -> None:
-        """Set ``start_values`` and enter Initialization Mode (times in s; FMI 2.0, 4.2.1)."""
+    def enter_initialization(
+        self, start_time: float, stop_time: float | None, start_values: Mapping[str, Value]
+    ) -> None:
+        """Set ``start_values`` and enter Initialization Mode (times in s, None: open end; FMI 2.0, 4.2.1)."""
         ...
 
     def exit_initialization(self) -> None:

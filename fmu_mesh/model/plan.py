@@ -8,15 +8,16 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable
+from typing import Literal
 
 import msgspec
 from msgspec.structs import replace
 
 from ..errors import ConfigurationError, Finding
 from ..simtime import TimeGrid
-from .config import LimitsConfig, TimeoutsConfig
+from .config import InitializationConfig, LimitsConfig, TimeoutsConfig
 from .graph import cycle_through, feedback_edges, strongly_connected, topological_order
-from .initialization import InitializationPlan, plan_initialization
+from .initialization import InitializationPlan, Loop, plan_initialization
 from .ring import Layout, rows_for
 from .system import Connection, System, SystemInstance
 from .types import PlainValue
@@ -57,8 +58,7 @@ class InstancePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         outputs: the columns read after every step: connected or recorded outputs.
         inputs: the connected inputs, set before every step.
         initialization: the levels at which connected outputs become known in Initialization Mode, by name.
-        held: connected inputs, or elements of them, that keep their start value in Initialization Mode, because their
-            connection closes a loop there.
+        interpolation: what the time of a value that is sent to an unconnected input means; None: nothing.
     """
 
     name: str
@@ -69,7 +69,7 @@ class InstancePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     inputs: Layout
     feeds: tuple[Feed, ...]
     initialization: dict[str, int]
-    held: tuple[str, ...] = ()
+    interpolation: Literal["hold", "linear"] | None = None
     sha256: str | None = None
 
 
@@ -79,6 +79,8 @@ class Link(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     Attributes:
         index: number of the link in the mesh; stands in every frame.
         levels: initialization level of each column, in the order of `layout.names`; -1 for one that is not needed then.
+        initial_only: whether it carries nothing after Initialization Mode: a node that takes part in the iteration of a
+            loop has to see what the torn connections of others bring.
     """
 
     index: int
@@ -88,6 +90,7 @@ class Link(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     step_points: int
     layout: Layout
     levels: tuple[int, ...]
+    initial_only: bool = False
 
 
 class NodePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -100,6 +103,8 @@ class NodePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         progress_stride: points after which the master is told; a quarter of the window, or every point where a single
             step is as long as that.
         ring_rows: rows of every ring; a power of two.
+        loops: the algebraic loops at the start that instances of this node are part of.
+        initialization: how they are iterated.
         links_in: links that end here.
         links_out: links that start here.
         result_file: absolute path of the result CSV (for the recorder).
@@ -119,6 +124,8 @@ class NodePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     units: tuple[tuple[str, ...], ...]
     links_in: tuple[Link, ...]
     links_out: tuple[Link, ...]
+    loops: tuple[Loop, ...] = ()
+    initialization: InitializationConfig = InitializationConfig()
     result_file: str | None = None
     recorded: tuple[tuple[str, str], ...] = ()
     limits: LimitsConfig = LimitsConfig()
@@ -185,7 +192,7 @@ def make_plan(system: System, *, window: int | None = None, file: str = "") -> P
     edges = [(c.source_instance, c.target_instance) for c in connections]
     order = topological_order(system.instances, instant)
     cycles = tuple(tuple(part) for part in strongly_connected(system.instances, edges) if _is_cycle(part, edges))
-    initialization = plan_initialization(connections)
+    initialization = plan_initialization(system, connections)
     points = window if window is not None else _window(system)
     plan = Plan(
         system=system,
@@ -331,6 +338,8 @@ def _node(
         units=units,
         links_in=tuple(link for link in links if link.target_node == node),
         links_out=tuple(link for link in links if link.source_node == node),
+        loops=tuple(loop for loop in plan.initialization.loops if node in loop.nodes),
+        initialization=config.initialization,
         result_file=plan.system.result_file if node == RECORDER else None,
         recorded=plan.system.recorded if node == RECORDER else (),
         limits=config.limits,
@@ -365,13 +374,13 @@ def _instance_plan(plan: Plan, instance: SystemInstance, outputs: Layout) -> Ins
         inputs=Layout.of(v for v in instance.description.variables if v.name in connected),
         feeds=tuple(Feed(source=s, delay=d, columns=tuple(columns)) for (s, d), columns in sorted(feeds.items())),
         initialization={variable: level for (owner, variable), level in levels.items() if owner == instance.name},
-        held=tuple(variable for owner, variable in plan.initialization.held if owner == instance.name),
+        interpolation=plan.system.config.instances[instance.name].interpolation,
         sha256=plan.system.config.instances[instance.name].sha256,
     )
 
 
 def _links(plan: Plan) -> tuple[Link, ...]:
-    """One link per source instance and other node that needs some of its outputs, recorder last."""
+    """One link per source instance and other node that needs some of its outputs, recorder last, initial ones after."""
     needed: dict[tuple[str, str], set[str]] = {}
     for c in plan.connections:
         target_node = plan.node_of(c.target_instance)
@@ -382,8 +391,9 @@ def _links(plan: Plan) -> tuple[Link, ...]:
             needed.setdefault((name, RECORDER), set()).add(_base(plan, name, variable))
     links = []
     ends = sorted(needed, key=lambda end: (end[0], end[1] == RECORDER, end[1]))
-    for index, (source, target_node) in enumerate(ends):
-        names = needed[source, target_node]
+    initial = _needed_initially(plan, needed)
+    for index, (source, target_node) in enumerate([*ends, *sorted(initial)]):
+        names = needed[source, target_node] if index < len(ends) else initial[source, target_node]
         instance = plan.system.instances[source]
         layout = Layout.of(v for v in instance.description.variables if v.name in names)
         levels = plan.initialization.levels
@@ -398,12 +408,25 @@ def _links(plan: Plan) -> tuple[Link, ...]:
                 levels=tuple(
                     -1 if target_node == RECORDER else levels.get((source, name), -1) for name in layout.names
                 ),
+                initial_only=index >= len(ends),
             )
         )
     return tuple(links)
 
 
+def _needed_initially(plan: Plan, needed: dict[tuple[str, str], set[str]]) -> dict[tuple[str, str], set[str]]:
+    """Outputs by (instance, node) that decide whether a loop is consistent, and come over no other link."""
+    initial: dict[tuple[str, str], set[str]] = {}
+    for loop in plan.initialization.loops:
+        for node in loop.nodes:
+            for tear in loop.tears:
+                output = _base(plan, tear.source, tear.output)
+                if node != plan.node_of(tear.source) and output not in needed.get((tear.source, node), ()):
+                    initial.setdefault((tear.source, node), set()).add(output)
+    return initial
+
+
 def _base(plan: Plan, instance: str, name: str) -> str:
-    """The name of the variable that a recorded column is, or is an element of."""
+    """The name of the variable that a column or an end of a connection is, or is an element of."""
     variable = plan.system.instances[instance].description.variable_of(name)
     return variable.name if variable is not None else name

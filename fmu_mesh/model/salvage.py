@@ -17,7 +17,9 @@ from fmu_mesh.model.yaml_text import Plain
 
 __all__ = ["salvage"]
 
-_CONTAINERS = re.compile(r"|simulation|connections|record|zenoh|timeouts|limits|instances(\.[^.]+(\.start_values)?)?")
+_CONTAINERS = re.compile(
+    r"|simulation|connections|initialization|record|zenoh|timeouts|limits|instances(\.[^.]+(\.start_values)?)?"
+)
 _TIMES = ("start_time", "stop_time", "step_size")
 
 

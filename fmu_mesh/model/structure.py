@@ -158,10 +158,11 @@ def _fits(value: Plain, kind: inspect.Type) -> bool:
 
 def _within(value: Plain, kind: inspect.FloatType | inspect.IntType) -> bool:
     assert isinstance(value, int | float)
-    return (kind.gt is None or value > kind.gt) and (kind.ge is None or value >= kind.ge)
+    above = (kind.gt is None or value > kind.gt) and (kind.ge is None or value >= kind.ge)
+    return above and (kind.le is None or value <= kind.le)
 
 
 def _bounds(kind: inspect.FloatType | inspect.IntType) -> str:
-    if kind.gt is not None:
-        return f" > {kind.gt:g}"
-    return f" >= {kind.ge:g}" if kind.ge is not None else ""
+    limits = ((">", kind.gt), (">=", kind.ge), ("<=", kind.le))
+    words = [f"{sign} {limit:g}" for sign, limit in limits if limit is not None]
+    return f" {' and '.join(words)}" if words else ""

@@ -27,12 +27,11 @@ from fmu_mesh.model.grouping import automatic_nodes
 from fmu_mesh.model.loading import LoadedConfig
 from fmu_mesh.model.start_values import resolve_start_values, sized
 from fmu_mesh.model.types import element_name, is_text
-from fmu_mesh.simtime import TimeGrid, steps_between
+from fmu_mesh.simtime import ENDLESS, TimeGrid, steps_between
 
 __all__ = ["Connection", "System", "SystemInstance", "build"]
 
 _RESERVED_NAME = "mesh"
-_MAXIMUM_POINTS = 2**53  # above it, the product of a point and the step size is no longer exact
 
 
 class SystemInstance(msgspec.Struct, frozen=True):
@@ -128,16 +127,21 @@ def _grid(config: Config, findings: Findings) -> TimeGrid | None:
     if simulation.real_time_factor < 0.0:
         found = f"{simulation.real_time_factor:g}"
         findings.add("simulation.real_time_factor", found, "0 (as fast as possible) or a positive factor")
-    if any(math.isnan(time) for time in (start, stop, step)):
+    if any(time is not None and math.isnan(time) for time in (start, stop, step)):
         return None  # no time of a file is NaN: the structure is wrong there, which is found already
     if not (math.isfinite(step) and step > 0.0):
         findings.add("simulation.step_size", f"{step:g}", "a step size > 0 in s")
         return None
+    last_point = _last_point(start, stop, step, findings) if stop is not None else ENDLESS
+    return TimeGrid(start_time=start, step_size=step, last_point=last_point) if last_point is not None else None
+
+
+def _last_point(start: float, stop: float, step: float, findings: Findings) -> int | None:
     if stop < start:
         findings.add("simulation.stop_time", f"{stop:g}, before start_time {start:g}", f"a time >= {start:g}")
         return None
-    if not (stop - start) / step <= _MAXIMUM_POINTS:
-        found = f"more than {_MAXIMUM_POINTS} points from {start:g} s to {stop:g} s in steps of {step:g} s"
+    if not (stop - start) / step < ENDLESS:
+        found = f"more than {ENDLESS} points from {start:g} s to {stop:g} s in steps of {step:g} s"
         findings.add("simulation.step_size", found, "a larger step size or an earlier stop time")
         return None
     last_point = steps_between(stop - start, step)
@@ -147,8 +151,7 @@ def _grid(config: Config, findings: Findings) -> TimeGrid | None:
         duration = f"{stop - start:.12g} s between start_time and stop_time"
         found = f"{duration}, no whole multiple of step_size {step:.12g} s"
         findings.add("simulation.stop_time", found, f"{expected} or {start + (below + 1) * step:.12g}")
-        return None
-    return TimeGrid(start_time=start, step_size=step, last_point=last_point)
+    return last_point
 
 
 def _instances(
@@ -186,7 +189,7 @@ def _step_points(name: str, config: InstanceConfig, base: float, findings: Findi
     if not (math.isfinite(step) and step > 0.0):
         findings.add(path, f"{step:g}", "a step size > 0 in s")
         return 1
-    if not (math.isfinite(base) and base > 0.0) or step / base > _MAXIMUM_POINTS:
+    if not (math.isfinite(base) and base > 0.0) or step / base > ENDLESS:
         return 1
     points = steps_between(step, base)
     if not points:

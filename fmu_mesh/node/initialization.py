@@ -1,18 +1,31 @@
-"""Initialization Mode over the wire: values become known level by level, here and in other nodes (FMI 2.0, 4.2.3)."""
+"""Initialization Mode over the wire: values become known level by level, here and in other nodes (FMI 2.0, 4.2.3).
+
+An algebraic loop is iterated by all nodes that have outputs of it. They exchange the values of every sweep, and each of
+them runs the same `FixedPoint` on the same values, so that all stop at the same sweep; others see the last one only.
+"""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 
 from ..errors import DeadlineExceeded
 from ..model.elements import element_of, merged, scaled
+from ..model.fixed_point import FixedPoint
+from ..model.initialization import Loop
 from ..model.plan import Link, NodePlan
-from ..model.types import Value
+from ..model.ring import Column
+from ..model.types import Value, split_element
 from ..wire.frames import initial_values, needed_levels
+from .links import OutLink
 from .stepping import Runner
 
 __all__ = ["Initialization"]
+
+_SWEEP = 1 << 32
+"""In an INITIAL message, the level plus so many times the sweep."""
+
+Key = tuple[str, str]
 
 
 class Initialization:
@@ -21,19 +34,38 @@ class Initialization:
     Args:
         plan: the node's plan.
         wait: waits at most so many seconds for something to arrive, and takes it.
+
+    Attributes:
+        out_links: the links out that carry nothing afterwards.
     """
 
     def __init__(self, plan: NodePlan, wait: Callable[[float], None]) -> None:
+        self.out_links: list[OutLink] = []
         self._plan = plan
         self._wait = wait
-        self._links = {link.source: link for link in plan.links_in}
-        self._own = {instance.name: instance for instance in plan.instances}
-        self._known: dict[tuple[str, str], Value] = {}
+        self._columns: dict[Key, Column] = {}
+        self._levels: dict[Key, int] = {}
+        for link in plan.links_in:
+            for column, level in zip(link.layout.columns, link.levels, strict=True):
+                self._columns[link.source, column.name] = column
+                self._levels[link.source, column.name] = level
+        for own in plan.instances:
+            self._columns |= {(own.name, column.name): column for column in own.outputs.columns}
+            self._levels |= {(own.name, name): level for name, level in own.initialization.items()}
+        self._known: dict[Key, Value] = {}
+        self._settled: set[Key] = set()
+        self._sweeps: dict[tuple[str, str, int], Value] = {}
+        self._end = 0.0
 
-    def take(self, link: Link, level: int, data: bytes) -> None:
+    def take(self, link: Link, tag: int, data: bytes) -> None:
         """Take an INITIAL message of another node."""
+        sweep, level = divmod(tag, _SWEEP)
+        iterated = any(loop.first <= level <= loop.last for loop in self._plan.loops)
         for name, value in initial_values(link, level, data).items():
-            self._known[(link.source, name)] = value
+            if iterated:
+                self._sweeps[link.source, name, sweep] = value
+            else:
+                self._known[link.source, name] = value
 
     def run(self, runners: Collection[Runner]) -> None:
         """Propagate all connected values; every instance must be in Initialization Mode.
@@ -41,51 +73,127 @@ class Initialization:
         Raises:
             DeadlineExceeded: the initial value of another node did not come in time.
             FmuError: an FMU refused a value.
+            LoopNotConverged: a loop has no consistent values.
         """
-        end = time.monotonic() + self._plan.timeouts.initialize
-        for level in sorted({level for runner in runners for level in runner.plan.initialization.values()}):
-            for runner in runners:
-                if level in runner.plan.initialization.values():
-                    self._set_inputs(runner, level, end)
-                    self._get_outputs(runner, level)
+        self._end = time.monotonic() + self._plan.timeouts.initialize
+        loops = {loop.first: loop for loop in self._plan.loops}
+        iterated = {level for loop in self._plan.loops for level in range(loop.first, loop.last + 1)}
+        plain = {level for runner in runners for level in runner.plan.initialization.values()} - iterated
+        for level in sorted(plain | loops.keys()):
+            if level in loops:
+                self._iterate(loops[level], runners)
+            else:
+                for runner in runners:
+                    if names := _outputs_at(runner, level):
+                        self._set_inputs(runner, level)
+                        values = self._get_outputs(runner, names)
+                        self._known.update({(runner.name, name): value for name, value in values.items()})
+                        self._send(runner, level, values)
         for runner in runners:
-            self._set_inputs(runner, None, end)
+            self._set_inputs(runner, None)
+        self.out_links.clear()
 
-    def _set_inputs(self, runner: Runner, below: int | None, end: float) -> None:
+    def _iterate(self, loop: Loop, runners: Collection[Runner]) -> None:
+        """Sweep through the levels of a loop until it is consistent."""
+        members = frozenset(loop.outputs)
+        point = FixedPoint(loop, self._plan.initialization)
+        own = [
+            (runner, level, names)
+            for level in range(loop.first, loop.last + 1)
+            for runner in runners
+            if (names := _outputs_at(runner, level))
+        ]
+        consistent = False
+        while not consistent:
+            sweep = point.sweeps
+            for runner, level, names in own:
+                self._set_inputs_of_loop(runner, level, sweep, point, loop)
+                values = self._get_outputs(runner, names)
+                self._sweeps.update({(runner.name, name, sweep): value for name, value in values.items()})
+                self._send(runner, level, values, loop, sweep)
+            consistent = point.update(
+                [scaled(self._element(t.source, t.output, sweep), t.factor, t.offset) for t in loop.tears]
+            )
+            if consistent:
+                for key in members & self._levels.keys():
+                    self._known[key] = self._value(*key, sweep)
+            self._sweeps = {
+                k: v for k, v in self._sweeps.items() if k[:2] not in members or (k[2] > sweep and not consistent)
+            }
+        self._settled |= point.assumed.keys()
+        for runner, level, names in own:
+            self._send(runner, level, {name: self._known[runner.name, name] for name in names}, loop)
+
+    def _set_inputs(self, runner: Runner, below: int | None) -> None:
         """Set the inputs whose sources are known below a level (None: all)."""
         values: dict[str, Value] = {}
         for feed in runner.plan.feeds:
             for source, target, factor, offset in feed.columns:
                 early = below is None or self._level_of(feed.source, source) < below
-                if early and target not in runner.plan.held:
-                    values[target] = scaled(self._value(feed.source, source, end), factor, offset)
+                if early and (runner.name, target) not in self._settled:
+                    values[target] = scaled(self._element(feed.source, source), factor, offset)
         if values:
             runner.instance.set_values(merged(values, runner.plan.inputs, runner.instance.get_values))
 
-    def _level_of(self, instance: str, variable: str) -> int:
-        if instance in self._own:
-            own = self._own[instance]
-            return own.initialization[own.outputs.column(variable).name]
-        link = self._links[instance]
-        return link.levels[link.layout.columns.index(link.layout.column(variable))]
+    def _set_inputs_of_loop(self, runner: Runner, level: int, sweep: int, point: FixedPoint, loop: Loop) -> None:
+        """Set the assumed inputs, and those whose sources are known below a level of a loop in a sweep."""
+        values: dict[str, Value] = {}
+        for feed in runner.plan.feeds:
+            for source, target, factor, offset in feed.columns:
+                own_level = self._level_of(feed.source, source)
+                if (runner.name, target) in point.assumed:
+                    values[target] = point.assumed[runner.name, target]
+                elif own_level < loop.first and (runner.name, target) not in self._settled:
+                    values[target] = scaled(self._element(feed.source, source), factor, offset)
+                elif loop.first <= own_level < level:
+                    values[target] = scaled(self._element(feed.source, source, sweep), factor, offset)
+        if values:
+            runner.instance.set_values(merged(values, runner.plan.inputs, runner.instance.get_values))
 
-    def _value(self, instance: str, variable: str, end: float) -> Value:
-        """The initial value of an output, or of an element of it."""
-        layout = self._own[instance].outputs if instance in self._own else self._links[instance].layout
-        column = layout.column(variable)
-        while (instance, column.name) not in self._known:
-            left_s = end - time.monotonic()
-            if left_s <= 0:
-                text = f"its initial value did not come within {self._plan.timeouts.initialize:g} s"
-                raise DeadlineExceeded(text, instance=instance, variable=variable)
-            self._wait(left_s)
-        return element_of(self._known[(instance, column.name)], column, variable)
+    def _column(self, instance: str, name: str) -> Column:
+        """The column of an output, or of the array that ``name`` is an element of."""
+        if (instance, name) not in self._columns and (parts := split_element(name)) is not None:
+            return self._columns[instance, parts[0]]
+        return self._columns[instance, name]
 
-    def _get_outputs(self, runner: Runner, level: int) -> None:
-        """Get the outputs that are known at a level now, and send them to the nodes that need them."""
-        names = [name for name, own in runner.plan.initialization.items() if own == level]
-        values = dict(zip(names, runner.instance.get_values(names), strict=True))
-        self._known.update({(runner.name, name): value for name, value in values.items()})
-        for link in runner.out_links:
-            if level in needed_levels(link.link):
-                link.send_initial(level, values)
+    def _level_of(self, instance: str, name: str) -> int:
+        return self._levels[instance, self._column(instance, name).name]
+
+    def _element(self, instance: str, name: str, sweep: int | None = None) -> Value:
+        """The initial value of an output, or of an element of it; in a sweep of a loop, that of the sweep."""
+        column = self._column(instance, name)
+        return element_of(self._value(instance, column.name, sweep), column, name)
+
+    def _value(self, instance: str, variable: str, sweep: int | None = None) -> Value:
+        if sweep is None:
+            while (instance, variable) not in self._known:
+                self._wait_for(instance, variable)
+            return self._known[instance, variable]
+        while (instance, variable, sweep) not in self._sweeps:
+            self._wait_for(instance, variable)
+        return self._sweeps[instance, variable, sweep]
+
+    def _wait_for(self, instance: str, variable: str) -> None:
+        left_s = self._end - time.monotonic()
+        if left_s <= 0:
+            text = f"its initial value did not come within {self._plan.timeouts.initialize:g} s"
+            raise DeadlineExceeded(text, instance=instance, variable=variable)
+        self._wait(left_s)
+
+    def _get_outputs(self, runner: Runner, names: Sequence[str]) -> dict[str, Value]:
+        """Get outputs of an instance."""
+        return dict(zip(names, runner.instance.get_values(names), strict=True))
+
+    def _send(
+        self, runner: Runner, level: int, values: dict[str, Value], loop: Loop | None = None, sweep: int | None = None
+    ) -> None:
+        """Send the outputs of a level to the nodes that need them; in a sweep of a loop, to those that take part."""
+        for link in (*runner.out_links, *self.out_links):
+            if link.link.source != runner.name or level not in needed_levels(link.link):
+                continue
+            if loop is None or (link.link.target_node in loop.nodes) == (sweep is not None):
+                link.send_initial(level + (sweep or 0) * _SWEEP, values)
+
+
+def _outputs_at(runner: Runner, level: int) -> list[str]:
+    return [name for name, own in runner.plan.initialization.items() if own == level]

@@ -60,13 +60,13 @@ class OutLink:
             first += cut
         self.sent = end
 
-    def send_initial(self, level: int, values: Mapping[str, Value]) -> None:
-        """Send the values that became known at one level of Initialization Mode; other columns are zero."""
+    def send_initial(self, tag: int, values: Mapping[str, Value]) -> None:
+        """Send the values of one level of Initialization Mode, which ``tag`` tells; other columns are zero."""
         row = Ring(self.link.layout, 1)
         for name in row.layout.names:
             if name in values:
                 row.put(0, name, values[name])
-        self.put(encode_rows(INITIAL, self.link.index, level, row.parts))
+        self.put(encode_rows(INITIAL, self.link.index, tag, row.parts))
 
 
 def _picks(have: Layout, want: Layout) -> list[tuple[int, list[int] | None]]:

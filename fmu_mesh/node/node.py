@@ -44,6 +44,7 @@ from ..wire.messages import (
 )
 from ..wire.session import ask
 from .initialization import Initialization
+from .inputs import TimedInputs
 from .links import OutLink
 from .profiling import Profiler
 from .serving import Server
@@ -156,10 +157,16 @@ class Node:
         self.server.state = "loading"
         for item in plan.instances:
             instance = self._open_instance(item.name)
+            if item.interpolation is not None:
+                instance = TimedInputs(instance, item.interpolation)
             self._runners[item.name] = Runner(item, instance, plan.grid, plan.ring_rows)
         for link in plan.links_in:
             self._remote[link.index] = (FrameReceiver(link, f"node '{plan.node}'", plan.ring_rows), [])
-        receivers = {receiver.link.source: (receiver, feeds) for receiver, feeds in self._remote.values()}
+        receivers = {
+            receiver.link.source: (receiver, feeds)
+            for receiver, feeds in self._remote.values()
+            if not receiver.link.initial_only
+        }
         for runner in self._runners.values():
             for feed in runner.plan.feeds:
                 points = runner.plan.step_points
@@ -199,7 +206,8 @@ class Node:
         for link in plan.links_out:
             runner = self._runners[link.source]
             put = membership.sender(link.target_node, self._keys.frames(link.source, link.target_node))
-            runner.out_links.append(OutLink(link, runner.outputs, put, plan.window))
+            out_links = self._initialization.out_links if link.initial_only else runner.out_links
+            out_links.append(OutLink(link, runner.outputs, put, plan.window))
         self._poll = self._inbox.poll
         self._put_progress = membership.sender(MASTER, self._keys.progress())
         if self._profiler is not None:

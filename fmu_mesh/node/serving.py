@@ -27,6 +27,7 @@ from ..wire.session import ask, matches, undeclare_all
 from ..wire.values import ValueRefused, attachment, encode_value, json_encoding
 from ..wire.views import InstanceStatus, LogLine, SetAnswer
 from .info import instance_info
+from .inputs import set_input
 from .settings import checked_setting
 from .stepping import Runner
 from .streams import MAX_WAITING_ROWS, Batch, InstanceStreams, kind_of
@@ -56,6 +57,7 @@ class Server:
         self.state = "starting"
         self.waiting = False
         self.waited_s = 0.0
+        self._started: float | None = None
         self.on_hang: Callable[[FmuError], None] = lambda _error: None
         self._plan = plan
         self._session = session
@@ -101,6 +103,7 @@ class Server:
 
     def started(self) -> None:
         """All streams begin at the first point: subscriptions made before it are looked at now."""
+        self._started = time.monotonic()
         for streams in self._streams:
             streams.update()
         self.stepped()
@@ -281,15 +284,24 @@ class Server:
     # --- settings
 
     def _put_arrived(self, runner: Runner, sample: zenoh.Sample) -> None:
-        self._jobs.put(partial(self._take_put, runner, str(sample.key_expr), sample.payload.to_bytes()))
+        attachment = sample.attachment.to_bytes() if sample.attachment is not None else None
+        data = sample.payload.to_bytes()
+        self._jobs.put(partial(self._take_put, runner, str(sample.key_expr), data, attachment))
 
-    def _take_put(self, runner: Runner, key: str, data: bytes) -> None:
+    def _take_put(self, runner: Runner, key: str, data: bytes, attachment: bytes | None) -> None:
         try:
-            variable, value = checked_setting(runner, self._keys.instance(runner.name), key, data)
+            new = checked_setting(runner, self._keys.instance(runner.name), key, data, attachment)
         except ValueRefused as refused:
             self._publish_log(LogLine(runner.name, "warning", "set", str(refused), runner.point))
             return
-        self._inbox.post(lambda: runner.instance.set_values({variable.name: value}))
+
+        def take() -> None:
+            try:
+                set_input(runner.instance, new.variable, new.value, new.time, runner.step)
+            except ValueRefused as refused:
+                self.log_message(LogLine(runner.name, "warning", "set", str(refused), runner.point))
+
+        self._inbox.post(take)
 
     def _answer_setting(self, name: str, query: zenoh.Query) -> None:
         """A query with a payload sets a value and is told from which point on it holds, or why it was refused."""
@@ -299,10 +311,10 @@ class Server:
             query.reply_err(f"'{name}' is still being loaded")
             query.drop()
             return
+        data = query.payload.to_bytes() if query.payload else b""
+        attachment = query.attachment.to_bytes() if query.attachment is not None else None
         try:
-            variable, value = checked_setting(
-                runner, self._keys.instance(runner.name), key, query.payload.to_bytes() if query.payload else b""
-            )
+            new = checked_setting(runner, self._keys.instance(runner.name), key, data, attachment)
         except ValueRefused as refused:
             query.reply_err(str(refused))
             query.drop()
@@ -311,8 +323,13 @@ class Server:
         self._pending.append(pending)
 
         def take() -> None:
-            runner.instance.set_values({variable.name: value})
-            point = runner.point
+            try:
+                step = set_input(runner.instance, new.variable, new.value, new.time, runner.step)
+            except ValueRefused as refused:
+                reason = str(refused)
+                self._jobs.put(lambda: self._finish(pending, lambda: query.reply_err(reason)))
+                return
+            point = step * runner.plan.step_points
             answer = SetAnswer(key, point, self._plan.grid.time(point))
             self._jobs.put(
                 lambda: self._finish(
@@ -336,6 +353,7 @@ class Server:
             time=self._plan.grid.time(runner.point),
             step_time=runner.step_seconds / runner.step if runner.step else 0.0,
             wait_time=self.waited_s,
+            running_time=time.monotonic() - self._started if self._started is not None else 0.0,
         )
 
     def _activity(self, runner: Runner) -> str:

@@ -2,23 +2,34 @@
 
 from __future__ import annotations
 
-from ..model.description import Value, Variable
+import msgspec
+
+from ..model.description import Value
 from ..wire.keys import unescape
-from ..wire.values import ValueRefused, decode_value
+from ..wire.values import ValueRefused, decode_time, decode_value
 from .stepping import Runner
 from .streams import kind_of
 
-__all__ = ["checked_setting"]
+__all__ = ["Setting", "checked_setting"]
 
 
-def checked_setting(runner: Runner, root: str, key: str, data: bytes) -> tuple[Variable, Value]:
-    """The variable and value of a setting that arrived for an instance.
+class Setting(msgspec.Struct, frozen=True):
+    """A value for a variable; ``time`` (s) is from when on, where the instance takes that into account."""
+
+    variable: str
+    value: Value
+    time: float | None = None
+
+
+def checked_setting(runner: Runner, root: str, key: str, data: bytes, attachment: bytes | None) -> Setting:
+    """The variable, value and time of a setting that arrived for an instance.
 
     Args:
         runner: the instance.
         root: what its keys start with.
         key: the key that the value was sent to.
         data: the value as JSON.
+        attachment: the time of the value as JSON, if there is one.
 
     Raises:
         ValueRefused: with the reason.
@@ -43,6 +54,7 @@ def checked_setting(runner: Runner, root: str, key: str, data: bytes) -> tuple[V
     if kind not in ("in", "param"):
         raise ValueRefused(f"'{runner.name}.{name}' is no input and no parameter, so it cannot be set")
     try:
-        return variable, decode_value(data, variable)
+        time = decode_time(attachment) if attachment is not None and runner.plan.interpolation is not None else None
+        return Setting(name, decode_value(data, variable), time)
     except ValueRefused as refused:
         raise ValueRefused(f"'{runner.name}.{name}': {refused}") from refused

@@ -78,6 +78,36 @@ class MeshClient:
         """How far an instance is, and what it is doing."""
         return self._view(f"{self._instance_key(instance)}/status", InstanceStatus, f"instance '{instance}'")
 
+    def all_status(self) -> tuple[MeshStatus, dict[str, InstanceStatus]]:
+        """How far the mesh and all its instances are, by one question; an instance that does not answer is left out."""
+        # A querier for a key that spans several queryables is not told that they match (zenoh 1.10): this is a get.
+        replies = self._session.get(f"{self.keys.root}/*/status", timeout=self._timeout_s)
+        answers = {str(sample.key_expr): sample.payload.to_bytes() for sample in _answers(replies) or ()}
+        mesh = answers.pop(self.keys.mesh_key("status"), None)
+        status = self.status() if mesh is None else None  # nothing is known of the mesh yet, or it is gone
+        try:
+            status = status or msgspec.json.decode(mesh or b"", type=MeshStatus)
+            views = [msgspec.json.decode(data, type=InstanceStatus) for data in answers.values()]
+        except msgspec.DecodeError as error:
+            raise _not_understood(f"mesh '{self.keys.mesh}'", error) from error
+        return status, {view.instance: view for view in views}
+
+    @contextmanager
+    def until_end(self) -> Iterator[threading.Event]:
+        """An event that is set when the mesh ends, or is gone."""
+        there, ended = threading.Event(), threading.Event()
+
+        def changed(sample: zenoh.Sample) -> None:
+            (there if sample.kind == zenoh.SampleKind.PUT else ended).set()
+
+        token = self._session.liveliness().declare_subscriber(self.keys.master, changed, history=True)
+        try:
+            if not there.wait(self._timeout_s):
+                ended.set()
+            yield ended
+        finally:
+            token.undeclare()
+
     def instance_in(self, reference: str) -> str | None:
         """The instance that a reference names; None if it names the mesh as a whole."""
         name = reference.removeprefix(self.keys.root).strip("/")
@@ -213,8 +243,7 @@ class MeshClient:
         try:
             return msgspec.json.decode(data, type=kind)
         except msgspec.DecodeError as error:
-            hint = "Is it another version of fmu_mesh?"
-            raise ConfigurationError(f"the answer of {who} is not understood: {error}.", hint=hint) from error
+            raise _not_understood(who, error) from error
 
     def _ask(self, key: str, who: str, payload: bytes | None = None) -> list[zenoh.Sample]:
         """The answers to a query, at least one of them.
@@ -278,6 +307,12 @@ def _fits(pattern: str, name: str) -> bool:
     if "*" not in pattern:
         return pattern == name
     return re.fullmatch(".*".join(map(re.escape, pattern.split("*"))), name) is not None
+
+
+def _not_understood(who: str, error: msgspec.DecodeError) -> ConfigurationError:
+    return ConfigurationError(
+        f"the answer of {who} is not understood: {error}.", hint="Is it another version of fmu_mesh?"
+    )
 
 
 def _unknown(message: str, name: str, names: Sequence[str]) -> ConfigurationError:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import msgspec
@@ -11,7 +12,16 @@ from ..model.description import Value, Variable
 from ..model.values import MAX_TEXT_SIZE, ValueRefused, to_plain, to_value
 from .messages import decode_json
 
-__all__ = ["Stamp", "ValueRefused", "attachment", "decode_stamp", "decode_value", "encode_value", "json_encoding"]
+__all__ = [
+    "Stamp",
+    "ValueRefused",
+    "attachment",
+    "decode_stamp",
+    "decode_time",
+    "decode_value",
+    "encode_value",
+    "json_encoding",
+]
 
 MAX_VALUE_SIZE = 2 * MAX_TEXT_SIZE
 
@@ -37,6 +47,25 @@ def decode_stamp(data: bytes) -> Stamp:
         msgspec.DecodeError: it is none of ours.
     """
     return decode_json(data, Stamp)
+
+
+def decode_time(data: bytes) -> float:
+    """The time in s in the attachment of a value that is sent to an input: `{"time": 1.5}`, as a `Stamp` has it, too.
+
+    Raises:
+        ValueRefused: it has none.
+    """
+    try:
+        time = decode_json(data, _Moment).time
+    except msgspec.DecodeError as error:
+        raise ValueRefused(f'its attachment has no time, such as {{"time": 1.5}} in s ({error})') from error
+    if not math.isfinite(time):
+        raise ValueRefused(f"the time {time} in its attachment is not finite")
+    return time
+
+
+class _Moment(msgspec.Struct, frozen=True):
+    time: float
 
 
 def encode_value(value: Value) -> bytes:

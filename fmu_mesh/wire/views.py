@@ -80,6 +80,7 @@ class InstanceStatus(msgspec.Struct, frozen=True):
         time: simulation time in s.
         step_time: mean wall-clock time of a step in s.
         wait_time: wall-clock time spent waiting since the first point in s.
+        running_time: wall-clock time since the first point in s.
     """
 
     instance: str
@@ -91,6 +92,7 @@ class InstanceStatus(msgspec.Struct, frozen=True):
     wait_time: float
     overruns: int = 0
     restarts: int = 0
+    running_time: float = 0.0
 
 
 class LogLine(msgspec.Struct, frozen=True):
@@ -123,7 +125,7 @@ class MeshInfo(msgspec.Struct, frozen=True):
     version: str
     config: str
     start_time: float
-    stop_time: float
+    stop_time: float | None
     step_size: float
     algorithm: str
     window: int
@@ -144,6 +146,7 @@ class MeshStatus(msgspec.Struct, frozen=True):
         point: the last point that every instance has reached; ``time`` is its time in s.
         points_per_second: since the first point, or since the last pause.
         real_time_factor: simulated over wall-clock time since the first point.
+        overruns: points of the wall clock that were given up, because the run was too far behind it.
         progress: last point of every node.
     """
 
@@ -156,6 +159,7 @@ class MeshStatus(msgspec.Struct, frozen=True):
     real_time_factor: float
     progress: dict[str, int]
     error: ErrorReport | None = None
+    overruns: int = 0
 
 
 class Command(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

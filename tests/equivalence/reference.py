@@ -48,7 +48,6 @@ class Pipe(msgspec.Struct, frozen=True):
     delay: int
     factor: float = 1.0
     offset: float = 0.0
-    held: bool = False
 
 
 class Reference(msgspec.Struct, frozen=True):
@@ -57,6 +56,7 @@ class Reference(msgspec.Struct, frozen=True):
     Attributes:
         units: in the order in which they are stepped at a point.
         recorded: (unit, output) of each column but the time.
+        loops: the pipes at which each algebraic loop at the start is torn; what comes first stands first.
     """
 
     units: Sequence[Unit]
@@ -65,6 +65,7 @@ class Reference(msgspec.Struct, frozen=True):
     last_point: int
     recorded: Sequence[tuple[str, str]]
     start_time: float = 0.0
+    loops: Sequence[Sequence[Pipe]] = ()
 
 
 def run_fmpy(reference: Reference) -> Table:
@@ -141,10 +142,7 @@ def _opened(reference: Reference) -> Iterator[dict[str, _Fmu]]:
             for name, value in unit.start_values.items():
                 fmu.set(name, value)
             fmu.fmi.enterInitializationMode()
-        for _ in reference.units:  # so many times at most does a value have to be handed on
-            for pipe in reference.pipes:
-                if not pipe.held:
-                    fmus[pipe.target].set(pipe.input, _scaled(pipe, fmus[pipe.source].get(pipe.output)))
+        _settle(reference, fmus)
         for fmu in fmus.values():
             fmu.fmi.exitInitializationMode()
         yield fmus
@@ -153,6 +151,32 @@ def _opened(reference: Reference) -> Iterator[dict[str, _Fmu]]:
             fmu.fmi.freeInstance()
         for folder in folders.values():
             shutil.rmtree(folder, ignore_errors=True)
+
+
+def _settle(reference: Reference, fmus: Mapping[str, _Fmu]) -> None:
+    """Iterate each loop at the start until it is consistent, and hand all other values on."""
+    settled: list[Pipe] = []
+    for loop in reference.loops:
+        settled += loop
+        assumed = [fmus[pipe.target].get(pipe.input) for pipe in loop]
+        while True:
+            for pipe, value in zip(loop, assumed, strict=True):
+                fmus[pipe.target].set(pipe.input, value)
+            _propagate(reference, fmus, settled)
+            brought = [_scaled(pipe, fmus[pipe.source].get(pipe.output)) for pipe in loop]
+            residuals = [abs(new - old) / max(1.0, abs(new)) for old, new in zip(assumed, brought, strict=True)]
+            if max(residuals) <= 1e-9:
+                break
+            assumed = brought
+    _propagate(reference, fmus, settled)
+
+
+def _propagate(reference: Reference, fmus: Mapping[str, _Fmu], torn: Sequence[Pipe]) -> None:
+    """Hand values on through all pipes but the torn ones."""
+    for _ in reference.units:  # so many times at most does a value have to be handed on
+        for pipe in reference.pipes:
+            if pipe not in torn:
+                fmus[pipe.target].set(pipe.input, _scaled(pipe, fmus[pipe.source].get(pipe.output)))
 
 
 def reference_of(

@@ -74,11 +74,9 @@ def test_a_random_system_gives_the_floats_of_fmpy(seed: int, place: Place) -> No
         for c in plan.connections
     }
     reference = reference_of(config, delays, order=plan.order)
-    pipes = [
-        msgspec.structs.replace(pipe, held=(pipe.target, pipe.input) in plan.initialization.held)
-        for pipe in reference.pipes
-    ]
-    expected = run_fmpy(msgspec.structs.replace(reference, pipes=pipes))
+    into = {(pipe.target, pipe.input): pipe for pipe in reference.pipes}
+    loops = [[into[tear.target, tear.input] for tear in loop.tears] for loop in plan.initialization.loops]
+    expected = run_fmpy(msgspec.structs.replace(reference, loops=loops))
 
     output = place.folder / "result.csv"
     process = place.start("launch", config, "--no-progress", "--output", output)

@@ -170,15 +170,34 @@ def test_a_plan_with_another_step_size_has_another_digest(drawn: Drawn, which: i
 @given(systems())
 def test_initial_values_are_known_before_they_are_needed(drawn: Drawn) -> None:
     plan = planned(drawn)
-    levels, held = plan.initialization.levels, set(plan.initialization.held)
+    levels = plan.initialization.levels
+    torn = {(tear.target, tear.input): loop for loop in plan.initialization.loops for tear in loop.tears}
 
     assert {(c.source_instance, c.source.name) for c in plan.connections} == set(levels)
     for connection in plan.connections:
         target = (connection.target_instance, connection.target.name)
-        if target in held:
+        if target in torn:
             assert connection.delay == 1
+            assert torn[target].first <= levels[connection.source_instance, connection.source.name] <= torn[target].last
             continue
         for (instance, output), level in levels.items():
             depends = plan.system.instances[instance].description.variable(output)
             if instance == target[0] and depends is not None and depends.dependencies is None:
                 assert levels[connection.source_instance, connection.source.name] < level
+
+
+@given(systems())
+def test_every_output_of_a_loop_is_reached_from_every_other_and_no_other_has_its_levels(drawn: Drawn) -> None:
+    plan = planned(drawn)
+    levels = plan.initialization.levels
+
+    for loop in plan.initialization.loops:
+        between = {key for key, level in levels.items() if loop.first <= level <= loop.last}
+        assert between == set(loop.outputs)
+        assert loop.tears
+        for node in loop.nodes:
+            own = plan.nodes[node]
+            assert loop in own.loops
+            known = {(link.source, name) for link in own.links_in for name in link.layout.names}
+            known |= {(member.name, name) for member in own.instances for name in member.outputs.names}
+            assert {(tear.source, tear.output) for tear in loop.tears} <= known

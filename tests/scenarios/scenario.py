@@ -188,7 +188,9 @@ class Counter:
         self._initialization = initialization if initialization is not None else []
         self._inputs = self._outputs = Ring(plan.nodes[instance.node].instances[0].outputs, 1)
 
-    def enter_initialization(self, _start_time: float, _stop_time: float, _start_values: Mapping[str, Value]) -> None:
+    def enter_initialization(
+        self, _start_time: float, _stop_time: float | None, _start_values: Mapping[str, Value]
+    ) -> None:
         self._initialization.append(f"{self._name}: enter")
 
     def exit_initialization(self) -> None:

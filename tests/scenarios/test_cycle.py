@@ -107,15 +107,17 @@ def test_a_cycle_without_any_delay_is_refused_with_the_names_on_it() -> None:
         Scenario(("a -> b (delay 0)", "b -> a (delay 0)")).plan()
 
 
-def test_a_loop_in_initialization_mode_is_opened_at_the_delayed_connection() -> None:
+def test_a_loop_in_initialization_mode_is_torn_at_the_delayed_connection() -> None:
     cycle = Scenario(("a -> b", "b -> a"), points=0, feedthrough="ab")
 
-    assert cycle.plan().initialization.held == (("a", "b"),)
+    [loop] = cycle.plan().initialization.loops
+    assert [str(tear) for tear in loop.tears] == ["b.point -> a.b"]
     assert (
         cycle.initialization()
         == """\
 a: enter
 b: enter
+a: set b
 a: get point
 b: set a
 b: get point
@@ -126,10 +128,42 @@ b: exit
     )
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_every_node_of_a_loop_learns_what_the_torn_connection_brings(seed: int) -> None:
+    cycle = Scenario(("a -> b", "b -> c", "c -> a"), points=0, feedthrough="abc")
+
+    links = [link for node in cycle.plan().nodes.values() for link in node.links_in if link.initial_only]
+    calls = cycle.initialization_on_nodes(seed=seed)
+
+    assert [(link.source, link.target_node) for link in links] == [("c", "b")]
+    assert calls["a"] == ["enter", "set c", "get point", "exit"]
+    for name, source in (("b", "a"), ("c", "b")):
+        assert calls[name] == ["enter", f"set {source}", "get point", f"set {source}", "exit"]
+
+
+def test_jacobi_tears_a_loop_no_more_often_than_gauss_seidel() -> None:
+    cycle = Scenario(("a -> b", "b -> c", "c -> a", "c -> b"), points=0, feedthrough="abc", algorithm="jacobi")
+
+    [loop] = cycle.plan().initialization.loops
+
+    assert [str(tear) for tear in loop.tears] == ["c.point -> a.c", "c.point -> b.c"]
+    assert (loop.first, loop.last) == (0, 2)
+
+
+def test_what_comes_before_and_after_a_loop_is_read_once() -> None:
+    system = Scenario(("s -> a", "a -> b", "b -> a", "b -> t", "t -> e"), points=0, feedthrough="sabte")
+
+    plan = system.plan().initialization
+
+    [loop] = plan.loops
+    assert loop.outputs == (("a", "point"), ("b", "point"))
+    assert plan.levels == {("s", "point"): 0, ("a", "point"): 1, ("b", "point"): 2, ("t", "point"): 3}
+
+
 def test_a_cycle_that_is_none_in_initialization_mode_gets_all_its_values() -> None:
     cycle = Scenario(("a -> b", "b -> a"), points=0, feedthrough="b")
 
-    assert cycle.plan().initialization.held == ()
+    assert cycle.plan().initialization.loops == ()
     assert (
         cycle.initialization()
         == """\

@@ -58,7 +58,7 @@ Instances
   outer     Integrator.fmu (FMI 2.0)      step 0.01 s  group pair            u = 0.25
 
 Connections
-  pendulum.a -> sum.u1  delay 0  value at the end of the step    u1 = 57.3 * a - 1
+  pendulum.a -> sum.u1  delay 0  value at the end of the step    u1 = 57.3 * a - 1                  not converted: sum.u1 has no unit
   sum.y -> loop.u       delay 0  value at the end of the step
   loop.y -> sum.u2      delay 1  value at the start of the step                     closes a cycle
   sum.y -> inner.u      delay 0  value at the end of the step    u = y + 2
@@ -73,9 +73,10 @@ Groups
 
 Initialization
   level 0: pendulum.a
+  levels 1 to 2 are iterated, beginning with sum.u2 = 0.0
   level 1: sum.y
-  level 2: loop.y, inner.y
-  sum.u2 keeps its start value 0.0 until the first step
+  level 2: loop.y
+  level 3: inner.y
 
 Recorded
   pendulum.a  Real  rad
@@ -83,7 +84,7 @@ Recorded
   into results/loop.csv
 
 OK: mesh.yaml can run.
-"""
+"""  # noqa: E501 a line of the page is as long as it is
 
 
 def test_the_page_shows_everything_that_the_plan_decides(
@@ -154,6 +155,13 @@ def test_the_page_is_the_same_on_a_narrow_terminal(
     main(["check", "mesh.yaml"])
 
     assert capsys.readouterr().out == LOOP_PAGE
+
+
+def test_a_run_without_an_end_is_shown_as_one(tmp_path: Path) -> None:
+    plan = prepare(write(tmp_path, JACOBI.replace("stop_time: 1,", "stop_time: null,")))
+
+    assert plan_page(plan)[1] == "Simulation  0 s to an open end in steps of 0.5 s"
+    assert plan.grid.stop_time is None
 
 
 def test_options_change_the_plan(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -109,7 +109,7 @@ STRUCTURE = [
     pytest.param(
         changed("step_size", "step_sise"),
         "mesh.yaml:2: simulation.step_sise: the unknown key 'step_sise'; expected one of start_time, stop_time, "
-        "step_size, algorithm, window, real_time_factor. Did you mean 'step_size'?",
+        "step_size, algorithm, window, real_time_factor, update_period, catch_up. Did you mean 'step_size'?",
         id="an unknown key suggests the nearest and hides that this one is missing",
     ),
     pytest.param(
@@ -119,22 +119,22 @@ STRUCTURE = [
     ),
     pytest.param(
         changed("stop_time: 1", 'stop_time: "1"'),
-        "mesh.yaml:2: simulation.stop_time: '1'; expected a finite number",
+        "mesh.yaml:2: simulation.stop_time: '1'; expected a finite number or null",
         id="text is no number",
     ),
     pytest.param(
         changed("stop_time: 1", "stop_time: true"),
-        "mesh.yaml:2: simulation.stop_time: true; expected a finite number",
+        "mesh.yaml:2: simulation.stop_time: true; expected a finite number or null",
         id="a truth value is no number",
     ),
     pytest.param(
         changed("stop_time: 1", "stop_time: .nan"),
-        "mesh.yaml:2: simulation.stop_time: nan; expected a finite number",
+        "mesh.yaml:2: simulation.stop_time: nan; expected a finite number or null",
         id="NaN",
     ),
     pytest.param(
         changed("stop_time: 1", "stop_time: 1e999"),
-        "mesh.yaml:2: simulation.stop_time: inf; expected a finite number",
+        "mesh.yaml:2: simulation.stop_time: inf; expected a finite number or null",
         id="an overflow",
     ),
     pytest.param(
@@ -181,8 +181,9 @@ STRUCTURE = [
     ),
     pytest.param(
         changed("{fmu: delay.fmu}", "delay.fmu"),
-        "mesh.yaml:5: instances.delay: 'delay.fmu'; expected a mapping with fmu, start_values, step_size, group, "
-        "sha256, strict, host",
+        "mesh.yaml:5: instances.delay: 'delay.fmu'; "
+        "expected a mapping with fmu, start_values, step_size, interpolation, group, sha256, "
+        "strict, host",
         id="text for a mapping",
     ),
     pytest.param(
@@ -252,8 +253,8 @@ TEXTS = [
     ),
     pytest.param(
         "- 1\n",
-        "mesh.yaml:1: a list; expected a mapping with mesh, simulation, instances, group, connections, record, "
-        "zenoh, timeouts and 3 more",
+        "mesh.yaml:1: a list; expected a mapping with mesh, simulation, instances, group, connections, initialization, "
+        "record, zenoh and 4 more",
         id="a list",
     ),
     pytest.param(

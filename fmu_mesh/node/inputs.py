@@ -1,0 +1,140 @@
+"""Unconnected inputs over time: values that came with a time of their own, as any program sends them.
+
+Owns how such a value becomes what a step uses (the node-based use of ROS's `fmi_adapter`). Which settings are allowed
+at all is `fmu_mesh.node.settings`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Literal
+
+from ..model.description import ModelDescription, Value
+from ..model.instance import Instance
+from ..model.ring import Ring
+from ..model.trajectory import Trajectory
+from ..model.types import is_float
+from ..simtime import TimeGrid
+from ..wire.values import ValueRefused
+
+__all__ = ["TimedInputs", "set_input"]
+
+_WAITING = 1 << 16
+
+
+class TimedInputs:
+    """An `Instance` whose unconnected inputs follow trajectories; everything else goes to the one within.
+
+    The step from t sets each of these inputs to its value at t. A value that comes without a time holds from the next
+    step on, one whose time is past does so too, unless a later one is in use.
+
+    Args:
+        instance: the one within.
+        interpolation: linear between two times for Reals, or constant from each time on.
+    """
+
+    def __init__(self, instance: Instance, interpolation: Literal["hold", "linear"]) -> None:
+        self._instance = instance
+        self._linear = interpolation == "linear"
+        self._trajectories: dict[str, Trajectory] = {}
+        self._used: dict[str, Value] = {}
+        self._early: list[tuple[str, Value, float | None]] = []
+        self._grid: TimeGrid | None = None
+        self._points = 1
+        self._step = 0
+
+    @property
+    def description(self) -> ModelDescription:
+        """The model description."""
+        return self._instance.description
+
+    def enter_initialization(
+        self, start_time: float, stop_time: float | None, start_values: Mapping[str, Value]
+    ) -> None:
+        """As the one within."""
+        self._instance.enter_initialization(start_time, stop_time, start_values)
+
+    def exit_initialization(self) -> None:
+        """As the one within."""
+        self._instance.exit_initialization()
+
+    def set_values(self, values: Mapping[str, Value]) -> None:
+        """As the one within."""
+        self._instance.set_values(values)
+
+    def get_values(self, names: Sequence[str]) -> list[Value]:
+        """As the one within."""
+        return self._instance.get_values(names)
+
+    def bind(self, inputs: Ring, outputs: Sequence[Ring], grid: TimeGrid, points: int, step: int = 0) -> None:
+        """As the one within; from now on there is a time, and values that came before it get theirs."""
+        self._instance.bind(inputs, outputs, grid, points, step)
+        self._grid, self._points, self._step = grid, points, step
+        early, self._early = self._early, []
+        for name, value, time in early:
+            self.add(name, value, time)
+
+    def do_step(self, step: int) -> None:
+        """Set what follows a trajectory to its value at the start of the step, then as the one within."""
+        if self._trajectories:
+            time = self._time(step)
+            now = {name: own.value(time, self._resolution(time)) for name, own in self._trajectories.items()}
+            changed = {name: value for name, value in now.items() if self._used.get(name) != value}
+            if changed:
+                self._instance.set_values(changed)
+                self._used.update(changed)
+        self._instance.do_step(step)
+        self._step = step + 1
+
+    def close(self) -> None:
+        """As the one within."""
+        self._instance.close()
+
+    def add(self, name: str, value: Value, time: float | None) -> int:
+        """A value of an input from ``time`` (s; None: now) on; returns the own step that is the first to use it.
+
+        Raises:
+            ValueRefused: too many values wait for their time.
+        """
+        if self._grid is None:
+            self._early.append((name, value, time))
+            return 0
+        now = self._time(self._step)
+        when = now if time is None else time
+        if name not in self._trajectories:
+            variable = self.description.variable(name)
+            linear = self._linear and variable is not None and is_float(variable.type)
+            trajectory = Trajectory(linear=linear)
+            if when > now:
+                trajectory.add(now, self._instance.get_values([name])[0])
+            self._trajectories[name] = trajectory
+        if len(self._trajectories[name]) >= _WAITING:
+            raise ValueRefused(f"{_WAITING} values of '{name}' wait for their time already")
+        self._trajectories[name].add(when, value)
+        step_size = self._points * self._grid.step_size
+        first = math.ceil((when - self._resolution(when) - self._grid.start_time) / step_size)
+        return max(self._step, first)
+
+    def _time(self, step: int) -> float:
+        assert self._grid is not None
+        return self._grid.time(step * self._points)
+
+    def _resolution(self, time: float) -> float:
+        """How far apart two times may be and still mean the same: rounding of one multiplication and one addition."""
+        assert self._grid is not None
+        return 8 * math.ulp(max(abs(self._grid.start_time), abs(time)))
+
+
+def set_input(instance: Instance, name: str, value: Value, time: float | None, step: int) -> int:
+    """On the main thread, between steps: set a variable; returns the own step that is the first to use it.
+
+    Raises:
+        FmuError: the FMU refused it.
+        ValueRefused: too many values wait for their time.
+    """
+    variable = instance.description.variable(name)
+    if isinstance(instance, TimedInputs) and variable is not None and variable.causality == "input":
+        return instance.add(name, value, time)
+    instance.set_values({name: value})
+    return step

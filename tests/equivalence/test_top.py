@@ -1,0 +1,33 @@
+"""`top` looks at a running mesh until it ends."""
+
+from __future__ import annotations
+
+import json
+
+from tests.helpers import FMUS, Place, wait_until, write_config
+
+
+def test_top_shows_all_instances_until_the_mesh_ends(place: Place) -> None:
+    mesh = place.start("run", "--name", "one", "--no-progress", FMUS / "Gain.fmu")
+    config = write_config(place.folder, stop_time=3600.0, simulation={"real_time_factor": 1.0, "step_size": 0.01})
+    pair = place.start("launch", config, "--no-progress")
+    wait_until(lambda: '"state":"running"' in place.run("status", "pair", "--json").output, "a running mesh")
+
+    several = place.run("top", "--once")
+    once = place.run("top", "pair", "--once", "--json")
+    following = place.start("top", "pair", "--interval", "0.1")
+    wait_until(lambda: following.output.count("pendulum") >= 2, "two looks")
+    place.run("stop", "pair")
+
+    assert several.wait() == 2
+    assert "2 meshes are running: one, pair" in several.message
+    look = json.loads(once.output)
+    assert [view["instance"] for view in look["instances"]] == ["delay", "pendulum"]
+    assert all(view["running_time"] > 0.0 for view in look["instances"])
+    assert following.wait() == 0
+    assert following.output.endswith("mesh 'pair' has ended\n")
+    assert pair.wait() == 130
+    place.run("stop", "one")
+    assert mesh.wait() == 130
+    assert place.run("top").wait() == 2
+    place.assert_nothing_left()

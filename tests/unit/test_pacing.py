@@ -1,0 +1,95 @@
+"""The wall clock of a run, with a clock of the test's own."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+
+from fmu_mesh.launch.preparing import prepare
+from fmu_mesh.master import pacing
+from fmu_mesh.master.pacing import Pacer
+from tests.helpers import write_config
+
+STEP_SIZE = 0.5
+
+
+class Wall:
+    """A clock that the test sets, in s."""
+
+    def __init__(self) -> None:
+        self.now = 100.0
+
+    def perf_counter(self) -> float:
+        return self.now
+
+
+@pytest.fixture
+def wall(monkeypatch: pytest.MonkeyPatch) -> Wall:
+    clock = Wall()
+    monkeypatch.setattr(pacing, "time", clock)
+    return clock
+
+
+def pacer(folder: Path, factor: float = 1.0, **simulation: float) -> Pacer:
+    """A pacer that has been started, with steps of half a second."""
+    plan = prepare(write_config(folder, stop_time=1000.0, simulation={"step_size": STEP_SIZE, **simulation}))
+    made = Pacer(plan, factor)
+    made.start(0)
+    return made
+
+
+def test_without_a_factor_nothing_is_held_back(tmp_path: Path, wall: Wall) -> None:
+    assert pacer(tmp_path, 0.0).limit(1000, 0) == (1000, math.inf)
+    assert wall.now == 100.0
+
+
+def test_a_step_may_be_taken_when_the_wall_clock_is_at_its_start(tmp_path: Path, wall: Wall) -> None:
+    paced = pacer(tmp_path, 2.0)
+
+    assert paced.limit(1000, 0) == (1, 0.25)
+    wall.now += 0.3
+    allowed, pause = paced.limit(1000, 1)
+    assert allowed == 2
+    assert pause == pytest.approx(0.2)  # the clock of a test rounds as any other
+
+
+def test_with_an_update_period_what_is_due_is_taken_together(tmp_path: Path, wall: Wall) -> None:
+    paced = pacer(tmp_path, 1.0, update_period=2.0)
+
+    assert paced.limit(1000, 0) == (1, 2.0)
+    wall.now += 1.5
+    assert paced.limit(1000, 1) == (1, 0.5)
+    wall.now += 0.5
+    assert paced.limit(1000, 1) == (5, 2.0)
+
+
+def test_a_run_that_is_behind_catches_up_however_long_that_takes(tmp_path: Path, wall: Wall) -> None:
+    paced = pacer(tmp_path, 1.0)
+    wall.now += 100.0
+
+    assert paced.limit(1000, 1)[0] == 201
+    assert paced.overruns == 0
+
+
+def test_with_a_bound_it_gives_up_what_it_lost_and_counts_it(tmp_path: Path, wall: Wall) -> None:
+    paced = pacer(tmp_path, 1.0, catch_up=1.0)
+    wall.now += 100.0  # 200 points, of which 3 may be left: two of one second, and the one that is on its way
+
+    assert paced.limit(1000, 1)[0] == 1 + 3 + 1
+    assert paced.overruns == 200 - 1 - 3
+    wall.now += 1.0
+    assert paced.limit(1000, 4)[0] == 7
+    assert paced.overruns == 196
+
+
+def test_a_run_that_keeps_up_has_no_overruns(tmp_path: Path, wall: Wall) -> None:
+    paced = pacer(tmp_path, 1.0, catch_up=0.0, update_period=2.0)
+    reached = 0
+
+    for _ in range(100):
+        wall.now += 0.4
+        reached, _ = paced.limit(1000, reached)
+
+    assert (reached, paced.overruns) == (81, 0)

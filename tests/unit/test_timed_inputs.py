@@ -1,0 +1,132 @@
+"""Inputs over time: which value a step uses, whenever it was sent."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Literal
+
+import pytest
+
+from fmu_mesh.fmu import Fmi2Instance, read_description
+from fmu_mesh.model.ring import Layout, Ring
+from fmu_mesh.node.inputs import TimedInputs, set_input
+from fmu_mesh.simtime import TimeGrid
+from fmu_mesh.wire.values import ValueRefused, decode_time
+from tests.helpers import FMUS
+
+STEP_SIZE = 0.1
+
+
+class Steps:
+    """A gain of 1 whose input is not connected, from second 1 on in steps of a tenth."""
+
+    def __init__(self, folder: Path, interpolation: Literal["hold", "linear"]) -> None:
+        path = FMUS / "Gain.fmu"
+        self.inputs = TimedInputs(Fmi2Instance(path, "gain", read_description(path), folder), interpolation)
+        self.rings = Ring(Layout.of([]), 64), Ring(Layout.of([("y", "Float64")]), 64)
+        self.inputs.enter_initialization(1.0, None, {"u": 5.0})
+        self.inputs.exit_initialization()
+        self.step = 0
+
+    def bind(self) -> None:
+        self.inputs.bind(self.rings[0], (self.rings[1],), TimeGrid(1.0, STEP_SIZE, 60), 1)
+
+    def go(self, steps: int) -> list[float]:
+        """Take some steps; what they used as input."""
+        for step in range(self.step, self.step + steps):
+            self.inputs.do_step(step)
+        self.step += steps
+        values: list[float] = self.rings[1].part("Float64")[self.step - steps + 1 : self.step + 1, 0].tolist()
+        return values
+
+
+@pytest.fixture
+def linear(tmp_path: Path) -> Iterator[Steps]:
+    steps = Steps(tmp_path, "linear")
+    steps.bind()
+    yield steps
+    steps.inputs.close()
+
+
+@pytest.fixture
+def hold(tmp_path: Path) -> Iterator[Steps]:
+    steps = Steps(tmp_path, "hold")
+    steps.bind()
+    yield steps
+    steps.inputs.close()
+
+
+def test_without_any_value_the_input_keeps_its_start_value(linear: Steps) -> None:
+    assert linear.go(2) == [5.0, 5.0]
+
+
+def test_a_value_without_a_time_holds_from_the_next_step_on(linear: Steps) -> None:
+    linear.go(3)
+
+    assert linear.inputs.add("u", 7.0, None) == 3
+    assert linear.go(2) == [7.0, 7.0]
+
+
+def test_a_value_ahead_of_time_is_gone_to_in_a_line(linear: Steps) -> None:
+    assert linear.inputs.add("u", 9.0, 1.4) == 4
+
+    assert linear.go(6) == pytest.approx([5.0, 6.0, 7.0, 8.0, 9.0, 9.0], rel=1e-15)  # the times are rounded
+
+
+def test_with_hold_it_is_taken_when_its_time_has_come(hold: Steps) -> None:
+    assert hold.inputs.add("u", 9.0, 1.3) == 3  # 1.0 + 3 * 0.1 is not 1.3, and means the same
+
+    assert hold.go(5) == [5.0, 5.0, 5.0, 9.0, 9.0]
+
+
+def test_values_count_by_their_times_and_not_by_their_arrival(hold: Steps) -> None:
+    hold.inputs.add("u", 3.0, 1.3)
+    hold.inputs.add("u", 2.0, 1.15)
+    hold.inputs.add("u", 1.0, 1.1)
+
+    assert hold.go(5) == [5.0, 1.0, 2.0, 3.0, 3.0]
+
+
+def test_a_value_whose_time_is_past_holds_unless_a_later_one_is_in_use(hold: Steps) -> None:
+    hold.go(5)
+    hold.inputs.add("u", 8.0, 1.2)
+    assert hold.go(1) == [8.0]
+
+    hold.inputs.add("u", 6.0, 1.1)
+    assert hold.go(1) == [8.0]
+
+
+def test_values_that_come_before_the_first_point_wait_for_it(tmp_path: Path) -> None:
+    steps = Steps(tmp_path, "hold")
+    steps.inputs.add("u", 4.0, 1.2)
+    steps.inputs.add("u", 3.0, None)
+
+    steps.bind()
+
+    assert steps.go(4) == [3.0, 3.0, 4.0, 4.0]
+    steps.inputs.close()
+
+
+def test_a_parameter_is_set_at_once_whatever_its_time(linear: Steps) -> None:
+    assert set_input(linear.inputs, "k", 2.0, 99.0, 0) == 0
+    assert linear.go(1) == [10.0]
+
+
+def test_so_many_values_may_wait_for_their_time_and_no_more(linear: Steps) -> None:
+    for number in range((1 << 16) - 1):  # and the one that it began with
+        linear.inputs.add("u", 0.0, 10.0 + number)
+
+    with pytest.raises(ValueRefused, match="65536 values of 'u' wait for their time already"):
+        linear.inputs.add("u", 0.0, 1e9)
+
+
+def test_the_time_of_a_value_is_that_of_its_attachment() -> None:
+    assert decode_time(b'{"time": 1.5}') == 1.5
+    assert decode_time(b'{"point": 3, "time": 2}') == 2.0
+
+
+@pytest.mark.parametrize("attachment", [b"", b"{}", b'{"time": "1"}', b"[1.5]", b"\xff\x00", b'{"time": null}'])
+def test_an_attachment_without_a_time_is_refused(attachment: bytes) -> None:
+    with pytest.raises(ValueRefused, match="its attachment has no time"):
+        decode_time(attachment)
