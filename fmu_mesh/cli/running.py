@@ -125,6 +125,8 @@ def _run_local(plan: Plan, display: Display) -> tuple[int, float, int]:
     mesh = LocalMesh(plan, log, display.progress)
     with ended_by_signals(mesh.interrupt, mesh.clean_up, watch_stdin=False):
         mesh.run()
+    if mesh.ended_by is not None:
+        display.ended(mesh.ended_by)
     return mesh.point, mesh.seconds, mesh.rows
 
 

@@ -18,29 +18,16 @@ import math
 from collections.abc import Callable
 from typing import Final
 
-import msgspec
 
+
+from ..model.instance import SolverSettings
 from .model_calls import ModelCalls
 from .solver import Equations, Solver, SolverFailed, make_solver, resolvable
 
-__all__ = ["EventLoop", "SolverSettings", "iterate_events"]
+__all__ = ["EventLoop", "iterate_events"]
 
 EVENT_ITERATIONS: Final = 1000
 """Event iterations, or events without any advance of time, after which a model is taken not to converge."""
-
-
-class SolverSettings(msgspec.Struct, frozen=True):
-    """How the continuous states of a model are solved.
-
-    Attributes:
-        name: ``cvode`` or ``euler``.
-        relative_tolerance: of the local error.
-        maximum_step_size: in s; None: the communication step.
-    """
-
-    name: str
-    relative_tolerance: float
-    maximum_step_size: float | None = None
 
 
 class EventLoop:

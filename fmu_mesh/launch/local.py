@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import FmuMeshError, Interrupted, StepFailed
+from ..errors import FmuMeshError, Interrupted, StepFailed, TerminationRequested
 from ..fmu import Fmi2Instance, LogMessage
 from ..model.description import Value
 from ..model.instance import Instance
@@ -42,6 +42,7 @@ class LocalMesh:
         point: the last point reached.
         rows: rows in the result file.
         seconds: wall-clock time of the loop.
+        ended_by: which FMU asked to end the simulation before its last point, if one did.
     """
 
     def __init__(
@@ -54,6 +55,7 @@ class LocalMesh:
         self.point = 0
         self.rows = 0
         self.seconds = 0.0
+        self.ended_by: TerminationRequested | None = None
         self._plan = plan
         self._log = log
         self._progress = progress
@@ -149,6 +151,9 @@ class LocalMesh:
                     break
                 for member in members.values():
                     member.step_from(point, members)
+        except TerminationRequested as asked:
+            asked.point, asked.time = self.point, grid.time(self.point)
+            self.ended_by = asked
         except StepFailed as error:
             error.point, error.time = self.point, grid.time(self.point)
             raise

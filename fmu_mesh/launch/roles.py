@@ -187,7 +187,9 @@ def run_master(
             error = ended
         rows = recorder.rows if recorder is not None else 0
         report = error.report() if error is not None else None
-        emit(End(master.last_status(), master.seconds, rows, plan.system.result_file, report, master.profile()))
+        ended_by = master.ended_by.report() if master.ended_by is not None and error is None else None
+        status, result_file = master.last_status(), plan.system.result_file
+        emit(End(status, master.seconds, rows, result_file, report, master.profile(), ended_by))
         if error is not None:
             raise error
 
