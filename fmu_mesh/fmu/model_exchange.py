@@ -18,8 +18,6 @@ import math
 from collections.abc import Callable
 from typing import Final
 
-
-
 from ..model.instance import SolverSettings
 from .model_calls import ModelCalls
 from .solver import Equations, Solver, SolverFailed, make_solver, resolvable
@@ -61,10 +59,9 @@ class EventLoop:
             settings.name, _Extrapolated(self, calls), settings.relative_tolerance, settings.maximum_step_size
         )
 
-    def start(self, time: float, *, next_event: float = math.inf) -> None:
+    def start(self, time: float) -> None:
         """Handle the first event at ``time`` (s), in event mode after Initialization Mode."""
         self._time = time
-        self._next_event = next_event
         self._update()
 
     def event(self, set_values: Callable[[], None]) -> None:
@@ -81,9 +78,15 @@ class EventLoop:
                 return not resolvable(self._time, end)
         return True
 
-    def restart(self, time: float) -> None:
-        """Go on at ``time`` (s), at the states of the model, such as after its state was set."""
-        self._time = time
+    @property
+    def place(self) -> tuple[float, float]:
+        """The time where the model is, and that of its next time event, in s."""
+        return self._time, self._next_event
+
+    def resume(self, time: float, next_event: float) -> None:
+        """Go on where `place` was, in continuous-time mode; the solver begins anew."""
+        self.terminated = False
+        self._time, self._next_event = time, next_event
         self._solver.restart(time)
 
     def close(self) -> None:

@@ -102,23 +102,31 @@ class Instance(Protocol):
 
 
 class KeepsState(Protocol):
-    """An instance that can go back, and on in another process (FMI 2.0, 2.1.8; FMI 3.0, 2.2.10).
+    """An instance that can go back to where it was, also in another process (FMI 2.0, 2.1.8; FMI 3.0, 2.2.10).
 
-    Only where the model description says so: `can_get_and_set_state`, and `can_serialize_state` for a process's end.
+    Only where the model description says so: `can_get_and_set_state`, and `can_serialize_state` for the last two.
+    To be called between two calls of `do_step`.
+
+    Raises:
+        FmuError: the FMU cannot, or failed to.
     """
 
-    def get_state(self) -> bytes:
-        """Everything that the instance is between two calls of `do_step`, in a form that outlives the process.
-
-        Raises:
-            FmuError: the FMU cannot, or failed to.
-        """
+    def get_state(self) -> object:
+        """Everything that the instance is now; `free_state` it some time."""
         ...
 
-    def set_state(self, state: bytes) -> None:
-        """Be again what `get_state` of an instance of the same FMU has returned; then call `bind`.
+    def set_state(self, state: object) -> None:
+        """Be again what ``state`` was; the next `do_step` is the one that would have been the next then."""
+        ...
 
-        Raises:
-            FmuError: the FMU cannot, or refused it.
-        """
+    def free_state(self, state: object) -> None:
+        """Give the memory of a state back to the FMU."""
+        ...
+
+    def serialize_state(self, state: object) -> bytes:
+        """The state in a form that outlives the process."""
+        ...
+
+    def deserialize_state(self, data: bytes) -> object:
+        """The state that an instance of the same FMU has serialized."""
         ...

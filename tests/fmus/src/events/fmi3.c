@@ -446,12 +446,12 @@ fmi3Status fmi3DoStep(fmi3Instance c, fmi3Float64 time, fmi3Float64 step_size, f
     if (instance->event_needed) broken("fmi3DoStep", "step mode, where event mode is needed");
     if (step_size <= 0.0 || time + step_size > instance->stop + 1e-9) broken("fmi3DoStep past the stop time", "step mode");
     if (model_discards(&instance->model, step_size)) return says(instance, fmi3Discard, "the step is too long");
-    advance(&instance->model, time, step_size, instance->event_mode_used, last_time, &event);
+    advance(&instance->model, time, step_size, instance->event_mode_used && instance->early_return_allowed, last_time,
+            &event);
     instance->written = false;
     *terminate = instance->model.terminate;
     *event_needed = instance->event_needed = event;
     *early_return = *last_time < time + step_size;
-    if (*early_return && !instance->early_return_allowed && !*terminate) return fmi3Error;
     return fmi3OK;
 }
 
