@@ -17,11 +17,12 @@ from contextlib import contextmanager
 from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
-from typing import Literal, Self
+from typing import Any, Literal, Self
 
 from ..errors import FmuError
 from ..fmu import Fmi2Instance, LogMessage, read_description
 from ..model.description import ModelDescription, Value
+from ..model.types import is_float
 from .arguments import Arguments
 from .trajectory import Clock, Trajectory
 
@@ -267,7 +268,7 @@ class FMIAdapter:
             self._step(self._step_size)
         return self.simulation_time
 
-    def get_output_value(self, name: str) -> Value:
+    def get_output_value(self, name: str) -> Any:  # noqa: ANN401 what type it is, the FMU says
         """The current value of an output; before the first step, its initial value.
 
         Raises:
@@ -277,7 +278,7 @@ class FMIAdapter:
         self._arguments.output(name)
         return self.get_value(name)
 
-    def get_value(self, name: str) -> Value:
+    def get_value(self, name: str) -> Any:  # noqa: ANN401 what type it is, the FMU says
         """The current value of any variable.
 
         Raises:
@@ -318,7 +319,7 @@ class FMIAdapter:
 
     def _begin_trajectory(self, name: str, *, initial: bool) -> Trajectory:
         """A new trajectory, whose first value is the initial one at 0.0 if ``initial`` is true."""
-        linear = self._interpolate_input and self._arguments.inputs[name].type == "Real"
+        linear = self._interpolate_input and is_float(self._arguments.inputs[name].type)
         self._trajectories[name] = trajectory = Trajectory(linear=linear)
         if initial:
             trajectory.add(0.0, self._initial_inputs[name])

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import zipfile
 from pathlib import Path
-from typing import cast
 
 import fmpy
 from fmpy.model_description import ModelDescription as FmpyDescription
@@ -21,7 +20,13 @@ from ..model.description import DefaultExperiment, ModelDescription, Value, Vari
 __all__ = ["read_description"]
 
 _MAX_DESCRIPTION_SIZE = 64 * 2**20
-_TYPES: tuple[VariableType, ...] = ("Real", "Integer", "Boolean", "String", "Enumeration")
+_TYPES: dict[str, VariableType] = {
+    "Real": "Float64",
+    "Integer": "Int32",
+    "Boolean": "Boolean",
+    "String": "String",
+    "Enumeration": "Enumeration",
+}
 
 
 def read_description(path: Path) -> ModelDescription:
@@ -128,15 +133,16 @@ def _convert(source: FmpyDescription, platforms: tuple[str, ...], problems: tupl
 
 
 def _variable(source: ModelVariable, dependencies: dict[str, tuple[str, ...] | None]) -> Variable:
-    type_ = cast("VariableType", source.type)
+    type_ = _TYPES[source.type]
     declared = source.declaredType
     items = tuple((item.name, int(item.value)) for item in declared.items) if declared and declared.items else ()
     return Variable(
         name=source.name,
         value_reference=int(source.valueReference),
         type=type_,
+        declared_type=source.type,
         causality=source.causality or "local",
-        variability=source.variability or ("continuous" if type_ == "Real" else "discrete"),
+        variability=source.variability or ("continuous" if type_ == "Float64" else "discrete"),
         initial=source.initial,
         start=_start(type_, source.start),
         unit=source.unit or (declared.unit if declared is not None else None),
@@ -154,7 +160,8 @@ def _number(text: str | float | None) -> float | None:
     try:
         return float(text)
     except ValueError:
-        return None
+        pass
+    return None
 
 
 def _start(type_: VariableType, text: str | None) -> Value | None:
@@ -163,13 +170,14 @@ def _start(type_: VariableType, text: str | None) -> Value | None:
         return None
     try:
         match type_:
-            case "Real":
+            case "Float64":
                 return float(text)
-            case "Integer" | "Enumeration":
+            case "Int32" | "Enumeration":
                 return int(text)
             case "Boolean":
                 return text in ("true", "1")
             case "String":
                 return text
     except ValueError:
-        return None
+        pass
+    return None
