@@ -18,7 +18,7 @@ from ..errors import TerminationRequested
 from ..model.ring import Ring
 from ..model.types import Value
 from ..simtime import TimeGrid
-from .instance import STATUS_NAMES, FmuInstance
+from .instance import STATUS_NAMES, WARNING, FmuInstance
 from .model_calls import ModelCalls
 from .model_exchange import EventLoop
 from .solver import SolverFailed
@@ -119,6 +119,14 @@ class ContinuousInstance(FmuInstance):
         loop.event(lambda: self._set_inputs(slot))
         loop.extrapolate = self._line(slot, time)
 
+    def _set_inputs(self, slot: int) -> None:
+        for function, references, count, rows, size in self._direct_setters:
+            status = self._call_direct(function, references, count, rows[slot], size)
+            if status > WARNING:
+                raise self._failed(f"setting the inputs returned {STATUS_NAMES[status]}")
+        for set_row in self._setters:
+            set_row(slot)
+
     def _line(self, slot: int, start: float) -> Callable[[float], None] | None:
         """What sets the linear inputs at a time within a step that starts at ``start`` (s); None if none changes."""
         slopes = {name: slope for name, slope in self._slopes.items() if slope != 0.0}
@@ -138,7 +146,7 @@ class ContinuousInstance(FmuInstance):
             status = self._call_direct(
                 function, ctypes.addressof(references), count, ctypes.addressof(values), count
             )
-            if status > 1:
+            if status > WARNING:
                 raise FMICallException(function=self._function_name("Set", "Float64"), status=status)
 
         return set_inputs

@@ -9,7 +9,7 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import fmpy
 import numpy as np
@@ -68,6 +68,8 @@ _CALLBACKS = _callbacks()
 class Fmi2Instance(FmuInstance):
     """One instance of an FMI 2.0 co-simulation FMU."""
 
+    _library: type[Any] = FMU2Slave
+
     def do_step(self, step: int) -> None:
         """Set the inputs of row ``step``, advance to own step ``step + 1``, write the outputs to row ``step + 1``."""
         component = self._component
@@ -111,7 +113,7 @@ class Fmi2Instance(FmuInstance):
             msg = f"two instances of one process have the name '{self.name}'"
             raise ValueError(msg)
         _instances[key] = self
-        fmu = FMU2Slave(
+        fmu = self._library(
             guid=self._description.guid,
             modelIdentifier=self._description.model_identifier,
             unzipDirectory=str(folder),
@@ -120,17 +122,25 @@ class Fmi2Instance(FmuInstance):
         fmu.instantiate(callbacks=_CALLBACKS, loggingOn=False)
         self._fmu = fmu
         self._component = fmu.component
-        self._do_step = _DO_STEP(("fmi2DoStep", fmu.dll))
+        self._loaded()
+
+    def _loaded(self) -> None:
+        """Take the functions that only this kind has."""
+        self._do_step = _DO_STEP(("fmi2DoStep", self._fmu.dll))
 
     def _enter_initialization(self, start_time: float, stop_time: float | None, start_values: dict[str, Value]) -> None:
         """FMI 2.0, 2.1.6 and 4.2.1."""
-        tolerance = self._description.default_experiment.tolerance
+        tolerance = self._tolerance()
         self._initializing(
             "fmi2SetupExperiment",
             lambda: self._fmu.setupExperiment(tolerance=tolerance, startTime=start_time, stopTime=stop_time),
         )
         self.set_values(start_values)
         self._initializing("fmi2EnterInitializationMode", self._fmu.enterInitializationMode)
+
+    def _tolerance(self) -> float | None:
+        """The tolerance that the FMU is told (FMI 2.0, 2.1.6)."""
+        return self._description.default_experiment.tolerance
 
     def _exit_initialization(self) -> None:
         self._initializing("fmi2ExitInitializationMode", self._fmu.exitInitializationMode)

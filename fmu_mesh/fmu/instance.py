@@ -18,6 +18,7 @@ from fmpy.fmi1 import FMICallException
 
 from ..errors import InitializationFailed, LoadFailed, StepFailed
 from ..model.description import ModelDescription, Variable
+from ..model.instance import StepOptions
 from ..model.ring import Part, Ring
 from ..model.types import Value, VariableType, flattened, nested
 from ..model.values import to_value
@@ -62,6 +63,7 @@ class FmuInstance(ABC):
         description: what `read_description` returned for it.
         folder: an existing private folder to extract into.
         log: called with every log message, on the thread that calls the FMU.
+        options: how it is stepped.
 
     Raises:
         LoadFailed: the FMU cannot be extracted, loaded or instantiated.
@@ -74,8 +76,10 @@ class FmuInstance(ABC):
         description: ModelDescription,
         folder: Path,
         log: LogSink = lambda _message: None,
+        options: StepOptions = StepOptions(),  # noqa: B008 a frozen Struct
     ) -> None:
         self.name = name
+        self._options = options
         self._log = log
         self._last_messages: list[str] = []
         self._step = -1
@@ -177,7 +181,7 @@ class FmuInstance(ABC):
         if self._state == "closed":
             return
         if self._live:
-            if self._state in ("initialization", "stepping"):
+            if self._state == "stepping":
                 _quietly(self._terminate)
             _quietly(self._free)
         self._live = False

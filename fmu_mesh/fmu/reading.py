@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import zipfile
 from pathlib import Path
+from typing import Literal
 
 import fmpy
 from fmpy.model_description import ModelDescription as FmpyDescription
@@ -15,7 +16,7 @@ from fmpy.model_description import ModelVariable, read_model_description
 from fmpy.model_description import ValidationError as FmpyValidationError
 
 from ..errors import LoadFailed
-from ..model.description import DefaultExperiment, ModelDescription, Value, Variable, VariableType
+from ..model.description import DefaultExperiment, Kind, ModelDescription, Value, Variable, VariableType
 
 __all__ = ["read_description"]
 
@@ -29,8 +30,12 @@ _TYPES: dict[str, VariableType] = {
 }
 
 
-def read_description(path: Path) -> ModelDescription:
+def read_description(path: Path, kind: Literal["auto"] | Kind = "auto") -> ModelDescription:
     """Read the model description of the FMU at ``path``.
+
+    Args:
+        path: the .fmu file.
+        kind: which kind of it is wanted; ``auto``: co-simulation if it has both.
 
     Raises:
         LoadFailed: it is no FMU, or one that cannot run here; the message says which and what would help.
@@ -44,8 +49,8 @@ def read_description(path: Path) -> ModelDescription:
     source, problems = _parse(path)
     if source.fmiVersion is None or not source.fmiVersion.startswith("2."):
         raise LoadFailed(f"'{path}' is an FMI {source.fmiVersion} FMU; FMI 2.0 co-simulation is what can run today.")
-    if source.coSimulation is None:
-        raise LoadFailed(f"'{path}' is for model exchange only; export it for co-simulation.")
+    kind = _kind(source, kind, path)
+    interface = source.coSimulation if kind == "co_simulation" else source.modelExchange
     platforms = tuple(fmpy.supported_platforms(str(path)))
     if fmpy.platform not in platforms:
         there = ", ".join(platforms) or "no platform at all"
@@ -53,13 +58,29 @@ def read_description(path: Path) -> ModelDescription:
             f"'{path}' has no binary for this platform ({fmpy.platform}); it has: {there}.",
             hint="Export it for this platform, or compile its sources into it if it has some.",
         )
-    library = f"binaries/{fmpy.platform}/{source.coSimulation.modelIdentifier}{fmpy.sharedLibraryExtension}"
+    library = f"binaries/{fmpy.platform}/{interface.modelIdentifier}{fmpy.sharedLibraryExtension}"
     if library not in names:
         raise LoadFailed(
             f"'{path}' has no '{library}', although its model identifier is "
-            f"'{source.coSimulation.modelIdentifier}' (FMI 2.0, 2.3: the library must have that name)."
+            f"'{interface.modelIdentifier}' (FMI 2.0, 2.3: the library must have that name)."
         )
-    return _convert(source, platforms, problems)
+    return _convert(source, kind, platforms, problems)
+
+
+def _kind(source: FmpyDescription, wanted: str, path: Path) -> Kind:
+    """The kind to use: the wanted one, or the one that there is; co-simulation comes first."""
+    there: dict[Kind, bool] = {
+        "co_simulation": source.coSimulation is not None,
+        "model_exchange": source.modelExchange is not None,
+    }
+    for kind, is_there in there.items():
+        if is_there and wanted in ("auto", kind):
+            return kind
+    has = " and ".join(kind for kind, is_there in there.items() if is_there).replace("_", " ")
+    raise LoadFailed(
+        f"'{path}' is for {has or 'scheduled execution'} only, not for {wanted.replace('_', ' ')}.",
+        hint="`kind: auto` takes what there is." if has else None,
+    )
 
 
 def _archive_names(path: Path) -> frozenset[str]:
@@ -95,8 +116,10 @@ def _parse(path: Path) -> tuple[FmpyDescription, tuple[str, ...]]:
         raise LoadFailed(f"the modelDescription.xml of '{path}' cannot be read: {error}") from error
 
 
-def _convert(source: FmpyDescription, platforms: tuple[str, ...], problems: tuple[str, ...]) -> ModelDescription:
-    co_simulation = source.coSimulation
+def _convert(
+    source: FmpyDescription, kind: Kind, platforms: tuple[str, ...], problems: tuple[str, ...]
+) -> ModelDescription:
+    interface = source.coSimulation if kind == "co_simulation" else source.modelExchange
     experiment = source.defaultExperiment
     dependencies = {
         unknown.variable.name: None
@@ -107,9 +130,9 @@ def _convert(source: FmpyDescription, platforms: tuple[str, ...], problems: tupl
     }
     return ModelDescription(
         model_name=source.modelName or "",
-        model_identifier=co_simulation.modelIdentifier,
+        model_identifier=interface.modelIdentifier,
         fmi_version=source.fmiVersion or "",
-        kind="co_simulation",
+        kind=kind,
         guid=source.guid or "",
         variables=tuple(
             _variable(variable, dependencies) for variable in source.modelVariables if variable.type in _TYPES
@@ -122,11 +145,18 @@ def _convert(source: FmpyDescription, platforms: tuple[str, ...], problems: tupl
             step_size=_number(getattr(experiment, "stepSize", None)),
             tolerance=_number(getattr(experiment, "tolerance", None)),
         ),
-        can_handle_variable_step_size=bool(co_simulation.canHandleVariableCommunicationStepSize),
-        can_get_and_set_state=bool(co_simulation.canGetAndSetFMUstate),
-        can_serialize_state=bool(co_simulation.canSerializeFMUstate),
-        only_once_per_process=bool(co_simulation.canBeInstantiatedOnlyOncePerProcess),
-        needs_execution_tool=bool(co_simulation.needsExecutionTool),
+        can_handle_variable_step_size=bool(getattr(interface, "canHandleVariableCommunicationStepSize", True)),
+        can_get_and_set_state=bool(interface.canGetAndSetFMUstate),
+        can_serialize_state=bool(interface.canSerializeFMUstate),
+        only_once_per_process=bool(interface.canBeInstantiatedOnlyOncePerProcess),
+        needs_execution_tool=bool(interface.needsExecutionTool),
+        can_interpolate_inputs=bool(getattr(interface, "canInterpolateInputs", False)),
+        has_event_mode=bool(getattr(interface, "hasEventMode", False)),
+        # FMI 1.0 has no flag for it, and wants to be told.
+        tell_completed_steps=bool(getattr(interface, "needsCompletedIntegratorStep", False))
+        or (source.fmiVersion or "").startswith("1."),
+        continuous_states=int(source.numberOfContinuousStates),
+        event_indicators=int(source.numberOfEventIndicators),
         platforms=platforms,
         problems=problems,
     )

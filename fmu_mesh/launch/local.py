@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import FmuMeshError, Interrupted, StepFailed, TerminationRequested
-from ..fmu import Fmi2Instance, LogMessage
+from ..fmu import LogMessage, open_fmu, stepped
 from ..model.elements import scaled
 from ..model.instance import Instance
 from ..model.plan import Plan
@@ -115,7 +115,8 @@ class LocalMesh:
         if self._open_instance is not None:
             return self._open_instance(name)
         system = self._plan.system.instances[name]
-        return Fmi2Instance(Path(system.fmu), name, system.description, folder, self._log)
+        options = self._plan.nodes[system.node].instance(name).options
+        return stepped(open_fmu(Path(system.fmu), name, system.description, folder, self._log, options), options)
 
     def _initialize(self, members: dict[str, _Member]) -> None:
         grid = self._plan.grid

@@ -69,19 +69,20 @@ def _with_options(loaded: LoadedConfig, options: Options) -> LoadedConfig:
 
 def _descriptions(loaded: LoadedConfig) -> tuple[dict[str, ModelDescription], Sequence[Finding]]:
     """The description of every instance whose FMU can be read, and a finding for every other."""
-    cache: dict[Path, ModelDescription | LoadFailed] = {}
+    cache: dict[tuple[Path, str], ModelDescription | LoadFailed] = {}
     descriptions: dict[str, ModelDescription] = {}
     findings = []
     for name, instance in loaded.config.instances.items():
         if not instance.fmu:
             continue  # what stands there instead is a finding already
         path = loaded.resolve(instance.fmu)
-        if path not in cache:
+        key = (path, instance.kind)
+        if key not in cache:
             try:
-                cache[path] = read_description(path)
+                cache[key] = read_description(path, instance.kind)
             except LoadFailed as error:
-                cache[path] = error
-        found = cache[path]
+                cache[key] = error
+        found = cache[key]
         if isinstance(found, LoadFailed):
             text = found.message.rstrip(".") + (f" ({found.hint.rstrip('.')})" if found.hint else "")
             expected = "an FMI 2.0 co-simulation FMU for this platform"

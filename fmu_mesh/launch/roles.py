@@ -15,10 +15,11 @@ from pathlib import Path
 import msgspec
 
 from ..errors import ConfigurationError, FmuMeshError, StepFailed
-from ..fmu import Fmi2Instance, LogMessage, read_description
+from ..fmu import FmuInstance, LogMessage, open_fmu, read_description, stepped
 from ..master.master import Master
 from ..master.profiling import GrantWatch
 from ..model.findings import listed, nearest
+from ..model.instance import Instance
 from ..model.loading import load
 from ..model.plan import RECORDER, NodePlan, Plan
 from ..node.node import Node
@@ -71,7 +72,7 @@ class _NodeProcess:
         self._plan = plan
         self._zenoh = zenoh_section(load(config_file), options)
         self._folder = folder
-        self._instances: list[Fmi2Instance] = []
+        self._instances: list[FmuInstance] = []
         self._node: Node | None = None
         self._interrupted: str | None = None
 
@@ -96,12 +97,13 @@ class _NodeProcess:
                 error.told = child and node.failure_is_known
                 raise
 
-    def _open(self, name: str) -> Fmi2Instance:
+    def _open(self, name: str) -> Instance:
         item = self._plan.instance(name)
         path = Path(item.fmu)
-        instance = Fmi2Instance(path, name, read_description(path), self._folder / "fmus", self._log)
+        description = read_description(path, item.kind)
+        instance = open_fmu(path, name, description, self._folder / "fmus", self._log, item.options)
         self._instances.append(instance)
-        return instance
+        return stepped(instance, item.options)
 
     def _log(self, message: LogMessage) -> None:
         point = max(message.step, 0) * self._plan.instance(message.instance).step_points

@@ -18,6 +18,7 @@ from .types import PlainValue, Value, VariableType, element_names, split_element
 __all__ = [
     "Causality",
     "DefaultExperiment",
+    "Kind",
     "ModelDescription",
     "PlainValue",
     "Value",
@@ -31,6 +32,7 @@ Causality = Literal[
 ]
 Variability = Literal["constant", "fixed", "tunable", "discrete", "continuous"]
 Initial = Literal["exact", "approx", "calculated"]
+Kind = Literal["co_simulation", "model_exchange"]
 
 
 class Variable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -107,7 +109,7 @@ class ModelDescription(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     model_name: str
     model_identifier: str
     fmi_version: str
-    kind: Literal["co_simulation"]
+    kind: Kind
     guid: str
     variables: tuple[Variable, ...]
     description: str | None = None
@@ -118,6 +120,11 @@ class ModelDescription(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     can_serialize_state: bool = False
     only_once_per_process: bool = False
     needs_execution_tool: bool = False
+    can_interpolate_inputs: bool = False
+    has_event_mode: bool = False
+    tell_completed_steps: bool = False
+    continuous_states: int = 0
+    event_indicators: int = 0
     platforms: tuple[str, ...] = ()
     problems: tuple[str, ...] = ()
 

@@ -15,9 +15,12 @@ from msgspec.structs import replace
 from ..errors import ConfigurationError, Finding
 from ..simtime import TimeGrid
 from .config import TimeoutsConfig
+from .description import Kind
 from .graph import cycle_through, feedback_edges, strongly_connected, topological_order
 from .initialization import InitializationPlan, plan_initialization
+from .instance import StepOptions
 from .ring import Layout, rows_for
+from .step_options import linear_inputs
 from .system import Connection, System, SystemInstance
 from .types import PlainValue
 from .values import to_plain
@@ -59,6 +62,8 @@ class InstancePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         initialization: the levels at which connected outputs become known in Initialization Mode, by name.
         held: connected inputs, or elements of them, that keep their start value in Initialization Mode, because their
             connection closes a loop there.
+        kind: which kind of the FMU is used.
+        options: how it is stepped.
     """
 
     name: str
@@ -70,6 +75,8 @@ class InstancePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     feeds: tuple[Feed, ...]
     initialization: dict[str, int]
     held: tuple[str, ...] = ()
+    kind: Kind = "co_simulation"
+    options: StepOptions = StepOptions()
 
 
 class Link(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -358,6 +365,8 @@ def _instance_plan(plan: Plan, instance: SystemInstance, outputs: Layout) -> Ins
         feeds=tuple(Feed(source=s, delay=d, columns=tuple(columns)) for (s, d), columns in sorted(feeds.items())),
         initialization={variable: level for (owner, variable), level in levels.items() if owner == instance.name},
         held=tuple(variable for owner, variable in plan.initialization.held if owner == instance.name),
+        kind=instance.description.kind,
+        options=replace(instance.options, linear_inputs=linear_inputs(plan.connections, instance.name)),
     )
 
 

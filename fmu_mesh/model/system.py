@@ -24,9 +24,11 @@ from fmu_mesh.model.connection import (
 from fmu_mesh.model.description import ModelDescription, Value
 from fmu_mesh.model.findings import Findings, nearest_file, shown
 from fmu_mesh.model.grouping import automatic_nodes
+from fmu_mesh.model.instance import StepOptions
 from fmu_mesh.model.loading import LoadedConfig
 from fmu_mesh.model.start_values import resolve_start_values, sized
 from fmu_mesh.model.types import element_name, is_text
+from fmu_mesh.model.step_options import capability_warnings, check_extrapolation, resolve_step_options
 from fmu_mesh.simtime import TimeGrid, steps_between
 
 __all__ = ["Connection", "System", "SystemInstance", "build"]
@@ -45,6 +47,7 @@ class SystemInstance(msgspec.Struct, frozen=True):
         start_values: start values by variable name, converted to the variable's type.
         step_points: its step size as a multiple of the base step size; 1 or more.
         node: name of the node (process) it runs in: its group, that of its cycle (`group: auto`), or its own name.
+        options: how it is stepped; its linear inputs are not known before the delays.
     """
 
     name: str
@@ -53,6 +56,7 @@ class SystemInstance(msgspec.Struct, frozen=True):
     start_values: dict[str, Value]
     step_points: int
     node: str
+    options: StepOptions = StepOptions()
 
 
 class System(msgspec.Struct, frozen=True):
@@ -105,6 +109,7 @@ def build(
     instances = _instances(loaded, descriptions, variables, collected)
     _check_nodes(config, descriptions, collected)
     connections = resolve_connections(config.connections, variables, collected)
+    check_extrapolation(connections, descriptions, collected)
     recorded = _recorded(config, variables, collected)
     result_file = _result_file(loaded, collected)
     _check_zenoh(loaded, collected)
@@ -119,6 +124,7 @@ def build(
         instances = {name: replace(own, node=nodes.get(name, own.node)) for name, own in instances.items()}
     warnings = loaded.findings()
     unit_warnings(connections, warnings)
+    capability_warnings(config.instances, descriptions, warnings)
     return System(config, grid, instances, connections, recorded, result_file, tuple(warnings))
 
 
@@ -174,6 +180,7 @@ def _instances(
             start_values=resolve_start_values(name, config, own, findings),
             step_points=step_points,
             node=config.group or name,
+            options=resolve_step_options(name, config, descriptions[name], findings),
         )
     return instances
 

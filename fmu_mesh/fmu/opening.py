@@ -1,0 +1,39 @@
+"""From a model description to an instance: which class serves a kind and version of FMI."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import cast
+
+from ..model.description import ModelDescription
+from ..model.instance import Instance, StepOptions
+from .extrapolation import LinearInputs, TakesDerivatives
+from .fmi2 import Fmi2Instance
+from .fmi2_model import Fmi2ModelInstance
+from .instance import FmuInstance, LogSink
+
+__all__ = ["open_fmu", "stepped"]
+
+
+def open_fmu(
+    path: Path,
+    name: str,
+    description: ModelDescription,
+    folder: Path,
+    log: LogSink = lambda _message: None,
+    options: StepOptions = StepOptions(),  # noqa: B008 a frozen Struct
+) -> FmuInstance:
+    """The FMU at ``path`` as an instance; see `FmuInstance`.
+
+    Raises:
+        LoadFailed: it cannot be extracted, loaded or instantiated.
+    """
+    kind = Fmi2ModelInstance if description.kind == "model_exchange" else Fmi2Instance
+    return kind(path, name, description, folder, log, options)
+
+
+def stepped(instance: FmuInstance, options: StepOptions) -> Instance:
+    """The instance with linear inputs if it has some; ``instance`` stays the one to close."""
+    if not options.linear_inputs:
+        return instance
+    return LinearInputs(cast("TakesDerivatives", instance), options.linear_inputs)
