@@ -8,6 +8,7 @@ point to the next is `fmu_mesh.fmu.model_exchange`; how its functions are called
 from __future__ import annotations
 
 import ctypes
+import math
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from typing import TypeVar
@@ -22,11 +23,12 @@ from .instance import STATUS_NAMES, WARNING, FmuInstance
 from .model_calls import ModelCalls
 from .model_exchange import EventLoop
 from .solver import SolverFailed
+from .state import Standing
 
 __all__ = ["ContinuousInstance"]
 
 T = TypeVar("T")
-_RowBytes = tuple[bytes | list[object], ...]
+_RowBytes = tuple[bytes | list[str], ...]
 
 
 class ContinuousInstance(FmuInstance):
@@ -82,6 +84,25 @@ class ContinuousInstance(FmuInstance):
             self._loop.close()
             self._loop = None
 
+    def _standing(self) -> Standing:
+        """The solver begins anew where a state was taken, so that it makes no difference whether one goes back to it."""
+        loop = self._event_loop()
+        time, next_event = loop.place
+        self._guarded(lambda: loop.resume(time, next_event))
+        return Standing(self._step, time, next_event if math.isfinite(next_event) else None, self._row)
+
+    def _stand(self, standing: Standing) -> None:
+        super()._stand(standing)
+        self._row = standing.row
+        time, next_event = standing.time or 0.0, standing.next_event
+
+        def resume() -> None:
+            if self._loop is None:
+                self._make_loop()
+            self._event_loop().resume(time, math.inf if next_event is None else next_event)
+
+        self._guarded(resume)
+
     @abstractmethod
     def _model_calls(self) -> ModelCalls:
         """The functions of the model, once it is instantiated."""
@@ -90,14 +111,15 @@ class ContinuousInstance(FmuInstance):
         """After Initialization Mode: the first event, and into continuous-time mode."""
 
         def start() -> None:
-            self._loop = EventLoop(
-                self._model_calls(),
-                self._options.solver,
-                tell_completed_steps=self._description.tell_completed_steps,
-            )
-            self._loop.start(start_time)
+            self._make_loop().start(start_time)
 
         self._guarded(start)
+
+    def _make_loop(self) -> EventLoop:
+        self._loop = EventLoop(
+            self._model_calls(), self._options.solver, tell_completed_steps=self._description.tell_completed_steps
+        )
+        return self._loop
 
     def _event_loop(self) -> EventLoop:
         if self._loop is None:

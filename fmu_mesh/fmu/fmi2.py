@@ -16,6 +16,7 @@ import numpy as np
 from fmpy.fmi1 import FMICallException
 from fmpy.fmi2 import (
     FMU2Slave,
+    fmi2Terminated,
     fmi2CallbackAllocateMemoryTYPE,
     fmi2CallbackFreeMemoryTYPE,
     fmi2CallbackFunctions,
@@ -23,11 +24,13 @@ from fmpy.fmi2 import (
 )
 from fmpy.logging import addLoggerProxy
 
+from ..errors import FmuMeshError, TerminationRequested
 from ..model.description import Variable
 from ..model.ring import Part
 from ..model.types import Value, VariableType
 from .buffers import Buffer, NumberBuffer, StringBuffer
 from .instance import STATUS_NAMES, WARNING, FmuInstance, LogMessage, Verb
+from .substeps import DISCARD, SMALLEST, take_sub_steps
 
 __all__ = ["Fmi2Instance", "LogMessage"]
 
@@ -40,6 +43,7 @@ _SUFFIX: Final[dict[VariableType, str]] = {
     "Boolean": "Boolean",
     "String": "String",
 }
+PENDING: Final = 5
 _DIRECT: Final = ("Float64", "Int32")
 """The types that lie in a ring as in C; a Boolean and an Enumeration are an `int` in FMI 2.0 (2.1.2)."""
 
@@ -69,6 +73,7 @@ class Fmi2Instance(FmuInstance):
     """One instance of an FMI 2.0 co-simulation FMU."""
 
     _library: type[Any] = FMU2Slave
+    _retrying: _Retrying | None = None
 
     def do_step(self, step: int) -> None:
         """Set the inputs of row ``step``, advance to own step ``step + 1``, write the outputs to row ``step + 1``."""
@@ -83,7 +88,7 @@ class Fmi2Instance(FmuInstance):
         time = self._start_time + step * self._points * self._base_step_size  # `grid.time`, without a call
         status = self._do_step(component, time, self._step_size, 1)
         if status > WARNING:
-            raise self._failed(f"fmi2DoStep returned {STATUS_NAMES[status]}")
+            raise self._not_done(status)
         self._step = step + 1
         slot = (step + 1) & self._output_mask
         for function, references, count, rows, _ in self._direct_getters:
@@ -99,7 +104,7 @@ class Fmi2Instance(FmuInstance):
         try:
             self._fmu.doStep(currentCommunicationPoint=time, communicationStepSize=step_size)
         except FMICallException as error:
-            raise self._failed(f"{error.function} returned {STATUS_NAMES[error.status]}") from error
+            raise self._not_done(error.status) from error
 
     def close(self) -> None:
         """Terminate if allowed, free the instance and remove its files. Never raises; may be called twice."""
@@ -126,7 +131,28 @@ class Fmi2Instance(FmuInstance):
 
     def _loaded(self) -> None:
         """Take the functions that only this kind has."""
-        self._do_step = _DO_STEP(("fmi2DoStep", self._fmu.dll))
+        self._do_step: Callable[..., int] = _DO_STEP(("fmi2DoStep", self._fmu.dll))
+        if self._options.retry_discarded_steps:
+            self._retrying = _Retrying(self._fmu, self._do_step, self._asks_to_end, self._failed)
+            self._do_step = self._retrying
+
+    def _not_done(self, status: int) -> FmuMeshError:
+        """Why a step was not taken (FMI 2.0, 4.2.1): it failed, or the FMU asks to end the simulation."""
+        if status == DISCARD:
+            if self._asks_to_end() if self._retrying is None else self._retrying.ends:
+                return TerminationRequested("the FMU asked to end the simulation", instance=self.name)
+            if self._retrying is not None:
+                return self._failed(f"fmi2DoStep returned discard down to 1/{SMALLEST} of the step")
+        return self._failed(f"fmi2DoStep returned {STATUS_NAMES[status]}")
+
+    def _asks_to_end(self) -> bool:
+        """Whether a discarded step is a wish to end the simulation; most FMUs do not know of this question."""
+        value = ctypes.c_int(0)
+        try:
+            self._fmu.fmi2GetBooleanStatus(self._component, fmi2Terminated, ctypes.byref(value))
+        except FMICallException:
+            return False
+        return bool(value.value)
 
     def _enter_initialization(self, start_time: float, stop_time: float | None, start_values: dict[str, Value]) -> None:
         """FMI 2.0, 2.1.6 and 4.2.1."""
@@ -149,6 +175,8 @@ class Fmi2Instance(FmuInstance):
         self._fmu.terminate()
 
     def _free(self) -> None:
+        if self._retrying is not None:
+            self._retrying.free()
         self._fmu.freeInstance()
 
     def _function_name(self, verb: Verb, type_: VariableType) -> str:
@@ -171,3 +199,51 @@ class Fmi2Instance(FmuInstance):
 
     def _call_direct(self, function: Callable[..., int], references: int, count: int, row: int, _size: int) -> int:
         return function(self._component, references, count, row)
+
+
+class _Retrying:
+    """fmi2DoStep that goes back to where a discarded step began, and takes smaller ones.
+
+    After fmi2Discard, only fmi2SetFMUstate leads on (FMI 2.0, 4.2.4), so the state is kept before every step.
+
+    Attributes:
+        ends: whether the last discarded step was a wish to end the simulation.
+    """
+
+    def __init__(
+        self,
+        fmu: Any,  # noqa: ANN401 FMPy is untyped
+        do_step: Callable[..., int],
+        asks_to_end: Callable[[], bool],
+        failed: Callable[[str], Exception],
+    ) -> None:
+        self.ends = False
+        self._fmu = fmu
+        self._do_step = do_step
+        self._asks_to_end = asks_to_end
+        self._failed = failed
+        self._state = ctypes.c_void_p()
+
+    def __call__(self, component: int, time: float, step_size: float, _no_set_state: int) -> int:
+        def attempt(start: float, size: float) -> int:
+            self._fmu.fmi2GetFMUstate(component, ctypes.byref(self._state))
+            status = self._do_step(component, start, size, 0)
+            if status == DISCARD:
+                self.ends = self._asks_to_end()
+                if self.ends:
+                    return PENDING
+                self._fmu.fmi2SetFMUstate(component, self._state)
+            return status
+
+        try:
+            status = attempt(time, step_size)
+            if status == DISCARD:
+                status = take_sub_steps(attempt, time, step_size)
+        except FMICallException as error:
+            raise self._failed(f"{error.function} returned {STATUS_NAMES[error.status]}") from error
+        return DISCARD if self.ends else status
+
+    def free(self) -> None:
+        """Free the state that was kept."""
+        if self._state:
+            self._fmu.fmi2FreeFMUstate(self._fmu.component, ctypes.byref(self._state))

@@ -25,6 +25,7 @@ from ..model.values import to_value
 from ..simtime import TimeGrid
 from .archive import extract
 from .buffers import Buffer
+from .state import KeepsFmuState, Standing
 
 __all__ = ["OK", "STATUS_NAMES", "WARNING", "FmuInstance", "LogMessage", "LogSink", "Verb"]
 
@@ -54,7 +55,7 @@ class LogMessage(msgspec.Struct, frozen=True):
 LogSink = Callable[[LogMessage], None]
 
 
-class FmuInstance(ABC):
+class FmuInstance(KeepsFmuState, ABC):
     """One instance of an FMU; see `fmu_mesh.model.instance.Instance` for the call sequence.
 
     Args:
@@ -238,6 +239,15 @@ class FmuInstance(ABC):
     @abstractmethod
     def _call(self, function: Callable[..., int], references: Sequence[int], buffer: Buffer, size: int) -> int:
         """Call a getter or setter on a buffer with ``size`` values; returns the status."""
+
+    # --- the state
+
+    def _standing(self) -> Standing:
+        return Standing(self._step)
+
+    def _stand(self, standing: Standing) -> None:
+        self._step = standing.step
+        self._state = "stepping"
 
     # --- shared by the versions
 

@@ -14,6 +14,8 @@ from typing import Any, Final, Protocol
 import numpy as np
 from fmpy.fmi1 import FMICallException
 
+from ..simtime import steps_between
+
 __all__ = ["CVodeSolver", "EulerSolver", "Equations", "Solver", "SolverFailed", "make_solver", "resolvable"]
 
 DISCARD: Final = 2
@@ -124,17 +126,20 @@ class EulerSolver:
         self._derivatives = np.zeros(equations.n_states)
         self._indicators = np.zeros(equations.n_indicators)
         self._before = np.zeros(equations.n_indicators, dtype=bool)
+        self._steps: list[float] = []
 
     def restart(self, time: float) -> None:  # noqa: ARG002 the Protocol
         """Take the states of the model."""
         if self._equations.n_states:
             self._equations.get_states(self._states.ctypes.data)
         self._before = self._above_zero()
+        self._steps = []
 
     def step(self, time: float, stop: float) -> tuple[float, bool]:
         """See `Solver.step`."""
-        count = 1 if self._maximum is None else math.ceil((stop - time) / self._maximum)
-        end = stop if count <= 1 else time + (stop - time) / count
+        if not self._steps or self._steps[0] != stop:
+            self._steps = self._divided(time, stop)
+        end = self._steps.pop()
         if self._equations.n_states:
             self._equations.get_derivatives(self._derivatives.ctypes.data)
             self._states += (end - time) * self._derivatives
@@ -146,6 +151,14 @@ class EulerSolver:
 
     def close(self) -> None:
         """Nothing to free."""
+
+    def _divided(self, time: float, stop: float) -> list[float]:
+        """The ends of equal steps, no longer than allowed, from ``time`` to ``stop``; the first one is the last item."""
+        if self._maximum is None:
+            return [stop]
+        whole = steps_between(stop - time, self._maximum)
+        count = max(1, math.ceil((stop - time) / self._maximum) if whole is None else whole)
+        return [stop, *(time + (stop - time) * (number / count) for number in range(count - 1, 0, -1))]
 
     def _above_zero(self) -> np.ndarray[Any, np.dtype[np.bool_]]:
         if self._equations.n_indicators:
