@@ -13,7 +13,7 @@ from typing import Any, Final, NamedTuple
 from fmpy.fmi1 import FMICallException, fmi1EventInfo
 from fmpy.fmi2 import fmi2EventInfo
 
-__all__ = ["EventInfo", "ModelCalls", "model_calls"]
+__all__ = ["EventInfo", "Fmi1Calls", "Fmi3Calls", "ModelCalls", "event_info_1"]
 
 WARNING: Final = 1
 
@@ -125,7 +125,7 @@ class ModelCalls:
         return bool(event), bool(terminate)
 
 
-class _Fmi1Calls(ModelCalls):
+class Fmi1Calls(ModelCalls):
     """FMI 1.0: there are no modes; events are handled by fmiEventUpdate (FMI 1.0, 2.8)."""
 
     def _differing(self) -> tuple[Any, Any]:
@@ -148,8 +148,11 @@ class _Fmi1Calls(ModelCalls):
         return bool(self._fmu.completedIntegratorStep()), False
 
 
-class _Fmi3Calls(ModelCalls):
-    """FMI 3.0."""
+class Fmi3Calls(ModelCalls):
+    """FMI 3.0, where the FMU says itself how many states and indicators it has: it depends on structural parameters."""
+
+    def __init__(self, fmu: Any) -> None:  # noqa: ANN401 FMPy is untyped
+        super().__init__(fmu, fmu.getNumberOfContinuousStates(), fmu.getNumberOfEventIndicators(), "fmi3")
 
     def _differing(self) -> tuple[Any, Any]:
         return (
@@ -167,14 +170,3 @@ def event_info_1(info: fmi1EventInfo) -> EventInfo:
     """The event information of FMI 1.0, whose Booleans are characters."""
     next_event = info.nextEventTime if info.upcomingTimeEvent != b"\0" else math.inf
     return EventInfo(info.iterationConverged == b"\0", info.terminateSimulation != b"\0", next_event)
-
-
-def model_calls(fmu: Any, version: str, n_states: int, n_indicators: int) -> ModelCalls:  # noqa: ANN401 FMPy is untyped
-    """The functions of an instantiated FMU; ``version`` is that of its model description."""
-    match version[:1]:
-        case "1":
-            return _Fmi1Calls(fmu, n_states, n_indicators, f"{fmu.modelIdentifier}_fmi")
-        case "3":
-            return _Fmi3Calls(fmu, fmu.getNumberOfContinuousStates(), fmu.getNumberOfEventIndicators(), "fmi3")
-        case _:
-            return ModelCalls(fmu, n_states, n_indicators, "fmi2")

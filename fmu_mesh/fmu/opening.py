@@ -3,16 +3,25 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import cast
+from typing import Final, cast
 
-from ..model.description import ModelDescription
+from ..model.description import Kind, ModelDescription
 from ..model.instance import Instance, StepOptions
 from .extrapolation import LinearInputs, TakesDerivatives
 from .fmi2 import Fmi2Instance
 from .fmi2_model import Fmi2ModelInstance
+from .fmi3 import Fmi3Instance
+from .fmi3_model import Fmi3ModelInstance
 from .instance import FmuInstance, LogSink
 
 __all__ = ["open_fmu", "stepped"]
+
+_KINDS: Final[dict[tuple[str, Kind], type[FmuInstance]]] = {
+    ("2", "co_simulation"): Fmi2Instance,
+    ("2", "model_exchange"): Fmi2ModelInstance,
+    ("3", "co_simulation"): Fmi3Instance,
+    ("3", "model_exchange"): Fmi3ModelInstance,
+}
 
 
 def open_fmu(
@@ -28,7 +37,7 @@ def open_fmu(
     Raises:
         LoadFailed: it cannot be extracted, loaded or instantiated.
     """
-    kind = Fmi2ModelInstance if description.kind == "model_exchange" else Fmi2Instance
+    kind = _KINDS[description.fmi_version[:1], description.kind]
     return kind(path, name, description, folder, log, options)
 
 

@@ -15,8 +15,11 @@ from fmpy.model_description import ModelDescription as FmpyDescription
 from fmpy.model_description import ModelVariable, read_model_description
 from fmpy.model_description import ValidationError as FmpyValidationError
 
+from msgspec.structs import replace
+
 from ..errors import LoadFailed
 from ..model.description import DefaultExperiment, Kind, ModelDescription, Value, Variable, VariableType
+from .reading_clocks import read_clocks
 
 __all__ = ["read_description"]
 
@@ -27,6 +30,8 @@ _TYPES: dict[str, VariableType] = {
     "Boolean": "Boolean",
     "String": "String",
     "Enumeration": "Enumeration",
+    "Float64": "Float64",
+    "Int32": "Int32",
 }
 
 
@@ -47,24 +52,28 @@ def read_description(path: Path, kind: Literal["auto"] | Kind = "auto") -> Model
             hint="An FMU that was zipped inside a folder of its own must be zipped again without that folder.",
         )
     source, problems = _parse(path)
-    if source.fmiVersion is None or not source.fmiVersion.startswith("2."):
+    if source.fmiVersion is None or not source.fmiVersion.startswith(("2.", "3.")):
         raise LoadFailed(f"'{path}' is an FMI {source.fmiVersion} FMU; FMI 2.0 co-simulation is what can run today.")
     kind = _kind(source, kind, path)
     interface = source.coSimulation if kind == "co_simulation" else source.modelExchange
     platforms = tuple(fmpy.supported_platforms(str(path)))
-    if fmpy.platform not in platforms:
+    if fmpy.platform not in platforms and 'x86_64-linux' not in platforms:
         there = ", ".join(platforms) or "no platform at all"
         raise LoadFailed(
             f"'{path}' has no binary for this platform ({fmpy.platform}); it has: {there}.",
             hint="Export it for this platform, or compile its sources into it if it has some.",
         )
-    library = f"binaries/{fmpy.platform}/{interface.modelIdentifier}{fmpy.sharedLibraryExtension}"
+    folder = fmpy.platform if source.fmiVersion.startswith("2.") else "x86_64-linux"
+    library = f"binaries/{folder}/{interface.modelIdentifier}{fmpy.sharedLibraryExtension}"
     if library not in names:
         raise LoadFailed(
             f"'{path}' has no '{library}', although its model identifier is "
             f"'{interface.modelIdentifier}' (FMI 2.0, 2.3: the library must have that name)."
         )
-    return _convert(source, kind, platforms, problems)
+    description = _convert(source, kind, platforms, problems)
+    if any(variable.type == "Clock" for variable in source.modelVariables):
+        return replace(description, clocks=read_clocks(path))
+    return description
 
 
 def _kind(source: FmpyDescription, wanted: str, path: Path) -> Kind:

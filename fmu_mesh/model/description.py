@@ -17,6 +17,7 @@ from .types import PlainValue, Value, VariableType, element_names, split_element
 
 __all__ = [
     "Causality",
+    "Clock",
     "DefaultExperiment",
     "Kind",
     "ModelDescription",
@@ -103,6 +104,23 @@ class DefaultExperiment(msgspec.Struct, frozen=True, forbid_unknown_fields=True)
     tolerance: float | None = None
 
 
+class Clock(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One clock of an FMI 3.0 model description (FMI 3.0, 2.2.8).
+
+    Attributes:
+        interval_variability: constant, fixed, tunable, changing, countdown or triggered.
+        interval: in s; None where parameters or the FMU decide.
+        shift: time of the first tick after the start, in s.
+    """
+
+    name: str
+    value_reference: int
+    causality: Causality
+    interval_variability: str
+    interval: float | None = None
+    shift: float = 0.0
+
+
 class ModelDescription(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A model description (FMI 2.0, 2.2) as far as the mesh needs it."""
 
@@ -125,6 +143,7 @@ class ModelDescription(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     tell_completed_steps: bool = False
     continuous_states: int = 0
     event_indicators: int = 0
+    clocks: tuple[Clock, ...] = ()
     platforms: tuple[str, ...] = ()
     problems: tuple[str, ...] = ()
 
