@@ -183,6 +183,8 @@ _CV_ONE_STEP: Final = 2
 _CV_ROOT_RETURN: Final = 2
 _RETRY_SMALLER: Final = 1
 _GIVE_UP: Final = -1
+_MOST_STALLED: Final = 100
+"""Solver steps in a row that do not advance time beyond rounding."""
 
 
 class CVodeSolver:
@@ -208,6 +210,7 @@ class CVodeSolver:
         self._root = _ROOT(self._on_root)
         self._handler = _HANDLER(self._on_error)
         self._started = False
+        self._stalled = 0
         self._context = ctypes.c_void_p()
         self._check(api.SUNContext_Create(0, ctypes.byref(self._context)))
         self._check(api.SUNContext_ClearErrHandlers(self._context))  # the default one writes to standard error
@@ -246,9 +249,10 @@ class CVodeSolver:
             self._check(api.CVodeRootInit(self._memory, self._equations.n_indicators, self._root))
         if self._maximum is not None:
             self._check(api.CVodeSetMaxStep(self._memory, self._maximum))
+        self._check(api.CVodeSetMaxHnilWarns(self._memory, -1))  # they would go to standard output
         self._started = True
 
-    def step(self, time: float, stop: float) -> tuple[float, bool]:  # noqa: ARG002 CVode knows where it is
+    def step(self, time: float, stop: float) -> tuple[float, bool]:
         """See `Solver.step`."""
         reached = ctypes.c_double()
         self._failure = None
@@ -258,6 +262,9 @@ class CVodeSolver:
             if self._failure is not None:
                 raise self._failure
             raise SolverFailed(self._said or f"CVode returned {flag}")
+        self._stalled = 0 if resolvable(time, reached.value) else self._stalled + 1
+        if self._stalled > _MOST_STALLED:
+            raise self._failure or SolverFailed(f"CVode makes no progress at t = {time:.12g} s")
         self._equations.set_point(reached.value, self._x_data)
         return reached.value, flag == _CV_ROOT_RETURN
 
@@ -361,6 +368,7 @@ class _Sundials:
         self.CVodeSetNoInactiveRootWarn = declare(cvode, "CVodeSetNoInactiveRootWarn", integer, pointer)
         self.CVodeRootInit = declare(cvode, "CVodeRootInit", integer, pointer, integer, _ROOT)
         self.CVodeSetMaxStep = declare(cvode, "CVodeSetMaxStep", integer, pointer, real)
+        self.CVodeSetMaxHnilWarns = declare(cvode, "CVodeSetMaxHnilWarns", integer, pointer, integer)
         self.CVodeSetStopTime = declare(cvode, "CVodeSetStopTime", integer, pointer, real)
         self.CVode = declare(cvode, "CVode", integer, pointer, real, pointer, pointer, integer)
         self.CVodeFree = declare(cvode, "CVodeFree", None, pointer)

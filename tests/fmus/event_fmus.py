@@ -222,7 +222,8 @@ def _kinds(name: str, changes: dict[str, str], defaults: dict[str, str]) -> str:
     shared = {key: value for key, value in attributes.items() if key in _SHARED}
     kinds = ""
     if only != "co_simulation":
-        kinds += f'  <ModelExchange modelIdentifier="{name}"{_written(shared)}/>\n'
+        told = {} if "canGetAndSetFMUstate" in defaults else {"needsCompletedIntegratorStep": "true"}
+        kinds += f'  <ModelExchange modelIdentifier="{name}"{_written(shared | told)}/>\n'
     if only != "model_exchange":
         kinds += f'  <CoSimulation modelIdentifier="{name}"{_written(attributes)}/>\n'
     return kinds
