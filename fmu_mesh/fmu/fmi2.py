@@ -32,7 +32,7 @@ from .buffers import Buffer, NumberBuffer, StringBuffer
 from .instance import STATUS_NAMES, WARNING, FmuInstance, LogMessage, Verb
 from .substeps import DISCARD, SMALLEST, take_sub_steps
 
-__all__ = ["Fmi2Instance", "LogMessage"]
+__all__ = ["CALLBACKS", "Fmi2Instance", "LogMessage", "listen", "silence"]
 
 _GET_OR_SET = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_size_t, ctypes.c_void_p)
 _DO_STEP = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_double, ctypes.c_double, ctypes.c_int)
@@ -47,7 +47,7 @@ PENDING: Final = 5
 _DIRECT: Final = ("Float64", "Int32")
 """The types that lie in a ring as in C; a Boolean and an Enumeration are an `int` in FMI 2.0 (2.1.2)."""
 
-_instances: dict[bytes, Fmi2Instance] = {}
+_instances: dict[bytes, FmuInstance] = {}
 
 
 def _log(_environment: int | None, name: bytes, status: int, category: bytes, message: bytes) -> None:
@@ -66,7 +66,22 @@ def _callbacks() -> fmi2CallbackFunctions:
     return callbacks
 
 
-_CALLBACKS = _callbacks()
+CALLBACKS = _callbacks()
+
+
+def listen(instance: FmuInstance) -> None:
+    """From now on, messages under its name go to this instance."""
+    key = instance.name.encode()
+    if key in _instances:
+        msg = f"two instances of one process have the name '{instance.name}'"
+        raise ValueError(msg)
+    _instances[key] = instance
+
+
+def silence(instance: FmuInstance) -> None:
+    """No messages go to this instance any more."""
+    if _instances.get(instance.name.encode()) is instance:
+        del _instances[instance.name.encode()]
 
 
 class Fmi2Instance(FmuInstance):
@@ -109,22 +124,17 @@ class Fmi2Instance(FmuInstance):
     def close(self) -> None:
         """Terminate if allowed, free the instance and remove its files. Never raises; may be called twice."""
         super().close()
-        if _instances.get(self.name.encode()) is self:
-            del _instances[self.name.encode()]
+        silence(self)
 
     def _instantiate(self, folder: Path) -> None:
-        key = self.name.encode()
-        if key in _instances:
-            msg = f"two instances of one process have the name '{self.name}'"
-            raise ValueError(msg)
-        _instances[key] = self
+        listen(self)
         fmu = self._library(
             guid=self._description.guid,
             modelIdentifier=self._description.model_identifier,
             unzipDirectory=str(folder),
             instanceName=self.name,
         )
-        fmu.instantiate(callbacks=_CALLBACKS, loggingOn=False)
+        fmu.instantiate(callbacks=CALLBACKS, loggingOn=False)
         self._fmu = fmu
         self._component = fmu.component
         self._loaded()

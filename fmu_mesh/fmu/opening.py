@@ -8,6 +8,7 @@ from typing import Final, cast
 from ..model.description import Kind, ModelDescription
 from ..model.instance import Instance, StepOptions
 from .extrapolation import LinearInputs, TakesDerivatives
+from .fmi1_model import Fmi1ModelInstance
 from .fmi2 import Fmi2Instance
 from .fmi2_model import Fmi2ModelInstance
 from .fmi3 import Fmi3Instance
@@ -17,6 +18,7 @@ from .instance import FmuInstance, LogSink
 __all__ = ["open_fmu", "stepped"]
 
 _KINDS: Final[dict[tuple[str, Kind], type[FmuInstance]]] = {
+    ("1", "model_exchange"): Fmi1ModelInstance,
     ("2", "co_simulation"): Fmi2Instance,
     ("2", "model_exchange"): Fmi2ModelInstance,
     ("3", "co_simulation"): Fmi3Instance,

@@ -52,7 +52,7 @@ def read_description(path: Path, kind: Literal["auto"] | Kind = "auto") -> Model
             hint="An FMU that was zipped inside a folder of its own must be zipped again without that folder.",
         )
     source, problems = _parse(path)
-    if source.fmiVersion is None or not source.fmiVersion.startswith(("2.", "3.")):
+    if source.fmiVersion is None or not source.fmiVersion.startswith(("1.", "2.", "3.")):
         raise LoadFailed(f"'{path}' is an FMI {source.fmiVersion} FMU; FMI 2.0 co-simulation is what can run today.")
     kind = _kind(source, kind, path)
     interface = source.coSimulation if kind == "co_simulation" else source.modelExchange
@@ -63,7 +63,7 @@ def read_description(path: Path, kind: Literal["auto"] | Kind = "auto") -> Model
             f"'{path}' has no binary for this platform ({fmpy.platform}); it has: {there}.",
             hint="Export it for this platform, or compile its sources into it if it has some.",
         )
-    folder = fmpy.platform if source.fmiVersion.startswith("2.") else "x86_64-linux"
+    folder = fmpy.platform if not source.fmiVersion.startswith("3.") else "x86_64-linux"
     library = f"binaries/{folder}/{interface.modelIdentifier}{fmpy.sharedLibraryExtension}"
     if library not in names:
         raise LoadFailed(
@@ -144,7 +144,9 @@ def _convert(
         kind=kind,
         guid=source.guid or "",
         variables=tuple(
-            _variable(variable, dependencies) for variable in source.modelVariables if variable.type in _TYPES
+            _variable(variable, dependencies, one=(source.fmiVersion or "").startswith("1."))
+            for variable in source.modelVariables
+            if variable.type in _TYPES
         ),
         description=source.description,
         generation_tool=source.generationTool,
@@ -171,7 +173,8 @@ def _convert(
     )
 
 
-def _variable(source: ModelVariable, dependencies: dict[str, tuple[str, ...] | None]) -> Variable:
+def _variable(source: ModelVariable, dependencies: dict[str, tuple[str, ...] | None], *, one: bool) -> Variable:
+    """A variable; ``one``: of FMI 1.0."""
     type_ = _TYPES[source.type]
     declared = source.declaredType
     items = tuple((item.name, int(item.value)) for item in declared.items) if declared and declared.items else ()
@@ -182,7 +185,8 @@ def _variable(source: ModelVariable, dependencies: dict[str, tuple[str, ...] | N
         declared_type=source.type,
         causality=source.causality or "local",
         variability=source.variability or ("continuous" if type_ == "Float64" else "discrete"),
-        initial=source.initial,
+        # FMI 1.0 has no `initial`: what has a start value may be given another one.
+        initial=source.initial or ("exact" if one and source.start is not None else None),
         start=_start(type_, source.start),
         unit=source.unit or (declared.unit if declared is not None else None),
         description=source.description,
