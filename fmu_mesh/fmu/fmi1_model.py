@@ -18,7 +18,6 @@ from fmpy.fmi1 import (
     fmi1CallbackFreeMemoryTYPE,
     fmi1CallbackFunctions,
     fmi1CallbackLoggerTYPE,
-    fmi1EventInfo,
 )
 
 from ..model.description import Variable
@@ -78,10 +77,11 @@ class Fmi1ModelInstance(ContinuousInstance):
         )
         self._fmu.instantiate(functions=_callbacks(), loggingOn=False)
         self._component = self._fmu.component
+        description = self._description
+        self._calls = Fmi1Calls(self._fmu, description.continuous_states, description.event_indicators)
 
     def _enter_initialization(self, start_time: float, _stop_time: float | None, start_values: dict[str, Value]) -> None:
         self._time_of_start = start_time
-        self._initializing("fmiSetTime", lambda: self._fmu.setTime(start_time))
         self.set_values(start_values)
 
     def _exit_initialization(self) -> None:
@@ -91,22 +91,12 @@ class Fmi1ModelInstance(ContinuousInstance):
     def _initialize(self) -> None:
         if self._is_initialized:
             return
-        info = fmi1EventInfo()
         tolerance = self._options.solver.relative_tolerance
-        self._initializing(
-            "fmiInitialize",
-            lambda: self._fmu.fmi1Initialize(self._component, b"\1", tolerance, ctypes.byref(info)),
-        )
+        self._initializing("fmiInitialize", lambda: self._calls.initialize(self._time_of_start, tolerance))
         self._is_initialized = True
 
     def _model_calls(self) -> ModelCalls:
-        description = self._description
-        return Fmi1Calls(
-            self._fmu,
-            description.continuous_states,
-            description.event_indicators,
-            f"{description.model_identifier}_fmi",
-        )
+        return self._calls
 
     def _terminate(self) -> None:
         self._fmu.fmi1Terminate(self._component)

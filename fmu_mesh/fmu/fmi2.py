@@ -7,7 +7,7 @@ that are allocated once: an input row is set from, and an output row read into, 
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -120,6 +120,14 @@ class Fmi2Instance(FmuInstance):
             self._fmu.doStep(currentCommunicationPoint=time, communicationStepSize=step_size)
         except FMICallException as error:
             raise self._not_done(error.status) from error
+
+    def set_input_derivatives(self, derivatives: Mapping[str, float]) -> None:
+        """First time derivatives (1/s) of Real inputs for the next step (FMI 2.0, 4.2.1)."""
+        references = [self._variables[name].value_reference for name in derivatives]
+        try:
+            self._fmu.setRealInputDerivatives(references, [1] * len(references), list(derivatives.values()))
+        except FMICallException as error:
+            raise self._failed(f"{error.function} returned {STATUS_NAMES[error.status]}") from error
 
     def close(self) -> None:
         """Terminate if allowed, free the instance and remove its files. Never raises; may be called twice."""

@@ -13,13 +13,15 @@ from typing import Any, Final, NamedTuple
 from fmpy.fmi1 import FMICallException, fmi1EventInfo
 from fmpy.fmi2 import fmi2EventInfo
 
-__all__ = ["EventInfo", "Fmi1Calls", "Fmi3Calls", "ModelCalls", "event_info_1"]
+__all__ = ["EventInfo", "Fmi1Calls", "Fmi3Calls", "ModelCalls"]
 
 WARNING: Final = 1
 
 _ARRAY = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_size_t)
 _TIME = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_double)
-_PLAIN = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p)
+_EVENT_UPDATE = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_char, ctypes.c_void_p)
+_COMPLETED = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p)
+_INITIALIZE = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_char, ctypes.c_double, ctypes.c_void_p)
 
 
 class EventInfo(NamedTuple):
@@ -66,7 +68,7 @@ class ModelCalls:
 
     def _declare(self, name: str, prototype: Any) -> Any:  # noqa: ANN401 ctypes has no types
         function = prototype((self._prefix + name, self._fmu.dll))
-        function.errcheck = self._checked(self._prefix + name)
+        function.errcheck = self._checked(self._prefix.rpartition("_")[2] + name)
         return function
 
     @staticmethod
@@ -126,7 +128,21 @@ class ModelCalls:
 
 
 class Fmi1Calls(ModelCalls):
-    """FMI 1.0: there are no modes; events are handled by fmiEventUpdate (FMI 1.0, 2.8)."""
+    """FMI 1.0: there are no modes; events are handled by fmiEventUpdate (FMI 1.0, 2.8).
+
+    FMPy takes the status of these functions for text and does not check it, so they are called by our own prototypes.
+    """
+
+    def __init__(self, fmu: Any, n_states: int, n_indicators: int) -> None:  # noqa: ANN401 FMPy is untyped
+        super().__init__(fmu, n_states, n_indicators, f"{fmu.modelIdentifier}_fmi")
+        self._event_update = self._declare("EventUpdate", _EVENT_UPDATE)
+        self._completed_step = self._declare("CompletedIntegratorStep", _COMPLETED)
+        self._initialize = self._declare("Initialize", _INITIALIZE)
+
+    def initialize(self, time: float, tolerance: float) -> None:
+        """Compute what follows from the values that were set, at ``time`` in s (FMI 1.0, 2.5)."""
+        self.set_time(time)
+        self._initialize(self._component, b"\1", tolerance, ctypes.byref(fmi1EventInfo()))
 
     def _differing(self) -> tuple[Any, Any]:
         return self._declare("GetNominalContinuousStates", _ARRAY), self._declare("GetDerivatives", _ARRAY)
@@ -140,12 +156,15 @@ class Fmi1Calls(ModelCalls):
     def update_discrete_states(self) -> EventInfo:
         """One event iteration."""
         info = fmi1EventInfo()
-        self._fmu.fmi1EventUpdate(self._component, b"\0", ctypes.byref(info))
-        return event_info_1(info)
+        self._event_update(self._component, b"\0", ctypes.byref(info))
+        next_event = info.nextEventTime if info.upcomingTimeEvent != b"\0" else math.inf
+        return EventInfo(info.iterationConverged == b"\0", info.terminateSimulation != b"\0", next_event)
 
     def completed_step(self) -> tuple[bool, bool]:
         """Tell that a step of the solver is done; an FMU cannot ask to end here."""
-        return bool(self._fmu.completedIntegratorStep()), False
+        event = ctypes.c_char()
+        self._completed_step(self._component, ctypes.byref(event))
+        return event.value != b"\0", False
 
 
 class Fmi3Calls(ModelCalls):
@@ -164,9 +183,3 @@ class Fmi3Calls(ModelCalls):
         """One event iteration, in event mode."""
         again, terminate, _nominals, _states, defined, time = self._fmu.updateDiscreteStates()
         return EventInfo(bool(again), bool(terminate), float(time) if defined else math.inf)
-
-
-def event_info_1(info: fmi1EventInfo) -> EventInfo:
-    """The event information of FMI 1.0, whose Booleans are characters."""
-    next_event = info.nextEventTime if info.upcomingTimeEvent != b"\0" else math.inf
-    return EventInfo(info.iterationConverged == b"\0", info.terminateSimulation != b"\0", next_event)

@@ -69,7 +69,7 @@ MODELS = {
             Var("last_bounce", output=True, continuous=False),
             Var("z"),
         ),
-        integers=(Var("bounces", output=True), Var("events"), Var("completed_steps")),
+        integers=(Var("bounces", output=True), Var("events"), Var("completed_steps"), Var("resting")),
     ),
     "Oscillator": Model(
         states=2,
