@@ -46,7 +46,9 @@ class Clocks:
         self.ticked: set[str] = set()
         self._fmu = fmu
         self._periodic = [_Periodic(clock) for clock in inputs if clock.interval_variability in _PERIODIC]
-        self._aperiodic = {clock.value_reference: math.inf for clock in inputs if clock.interval_variability in _APERIODIC}
+        self._aperiodic = {
+            clock.value_reference: math.inf for clock in inputs if clock.interval_variability in _APERIODIC
+        }
         self._outputs = [clock for clock in clocks if clock.causality == "output"]
 
     def __bool__(self) -> bool:

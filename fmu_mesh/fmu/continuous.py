@@ -85,7 +85,7 @@ class ContinuousInstance(FmuInstance):
             self._loop = None
 
     def _standing(self) -> Standing:
-        """The solver begins anew where a state was taken, so that it makes no difference whether one goes back to it."""
+        """The solver begins anew where a state is taken, so that it makes no difference whether one goes back to it."""
         loop = self._event_loop()
         time, next_event = loop.place
         self._guarded(lambda: loop.resume(time, next_event))
@@ -165,9 +165,7 @@ class ContinuousInstance(FmuInstance):
 
         def set_inputs(time: float) -> None:
             values[:] = [value + (time - start) * slope for value, slope in pairs]
-            status = self._call_direct(
-                function, ctypes.addressof(references), count, ctypes.addressof(values), count
-            )
+            status = self._call_direct(function, ctypes.addressof(references), count, ctypes.addressof(values), count)
             if status > WARNING:
                 raise FMICallException(function=self._function_name("Set", "Float64"), status=status)
 

@@ -1,7 +1,7 @@
 """FMI 1.0 model exchange.
 
-FMI 1.0 has no Initialization Mode: values are set, then `fmiInitialize` computes the rest (FMI 1.0, 2.8). Outputs that a
-connection needs before are read after it, and inputs that become known later are set as at any other event.
+FMI 1.0 has no Initialization Mode: values are set, then `fmiInitialize` computes the rest (FMI 1.0, 2.8). Outputs that
+a connection needs before are read after it, and inputs that become known later are set as at any other event.
 """
 
 from __future__ import annotations
@@ -80,7 +80,9 @@ class Fmi1ModelInstance(ContinuousInstance):
         description = self._description
         self._calls = Fmi1Calls(self._fmu, description.continuous_states, description.event_indicators)
 
-    def _enter_initialization(self, start_time: float, _stop_time: float | None, start_values: dict[str, Value]) -> None:
+    def _enter_initialization(
+        self, start_time: float, _stop_time: float | None, start_values: dict[str, Value]
+    ) -> None:
         self._time_of_start = start_time
         self.set_values(start_values)
 

@@ -16,11 +16,11 @@ import numpy as np
 from fmpy.fmi1 import FMICallException
 from fmpy.fmi2 import (
     FMU2Slave,
-    fmi2Terminated,
     fmi2CallbackAllocateMemoryTYPE,
     fmi2CallbackFreeMemoryTYPE,
     fmi2CallbackFunctions,
     fmi2CallbackLoggerTYPE,
+    fmi2Terminated,
 )
 from fmpy.logging import addLoggerProxy
 
@@ -263,5 +263,5 @@ class _Retrying:
 
     def free(self) -> None:
         """Free the state that was kept."""
-        if self._state:
+        if self._state.value is not None:
             self._fmu.fmi2FreeFMUstate(self._fmu.component, ctypes.byref(self._state))

@@ -34,6 +34,4 @@ class Fmi2ModelInstance(ContinuousInstance, Fmi2Instance):
         return self._options.solver.relative_tolerance
 
     def _model_calls(self) -> ModelCalls:
-        return ModelCalls(
-            self._fmu, self._description.continuous_states, self._description.event_indicators, "fmi2"
-        )
+        return ModelCalls(self._fmu, self._description.continuous_states, self._description.event_indicators, "fmi2")

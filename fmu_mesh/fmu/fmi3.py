@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from fmpy.fmi3 import FMU3Slave
 
 from ..model.description import Variable

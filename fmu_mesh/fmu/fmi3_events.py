@@ -81,9 +81,7 @@ class SteppedInEvents(FmuInstance):
             lambda: self._steps.event(lambda: self._set_row(slot, self._discrete_direct, self._discrete_setters))
         )
 
-    def _set_row(
-        self, slot: int, direct: Sequence[DirectCall], setters: Sequence[Callable[[int], None]]
-    ) -> None:
+    def _set_row(self, slot: int, direct: Sequence[DirectCall], setters: Sequence[Callable[[int], None]]) -> None:
         for function, references, count, rows, size in direct:
             status = self._call_direct(function, references, count, rows[slot], size)
             if status > WARNING:

@@ -73,9 +73,8 @@ class Fmi3Steps:
         self._do_step = _DO_STEP(("fmi3DoStep", fmu.dll))
         self._event_needed, self._terminate, self._early = (ctypes.c_bool() for _ in range(3))
         self._last_time = ctypes.c_double()
-        self._results = tuple(
-            map(ctypes.addressof, (self._event_needed, self._terminate, self._early, self._last_time))
-        )
+        results = (self._event_needed, self._terminate, self._early, self._last_time)
+        self._results = [ctypes.addressof(result) for result in results]
         self._time = 0.0
         self._next_event = math.inf
 
@@ -113,19 +112,20 @@ class Fmi3Steps:
                 largest /= 2.0
                 continue
             self._check(status, retried=largest < step_size)
-            before, time = time, self._last_time.value if self._early else target
+            before, time = time, self._last_time.value if self._early.value else target
             stuck = 0 if time > before else stuck + 1
             if stuck > MOST_RETURNS:
                 raise SolverFailed(f"fmi3DoStep returned early {MOST_RETURNS} times at t = {time:.12g} s")
             self._time = time
-            self.terminated = bool(self._terminate)
-            if self._event_needed and not self.terminated:
+            self.terminated = self._terminate.value
+            if self._event_needed.value and not self.terminated:
                 self._handle_event()
         return not resolvable(time, end)
 
     def _attempt(self, time: float, size: float) -> int:
         self._event_needed.value = self._terminate.value = self._early.value = False
-        return self._do_step(self._component, time, size, True, *self._results)  # noqa: FBT003 a C function
+        status: int = self._do_step(self._component, time, size, True, *self._results)  # noqa: FBT003 a C function
+        return status
 
     def _check(self, status: int, *, retried: bool) -> None:
         if status == DISCARD and retried:

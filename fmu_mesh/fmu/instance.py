@@ -70,7 +70,7 @@ class FmuInstance(KeepsFmuState, ABC):
         LoadFailed: the FMU cannot be extracted, loaded or instantiated.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913, PLR0917 what an instance is made of; all of it is named where it is called
         self,
         path: Path,
         name: str,

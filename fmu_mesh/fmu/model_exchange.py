@@ -118,7 +118,9 @@ class EventLoop:
         self._events_there = self._events_there + 1 if self._time == self._event_time else 0
         self._event_time = self._time
         if self._events_there > EVENT_ITERATIONS:
-            raise SolverFailed(f"more than {EVENT_ITERATIONS} events at t = {self._time:.12g} s, and time does not advance")
+            raise SolverFailed(
+                f"more than {EVENT_ITERATIONS} events at t = {self._time:.12g} s, and time does not advance"
+            )
 
     def _update(self) -> None:
         """The event iteration, in event mode, and back to continuous-time mode."""

@@ -26,7 +26,7 @@ _KINDS: Final[dict[tuple[str, Kind], type[FmuInstance]]] = {
 }
 
 
-def open_fmu(
+def open_fmu(  # noqa: PLR0913, PLR0917 the parameters of `FmuInstance`
     path: Path,
     name: str,
     description: ModelDescription,

@@ -14,7 +14,6 @@ import fmpy
 from fmpy.model_description import ModelDescription as FmpyDescription
 from fmpy.model_description import ModelVariable, read_model_description
 from fmpy.model_description import ValidationError as FmpyValidationError
-
 from msgspec.structs import replace
 
 from ..errors import LoadFailed
@@ -57,7 +56,7 @@ def read_description(path: Path, kind: Literal["auto"] | Kind = "auto") -> Model
     kind = _kind(source, kind, path)
     interface = source.coSimulation if kind == "co_simulation" else source.modelExchange
     platforms = tuple(fmpy.supported_platforms(str(path)))
-    if fmpy.platform not in platforms and 'x86_64-linux' not in platforms:
+    if fmpy.platform not in platforms and "x86_64-linux" not in platforms:
         there = ", ".join(platforms) or "no platform at all"
         raise LoadFailed(
             f"'{path}' has no binary for this platform ({fmpy.platform}); it has: {there}.",

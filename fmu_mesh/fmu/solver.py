@@ -9,14 +9,14 @@ from __future__ import annotations
 import ctypes
 import math
 from collections.abc import Callable
-from typing import Any, Final, Protocol
+from typing import Any, Final, NoReturn, Protocol
 
 import numpy as np
 from fmpy.fmi1 import FMICallException
 
 from ..simtime import steps_between
 
-__all__ = ["CVodeSolver", "EulerSolver", "Equations", "Solver", "SolverFailed", "make_solver", "resolvable"]
+__all__ = ["CVodeSolver", "Equations", "EulerSolver", "Solver", "SolverFailed", "make_solver", "resolvable"]
 
 DISCARD: Final = 2
 
@@ -60,7 +60,7 @@ class Solver(Protocol):
         ...
 
     def step(self, time: float, stop: float) -> tuple[float, bool]:
-        """One step from ``time`` to ``stop`` (s) at most; the time reached, and whether an event indicator crossed zero.
+        """One step from ``time`` to ``stop`` (s) at most: the time reached, and whether an event indicator crossed 0.
 
         The model is at that time and at its states afterwards.
 
@@ -153,7 +153,7 @@ class EulerSolver:
         """Nothing to free."""
 
     def _divided(self, time: float, stop: float) -> list[float]:
-        """The ends of equal steps, no longer than allowed, from ``time`` to ``stop``; the first one is the last item."""
+        """The ends of equal steps, no longer than allowed, from ``time`` to ``stop``; the first is the last item."""
         if self._maximum is None:
             return [stop]
         whole = steps_between(stop - time, self._maximum)
@@ -259,18 +259,16 @@ class CVodeSolver:
         self._check(self._api.CVodeSetStopTime(self._memory, stop))
         flag = self._api.CVode(self._memory, stop, self._x, ctypes.byref(reached), _CV_ONE_STEP)
         if flag < 0:
-            if self._failure is not None:
-                raise self._failure
-            raise SolverFailed(self._said or f"CVode returned {flag}")
+            self._give_up(self._said or f"CVode returned {flag}")
         self._stalled = 0 if resolvable(time, reached.value) else self._stalled + 1
         if self._stalled > _MOST_STALLED:
-            raise self._failure or SolverFailed(f"CVode makes no progress at t = {time:.12g} s")
+            self._give_up(f"CVode makes no progress at t = {time:.12g} s")
         self._equations.set_point(reached.value, self._x_data)
         return reached.value, flag == _CV_ROOT_RETURN
 
     def close(self) -> None:
         """See `Solver.close`."""
-        if not self._memory:
+        if not self._memory.value:
             return
         self._api.CVodeFree(ctypes.byref(self._memory))
         self._api.SUNLinSolFree(self._linear)
@@ -279,6 +277,10 @@ class CVodeSolver:
         self._api.N_VDestroy(self._tolerances)
         self._api.SUNContext_Free(ctypes.byref(self._context))
         self._memory = ctypes.c_void_p()
+
+    def _give_up(self, why: str) -> NoReturn:
+        """End with what the model failed with during this step, or else with ``why``."""
+        raise self._failure or SolverFailed(why)
 
     def _on_rhs(self, time: float, x: int, dx: int, _data: int | None) -> int:
         get_pointer = self._api.N_VGetArrayPointer
@@ -310,7 +312,7 @@ class CVodeSolver:
             return _GIVE_UP
         return 0
 
-    def _on_error(  # noqa: PLR0913, PLR0917 the signature of SUNErrHandlerFn
+    def _on_error(
         self,
         _line: int,
         function: bytes,
@@ -347,9 +349,7 @@ class _Sundials:
         self.SUNContext_Free = declare(core, "SUNContext_Free", integer, pointer)
         self.SUNContext_ClearErrHandlers = declare(core, "SUNContext_ClearErrHandlers", integer, pointer)
         self.SUNContext_PushErrHandler = declare(core, "SUNContext_PushErrHandler", integer, pointer, _HANDLER, pointer)
-        self.N_VNew_Serial = declare(
-            libraries.sundials_nvecserial, "N_VNew_Serial", pointer, ctypes.c_int64, pointer
-        )
+        self.N_VNew_Serial = declare(libraries.sundials_nvecserial, "N_VNew_Serial", pointer, ctypes.c_int64, pointer)
         self.N_VGetArrayPointer = declare(core, "N_VGetArrayPointer", pointer, pointer)
         self.N_VDestroy = declare(core, "N_VDestroy", None, pointer)
         self.SUNDenseMatrix = declare(

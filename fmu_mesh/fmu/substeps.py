@@ -17,11 +17,13 @@ SMALLEST: Final = 1024
 
 
 def take_sub_steps(attempt: Callable[[float, float], int], time: float, step_size: float) -> int:
-    """Take a step of ``step_size`` from ``time`` (both in s) in halves, quarters and so on, as small as they have to be.
+    """Take a step in halves, quarters and so on, as small as they have to be.
 
     Args:
         attempt: takes a step from a time of some size, and returns its status. After `DISCARD`, the FMU is where it was
             before.
+        time: where the step begins, in s.
+        step_size: its size in s.
 
     Returns:
         `DISCARD` if even the smallest sub-step was discarded; the status that ended it; or that of the last sub-step.

@@ -1,4 +1,4 @@
-"""The Protocol that a local FMU, a physics engine and a test double implement, and what it is told about its stepping."""
+"""The Protocol that a local FMU, a physics engine and a test double implement, and how such an instance is stepped."""
 
 from __future__ import annotations
 

@@ -61,7 +61,9 @@ def linear_inputs(connections: Sequence[Connection], name: str) -> tuple[LinearI
     )
 
 
-def capability_warnings(config: Mapping[str, InstanceConfig], descriptions: Mapping[str, ModelDescription], findings: Findings) -> None:
+def capability_warnings(
+    config: Mapping[str, InstanceConfig], descriptions: Mapping[str, ModelDescription], findings: Findings
+) -> None:
     """Note what an FMU needs that this program does not give it."""
     for name in config:
         description = descriptions[name]

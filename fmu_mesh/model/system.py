@@ -27,8 +27,8 @@ from fmu_mesh.model.grouping import automatic_nodes
 from fmu_mesh.model.instance import StepOptions
 from fmu_mesh.model.loading import LoadedConfig
 from fmu_mesh.model.start_values import resolve_start_values, sized
-from fmu_mesh.model.types import element_name, is_text
 from fmu_mesh.model.step_options import capability_warnings, check_extrapolation, resolve_step_options
+from fmu_mesh.model.types import element_name, is_text
 from fmu_mesh.simtime import TimeGrid, steps_between
 
 __all__ = ["Connection", "System", "SystemInstance", "build"]

@@ -54,10 +54,12 @@ def system(event_fmu: EventFmu, kinds: Mapping[str, tuple[Version, str]], **conn
     }
 
 
-ALL_1 = dict.fromkeys(("ball", "oscillator", "integral", "stairs"), (1, "model_exchange"))
-ALL_2 = dict.fromkeys(ALL_1, (2, "model_exchange"))
-ALL_3 = dict.fromkeys(ALL_1, (3, "model_exchange"))
-MIXED = {
+Kinds = dict[str, tuple[Version, str]]
+NAMES = ("ball", "oscillator", "integral", "stairs")
+ALL_1: Kinds = dict.fromkeys(NAMES, (1, "model_exchange"))
+ALL_2: Kinds = dict.fromkeys(NAMES, (2, "model_exchange"))
+ALL_3: Kinds = dict.fromkeys(NAMES, (3, "model_exchange"))
+MIXED: Kinds = {
     "ball": (3, "co_simulation"),
     "oscillator": (1, "model_exchange"),
     "integral": (2, "co_simulation"),
@@ -77,7 +79,7 @@ def test_a_chain_with_events_gives_the_same_floats(
 
 @pytest.mark.parametrize("algorithm", ["jacobi", "gauss_seidel"])
 def test_linear_inputs_give_the_same_floats(algorithm: str, place: Place, event_fmu: EventFmu) -> None:
-    kinds = {**ALL_3, "integral": (2, "co_simulation")}
+    kinds: Kinds = {**ALL_3, "integral": (2, "co_simulation")}
     content = system(event_fmu, kinds, extrapolation="linear")
     content["simulation"] |= {"algorithm": algorithm, "window": 7}
 

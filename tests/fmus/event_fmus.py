@@ -1,4 +1,4 @@
-"""Builds the event test FMUs: one model behind the functions of FMI 1.0, 2.0 or 3.0, for both kinds where there are two.
+"""Builds the event test FMUs: one model behind the functions of FMI 1.0, 2.0 or 3.0, for both kinds if there are two.
 
 One table per model gives its model description in each version and the C header with the roles of its variables. The
 FMUs hold the state machines of their standard and abort the process on a call that it forbids, so every run of one of
@@ -191,11 +191,12 @@ def _fmi1(name: str, model: Model, guid: str, changes: dict[str, str]) -> str:
         "  <ModelVariables>",
     ]
     for reference, variable, type_ in _all(model):
+        variability = _variability(variable, real=type_ == "Real", version=1)
         start = "" if variable.start is None else f' start="{_number(variable.start, type_)}"'
         fixed = ' fixed="true"' if start and _causality(variable, 1) != "input" else ""
         lines.append(
             f'    <ScalarVariable name="{variable.name}" valueReference="{reference}" '
-            f'causality="{_causality(variable, 1)}" variability="{_variability(variable, real=type_ == "Real", version=1)}">'
+            f'causality="{_causality(variable, 1)}" variability="{variability}">'
             f"<{type_}{start}{fixed}/></ScalarVariable>"
         )
     return "\n".join([*lines, "  </ModelVariables>", "</fmiModelDescription>", ""])
@@ -203,7 +204,9 @@ def _fmi1(name: str, model: Model, guid: str, changes: dict[str, str]) -> str:
 
 def _all(model: Model) -> list[tuple[int, Var, str]]:
     reals = [(reference, variable, "Real") for reference, variable in enumerate(model.reals)]
-    return reals + [(FIRST_INTEGER + reference, variable, "Integer") for reference, variable in enumerate(model.integers)]
+    return reals + [
+        (FIRST_INTEGER + reference, variable, "Integer") for reference, variable in enumerate(model.integers)
+    ]
 
 
 def _number(value: float, type_: str) -> str:
@@ -255,9 +258,10 @@ def _fmi2(name: str, model: Model, guid: str, changes: dict[str, str]) -> str:
     for index, (reference, variable, type_) in enumerate(_all(model), start=1):
         start = "" if variable.start is None else f' start="{_number(variable.start, type_)}"'
         state = "" if variable.derivative is None else f' derivative="{names.index(variable.derivative) + 1}"'
+        variability = _variability(variable, real=type_ == "Real", version=2)
         variables += (
             f'    <ScalarVariable name="{variable.name}" valueReference="{reference}" '
-            f'causality="{_causality(variable, 2)}" variability="{_variability(variable, real=type_ == "Real", version=2)}"'
+            f'causality="{_causality(variable, 2)}" variability="{variability}"'
             f"{_initial(variable)}><{type_}{start}{state}/></ScalarVariable>\n"
         )
         if variable.output:
@@ -293,9 +297,10 @@ def _fmi3(name: str, model: Model, guid: str, changes: dict[str, str]) -> str:
         type_ = "Float64" if old_type == "Real" else "Int32"
         start = "" if variable.start is None else f' start="{_number(variable.start, old_type)}"'
         state = "" if variable.derivative is None else f' derivative="{references[variable.derivative]}"'
+        variability = _variability(variable, real=old_type == "Real", version=3)
         variables += (
             f'    <{type_} name="{variable.name}" valueReference="{reference}" causality="{_causality(variable, 3)}" '
-            f'variability="{_variability(variable, real=old_type == "Real", version=3)}"{_initial(variable)}{state}{start}/>\n'
+            f'variability="{variability}"{_initial(variable)}{state}{start}/>\n'
         )
         if variable.output:
             structure[0] += f'    <Output valueReference="{reference}"/>\n'

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -32,7 +31,7 @@ def bounce_times() -> list[float]:
 
 
 def simulated(
-    folder: Path, fmu: Path, variables: list[str], *, stop_time: float, step_size: float, **instance: Any
+    folder: Path, fmu: Path, variables: list[str], *, stop_time: float, step_size: float, **instance: object
 ) -> list[Row]:
     """The recorded rows (time, then ``variables``) of one instance on its own."""
     config = write_config(
@@ -57,7 +56,13 @@ def test_a_ball_bounces_at_the_times_of_the_formula(
     solver = {"solver": {"relative_tolerance": 1e-8}} if kind == "model_exchange" else {}
 
     rows = simulated(
-        tmp_path, event_fmu("Ball", version), ["last_bounce", "bounces"], stop_time=2.2, step_size=0.01, kind=kind, **solver
+        tmp_path,
+        event_fmu("Ball", version),
+        ["last_bounce", "bounces"],
+        stop_time=2.2,
+        step_size=0.01,
+        kind=kind,
+        **solver,
     )
 
     times = sorted({row[1] for row in rows if row[2]})
@@ -118,7 +123,7 @@ def test_an_input_that_jumps_over_a_level_is_an_event_and_is_integrated_as_it_is
 def test_model_exchange_agrees_with_co_simulation_of_the_same_model(
     version: Version, event_fmu: EventFmu, tmp_path: Path
 ) -> None:
-    def run(fmu: Path, **instance: Any) -> list[Row]:
+    def run(fmu: Path, **instance: object) -> list[Row]:
         return simulated(tmp_path, fmu, ["x", "y"], stop_time=20.0, step_size=0.1, **instance)
 
     ours = run(event_fmu("Oscillator", version), kind="model_exchange", solver={"relative_tolerance": 1e-9})

@@ -102,7 +102,9 @@ def test_a_step_that_is_always_discarded_fails_and_says_so(
 
     with (
         running(event_fmu("Stairs", version), tmp_path, kind, 0.25, options, longest_step=1e-9) as stairs,
-        pytest.raises(StepFailed, match=r"DoStep returned discard down to 1/1024 of the step; the FMU says: the step is"),
+        pytest.raises(
+            StepFailed, match=r"DoStep returned discard down to 1/1024 of the step; the FMU says: the step is"
+        ),
     ):
         stairs.do_step(0)
 
@@ -132,7 +134,7 @@ def test_an_fmu_of_fmi_3_with_a_fixed_step_size_is_not_asked_for_another_one(
 
 @pytest.mark.parametrize(("version", "kind"), ALL)
 @pytest.mark.parametrize(("period", "last_step"), [(1.0, 8), (0.3, 2)], ids=["at a point", "between points"])
-def test_an_fmu_that_asks_to_end_is_heard_before_the_step_that_it_does_not_finish(  # noqa: PLR0917 a table
+def test_an_fmu_that_asks_to_end_is_heard_before_the_step_that_it_does_not_finish(
     version: Version, kind: Kind, period: float, last_step: int, event_fmu: EventFmu, tmp_path: Path
 ) -> None:
     with running(event_fmu("Stairs", version), tmp_path, kind, period=period, end=2) as stairs:
@@ -161,9 +163,13 @@ def test_where_a_model_cannot_be_evaluated_the_solver_ends_with_its_words(
 ) -> None:
     fmu = event_fmu("Oscillator", version)
 
-    with running(fmu, tmp_path, "model_exchange", limit=0.5) as oscillator, pytest.raises(StepFailed) as caught:
-        for step in range(20):
-            oscillator.do_step(step)
+    def run() -> None:
+        with running(fmu, tmp_path, "model_exchange", limit=0.5) as oscillator:
+            for step in range(20):
+                oscillator.do_step(step)
+
+    with pytest.raises(StepFailed) as caught:
+        run()
 
     assert "returned discard" in str(caught.value)
     assert version == 1 or "the FMU says: y is out of its range" in str(caught.value)
