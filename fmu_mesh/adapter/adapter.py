@@ -20,7 +20,7 @@ from types import TracebackType
 from typing import Any, Literal, Self
 
 from ..errors import FmuError
-from ..fmu import Fmi2Instance, LogMessage, read_description
+from ..fmu import FmuInstance, LogMessage, open_instance, read_description
 from ..model.description import ModelDescription, Value
 from ..model.types import is_float
 from .arguments import Arguments
@@ -35,7 +35,7 @@ _HALF = Fraction(1, 2)
 
 
 class FMIAdapter:
-    """One FMI 2.0 co-simulation FMU, stepped by the program that owns this object.
+    """One co-simulation FMU of FMI 1.0, 2.0 or 3.0, stepped by the program that owns this object.
 
     Call sequence: `set_initial_value` as often as needed, `exit_initialization_mode`, then `do_step` or
     `do_steps_until` with `set_input_value` and `get_output_value` in between; `close`, or the end of a `with` block, at
@@ -85,7 +85,7 @@ class FMIAdapter:
         self._point = 0
         folder = Path(tempfile.mkdtemp(prefix="fmu_mesh-"))
         try:
-            self._instance = Fmi2Instance(path, name, description, folder, _forward)
+            self._instance = open_instance(path, name, description, folder, _forward)
             self._release = weakref.finalize(self, _release, self._instance, folder)
         except BaseException:
             shutil.rmtree(folder, ignore_errors=True)
@@ -166,8 +166,11 @@ class FMIAdapter:
         converted = self._arguments.value(variable, value)
         if not self._entered:
             self._start_values[name] = converted
+            if variable.causality == "structuralParameter":  # arrays have other shapes now
+                self._arguments = Arguments(self._arguments.instance, self._description.sized(self._start_values))
             return
-        if variable.causality != "input" and variable.initial != "exact":  # FMI 2.0, 4.2.4
+        early = variable.causality == "structuralParameter" or variable.initial != "exact"
+        if variable.causality != "input" and early:  # FMI 2.0, 4.2.4
             raise self._arguments.refusal("it can only be set before the first value is read.", variable=name)
         with self._fmu_called():
             self._instance.set_values({name: converted})
@@ -356,6 +359,6 @@ def _forward(message: LogMessage) -> None:
     log.log(level, "fmu_message instance=%s category=%s: %s", message.instance, message.category, message.message)
 
 
-def _release(instance: Fmi2Instance, folder: Path) -> None:
+def _release(instance: FmuInstance, folder: Path) -> None:
     instance.close()
     shutil.rmtree(folder, ignore_errors=True)

@@ -27,7 +27,7 @@ class Arguments:
     """
 
     def __init__(self, instance: str, description: ModelDescription) -> None:
-        self._instance = instance
+        self.instance = instance
         self._description = description
         self.all = {variable.name: variable for variable in description.variables}
         self.inputs = self._having("input")
@@ -99,7 +99,7 @@ class Arguments:
 
     def refusal(self, message: str, hint: str | None = None, variable: str | None = None) -> CallRefused:
         """An error that names this instance."""
-        return CallRefused(message, instance=self._instance, variable=variable, hint=hint)
+        return CallRefused(message, instance=self.instance, variable=variable, hint=hint)
 
     def _having(self, causality: Causality) -> dict[str, Variable]:
         return {variable.name: variable for variable in self._description.with_causality(causality)}

@@ -11,28 +11,20 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-import fmpy
 import numpy as np
 from fmpy.fmi1 import FMICallException
-from fmpy.fmi2 import (
-    FMU2Slave,
-    fmi2CallbackAllocateMemoryTYPE,
-    fmi2CallbackFreeMemoryTYPE,
-    fmi2CallbackFunctions,
-    fmi2CallbackLoggerTYPE,
-    fmi2Terminated,
-)
-from fmpy.logging import addLoggerProxy
+from fmpy.fmi2 import FMU2Slave, fmi2Terminated
 
 from ..errors import FmuMeshError, TerminationRequested
 from ..model.description import Variable
 from ..model.ring import Part
 from ..model.types import Value, VariableType
 from .buffers import Buffer, NumberBuffer, StringBuffer
-from .instance import STATUS_NAMES, WARNING, FmuInstance, LogMessage, Verb
+from .callbacks import FMI2_CALLBACKS, register, unregister
+from .instance import STATUS_NAMES, WARNING, FmuInstance, Verb
 from .substeps import DISCARD, SMALLEST, take_sub_steps
 
-__all__ = ["CALLBACKS", "Fmi2Instance", "LogMessage", "listen", "silence"]
+__all__ = ["Fmi2Instance"]
 
 _GET_OR_SET = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_size_t, ctypes.c_void_p)
 _DO_STEP = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_double, ctypes.c_double, ctypes.c_int)
@@ -46,42 +38,6 @@ _SUFFIX: Final[dict[VariableType, str]] = {
 PENDING: Final = 5
 _DIRECT: Final = ("Float64", "Int32")
 """The types that lie in a ring as in C; a Boolean and an Enumeration are an `int` in FMI 2.0 (2.1.2)."""
-
-_instances: dict[bytes, FmuInstance] = {}
-
-
-def _log(_environment: int | None, name: bytes, status: int, category: bytes, message: bytes) -> None:
-    instance = _instances.get(name or b"")
-    if instance is not None:
-        instance.logged(status, category or b"", message or b"")
-
-
-def _callbacks() -> fmi2CallbackFunctions:
-    """One set of callbacks for the process: FMPy's proxy, which formats variadic messages, has one logger only."""
-    callbacks = fmi2CallbackFunctions()
-    callbacks.logger = fmi2CallbackLoggerTYPE(_log)
-    callbacks.allocateMemory = fmi2CallbackAllocateMemoryTYPE(fmpy.calloc)
-    callbacks.freeMemory = fmi2CallbackFreeMemoryTYPE(fmpy.free)
-    addLoggerProxy(ctypes.byref(callbacks))
-    return callbacks
-
-
-CALLBACKS = _callbacks()
-
-
-def listen(instance: FmuInstance) -> None:
-    """From now on, messages under its name go to this instance."""
-    key = instance.name.encode()
-    if key in _instances:
-        msg = f"two instances of one process have the name '{instance.name}'"
-        raise ValueError(msg)
-    _instances[key] = instance
-
-
-def silence(instance: FmuInstance) -> None:
-    """No messages go to this instance any more."""
-    if _instances.get(instance.name.encode()) is instance:
-        del _instances[instance.name.encode()]
 
 
 class Fmi2Instance(FmuInstance):
@@ -132,17 +88,17 @@ class Fmi2Instance(FmuInstance):
     def close(self) -> None:
         """Terminate if allowed, free the instance and remove its files. Never raises; may be called twice."""
         super().close()
-        silence(self)
+        unregister(self.name, self)
 
     def _instantiate(self, folder: Path) -> None:
-        listen(self)
+        register(self.name, self)
         fmu = self._library(
             guid=self._description.guid,
             modelIdentifier=self._description.model_identifier,
             unzipDirectory=str(folder),
             instanceName=self.name,
         )
-        fmu.instantiate(callbacks=CALLBACKS, loggingOn=False)
+        fmu.instantiate(callbacks=FMI2_CALLBACKS, loggingOn=False)
         self._fmu = fmu
         self._component = fmu.component
         self._loaded()

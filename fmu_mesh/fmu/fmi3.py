@@ -1,4 +1,9 @@
-"""FMI 3.0 co-simulation behind the `Instance` Protocol (stand-in)."""
+"""FMI 3.0 co-simulation behind the `Instance` Protocol.
+
+FMPy loads the library; values go between the memory of a `Ring` and the FMU directly, whole arrays at once. A step
+that returns early is finished here, with Event Mode in between where the FMU has one, so the communication points of
+the mesh stay (FMI 3.0, 4.2.1).
+"""
 
 from __future__ import annotations
 
@@ -7,25 +12,37 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from fmpy.fmi3 import FMU3Slave
 
 from ..model.description import Variable
 from ..model.ring import Part
-from ..model.types import DTYPES, Value, VariableType
-from .buffers import Buffer, NumberBuffer, StringBuffer
+from ..model.types import DTYPES, Value, VariableType, is_text
+from .buffers import BinaryBuffer, Buffer, NumberBuffer, StringBuffer
 from .fmi3_events import SteppedInEvents
 from .fmi3_steps import Fmi3Steps
-from .instance import Verb
+from .instance import FmuInstance, Verb
+
+__all__ = ["Fmi3Instance", "Fmi3Values"]
 
 _GET_OR_SET = ctypes.CFUNCTYPE(
     ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_size_t, ctypes.c_void_p, ctypes.c_size_t
 )
+_GET_OR_SET_BINARY = ctypes.CFUNCTYPE(
+    ctypes.c_int,
+    ctypes.c_void_p,
+    ctypes.c_void_p,
+    ctypes.c_size_t,
+    ctypes.c_void_p,
+    ctypes.c_void_p,
+    ctypes.c_size_t,
+)
 
 
-class Fmi3Instance(SteppedInEvents):
-    """One instance of an FMI 3.0 co-simulation FMU."""
+class Fmi3Values(FmuInstance):
+    """What all kinds of FMI 3.0 instances share: values, initialization and the end."""
 
-    _library: type[Any] = FMU3Slave
+    _library: type[Any]
 
     def _instantiate(self, folder: Path) -> None:
         fmu = self._library(
@@ -34,41 +51,38 @@ class Fmi3Instance(SteppedInEvents):
             unzipDirectory=str(folder),
             instanceName=self.name,
         )
-        fmu.instantiate(logMessage=self._on_message, **self._how())
+        fmu.instantiate(loggingOn=False, logMessage=self._message_came, **self._uses())
         self._fmu = fmu
         self._component = fmu.component
 
-    def _how(self) -> dict[str, Any]:
-        used = self._description.has_event_mode
-        return {"eventModeUsed": used, "earlyReturnAllowed": used}
+    def _uses(self) -> dict[str, bool]:
+        """What the instance is told of us when it is made."""
+        return {}
 
-    def _on_message(self, _environment: Any, status: int, category: bytes, message: bytes) -> None:
+    def _tolerance(self) -> float | None:
+        """The tolerance that the FMU is told (FMI 3.0, 2.3.2)."""
+        return self._description.default_experiment.tolerance
+
+    def _message_came(self, _environment: int | None, status: int, category: bytes, message: bytes) -> None:
         self.logged(status, category or b"", message or b"")
 
     def _enter_initialization(self, start_time: float, stop_time: float | None, start_values: dict[str, Value]) -> None:
-        self._time_of_start = start_time
-        self.set_values(start_values)
+        """Structural parameters in Configuration Mode, then all others (FMI 3.0, 2.3.3 and 2.3.2)."""
+        structural = {v.name for v in self._description.with_causality("structuralParameter")}
+        sizes = {name: value for name, value in start_values.items() if name in structural}
+        if sizes:
+            self._initializing("fmi3EnterConfigurationMode", self._fmu.enterConfigurationMode)
+            self.set_values(sizes)
+            self._initializing("fmi3ExitConfigurationMode", self._fmu.exitConfigurationMode)
+        self.set_values({name: value for name, value in start_values.items() if name not in structural})
+        self._time_of_start, tolerance = start_time, self._tolerance()
         self._initializing(
             "fmi3EnterInitializationMode",
-            lambda: self._fmu.enterInitializationMode(
-                tolerance=self._tolerance(), startTime=start_time, stopTime=stop_time
-            ),
+            lambda: self._fmu.enterInitializationMode(tolerance=tolerance, startTime=start_time, stopTime=stop_time),
         )
-        self._initialized()
-
-    def _initialized(self) -> None:
-        self._steps = Fmi3Steps(self._fmu, self._description)
-        self._steps.start(self._time_of_start)
-
-    def _tolerance(self) -> float | None:
-        return self._description.default_experiment.tolerance
 
     def _exit_initialization(self) -> None:
         self._initializing("fmi3ExitInitializationMode", self._fmu.exitInitializationMode)
-        self._first_events()
-
-    def _first_events(self) -> None:
-        self._stepped(self._steps.exit_initialization)
 
     def _terminate(self) -> None:
         self._fmu.terminate()
@@ -80,18 +94,50 @@ class Fmi3Instance(SteppedInEvents):
         return f"fmi3{verb}{'Int64' if type_ == 'Enumeration' else type_}"
 
     def _function(self, verb: Verb, type_: VariableType) -> Callable[..., int]:
-        return _GET_OR_SET((self._function_name(verb, type_), self._fmu.dll))
+        prototype: Any = _GET_OR_SET_BINARY if type_ == "Binary" else _GET_OR_SET
+        function: Callable[..., int] = prototype((self._function_name(verb, type_), self._fmu.dll))
+        return function
 
     def _buffer(self, type_: VariableType, variables: Sequence[Variable]) -> Buffer:
         size = sum(variable.size for variable in variables)
-        return StringBuffer(size) if type_ == "String" else NumberBuffer(type_, DTYPES[type_], size)
+        match type_:
+            case "String":
+                return StringBuffer(size)
+            case "Binary":
+                return BinaryBuffer(size)
+            case "Boolean":
+                return NumberBuffer(type_, np.uint8, size)
+            case _:
+                return NumberBuffer(type_, DTYPES[type_], size)
 
     def _is_direct(self, part: Part) -> bool:
-        return part.type not in ("String", "Binary")
+        return not is_text(part.type) and part.type != "Boolean"
 
     def _call(self, function: Callable[..., int], references: Sequence[int], buffer: Buffer, size: int) -> int:
         array = (ctypes.c_uint * len(references))(*references)
-        return function(self._component, ctypes.addressof(array), len(references), buffer.address, size)
+        address = ctypes.addressof(array)
+        if isinstance(buffer, BinaryBuffer):
+            return function(self._component, address, len(references), buffer.sizes_address, buffer.address, size)
+        return function(self._component, address, len(references), buffer.address, size)
 
     def _call_direct(self, function: Callable[..., int], references: int, count: int, row: int, size: int) -> int:
         return function(self._component, references, count, row, size)
+
+
+class Fmi3Instance(SteppedInEvents, Fmi3Values):
+    """One instance of an FMI 3.0 co-simulation FMU."""
+
+    _library = FMU3Slave
+
+    def _uses(self) -> dict[str, bool]:
+        return {"eventModeUsed": self._description.has_event_mode, "earlyReturnAllowed": True}
+
+    def _enter_initialization(self, start_time: float, stop_time: float | None, start_values: dict[str, Value]) -> None:
+        super()._enter_initialization(start_time, stop_time, start_values)
+        self._steps = Fmi3Steps(self._fmu, self._description)
+        self._stepped(lambda: self._steps.start(start_time))
+
+    def _exit_initialization(self) -> None:
+        """An FMU with Event Mode is in it now."""
+        super()._exit_initialization()
+        self._stepped(self._steps.exit_initialization)

@@ -43,13 +43,18 @@ class SteppedInEvents(FmuInstance):
         if self._discrete:
             self._set_discrete(slot)
         self._set_row(slot, self._direct_setters, self._setters)
-        self.advance(self._start_time + step * self._points * self._base_step_size, self._step_size)
+        end = self._start_time + (step + 1) * self._points * self._base_step_size
+        self._go_on(self._start_time + step * self._points * self._base_step_size, self._step_size, end)
         self._step = step + 1
         self._read_outputs((step + 1) & self._output_mask)
 
     def advance(self, time: float, step_size: float) -> None:
         """One step of ``step_size`` from ``time`` (both in s) without rings, for callers with their own time base."""
-        if not self._stepped(lambda: self._steps.step(time, step_size)):
+        self._check_live()
+        self._go_on(time, step_size, time + step_size)
+
+    def _go_on(self, time: float, step_size: float, end: float) -> None:
+        if not self._stepped(lambda: self._steps.step(time, step_size, end)):
             raise TerminationRequested("the FMU asked to end the simulation", instance=self.name)
 
     def set_values(self, values: Mapping[str, Value]) -> None:

@@ -98,9 +98,9 @@ class Fmi3Steps:
         set_values()
         self._update()
 
-    def step(self, start: float, step_size: float) -> bool:
-        """Go on from ``start`` by ``step_size`` (s); False if the FMU asked to end the simulation before the end."""
-        end, time, largest, stuck = start + step_size, start, step_size, 0
+    def step(self, start: float, step_size: float, end: float) -> bool:
+        """Go on from ``start`` by ``step_size`` to ``end`` (s); False if the FMU asked to end the simulation before."""
+        time, largest, stuck = start, step_size, 0
         self._time = start
         while not self.terminated and resolvable(time, end):
             if self._has_event_mode and self._is_due(time):

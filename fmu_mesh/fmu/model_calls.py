@@ -20,6 +20,7 @@ WARNING: Final = 1
 _ARRAY = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_size_t)
 _TIME = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_double)
 _EVENT_UPDATE = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_char, ctypes.c_void_p)
+_TERMINATE = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p)
 _COMPLETED = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p)
 _INITIALIZE = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_char, ctypes.c_double, ctypes.c_void_p)
 
@@ -138,6 +139,11 @@ class Fmi1Calls(ModelCalls):
         self._event_update = self._declare("EventUpdate", _EVENT_UPDATE)
         self._completed_step = self._declare("CompletedIntegratorStep", _COMPLETED)
         self._initialize = self._declare("Initialize", _INITIALIZE)
+        self._terminate = self._declare("Terminate", _TERMINATE)
+
+    def terminate(self) -> None:
+        """End the simulation."""
+        self._terminate(self._component)
 
     def initialize(self, time: float, tolerance: float) -> None:
         """Compute what follows from the values that were set, at ``time`` in s (FMI 1.0, 2.5)."""

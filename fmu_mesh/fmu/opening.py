@@ -1,4 +1,4 @@
-"""From a model description to an instance: which class serves a kind and version of FMI."""
+"""From a model description to the instance that calls that version and kind of FMI."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Final, cast
 from ..model.description import Kind, ModelDescription
 from ..model.instance import Instance, StepOptions
 from .extrapolation import LinearInputs, TakesDerivatives
+from .fmi1 import Fmi1Instance
 from .fmi1_model import Fmi1ModelInstance
 from .fmi2 import Fmi2Instance
 from .fmi2_model import Fmi2ModelInstance
@@ -15,9 +16,10 @@ from .fmi3 import Fmi3Instance
 from .fmi3_model import Fmi3ModelInstance
 from .instance import FmuInstance, LogSink
 
-__all__ = ["open_fmu", "stepped"]
+__all__ = ["open_instance", "stepped"]
 
-_KINDS: Final[dict[tuple[str, Kind], type[FmuInstance]]] = {
+_CLASSES: Final[dict[tuple[str, Kind], type[FmuInstance]]] = {
+    ("1", "co_simulation"): Fmi1Instance,
     ("1", "model_exchange"): Fmi1ModelInstance,
     ("2", "co_simulation"): Fmi2Instance,
     ("2", "model_exchange"): Fmi2ModelInstance,
@@ -26,7 +28,7 @@ _KINDS: Final[dict[tuple[str, Kind], type[FmuInstance]]] = {
 }
 
 
-def open_fmu(  # noqa: PLR0913, PLR0917 the parameters of `FmuInstance`
+def open_instance(  # noqa: PLR0913, PLR0917 the parameters of `FmuInstance`
     path: Path,
     name: str,
     description: ModelDescription,
@@ -34,13 +36,12 @@ def open_fmu(  # noqa: PLR0913, PLR0917 the parameters of `FmuInstance`
     log: LogSink = lambda _message: None,
     options: StepOptions = StepOptions(),  # noqa: B008 a frozen Struct
 ) -> FmuInstance:
-    """The FMU at ``path`` as an instance; see `FmuInstance`.
+    """Extract the FMU at ``path`` below ``folder``, load it, and make the instance called ``name``.
 
     Raises:
-        LoadFailed: it cannot be extracted, loaded or instantiated.
+        LoadFailed: the FMU cannot be extracted, loaded or instantiated.
     """
-    kind = _KINDS[description.fmi_version[:1], description.kind]
-    return kind(path, name, description, folder, log, options)
+    return _CLASSES[description.fmi_version[0], description.kind](path, name, description, folder, log, options)
 
 
 def stepped(instance: FmuInstance, options: StepOptions) -> Instance:

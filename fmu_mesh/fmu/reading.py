@@ -1,37 +1,29 @@
 """Reading the model description of an FMU into the mesh's own Structs, without extracting or loading it.
 
-Owns the judgement what can run (FMI 2.0 co-simulation with a binary for this platform) and what is only odd: problems
-that a strict validator finds are kept in `ModelDescription.problems`, and the FMU runs.
+Owns the judgement what can run (co-simulation of FMI 1.0, 2.0 and 3.0 with a binary for this platform) and what is only
+odd: problems that a strict validator finds are kept in `ModelDescription.problems`, and the FMU runs.
 """
 
 from __future__ import annotations
 
+import xml.etree.ElementTree as ET
 import zipfile
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal, cast
 
 import fmpy
 from fmpy.model_description import ModelDescription as FmpyDescription
-from fmpy.model_description import ModelVariable, read_model_description
 from fmpy.model_description import ValidationError as FmpyValidationError
-from msgspec.structs import replace
+from fmpy.model_description import read_model_description
 
 from ..errors import LoadFailed
-from ..model.description import DefaultExperiment, Kind, ModelDescription, Value, Variable, VariableType
-from .reading_clocks import read_clocks
+from ..model.description import Causality, Clock, DefaultExperiment, Kind, ModelDescription
+from .variables import variables_of
 
 __all__ = ["read_description"]
 
 _MAX_DESCRIPTION_SIZE = 64 * 2**20
-_TYPES: dict[str, VariableType] = {
-    "Real": "Float64",
-    "Integer": "Int32",
-    "Boolean": "Boolean",
-    "String": "String",
-    "Enumeration": "Enumeration",
-    "Float64": "Float64",
-    "Int32": "Int32",
-}
+_VERSIONS = ("1.0", "2.0", "3.0")
 
 
 def read_description(path: Path, kind: Literal["auto"] | Kind = "auto") -> ModelDescription:
@@ -51,44 +43,47 @@ def read_description(path: Path, kind: Literal["auto"] | Kind = "auto") -> Model
             hint="An FMU that was zipped inside a folder of its own must be zipped again without that folder.",
         )
     source, problems = _parse(path)
-    if source.fmiVersion is None or not source.fmiVersion.startswith(("1.", "2.", "3.")):
-        raise LoadFailed(f"'{path}' is an FMI {source.fmiVersion} FMU; FMI 2.0 co-simulation is what can run today.")
+    version = source.fmiVersion or ""
+    if not version.startswith(_VERSIONS) or "-" in version:  # 3.0-beta.1 is another interface than 3.0
+        raise LoadFailed(f"'{path}' is an FMI {version} FMU; FMI 1.0, 2.0 and 3.0 are what can run.")
     kind = _kind(source, kind, path)
-    interface = source.coSimulation if kind == "co_simulation" else source.modelExchange
     platforms = tuple(fmpy.supported_platforms(str(path)))
-    if fmpy.platform not in platforms and "x86_64-linux" not in platforms:
+    if fmpy.platform not in platforms:
         there = ", ".join(platforms) or "no platform at all"
         raise LoadFailed(
             f"'{path}' has no binary for this platform ({fmpy.platform}); it has: {there}.",
             hint="Export it for this platform, or compile its sources into it if it has some.",
         )
-    folder = fmpy.platform if not source.fmiVersion.startswith("3.") else "x86_64-linux"
-    library = f"binaries/{folder}/{interface.modelIdentifier}{fmpy.sharedLibraryExtension}"
+    identifier = _interface(source, kind).modelIdentifier
+    folder = fmpy.platform_tuple if version.startswith("3.") else fmpy.platform
+    library = f"binaries/{folder}/{identifier}{fmpy.sharedLibraryExtension}"
     if library not in names:
         raise LoadFailed(
             f"'{path}' has no '{library}', although its model identifier is "
-            f"'{interface.modelIdentifier}' (FMI 2.0, 2.3: the library must have that name)."
+            f"'{identifier}' (FMI 2.0, 2.3: the library must have that name)."
         )
-    description = _convert(source, kind, platforms, problems)
-    if any(variable.type == "Clock" for variable in source.modelVariables):
-        return replace(description, clocks=read_clocks(path))
-    return description
+    try:
+        return _convert(source, kind, _root(path), platforms, problems)
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+        raise LoadFailed(f"the modelDescription.xml of '{path}' has a value that cannot be: {error}") from error
 
 
 def _kind(source: FmpyDescription, wanted: str, path: Path) -> Kind:
     """The kind to use: the wanted one, or the one that there is; co-simulation comes first."""
-    there: dict[Kind, bool] = {
-        "co_simulation": source.coSimulation is not None,
-        "model_exchange": source.modelExchange is not None,
-    }
-    for kind, is_there in there.items():
-        if is_there and wanted in ("auto", kind):
+    kinds: tuple[Kind, ...] = ("co_simulation", "model_exchange")
+    there = [kind for kind in kinds if _interface(source, kind) is not None]
+    for kind in there:
+        if wanted in ("auto", kind):
             return kind
-    has = " and ".join(kind for kind, is_there in there.items() if is_there).replace("_", " ")
+    has = there[0].replace("_", " ") if there else "scheduled execution"
     raise LoadFailed(
-        f"'{path}' is for {has or 'scheduled execution'} only, not for {wanted.replace('_', ' ')}.",
-        hint="`kind: auto` takes what there is." if has else None,
+        f"'{path}' is for {has} only, not for {wanted.replace('_', ' ').replace('auto', 'co-simulation')}.",
+        hint="`kind: auto` takes what there is." if there else None,
     )
+
+
+def _interface(source: FmpyDescription, kind: Kind) -> Any:  # noqa: ANN401 FMPy is untyped
+    return source.coSimulation if kind == "co_simulation" else source.modelExchange
 
 
 def _archive_names(path: Path) -> frozenset[str]:
@@ -124,29 +119,32 @@ def _parse(path: Path) -> tuple[FmpyDescription, tuple[str, ...]]:
         raise LoadFailed(f"the modelDescription.xml of '{path}' cannot be read: {error}") from error
 
 
+def _root(path: Path) -> ET.Element:
+    """The XML itself, for what FMPy leaves out; it was parsed before."""
+    with zipfile.ZipFile(path) as archive:
+        text = archive.read("modelDescription.xml")
+    return ET.fromstring(text)  # noqa: S314  expat limits how far entities expand, and nothing external is resolved
+
+
 def _convert(
-    source: FmpyDescription, kind: Kind, platforms: tuple[str, ...], problems: tuple[str, ...]
+    source: FmpyDescription, kind: Kind, root: ET.Element, platforms: tuple[str, ...], problems: tuple[str, ...]
 ) -> ModelDescription:
-    interface = source.coSimulation if kind == "co_simulation" else source.modelExchange
+    interface = _interface(source, kind)
     experiment = source.defaultExperiment
-    dependencies = {
-        unknown.variable.name: None
-        if unknown.dependencies is None
-        else tuple(variable.name for variable in unknown.dependencies)
-        for unknown in source.initialUnknowns
-        if unknown.variable is not None
-    }
+    capabilities = root.find("Implementation/*/Capabilities")  # of FMI 1.0, which FMPy does not read
+
+    def can(attribute: str) -> bool:
+        if capabilities is not None:
+            return capabilities.get(attribute) in ("true", "1")
+        return bool(getattr(interface, attribute, False))
+
     return ModelDescription(
         model_name=source.modelName or "",
         model_identifier=interface.modelIdentifier,
         fmi_version=source.fmiVersion or "",
         kind=kind,
         guid=source.guid or "",
-        variables=tuple(
-            _variable(variable, dependencies, one=(source.fmiVersion or "").startswith("1."))
-            for variable in source.modelVariables
-            if variable.type in _TYPES
-        ),
+        variables=variables_of(source, root),
         description=source.description,
         generation_tool=source.generationTool,
         default_experiment=DefaultExperiment(
@@ -155,44 +153,37 @@ def _convert(
             step_size=_number(getattr(experiment, "stepSize", None)),
             tolerance=_number(getattr(experiment, "tolerance", None)),
         ),
-        can_handle_variable_step_size=bool(getattr(interface, "canHandleVariableCommunicationStepSize", True)),
+        can_handle_variable_step_size=can("canHandleVariableCommunicationStepSize"),
+        can_interpolate_inputs=can("canInterpolateInputs"),
+        has_event_mode=can("hasEventMode"),
         can_get_and_set_state=bool(interface.canGetAndSetFMUstate),
         can_serialize_state=bool(interface.canSerializeFMUstate),
-        only_once_per_process=bool(interface.canBeInstantiatedOnlyOncePerProcess),
-        needs_execution_tool=bool(interface.needsExecutionTool),
-        can_interpolate_inputs=bool(getattr(interface, "canInterpolateInputs", False)),
-        has_event_mode=bool(getattr(interface, "hasEventMode", False)),
+        only_once_per_process=can("canBeInstantiatedOnlyOncePerProcess"),
+        needs_execution_tool=bool(interface.needsExecutionTool)
+        or root.find("Implementation/CoSimulation_Tool") is not None,
         # FMI 1.0 has no flag for it, and wants to be told.
-        tell_completed_steps=bool(getattr(interface, "needsCompletedIntegratorStep", False))
-        or (source.fmiVersion or "").startswith("1."),
+        tell_completed_steps=can("needsCompletedIntegratorStep") or (source.fmiVersion or "").startswith("1."),
         continuous_states=int(source.numberOfContinuousStates),
         event_indicators=int(source.numberOfEventIndicators),
+        clocks=tuple(map(_clock, root.iterfind("ModelVariables/Clock"))),
         platforms=platforms,
         problems=problems,
     )
 
 
-def _variable(source: ModelVariable, dependencies: dict[str, tuple[str, ...] | None], *, one: bool) -> Variable:
-    """A variable; ``one``: of FMI 1.0."""
-    type_ = _TYPES[source.type]
-    declared = source.declaredType
-    items = tuple((item.name, int(item.value)) for item in declared.items) if declared and declared.items else ()
-    return Variable(
-        name=source.name,
-        value_reference=int(source.valueReference),
-        type=type_,
-        declared_type=source.type,
-        causality=source.causality or "local",
-        variability=source.variability or ("continuous" if type_ == "Float64" else "discrete"),
-        # FMI 1.0 has no `initial`: what has a start value may be given another one.
-        initial=source.initial or ("exact" if one and source.start is not None else None),
-        start=_start(type_, source.start),
-        unit=source.unit or (declared.unit if declared is not None else None),
-        description=source.description,
-        minimum=_number(source.min),
-        maximum=_number(source.max),
-        dependencies=dependencies.get(source.name, ()),
-        items=items,
+def _clock(element: ET.Element) -> Clock:
+    """A clock; one that has a fraction for an interval counts in units of its resolution (FMI 3.0, 2.2.8.4)."""
+    interval, shift = _number(element.get("intervalDecimal")), _number(element.get("shiftDecimal"))
+    counter, resolution = element.get("intervalCounter"), element.get("resolution")
+    if counter is not None and resolution is not None:
+        interval, shift = int(counter) / int(resolution), int(element.get("shiftCounter", 0)) / int(resolution)
+    return Clock(
+        name=element.attrib["name"],
+        value_reference=int(element.attrib["valueReference"]),
+        causality=cast("Causality", element.get("causality", "local")),
+        interval_variability=element.get("intervalVariability", "triggered"),
+        interval=interval,
+        shift=shift or 0.0,
     )
 
 
@@ -202,24 +193,4 @@ def _number(text: str | float | None) -> float | None:
     try:
         return float(text)
     except ValueError:
-        pass
-    return None
-
-
-def _start(type_: VariableType, text: str | None) -> Value | None:
-    """The start value as a Python value, or None if there is none or it is not of the type."""
-    if text is None:
         return None
-    try:
-        match type_:
-            case "Float64":
-                return float(text)
-            case "Int32" | "Enumeration":
-                return int(text)
-            case "Boolean":
-                return text in ("true", "1")
-            case "String":
-                return text
-    except ValueError:
-        pass
-    return None

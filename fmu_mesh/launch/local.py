@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import FmuMeshError, Interrupted, StepFailed, TerminationRequested
-from ..fmu import LogMessage, open_fmu, stepped
+from ..fmu import LogMessage, open_instance, stepped
 from ..model.elements import scaled
 from ..model.instance import Instance
 from ..model.plan import Plan
@@ -116,7 +116,7 @@ class LocalMesh:
             return self._open_instance(name)
         system = self._plan.system.instances[name]
         options = self._plan.nodes[system.node].instance(name).options
-        return stepped(open_fmu(Path(system.fmu), name, system.description, folder, self._log, options), options)
+        return stepped(open_instance(Path(system.fmu), name, system.description, folder, self._log, options), options)
 
     def _initialize(self, members: dict[str, _Member]) -> None:
         grid = self._plan.grid

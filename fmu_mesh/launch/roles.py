@@ -15,7 +15,7 @@ from pathlib import Path
 import msgspec
 
 from ..errors import ConfigurationError, FmuMeshError, StepFailed
-from ..fmu import FmuInstance, LogMessage, open_fmu, read_description, stepped
+from ..fmu import FmuInstance, LogMessage, open_instance, read_description, stepped
 from ..master.master import Master
 from ..master.profiling import GrantWatch
 from ..model.findings import listed, nearest
@@ -101,7 +101,7 @@ class _NodeProcess:
         item = self._plan.instance(name)
         path = Path(item.fmu)
         description = read_description(path, item.kind)
-        instance = open_fmu(path, name, description, self._folder / "fmus", self._log, item.options)
+        instance = open_instance(path, name, description, self._folder / "fmus", self._log, item.options)
         self._instances.append(instance)
         return stepped(instance, item.options)
 

@@ -11,7 +11,7 @@ from typing import cast
 import pytest
 
 from fmu_mesh.errors import StepFailed, TerminationRequested
-from fmu_mesh.fmu import FmuInstance, open_fmu, read_description
+from fmu_mesh.fmu import FmuInstance, open_instance, read_description
 from fmu_mesh.fmu.substeps import DISCARD, SMALLEST, take_sub_steps
 from fmu_mesh.model.description import Kind
 from fmu_mesh.model.instance import SolverSettings, StepOptions
@@ -37,7 +37,7 @@ def running(
 ) -> Iterator[FmuInstance]:
     """An instance at point 0, with all its inputs and outputs in rings of 64 rows."""
     description = read_description(fmu, kind)
-    with closing(open_fmu(fmu, "m", description, folder, options=options)) as instance:
+    with closing(open_instance(fmu, "m", description, folder, options=options)) as instance:
         instance.enter_initialization(0.0, 100.0, start_values)
         instance.exit_initialization()
         rings = [Ring(Layout.of(description.with_causality(causality)), 64) for causality in ("input", "output")]
