@@ -15,7 +15,7 @@ from fmpy.fmi3 import fmi3Float64, fmi3IntervalQualifier, fmi3ValueReference
 from ..model.description import Clock
 from .solver import resolvable
 
-__all__ = ["Clocks"]
+__all__ = ["NO_CLOCKS", "Clocks"]
 
 _INTERVAL_CHANGED: Final = 2
 _PERIODIC: Final = ("constant", "fixed", "tunable")
@@ -118,6 +118,10 @@ class _Periodic:
     @property
     def next_tick(self) -> float:
         return self.start + self.shift + self.ticks * (self.interval or math.inf)
+
+
+NO_CLOCKS: Final = Clocks(None, ())
+"""For an FMU without clocks: nothing of it is ever called."""
 
 
 def _references(reference: int) -> Any:  # noqa: ANN401 an array of ctypes

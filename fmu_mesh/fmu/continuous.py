@@ -19,6 +19,7 @@ from ..errors import TerminationRequested
 from ..model.ring import Ring
 from ..model.types import Value
 from ..simtime import TimeGrid
+from .clocks import Clocks
 from .instance import STATUS_NAMES, WARNING, FmuInstance
 from .model_calls import ModelCalls
 from .model_exchange import EventLoop
@@ -36,6 +37,7 @@ class ContinuousInstance(FmuInstance):
 
     _loop: EventLoop | None = None
     _inputs: Ring | None = None
+    _clocks: Clocks | None = None
     _row: _RowBytes = ()
     _slopes: Mapping[str, float] = {}
 
@@ -117,7 +119,10 @@ class ContinuousInstance(FmuInstance):
 
     def _make_loop(self) -> EventLoop:
         self._loop = EventLoop(
-            self._model_calls(), self._options.solver, tell_completed_steps=self._description.tell_completed_steps
+            self._model_calls(),
+            self._options.solver,
+            tell_completed_steps=self._description.tell_completed_steps,
+            clocks=self._clocks,
         )
         return self._loop
 

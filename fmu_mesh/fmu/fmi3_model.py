@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from fmpy.fmi3 import FMU3Model
 
+from ..model.types import Value
+from .clocks import Clocks
 from .continuous import ContinuousInstance
 from .fmi3 import Fmi3Values
 from .model_calls import Fmi3Calls, ModelCalls
@@ -18,6 +20,11 @@ class Fmi3ModelInstance(ContinuousInstance, Fmi3Values):
 
     def _tolerance(self) -> float | None:
         return self._options.solver.relative_tolerance
+
+    def _enter_initialization(self, start_time: float, stop_time: float | None, start_values: dict[str, Value]) -> None:
+        super()._enter_initialization(start_time, stop_time, start_values)
+        self._clocks = Clocks(self._fmu, self._description.clocks)
+        self._clocks.start(start_time)
 
     def _exit_initialization(self) -> None:
         super()._exit_initialization()

@@ -77,6 +77,7 @@ class Fmi3Steps:
         self._results = [ctypes.addressof(result) for result in results]
         self._time = 0.0
         self._next_event = math.inf
+        self._event_time = -math.inf
 
     def start(self, time: float) -> None:
         """In Initialization Mode at ``time`` (s)."""
@@ -103,7 +104,7 @@ class Fmi3Steps:
         time, largest, stuck = start, step_size, 0
         self._time = start
         while not self.terminated and resolvable(time, end):
-            if self._has_event_mode and self._is_due(time):
+            if self._is_due(time):
                 self._handle_event()
                 continue
             target = self._target(time, min(end, time + largest))
@@ -118,7 +119,7 @@ class Fmi3Steps:
                 raise SolverFailed(f"fmi3DoStep returned early {MOST_RETURNS} times at t = {time:.12g} s")
             self._time = time
             self.terminated = self._terminate.value
-            if self._event_needed.value and not self.terminated:
+            if not self.terminated and (self._event_needed.value or self._is_due(time)):
                 self._handle_event()
         return not resolvable(time, end)
 
@@ -134,14 +135,19 @@ class Fmi3Steps:
             raise FMICallException(function="fmi3DoStep", status=status)
 
     def _is_due(self, time: float) -> bool:
-        return not (resolvable(time, self._next_event) and resolvable(time, self.clocks.next_tick))
+        """Whether event mode is needed at ``time`` (s).
+
+        An FMU whose own time differs by rounding may not see its time event yet: then it is not asked a second time.
+        """
+        if not self._has_event_mode:
+            return False
+        return (self._next_event <= time and time > self._event_time) or not resolvable(time, self.clocks.next_tick)
 
     def _target(self, time: float, end: float) -> float:
         """Where the next fmi3DoStep ends: an FMU with a fixed step size is not asked for another one."""
         if not (self._has_event_mode and self._varies):
             return end
-        target = min(end, self._next_event, self.clocks.next_tick)
-        return target if resolvable(time, target) else end
+        return min(t for t in (end, self._next_event, self.clocks.next_tick) if t > time)
 
     def _handle_event(self) -> None:
         self._fmu.enterEventMode()
@@ -149,6 +155,7 @@ class Fmi3Steps:
 
     def _update(self) -> None:
         """Event mode at the current time, and back to step mode."""
+        self._event_time = self._time
         self.clocks.set_due(self._time)
         for _ in range(MOST_RETURNS):
             again, self.terminated, _nominals, _states, defined, next_event = self._fmu.updateDiscreteStates()

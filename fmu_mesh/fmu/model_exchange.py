@@ -19,10 +19,11 @@ from collections.abc import Callable
 from typing import Final
 
 from ..model.instance import SolverSettings
+from .clocks import NO_CLOCKS, Clocks
 from .model_calls import ModelCalls
 from .solver import Equations, Solver, SolverFailed, make_solver, resolvable
 
-__all__ = ["EventLoop", "iterate_events"]
+__all__ = ["EventLoop"]
 
 EVENT_ITERATIONS: Final = 1000
 """Event iterations, or events without any advance of time, after which a model is taken not to converge."""
@@ -35,6 +36,7 @@ class EventLoop:
         calls: the functions of the model.
         settings: of the solver.
         tell_completed_steps: whether the FMU wants to know of completed integrator steps.
+        clocks: the clocks of the model, if it has some.
 
     Attributes:
         terminated: whether the FMU has asked to end the simulation; nothing may be advanced then.
@@ -46,8 +48,11 @@ class EventLoop:
         SolverFailed: the solver gave up, or the events do not converge.
     """
 
-    def __init__(self, calls: ModelCalls, settings: SolverSettings, *, tell_completed_steps: bool) -> None:
+    def __init__(
+        self, calls: ModelCalls, settings: SolverSettings, *, tell_completed_steps: bool, clocks: Clocks | None = None
+    ) -> None:
         self.terminated = False
+        self._clocks = clocks if clocks is not None else NO_CLOCKS
         self._calls = calls
         self._tell = tell_completed_steps
         self._time = 0.0
@@ -124,23 +129,26 @@ class EventLoop:
 
     def _update(self) -> None:
         """The event iteration, in event mode, and back to continuous-time mode."""
-        self.terminated, self._next_event = iterate_events(self._calls, self._time)
+        self._clocks.set_due(self._time)
+        self.terminated, next_event = self._iterate()
         if not self.terminated:
+            self._clocks.update_intervals(self._time)
+            self._next_event = min(next_event, self._clocks.next_tick)
             self._calls.enter_continuous_time_mode()
             self._solver.restart(self._time)
 
+    def _iterate(self) -> tuple[bool, float]:
+        """Update the discrete states until they need no update; whether the FMU asks to end, and its next time event.
 
-def iterate_events(calls: ModelCalls, time: float) -> tuple[bool, float]:
-    """Update the discrete states until they need no update; whether the FMU asks to end, and its next time event in s.
-
-    Raises:
-        SolverFailed: they need updates for ever.
-    """
-    for _ in range(EVENT_ITERATIONS):
-        info = calls.update_discrete_states()
-        if info.terminate or not info.again:
-            return info.terminate, info.next_event
-    raise SolverFailed(f"the discrete states at t = {time:.12g} s need more than {EVENT_ITERATIONS} updates")
+        Raises:
+            SolverFailed: they need updates for ever.
+        """
+        for _ in range(EVENT_ITERATIONS):
+            info = self._calls.update_discrete_states()
+            self._clocks.read()
+            if info.terminate or not info.again:
+                return info.terminate, info.next_event
+        raise SolverFailed(f"the discrete states at t = {self._time:.12g} s need more than {EVENT_ITERATIONS} updates")
 
 
 class _Extrapolated:

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import FmuMeshError, Interrupted, StepFailed, TerminationRequested
+from ..errors import ConfigurationError, FmuMeshError, Interrupted, StepFailed, TerminationRequested
 from ..fmu import LogMessage, open_instance, stepped
 from ..model.elements import scaled
 from ..model.instance import Instance
@@ -78,13 +78,31 @@ class LocalMesh:
 
         Raises:
             FmuMeshError: an FMU failed, or the run was interrupted; rows up to then are kept.
+            Or this system cannot run in one process.
         """
+        self._check_one_process()
         try:
             self._run()
         except FmuMeshError as error:
             if self.rows and error.hint is None:
                 error.hint = f"What was recorded up to then ({self.rows} rows) is in '{self._plan.system.result_file}'."
             raise
+
+    def _check_one_process(self) -> None:
+        """Two instances of an FMU that allows one per process cannot run here, whatever their groups.
+
+        Raises:
+            ConfigurationError: there are two.
+        """
+        first_of: dict[str, str] = {}
+        for name, instance in self._plan.system.instances.items():
+            if instance.description.only_once_per_process and self._open_instance is None:
+                first = first_of.setdefault(instance.description.guid, name)
+                if first != name:
+                    text = (
+                        f"'{first}' and '{name}' cannot run in one process: their FMU allows one instance per process"
+                    )
+                    raise ConfigurationError(text, hint="Run it without --local.")
 
     def _run(self) -> None:
         plan = self._plan

@@ -92,6 +92,7 @@ MODELS = {
             Var("period", "fixed", 1.0),
             Var("longest_step", "tunable", 1e300),
             Var("last_stair", output=True, continuous=False),
+            Var("last_tick", output=True, continuous=False),
         ),
         integers=(
             Var("counter", output=True),

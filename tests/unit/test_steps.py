@@ -253,3 +253,50 @@ def test_another_instance_goes_on_bit_by_bit_from_a_serialized_state(
 
         assert outputs(other) == there
         other.free_state(state)
+
+
+# ---- clocks
+
+
+@pytest.mark.parametrize("kind", ["co_simulation", "model_exchange"])
+@pytest.mark.parametrize(
+    ("clock", "ticks"),
+    [
+        ('intervalVariability="constant" intervalDecimal="0.4" shiftDecimal="0.2"', [0.2, 0.6, 1.0, 1.4, 1.8]),
+        (
+            'intervalVariability="tunable" intervalDecimal="0" supportsFraction="true" resolution="8" '
+            'intervalCounter="4" shiftCounter="1"',
+            [0.125, 0.625, 1.125, 1.625],
+        ),
+        ('intervalVariability="fixed"', [0.1 + number * 0.3 for number in range(7)]),
+        ('intervalVariability="countdown"', [0.3, 0.6, 0.9, 1.2, 1.5, 1.8]),
+    ],
+    ids=["constant", "fraction", "by the FMU", "countdown"],
+)
+def test_a_time_based_input_clock_ticks_when_it_is_time_also_between_points(
+    clock: str, ticks: list[float], kind: Kind, event_fmu: EventFmu, tmp_path: Path
+) -> None:
+    fmu = event_fmu("Stairs", 3, clocks=clock)
+    seen: set[float] = set()
+
+    with running(fmu, tmp_path, kind, 0.05) as stairs:
+        for step in range(39):
+            stairs.do_step(step)
+            seen.add(cast("float", stairs.get_values(["last_tick"])[0]))
+        assert stairs.get_values(["counter"]) == [100 * len(ticks) + 1]
+
+    # The times of an aperiodic clock are sums: each interval counts from the tick before.
+    assert sorted(seen - {0.0}) == pytest.approx(ticks, rel=1e-12)
+
+
+def test_an_fmu_with_a_fixed_step_size_takes_its_ticks_at_the_points(event_fmu: EventFmu, tmp_path: Path) -> None:
+    clock = 'intervalVariability="constant" intervalDecimal="0.4" shiftDecimal="0.2"'
+    fmu = event_fmu("Stairs", 3, clocks=clock, canHandleVariableCommunicationStepSize="false")
+
+    with running(fmu, tmp_path, "co_simulation", 0.25) as stairs:
+        ticks = []
+        for step in range(4):
+            stairs.do_step(step)
+            ticks += stairs.get_values(["last_tick"])
+
+    assert ticks == [0.25, 0.25, 0.75, 1.0]

@@ -5,7 +5,7 @@
  */
 #include "model.h"
 
-enum { PERIOD, LONGEST, LAST };
+enum { PERIOD, LONGEST, LAST, TICK };
 enum { COUNTER, INCREMENT, END, FOREVER, EVENTS };
 
 void model_start(Model *m)
@@ -36,6 +36,7 @@ Update model_event(Model *m)
     if (m->clock) {
         m->clock = false;
         m->i[COUNTER] += 100;
+        m->r[TICK] = m->time;
     }
     if (m->time >= m->next_event) {
         m->i[COUNTER] += m->i[INCREMENT];

@@ -33,6 +33,7 @@ typedef struct {
     bool written;        /* values were set since the last step: 4.2.1, fmi3Get{VariableType} */
     bool event_needed;   /* fmi3DoStep has asked for event mode */
     bool ticked;         /* the output clock */
+    bool armed;          /* the interval of the input clock has been asked for since it ticked */
     Model model;
 } Instance;
 
@@ -242,6 +243,7 @@ fmi3Status fmi3SetClock(fmi3Instance c, const fmi3ValueReference vr[], size_t n,
     for (size_t k = 0; k < n; k++) {
         if (vr[k] != FIRST_CLOCK) broken("fmi3SetClock of this clock", "event mode");
         instance->model.clock = value[k];
+        instance->armed = false;
     }
     return fmi3OK;
 }
@@ -271,6 +273,29 @@ fmi3Status fmi3UpdateDiscreteStates(fmi3Instance c, fmi3Boolean *again, fmi3Bool
     *states = update.states_changed;
     *next_defined = instance->model.next_event_defined;
     *next = instance->model.next_event;
+    return fmi3OK;
+}
+
+#define INTERVAL 0.3
+#define SHIFT 0.1
+
+fmi3Status fmi3GetIntervalDecimal(fmi3Instance c, const fmi3ValueReference vr[], size_t n, fmi3Float64 interval[],
+                                  fmi3IntervalQualifier qualifier[])
+{
+    Instance *instance = called(c, "fmi3GetIntervalDecimal", INITIALIZATION | EVENT);
+
+    if (n != 1 || vr[0] != FIRST_CLOCK) broken("fmi3GetIntervalDecimal of this clock", "event mode");
+    interval[0] = INTERVAL;
+    qualifier[0] = instance->armed ? fmi3IntervalUnchanged : fmi3IntervalChanged;
+    instance->armed = true;
+    return fmi3OK;
+}
+
+fmi3Status fmi3GetShiftDecimal(fmi3Instance c, const fmi3ValueReference vr[], size_t n, fmi3Float64 shift[])
+{
+    called(c, "fmi3GetShiftDecimal", INITIALIZATION);
+    if (n != 1 || vr[0] != FIRST_CLOCK) broken("fmi3GetShiftDecimal of this clock", "initialization mode");
+    shift[0] = SHIFT;
     return fmi3OK;
 }
 
@@ -490,9 +515,7 @@ DENIED(fmi3GetDirectionalDerivative)
 DENIED(fmi3GetAdjointDerivative)
 DENIED(fmi3EnterConfigurationMode)
 DENIED(fmi3ExitConfigurationMode)
-DENIED(fmi3GetIntervalDecimal)
 DENIED(fmi3GetIntervalFraction)
-DENIED(fmi3GetShiftDecimal)
 DENIED(fmi3GetShiftFraction)
 DENIED(fmi3SetIntervalDecimal)
 DENIED(fmi3SetIntervalFraction)
