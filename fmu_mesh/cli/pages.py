@@ -7,7 +7,7 @@ from collections.abc import Iterable
 import msgspec
 
 from ..wire.readings import Reading
-from ..wire.views import InstanceInfo, InstanceStatus, MeshInfo, MeshStatus
+from ..wire.views import InstanceInfo, InstanceStatus, MeshInfo, MeshStatus, VariableView
 from .tables import pairs, table
 
 __all__ = [
@@ -26,7 +26,7 @@ __all__ = [
 def variables(info: InstanceInfo) -> list[str]:
     """One line for each variable of an instance."""
     rows = [
-        [v.key, v.type, v.variability, v.unit or "", "" if v.start is None else _text(v.start), v.description or ""]
+        [v.key, _type(v), v.variability, v.unit or "", "" if v.start is None else _text(v.start), v.description or ""]
         for v in info.variables
     ]
     return table(rows, heading=["variable", "type", "variability", "unit", "start", "description"], indent=2)
@@ -132,6 +132,11 @@ def progress(status: MeshStatus) -> str:
 def seconds(time: float) -> str:
     """A time in s."""
     return f"{time:.12g} s"
+
+
+def _type(view: VariableView) -> str:
+    """The type, with the sizes of an array's dimensions."""
+    return f"{view.type}[{','.join(map(str, view.shape))}]" if view.shape else view.type
 
 
 def _text(value: object) -> str:

@@ -2,25 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from fmpy.fmi2 import FMU2Model
 
 from ..model.types import Value
 from .continuous import ContinuousInstance
-from .fmi2 import Fmi2Instance
+from .fmi2 import Fmi2Values
 from .model_calls import ModelCalls
 
 __all__ = ["Fmi2ModelInstance"]
 
 
-class Fmi2ModelInstance(ContinuousInstance, Fmi2Instance):
+class Fmi2ModelInstance(ContinuousInstance, Fmi2Values):
     """One instance of an FMI 2.0 FMU for model exchange (FMI 2.0, 3.2)."""
 
-    _library: type[Any] = FMU2Model
-
-    def _loaded(self) -> None:
-        """It has no fmi2DoStep."""
+    _library = FMU2Model
 
     def _enter_initialization(self, start_time: float, stop_time: float | None, start_values: dict[str, Value]) -> None:
         self._time_of_start = start_time

@@ -264,8 +264,7 @@ def test_another_instance_goes_on_bit_by_bit_from_a_serialized_state(
     [
         ('intervalVariability="constant" intervalDecimal="0.4" shiftDecimal="0.2"', [0.2, 0.6, 1.0, 1.4, 1.8]),
         (
-            'intervalVariability="tunable" intervalDecimal="0" supportsFraction="true" resolution="8" '
-            'intervalCounter="4" shiftCounter="1"',
+            'intervalVariability="tunable" supportsFraction="true" resolution="8" intervalCounter="4" shiftCounter="1"',
             [0.125, 0.625, 1.125, 1.625],
         ),
         ('intervalVariability="fixed"', [0.1 + number * 0.3 for number in range(7)]),
