@@ -163,11 +163,18 @@ class Fmi2Instance(Fmi2Values):
 
     def set_input_derivatives(self, derivatives: Mapping[str, float]) -> None:
         """First time derivatives (1/s) of Real inputs for the next step (FMI 2.0, 4.2.1)."""
-        references = [self._variables[name].value_reference for name in derivatives]
+        self._derivatives: dict[int, float] = {
+            self._variables[name].value_reference: slope for name, slope in derivatives.items()
+        }
+
+    def _step_with_derivatives(self, component: int, time: float, step_size: float, no_set_state: int) -> int:
+        """fmi2DoStep, after the derivatives of the inputs, which are set after their values."""
+        references, slopes = list(self._derivatives), list(self._derivatives.values())
         try:
-            self._fmu.setRealInputDerivatives(references, [1] * len(references), list(derivatives.values()))
+            self._fmu.setRealInputDerivatives(references, [1] * len(references), slopes)
         except FMICallException as error:
             raise self._failed(f"{error.function} returned {STATUS_NAMES[error.status]}") from error
+        return self._step_of_fmu(component, time, step_size, no_set_state)
 
     def _instantiate(self, folder: Path) -> None:
         super()._instantiate(folder)
@@ -175,6 +182,9 @@ class Fmi2Instance(Fmi2Values):
         if self._options.retry_discarded_steps:
             self._retrying = _Retrying(self._fmu, self._do_step, self._asks_to_end, self._failed)
             self._do_step = self._retrying
+        if self._options.linear_inputs:
+            self._step_of_fmu, self._do_step = self._do_step, self._step_with_derivatives
+            self._derivatives = {}
 
     def _not_done(self, status: int) -> FmuMeshError:
         """Why a step was not taken (FMI 2.0, 4.2.1): it failed, or the FMU asks to end the simulation."""

@@ -24,6 +24,7 @@ __all__ = ["read_description"]
 
 _MAX_DESCRIPTION_SIZE = 64 * 2**20
 _VERSIONS = ("1.0", "2.0", "3.0")
+_WORDS = {"co_simulation": "co-simulation", "model_exchange": "model exchange"}
 
 
 def read_description(path: Path, kind: Literal["auto"] | Kind = "auto") -> ModelDescription:
@@ -75,9 +76,9 @@ def _kind(source: FmpyDescription, wanted: str, path: Path) -> Kind:
     for kind in there:
         if wanted in ("auto", kind):
             return kind
-    has = there[0].replace("_", " ") if there else "scheduled execution"
+    has = _WORDS[there[0]] if there else "scheduled execution"
     raise LoadFailed(
-        f"'{path}' is for {has} only, not for {wanted.replace('_', ' ').replace('auto', 'co-simulation')}.",
+        f"'{path}' is for {has} only, not for {_WORDS.get(wanted, 'co-simulation or model exchange')}.",
         hint="`kind: auto` takes what there is." if there else None,
     )
 

@@ -41,12 +41,17 @@ def resolve_step_options(
 
 
 def check_extrapolation(
-    connections: Sequence[Connection], descriptions: Mapping[str, ModelDescription], findings: Findings
+    connections: Sequence[Connection],
+    configs: Mapping[str, InstanceConfig],
+    descriptions: Mapping[str, ModelDescription],
+    findings: Findings,
 ) -> None:
     """Refuse `extrapolation: linear` where the target cannot take the derivative of an input."""
     for connection in connections:
         if connection.extrapolation == "linear":
-            reason = _cannot_extrapolate(connection, descriptions[connection.target_instance])
+            target = connection.target_instance
+            retries = configs[target].retry_discarded_steps
+            reason = _cannot_extrapolate(connection, descriptions[target], retries=retries)
             if reason is not None:
                 found = f"linear for {connection}, but {reason}"
                 findings.add(f"{connection.path}.extrapolation", found, "hold")
@@ -85,7 +90,7 @@ def _cannot_retry(description: ModelDescription) -> str | None:
     return None
 
 
-def _cannot_extrapolate(connection: Connection, description: ModelDescription) -> str | None:
+def _cannot_extrapolate(connection: Connection, description: ModelDescription, *, retries: bool) -> str | None:
     target = connection.target
     if target.type != "Float64" or target.shape or connection.target_index:
         return f"'{target.name}' is no scalar Real input"
@@ -94,7 +99,11 @@ def _cannot_extrapolate(connection: Connection, description: ModelDescription) -
     if description.kind == "model_exchange":
         return None
     if description.fmi_version.startswith("3."):
-        return "co-simulation in FMI 3.0 takes no input derivatives (it would run as model exchange)"
-    if not description.can_interpolate_inputs:
-        return f"the FMU of '{connection.target_instance}' does not interpolate inputs (canInterpolateInputs)"
-    return None
+        reason = "co-simulation in FMI 3.0 takes no input derivatives (it would run as model exchange)"
+    elif not description.can_interpolate_inputs:
+        reason = f"the FMU of '{connection.target_instance}' does not interpolate inputs (canInterpolateInputs)"
+    elif retries:
+        reason = "discarded steps of its target are retried, and a part of a step has no input derivatives of its own"
+    else:
+        return None
+    return reason

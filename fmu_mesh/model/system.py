@@ -109,7 +109,7 @@ def build(
     instances = _instances(loaded, descriptions, variables, collected)
     _check_nodes(config, descriptions, collected)
     connections = resolve_connections(config.connections, variables, collected)
-    check_extrapolation(connections, descriptions, collected)
+    check_extrapolation(connections, config.instances, descriptions, collected)
     recorded = _recorded(config, variables, collected)
     result_file = _result_file(loaded, collected)
     _check_zenoh(loaded, collected)

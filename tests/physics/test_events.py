@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import yaml
 
 from fmu_mesh.launch.local import LocalMesh
 from fmu_mesh.launch.preparing import prepare
@@ -132,3 +133,35 @@ def test_model_exchange_agrees_with_co_simulation_of_the_same_model(
     # The co-simulation is good to 1e-11. A local tolerance of 1e-9 per step becomes a phase error of the cycle.
     for row, other in zip(ours, theirs, strict=True):
         assert row == pytest.approx(other, abs=1e-6, rel=0.0)
+
+
+@pytest.mark.parametrize(
+    ("version", "kind"), [(2, "co_simulation"), (1, "model_exchange"), (2, "model_exchange"), (3, "model_exchange")]
+)
+@pytest.mark.parametrize("delay", [0, 1])
+def test_the_integral_of_a_ramp_is_right_if_the_input_changes_linearly(
+    version: Version, kind: str, delay: int, event_fmu: EventFmu, tmp_path: Path
+) -> None:
+    """Held inputs would be wrong by half a step of the ramp each time: at t = 1 s by 0.05."""
+    ramp = {"fmu": str(event_fmu("Integral", 2)), "start_values": {"u": 1.0}}
+    square: dict[str, object] = {"fmu": str(event_fmu("Integral", version)), "kind": kind}
+    if kind == "model_exchange":
+        square["solver"] = {"relative_tolerance": 1e-9}
+    config = write_config(
+        tmp_path,
+        instances={"ramp": ramp, "square": square},
+        connections=[],
+        stop_time=1.0,
+        simulation={"step_size": 0.1},
+        record={"file": "m.csv", "variables": ["square.s"]},
+    )
+    content = yaml.safe_load(config.read_text(encoding="utf-8"))
+    content["connections"] = [{"from": "ramp.s", "to": "square.u", "extrapolation": "linear", "delay": delay}]
+    config.write_text(yaml.safe_dump(content), encoding="utf-8")
+
+    LocalMesh(prepare(config)).run()
+
+    # With a delay of one point, the slope of the first step is not known yet: there the input is 0.
+    missing = 0.005 if delay else 0.0
+    for row in rows_of(tmp_path / "m.csv")[1:]:
+        assert row[1] == pytest.approx(row[0] ** 2 / 2 - missing, abs=1e-6, rel=0.0)
