@@ -65,9 +65,8 @@ class Runner:
 
     def bind(self) -> None:
         """Let the instance work on the rings, and read the current outputs. Call after Initialization Mode."""
-        if self.step == 0 and self.watched is None:
-            connected = [target for feed in self.plan.feeds for _, target, _, _ in feed.columns]
-            fill_unconnected(self.inputs, connected, self.instance.get_values)
+        connected = [target for feed in self.plan.feeds for _, target, _, _ in feed.columns]
+        fill_unconnected(self.inputs, connected, self.instance.get_values)
         outputs = (self.outputs,) if self.watched is None else (self.outputs, self.watched)
         self.instance.bind(self.inputs, outputs, self._grid, self.plan.step_points, self.step)
 
