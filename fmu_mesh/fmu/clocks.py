@@ -66,6 +66,20 @@ class Clocks:
             clock.start = time
         self._look()
 
+    @property
+    def place(self) -> tuple[float | None, ...]:
+        """The ticks of each periodic clock, then the next tick of each aperiodic one in s; None if it has none."""
+        aperiodic = (tick if math.isfinite(tick) else None for tick in self._aperiodic.values())
+        return (*(float(clock.ticks) for clock in self._periodic), *aperiodic)
+
+    def resume(self, place: Sequence[float | None]) -> None:
+        """Go on where `place` was."""
+        for clock, ticks in zip(self._periodic, place, strict=False):
+            clock.ticks = int(ticks or 0)
+        for reference, tick in zip(self._aperiodic, place[len(self._periodic) :], strict=True):
+            self._aperiodic[reference] = math.inf if tick is None else tick
+        self._look()
+
     def set_due(self, time: float) -> None:
         """In event mode: activate every input clock whose tick is at ``time`` (s)."""
         due = []

@@ -91,11 +91,14 @@ class ContinuousInstance(FmuInstance):
         loop = self._event_loop()
         time, next_event = loop.place
         self._guarded(lambda: loop.resume(time, next_event))
-        return Standing(self._step, time, next_event if math.isfinite(next_event) else None, self._row)
+        ticks = self._clocks.place if self._clocks is not None else ()
+        return Standing(self._step, time, next_event if math.isfinite(next_event) else None, self._row, ticks)
 
     def _stand(self, standing: Standing) -> None:
         super()._stand(standing)
         self._row = standing.row
+        if self._clocks is not None:
+            self._clocks.resume(standing.ticks)
         time, next_event = standing.time or 0.0, standing.next_event
 
         def resume() -> None:

@@ -18,6 +18,7 @@ from ..simtime import TimeGrid
 from .fmi3_steps import Fmi3Steps
 from .instance import STATUS_NAMES, WARNING, DirectCall, FmuInstance, Verb
 from .solver import SolverFailed
+from .state import Standing
 
 __all__ = ["SteppedInEvents"]
 
@@ -65,6 +66,16 @@ class SteppedInEvents(FmuInstance):
         set_values = super().set_values
         if not self._steps.terminated:
             self._stepped(lambda: self._steps.event(lambda: set_values(values)))
+
+    def _standing(self) -> Standing:
+        next_event, event_time = self._steps.place
+        return Standing(self._step, event_time, next_event, self._discrete_row, self._steps.clocks.place)
+
+    def _stand(self, standing: Standing) -> None:
+        super()._stand(standing)
+        self._discrete_row = standing.row
+        self._steps.resume(standing.next_event, standing.time)
+        self._steps.clocks.resume(standing.ticks)
 
     def _prepare(self, verb: Verb, part: Part, array: Any) -> None:  # noqa: ANN401 an array of any dtype
         direct, others = len(self._direct_setters), len(self._setters)

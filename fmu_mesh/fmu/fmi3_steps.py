@@ -90,6 +90,18 @@ class Fmi3Steps:
         if self._has_event_mode:
             self._update()
 
+    @property
+    def place(self) -> tuple[float | None, float | None]:
+        """The times of the next time event and of the last event mode in s; None where there is none."""
+        next_event, event_time = (t if math.isfinite(t) else None for t in (self._next_event, self._event_time))
+        return next_event, event_time
+
+    def resume(self, next_event: float | None, event_time: float | None) -> None:
+        """Go on where `place` was."""
+        self.terminated = False
+        self._next_event = math.inf if next_event is None else next_event
+        self._event_time = -math.inf if event_time is None else event_time
+
     def event(self, set_values: Callable[[], None]) -> None:
         """Set values in event mode, or between two steps if there is none."""
         if not self._has_event_mode:

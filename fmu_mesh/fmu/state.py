@@ -25,15 +25,17 @@ class Standing(msgspec.Struct, frozen=True):
 
     Attributes:
         step: own steps done; -1 in or before Initialization Mode.
-        time: the time of a model-exchange FMU in s.
+        time: the time of the FMU in s, where it is not that of the step.
         next_event: that of its next time event; None if there is none.
-        row: the inputs that a model-exchange FMU has been given.
+        row: the inputs that it was given in its last event mode.
+        ticks: where its clocks are; see `Clocks.place`.
     """
 
     step: int
     time: float | None = None
     next_event: float | None = None
     row: tuple[bytes | list[str], ...] = ()
+    ticks: tuple[float | None, ...] = ()
 
 
 class FmuState:

@@ -11,10 +11,11 @@ from typing import cast
 import pytest
 
 from fmu_mesh.errors import StepFailed, TerminationRequested
-from fmu_mesh.fmu import FmuInstance, open_instance, read_description
+from fmu_mesh.fmu import FmuInstance, open_instance, read_description, stepped
+from fmu_mesh.fmu.extrapolation import LinearInputs
 from fmu_mesh.fmu.substeps import DISCARD, SMALLEST, take_sub_steps
 from fmu_mesh.model.description import Kind
-from fmu_mesh.model.instance import SolverSettings, StepOptions
+from fmu_mesh.model.instance import LinearInput, SolverSettings, StepOptions
 from fmu_mesh.model.ring import Layout, Ring
 from fmu_mesh.model.types import Value
 from fmu_mesh.simtime import TimeGrid
@@ -299,3 +300,52 @@ def test_an_fmu_with_a_fixed_step_size_takes_its_ticks_at_the_points(event_fmu: 
             ticks += stairs.get_values(["last_tick"])
 
     assert ticks == [0.25, 0.25, 0.75, 1.0]
+
+
+@pytest.mark.parametrize("kind", ["co_simulation", "model_exchange"])
+def test_clocks_and_linear_inputs_go_on_from_a_state_too(kind: Kind, event_fmu: EventFmu, tmp_path: Path) -> None:
+    clock = 'intervalVariability="constant" intervalDecimal="0.07" shiftDecimal="0.02"'
+    with running(event_fmu("Stairs", 3, clocks=clock), tmp_path, kind, 0.05, period=0.11) as stairs:
+        for step in range(6):
+            stairs.do_step(step)
+        state = stairs.get_state()
+        for step in range(6, 20):
+            stairs.do_step(step)
+        there = outputs(stairs)
+
+        stairs.set_state(state)
+        for step in range(6, 20):
+            stairs.do_step(step)
+
+        assert outputs(stairs) == there
+        stairs.free_state(state)
+
+
+@pytest.mark.parametrize(("version", "kind"), [(2, "co_simulation"), (2, "model_exchange"), (3, "model_exchange")])
+def test_linear_inputs_are_part_of_the_state(version: Version, kind: Kind, event_fmu: EventFmu, tmp_path: Path) -> None:
+    options = StepOptions(linear_inputs=(LinearInput("u", 1),))
+    description = read_description(event_fmu("Integral", version), kind)
+    rings = [Ring(Layout.of(description.with_causality(causality)), 32) for causality in ("input", "output")]
+    for row in range(32):
+        rings[0].put(row, "u", math.sin(row))
+    with closing(open_instance(event_fmu("Integral", version), "m", description, tmp_path, options=options)) as inner:
+        instance = cast("LinearInputs", stepped(inner, options))
+        instance.enter_initialization(0.0, 10.0, {})
+        instance.exit_initialization()
+        instance.bind(rings[0], (rings[1],), TimeGrid(0.0, 0.1, 100), 1)
+        for step in range(5):
+            instance.do_step(step)
+        state = instance.get_state()
+        data = instance.serialize_state(state)
+        for step in range(5, 20):
+            instance.do_step(step)
+        there = outputs(inner)
+
+        again = instance.deserialize_state(data)
+        instance.set_state(again)
+        for step in range(5, 20):
+            instance.do_step(step)
+
+        assert outputs(inner) == there
+        instance.free_state(again)
+        instance.free_state(state)
