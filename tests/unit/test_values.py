@@ -54,6 +54,15 @@ def test_values_are_json(value: Value, data: bytes) -> None:
         ("String", b'"text"', "text"),
         ("Enumeration", b'"high"', 5),
         ("Enumeration", b"1", 1),
+        ("Int8", b"-128", -128),
+        ("UInt8", b"255", 255),
+        ("Int64", b"-9223372036854775808", -(2**63)),
+        ("UInt64", b"18446744073709551615", 2**64 - 1),
+        ("Float32", b"0.1", 0.10000000149011612),
+        ("Float32", b"3.4028234663852886e38", 3.4028234663852886e38),
+        ("Float32", b'"INF"', math.inf),
+        ("Binary", b'""', b""),
+        ("Binary", b'"/wA="', b"\xff\0"),
     ],
 )
 def test_values_of_the_right_type_are_taken(kind: VariableType, data: bytes, value: Value) -> None:
@@ -82,6 +91,16 @@ def test_values_of_the_right_type_are_taken(kind: VariableType, data: bytes, val
         ("Enumeration", b'"middle"'),
         ("Enumeration", b"3"),
         ("Enumeration", b"true"),
+        ("Int8", b"128"),
+        ("UInt8", b"-1"),
+        ("Int64", b"9223372036854775808"),
+        ("UInt64", b"18446744073709551616"),
+        ("UInt64", b"1.0"),
+        ("Float32", b"3.5e38"),
+        ("Binary", b'"/wA"'),
+        ("Binary", b'"a b"'),
+        ("Binary", b"1"),
+        ("String", b'"a\\u0000b"'),
     ],
 )
 def test_values_of_another_type_are_refused_with_a_reason(kind: VariableType, data: bytes) -> None:
