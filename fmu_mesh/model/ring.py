@@ -178,14 +178,26 @@ class Ring:
     def value(self, row: int, name: str) -> Value:
         """The value of a column of ``row``, or of an element of it, as Python has it."""
         part, first, size, shape = self._place(name)
+        if not shape:
+            element: Value = self.parts[part].item(row & self.mask, first)
+            return element
         return nested(self.parts[part][row & self.mask, first : first + size].tolist(), shape)
 
     def put(self, row: int, name: str, value: Value) -> None:
-        """Give a column of ``row``, or an element of it, a value that its type can hold."""
+        """Give a column of ``row``, or an element of it, a value that its type can hold.
+
+        What is beyond the range of a Float32 becomes an infinity, as in C.
+        """
         part, first, _, shape = self._place(name)
-        with np.errstate(over="ignore"):  # beyond the range of a Float32 is an infinity, as in C
+        array, slot = self.parts[part], row & self.mask
+        if array.dtype == np.float32:
+            with np.errstate(over="ignore"):
+                array[slot, first : first + math.prod(shape)] = flattened(value, len(shape))
+        elif not shape:
+            array[slot, first] = value
+        else:
             for place, element in enumerate(flattened(value, len(shape)), first):
-                self.parts[part][row & self.mask, place] = element
+                array[slot, place] = element
 
     def _place(self, name: str) -> Place:
         if name not in self._places:

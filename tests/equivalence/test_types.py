@@ -130,11 +130,13 @@ def test_every_type_can_be_asked_for_set_and_watched(looked_at: Callable[..., An
     }
     for name, text in given.items():
         (answer,) = looked_at("set", f"it.{name}", text, "--json")
-        assert answer["point"] > 0, answer
+        assert answer["point"] >= 0, answer
 
     read = {r["variable"]: r["value"] for r in looked_at("get", *(f"it.{name}" for name in given), "--json")}
-    names = ["it.string_array_out", "it.uint64_out", "it.binary_out"]
-    watched = {r["variable"]: r["value"] for r in looked_at("watch", *names, "--count", "9", "--json")}
+    watched = {
+        name: looked_at("watch", f"it.{name}", "--count", "1", "--json")[0]["value"]
+        for name in ("string_array_out", "uint64_out", "binary_out")
+    }
 
     assert repr(read) == repr(
         {
