@@ -12,7 +12,8 @@ FmuMeshError                     1   an internal error
 ├── MeshLost                     4   a node, the master or the recorder is gone or silent
 │   ├── DeadlineExceeded             a wait met its deadline
 │   └── FrameGap                     a point is missing, or came twice with other values
-└── Interrupted                130   a person or the parent process asked to end
+├── Interrupted                130   a person or the parent process asked to end
+└── TerminationRequested         0   an FMU asked to end the simulation: an orderly end, no failure
 ```
 
 Errors carry fields (instance, variable, point, time) and say what to do next. This module knows nothing of the
@@ -40,6 +41,7 @@ __all__ = [
     "LoopNotConverged",
     "MeshLost",
     "StepFailed",
+    "TerminationRequested",
 ]
 
 
@@ -207,6 +209,15 @@ class Interrupted(FmuMeshError):
     exit_code = 130
 
 
+class TerminationRequested(FmuMeshError):
+    """An FMU asked to end the simulation during the step from `point` (FMI 2.0, 4.2.3; FMI 3.0, 4.2.1).
+
+    That is no failure: all instances go on to this point, and the run ends there with exit code 0.
+    """
+
+    exit_code = 0
+
+
 _BY_KIND: dict[str, type[FmuMeshError]] = {
     kind.__name__: kind
     for kind in (
@@ -219,6 +230,7 @@ _BY_KIND: dict[str, type[FmuMeshError]] = {
         DeadlineExceeded,
         FrameGap,
         Interrupted,
+        TerminationRequested,
     )
 }
 

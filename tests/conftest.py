@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
 
-from tests.fmus.helpers import find_fmu
+from tests.fmus.event_fmus import Version, build_event_fmu
+from tests.fmus.helpers import NO_COMPILER, find_fmu
 from tests.helpers import Place
 
 # How long an example takes says more about the machine than about the code; a failure must be the same everywhere.
@@ -27,3 +28,16 @@ def place() -> Iterator[Place]:
 def faulty(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The FMU that fails on demand, built once; without a C compiler the test is skipped."""
     return find_fmu("Faulty", tmp_path_factory.mktemp("faulty"))
+
+
+@pytest.fixture(scope="session")
+def event_fmu(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
+    """Returns an event test FMU by model and FMI version; without a C compiler the test is skipped."""
+    folder = tmp_path_factory.mktemp("event_fmus")
+
+    def find(name: str, version: Version, **changes: str) -> Path:
+        if NO_COMPILER is not None:
+            pytest.skip(NO_COMPILER)
+        return build_event_fmu(name, version, folder, **changes)
+
+    return find

@@ -88,7 +88,7 @@ def _instances(plan: Plan) -> list[str]:
     rows = [
         [
             instance.name,
-            f"{Path(instance.fmu).name} (FMI {instance.description.fmi_version})",
+            f"{Path(instance.fmu).name} (FMI {instance.description.fmi_version}{_solver(instance)})",
             f"step {_number(instance.step_points * plan.grid.step_size)} s",
             "a process of its own" if instance.node == instance.name else f"group {instance.node}",
             _start_values(instance),
@@ -96,6 +96,15 @@ def _instances(plan: Plan) -> list[str]:
         for instance in plan.system.instances.values()
     ]
     return table(rows, indent=2)
+
+
+def _solver(instance: SystemInstance) -> str:
+    """How a model-exchange FMU is solved; nothing for co-simulation, which has a solver of its own."""
+    if instance.description.kind == "co_simulation":
+        return ""
+    solver = instance.options.solver
+    tolerance = f" {solver.relative_tolerance:g}" if solver.name == "cvode" else ""
+    return f" model exchange, {solver.name}{tolerance}"
 
 
 def _start_values(instance: SystemInstance) -> str:
@@ -110,6 +119,8 @@ def _connections(plan: Plan) -> list[str]:
     for c in plan.connections:
         what = "value at the start of the step" if c.delay else "value at the end of the step"
         closing = "closes a cycle" if c in plan.closing else ""
+        if c.extrapolation == "linear":
+            what = "goes on linearly in the step" if c.delay else "changes linearly in the step"
         rows.append([str(c), f"delay {c.delay}", what, _arithmetic(c), closing, c.units])
     return table(rows, indent=2)
 

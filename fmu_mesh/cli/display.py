@@ -15,6 +15,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn
 
+from ..errors import ErrorReport, FmuMeshError, from_report
 from ..launch.events import End, Event, Log, Ready, Status
 from ..model.plan import Plan
 from ..wire.views import LogLine, MeshStatus
@@ -65,8 +66,14 @@ class Display:
                 self._status(status)
             case Log(line):
                 self.log(line)
+            case End(ended_by=ErrorReport() as report):
+                self.ended(from_report(report))
             case End():
                 pass
+
+    def ended(self, early: FmuMeshError) -> None:
+        """Show why a run ended before its last point although nothing failed."""
+        self._console.print(escape(str(early)))
 
     def progress(self, point: int) -> None:
         """Show the point of a run in this process."""

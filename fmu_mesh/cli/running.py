@@ -145,6 +145,8 @@ def _run_local(plan: Plan, display: Display) -> tuple[int, float, int]:
             mesh.run()
     finally:
         leave_run_folder(folder)
+    if mesh.ended_by is not None:
+        display.ended(mesh.ended_by)
     return mesh.point, mesh.seconds, mesh.rows
 
 

@@ -6,7 +6,7 @@ from .fmi1 import Fmi1Instance
 from .fmi2 import Fmi2Instance
 from .fmi3 import Fmi3Instance
 from .instance import FmuInstance, LogMessage
-from .opening import open_instance
+from .opening import open_instance, stepped
 from .reading import read_description
 from .sources import compile_sources
 
@@ -22,4 +22,5 @@ __all__ = [
     "open_instance",
     "read_description",
     "sha256_of",
+    "stepped",
 ]

@@ -7,14 +7,15 @@ that are allocated once: an input row is set from, and an output row read into, 
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from fmpy.fmi1 import FMICallException
-from fmpy.fmi2 import FMU2Slave
+from fmpy.fmi2 import FMU2Slave, fmi2Terminated
 
+from ..errors import FmuMeshError, TerminationRequested
 from ..model.description import Variable
 from ..model.ring import Part, Ring
 from ..model.types import Value, VariableType
@@ -22,8 +23,9 @@ from ..simtime import TimeGrid
 from .buffers import Buffer, NumberBuffer, StringBuffer
 from .callbacks import FMI2_CALLBACKS, register, unregister
 from .instance import STATUS_NAMES, WARNING, FmuInstance, Verb
+from .substeps import DISCARD, SMALLEST, take_sub_steps
 
-__all__ = ["Fmi2Instance"]
+__all__ = ["Fmi2Instance", "Fmi2Values"]
 
 _GET_OR_SET = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_size_t, ctypes.c_void_p)
 _DO_STEP = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_double, ctypes.c_double, ctypes.c_int)
@@ -34,59 +36,15 @@ _SUFFIX: Final[dict[VariableType, str]] = {
     "Boolean": "Boolean",
     "String": "String",
 }
+PENDING: Final = 5
 _DIRECT: Final = ("Float64", "Int32")
 """The types that lie in a ring as in C; a Boolean and an Enumeration are an `int` in FMI 2.0 (2.1.2)."""
 
 
-class Fmi2Instance(FmuInstance):
-    """One instance of an FMI 2.0 co-simulation FMU."""
+class Fmi2Values(FmuInstance):
+    """What both kinds of FMI 2.0 instances share: values, initialization and the end."""
 
-    def bind(self, inputs: Ring, outputs: Sequence[Ring], grid: TimeGrid, points: int, step: int = 0) -> None:
-        """Let `do_step` work on these rings, ``points`` of ``grid`` each; write the current outputs as row ``step``."""
-        super().bind(inputs, outputs, grid, points, step)
-        # One look-up for all that a step needs: it is a part of the time of a small FMU.
-        self._hot = (
-            self._component,
-            self._do_step,
-            self._input_mask,
-            self._output_mask,
-            [call[:4] for call in self._direct_setters],
-            [call[:4] for call in self._direct_getters],
-            bool(self._setters or self._getters),
-        )
-
-    def do_step(self, step: int) -> None:
-        """Set the inputs of row ``step``, advance to own step ``step + 1``, write the outputs to row ``step + 1``."""
-        component, do_step, input_mask, output_mask, setters, getters, has_buffers = self._hot
-        slot = step & input_mask
-        for function, references, count, rows in setters:
-            status = function(component, references, count, rows[slot])
-            if status > WARNING:
-                raise self._failed(f"setting the inputs returned {STATUS_NAMES[status]}")
-        if has_buffers:
-            for set_row in self._setters:
-                set_row(slot)
-        time = self._start_time + step * self._points * self._base_step_size  # `grid.time`, without a call
-        status = do_step(component, time, self._step_size, 1)
-        if status > WARNING:
-            raise self._failed(f"fmi2DoStep returned {STATUS_NAMES[status]}")
-        self._step = step + 1
-        slot = (step + 1) & output_mask
-        for function, references, count, rows in getters:
-            status = function(component, references, count, rows[slot])
-            if status > WARNING:
-                raise self._failed(f"reading the outputs returned {STATUS_NAMES[status]}")
-        if has_buffers:
-            for get_row in self._getters:
-                get_row(slot)
-
-    def advance(self, time: float, step_size: float) -> None:
-        """One step of ``step_size`` from ``time`` (both in s) without rings, for callers with their own time base."""
-        self._check_live()
-        try:
-            self._fmu.doStep(currentCommunicationPoint=time, communicationStepSize=step_size)
-        except FMICallException as error:
-            raise self._failed(f"{error.function} returned {STATUS_NAMES[error.status]}") from error
+    _library: type[Any]
 
     def close(self) -> None:
         """Terminate if allowed, free the instance and remove its files. Never raises; may be called twice."""
@@ -95,7 +53,7 @@ class Fmi2Instance(FmuInstance):
 
     def _instantiate(self, folder: Path) -> None:
         register(self.name, self)
-        fmu = FMU2Slave(
+        fmu = self._library(
             guid=self._description.guid,
             modelIdentifier=self._description.model_identifier,
             unzipDirectory=str(folder),
@@ -104,17 +62,20 @@ class Fmi2Instance(FmuInstance):
         fmu.instantiate(callbacks=FMI2_CALLBACKS, loggingOn=False)
         self._fmu = fmu
         self._component = fmu.component
-        self._do_step = _DO_STEP(("fmi2DoStep", fmu.dll))
 
     def _enter_initialization(self, start_time: float, stop_time: float | None, start_values: dict[str, Value]) -> None:
         """FMI 2.0, 2.1.6 and 4.2.1."""
-        tolerance = self._description.default_experiment.tolerance
+        tolerance = self._tolerance()
         self._initializing(
             "fmi2SetupExperiment",
             lambda: self._fmu.setupExperiment(tolerance=tolerance, startTime=start_time, stopTime=stop_time),
         )
         self.set_values(start_values)
         self._initializing("fmi2EnterInitializationMode", self._fmu.enterInitializationMode)
+
+    def _tolerance(self) -> float | None:
+        """The tolerance that the FMU is told (FMI 2.0, 2.1.6)."""
+        return self._description.default_experiment.tolerance
 
     def _exit_initialization(self) -> None:
         self._initializing("fmi2ExitInitializationMode", self._fmu.exitInitializationMode)
@@ -145,3 +106,153 @@ class Fmi2Instance(FmuInstance):
 
     def _call_direct(self, function: Callable[..., int], references: int, count: int, row: int, _size: int) -> int:
         return function(self._component, references, count, row)
+
+
+class Fmi2Instance(Fmi2Values):
+    """One instance of an FMI 2.0 co-simulation FMU."""
+
+    _library = FMU2Slave
+    _retrying: _Retrying | None = None
+
+    def bind(self, inputs: Ring, outputs: Sequence[Ring], grid: TimeGrid, points: int, step: int = 0) -> None:
+        """Let `do_step` work on these rings, ``points`` of ``grid`` each; write the current outputs as row ``step``."""
+        super().bind(inputs, outputs, grid, points, step)
+        # One look-up for all that a step needs: it is a part of the time of a small FMU.
+        self._hot = (
+            self._component,
+            self._do_step,
+            self._input_mask,
+            self._output_mask,
+            [call[:4] for call in self._direct_setters],
+            [call[:4] for call in self._direct_getters],
+            bool(self._setters or self._getters),
+        )
+
+    def do_step(self, step: int) -> None:
+        """Set the inputs of row ``step``, advance to own step ``step + 1``, write the outputs to row ``step + 1``."""
+        component, do_step, input_mask, output_mask, setters, getters, has_buffers = self._hot
+        slot = step & input_mask
+        for function, references, count, rows in setters:
+            status = function(component, references, count, rows[slot])
+            if status > WARNING:
+                raise self._failed(f"setting the inputs returned {STATUS_NAMES[status]}")
+        if has_buffers:
+            for set_row in self._setters:
+                set_row(slot)
+        time = self._start_time + step * self._points * self._base_step_size  # `grid.time`, without a call
+        status = do_step(component, time, self._step_size, 1)
+        if status > WARNING:
+            raise self._not_done(status)
+        self._step = step + 1
+        slot = (step + 1) & output_mask
+        for function, references, count, rows in getters:
+            status = function(component, references, count, rows[slot])
+            if status > WARNING:
+                raise self._failed(f"reading the outputs returned {STATUS_NAMES[status]}")
+        if has_buffers:
+            for get_row in self._getters:
+                get_row(slot)
+
+    def advance(self, time: float, step_size: float) -> None:
+        """One step of ``step_size`` from ``time`` (both in s) without rings, for callers with their own time base."""
+        self._check_live()
+        try:
+            self._fmu.doStep(currentCommunicationPoint=time, communicationStepSize=step_size)
+        except FMICallException as error:
+            raise self._not_done(error.status) from error
+
+    def set_input_derivatives(self, derivatives: Mapping[str, float]) -> None:
+        """First time derivatives (1/s) of Real inputs for the next step (FMI 2.0, 4.2.1)."""
+        self._derivatives: dict[int, float] = {
+            self._variables[name].value_reference: slope for name, slope in derivatives.items()
+        }
+
+    def _step_with_derivatives(self, component: int, time: float, step_size: float, no_set_state: int) -> int:
+        """fmi2DoStep, after the derivatives of the inputs, which are set after their values."""
+        references, slopes = list(self._derivatives), list(self._derivatives.values())
+        try:
+            self._fmu.setRealInputDerivatives(references, [1] * len(references), slopes)
+        except FMICallException as error:
+            raise self._failed(f"{error.function} returned {STATUS_NAMES[error.status]}") from error
+        return self._step_of_fmu(component, time, step_size, no_set_state)
+
+    def _instantiate(self, folder: Path) -> None:
+        super()._instantiate(folder)
+        self._do_step: Callable[..., int] = _DO_STEP(("fmi2DoStep", self._fmu.dll))
+        if self._options.retry_discarded_steps:
+            self._retrying = _Retrying(self._fmu, self._do_step, self._asks_to_end, self._failed)
+            self._do_step = self._retrying
+        if self._options.linear_inputs:
+            self._step_of_fmu, self._do_step = self._do_step, self._step_with_derivatives
+            self._derivatives = {}
+
+    def _not_done(self, status: int) -> FmuMeshError:
+        """Why a step was not taken (FMI 2.0, 4.2.1): it failed, or the FMU asks to end the simulation."""
+        if status == DISCARD:
+            if self._asks_to_end() if self._retrying is None else self._retrying.ends:
+                return TerminationRequested("the FMU asked to end the simulation", instance=self.name)
+            if self._retrying is not None:
+                return self._failed(f"fmi2DoStep returned discard down to 1/{SMALLEST} of the step")
+        return self._failed(f"fmi2DoStep returned {STATUS_NAMES[status]}")
+
+    def _asks_to_end(self) -> bool:
+        """Whether a discarded step is a wish to end the simulation; most FMUs do not know of this question."""
+        value = ctypes.c_int(0)
+        try:
+            self._fmu.fmi2GetBooleanStatus(self._component, fmi2Terminated, ctypes.byref(value))
+        except FMICallException:
+            return False
+        return bool(value.value)
+
+    def _free(self) -> None:
+        if self._retrying is not None:
+            self._retrying.free()
+        super()._free()
+
+
+class _Retrying:
+    """fmi2DoStep that goes back to where a discarded step began, and takes smaller ones.
+
+    After fmi2Discard, only fmi2SetFMUstate leads on (FMI 2.0, 4.2.4), so the state is kept before every step.
+
+    Attributes:
+        ends: whether the last discarded step was a wish to end the simulation.
+    """
+
+    def __init__(
+        self,
+        fmu: Any,  # noqa: ANN401 FMPy is untyped
+        do_step: Callable[..., int],
+        asks_to_end: Callable[[], bool],
+        failed: Callable[[str], Exception],
+    ) -> None:
+        self.ends = False
+        self._fmu = fmu
+        self._do_step = do_step
+        self._asks_to_end = asks_to_end
+        self._failed = failed
+        self._state = ctypes.c_void_p()
+
+    def __call__(self, component: int, time: float, step_size: float, _no_set_state: int) -> int:
+        def attempt(start: float, size: float) -> int:
+            self._fmu.fmi2GetFMUstate(component, ctypes.byref(self._state))
+            status = self._do_step(component, start, size, 0)
+            if status == DISCARD:
+                self.ends = self._asks_to_end()
+                if self.ends:
+                    return PENDING
+                self._fmu.fmi2SetFMUstate(component, self._state)
+            return status
+
+        try:
+            status = attempt(time, step_size)
+            if status == DISCARD:
+                status = take_sub_steps(attempt, time, step_size)
+        except FMICallException as error:
+            raise self._failed(f"{error.function} returned {STATUS_NAMES[error.status]}") from error
+        return DISCARD if self.ends else status
+
+    def free(self) -> None:
+        """Free the state that was kept."""
+        if self._state.value is not None:
+            self._fmu.fmi2FreeFMUstate(self._fmu.component, ctypes.byref(self._state))

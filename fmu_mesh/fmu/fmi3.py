@@ -8,21 +8,22 @@ the mesh stay (FMI 3.0, 4.2.1).
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
-from fmpy.fmi1 import FMICallException
 from fmpy.fmi3 import FMU3Slave
 
 from ..model.description import Variable
 from ..model.ring import Part
 from ..model.types import DTYPES, Value, VariableType, is_text
 from .buffers import BinaryBuffer, Buffer, NumberBuffer, StringBuffer
-from .instance import STATUS_NAMES, WARNING, FmuInstance, Verb
+from .fmi3_events import SteppedInEvents
+from .fmi3_steps import Fmi3Steps
+from .instance import FmuInstance, Verb
 
-__all__ = ["Fmi3Instance"]
+__all__ = ["Fmi3Instance", "Fmi3Values"]
 
 _GET_OR_SET = ctypes.CFUNCTYPE(
     ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_size_t, ctypes.c_void_p, ctypes.c_size_t
@@ -36,90 +37,31 @@ _GET_OR_SET_BINARY = ctypes.CFUNCTYPE(
     ctypes.c_void_p,
     ctypes.c_size_t,
 )
-_DO_STEP = ctypes.CFUNCTYPE(
-    ctypes.c_int,
-    ctypes.c_void_p,
-    ctypes.c_double,
-    ctypes.c_double,
-    ctypes.c_bool,
-    ctypes.c_void_p,
-    ctypes.c_void_p,
-    ctypes.c_void_p,
-    ctypes.c_void_p,
-)
-_EVENTS_AT_ONE_TIME: Final = 1000
-"""Early returns without progress in time, and updates of discrete states, after which an FMU is taken to be stuck."""
 
 
-class Fmi3Instance(FmuInstance):
-    """One instance of an FMI 3.0 co-simulation FMU."""
+class Fmi3Values(FmuInstance):
+    """What all kinds of FMI 3.0 instances share: values, initialization and the end."""
 
-    def do_step(self, step: int) -> None:
-        """Set the inputs of row ``step``, advance to own step ``step + 1``, write the outputs to row ``step + 1``."""
-        slot = step & self._input_mask
-        if self._sets_in_event_mode:
-            self._fmu_called(self._fmu.enterEventMode)
-        component = self._component
-        for function, references, count, rows, size in self._direct_setters:
-            status = function(component, references, count, rows[slot], size)
-            if status > WARNING:
-                raise self._failed(f"setting the inputs returned {STATUS_NAMES[status]}")
-        for set_row in self._setters:
-            set_row(slot)
-        if self._sets_in_event_mode:
-            self._leave_event_mode()
-        time = self._start_time + step * self._points * self._base_step_size  # `grid.time`, without a call
-        self._advance(time, self._step_size, self._start_time + (step + 1) * self._points * self._base_step_size)
-        self._step = step + 1
-        slot = (step + 1) & self._output_mask
-        for function, references, count, rows, size in self._direct_getters:
-            status = function(component, references, count, rows[slot], size)
-            if status > WARNING:
-                raise self._failed(f"reading the outputs returned {STATUS_NAMES[status]}")
-        for get_row in self._getters:
-            get_row(slot)
-
-    def advance(self, time: float, step_size: float) -> None:
-        """One step of ``step_size`` from ``time`` (both in s) without rings, for callers with their own time base."""
-        self._check_live()
-        self._advance(time, step_size, time + step_size)
-
-    def set_values(self, values: Mapping[str, Value]) -> None:
-        """Set variables by name; between steps in Event Mode if one of them may not change otherwise."""
-        discrete = any(self._needs_event_mode(self._variables[name]) for name in values)
-        if self._state == "stepping" and discrete:
-            self._fmu_called(self._fmu.enterEventMode)
-            super().set_values(values)
-            self._leave_event_mode()
-        else:
-            super().set_values(values)
-
-    # --- what the base class asks for
+    _library: type[Any]
 
     def _instantiate(self, folder: Path) -> None:
-        description = self._description
-        fmu = FMU3Slave(
-            guid=description.guid,
-            modelIdentifier=description.model_identifier,
+        fmu = self._library(
+            guid=self._description.guid,
+            modelIdentifier=self._description.model_identifier,
             unzipDirectory=str(folder),
             instanceName=self.name,
         )
-        fmu.instantiate(
-            loggingOn=False,
-            eventModeUsed=description.has_event_mode,
-            earlyReturnAllowed=True,
-            logMessage=self._message_came,
-        )
+        fmu.instantiate(loggingOn=False, logMessage=self._message_came, **self._uses())
         self._fmu = fmu
         self._component = fmu.component
-        self._do_step = _DO_STEP(("fmi3DoStep", fmu.dll))
-        self._next_event: float | None = None
-        # eventHandlingNeeded, terminateSimulation and earlyReturn, one byte each.
-        self._flags = ctypes.create_string_buffer(3)
-        self._last_time = ctypes.c_double()
-        first = ctypes.addressof(self._flags)
-        self._answers = (first, first + 1, first + 2, ctypes.addressof(self._last_time))
-        self._sets_in_event_mode = False
+
+    def _uses(self) -> dict[str, bool]:
+        """What the instance is told of us when it is made."""
+        return {}
+
+    def _tolerance(self) -> float | None:
+        """The tolerance that the FMU is told (FMI 3.0, 2.3.2)."""
+        return self._description.default_experiment.tolerance
 
     def _message_came(self, _environment: int | None, status: int, category: bytes, message: bytes) -> None:
         self.logged(status, category or b"", message or b"")
@@ -133,17 +75,14 @@ class Fmi3Instance(FmuInstance):
             self.set_values(sizes)
             self._initializing("fmi3ExitConfigurationMode", self._fmu.exitConfigurationMode)
         self.set_values({name: value for name, value in start_values.items() if name not in structural})
-        tolerance = self._description.default_experiment.tolerance
+        self._time_of_start, tolerance = start_time, self._tolerance()
         self._initializing(
             "fmi3EnterInitializationMode",
             lambda: self._fmu.enterInitializationMode(tolerance=tolerance, startTime=start_time, stopTime=stop_time),
         )
 
     def _exit_initialization(self) -> None:
-        """An FMU with Event Mode is in it now."""
         self._initializing("fmi3ExitInitializationMode", self._fmu.exitInitializationMode)
-        if self._description.has_event_mode:
-            self._leave_event_mode()
 
     def _terminate(self) -> None:
         self._fmu.terminate()
@@ -174,11 +113,6 @@ class Fmi3Instance(FmuInstance):
     def _is_direct(self, part: Part) -> bool:
         return not is_text(part.type) and part.type != "Boolean"
 
-    def _prepare(self, verb: Verb, part: Part, array: Any) -> None:  # noqa: ANN401 as in the base class
-        super()._prepare(verb, part, array)
-        if verb == "Set" and any(self._needs_event_mode(self._variables[column.name]) for column in part.columns):
-            self._sets_in_event_mode = True
-
     def _call(self, function: Callable[..., int], references: Sequence[int], buffer: Buffer, size: int) -> int:
         array = (ctypes.c_uint * len(references))(*references)
         address = ctypes.addressof(array)
@@ -189,49 +123,21 @@ class Fmi3Instance(FmuInstance):
     def _call_direct(self, function: Callable[..., int], references: int, count: int, row: int, size: int) -> int:
         return function(self._component, references, count, row, size)
 
-    # --- steps and events
 
-    def _advance(self, time: float, step_size: float, end: float) -> None:
-        """Call `fmi3DoStep` until ``end`` (s) is reached, with Event Mode where the FMU wants it (FMI 3.0, 4.2.1)."""
-        has_events, stuck = self._description.has_event_mode, 0
-        while True:
-            target = end
-            if self._next_event is not None and time < self._next_event < end:
-                target, step_size = self._next_event, self._next_event - time
-            status = self._do_step(self._component, time, step_size, True, *self._answers)  # noqa: FBT003  as in C
-            if status > WARNING:
-                raise self._failed(f"fmi3DoStep returned {STATUS_NAMES[status]}")
-            event, terminate, early = self._flags.raw
-            if terminate:
-                raise self._failed("fmi3DoStep asks to end the simulation")
-            reached = self._last_time.value if early else target
-            if has_events and (event or (self._next_event is not None and reached >= self._next_event)):
-                self._fmu_called(self._fmu.enterEventMode)
-                self._leave_event_mode()
-            if reached >= end:
-                return
-            stuck = stuck + 1 if reached <= time else 0
-            if reached < time or stuck > _EVENTS_AT_ONE_TIME:
-                raise self._failed(f"fmi3DoStep returns early at t = {reached!r} s again and again")
-            time, step_size = reached, end - reached
+class Fmi3Instance(SteppedInEvents, Fmi3Values):
+    """One instance of an FMI 3.0 co-simulation FMU."""
 
-    def _leave_event_mode(self) -> None:
-        """Update the discrete states until they stay, and enter Step Mode (FMI 3.0, 2.3.5)."""
-        for _ in range(_EVENTS_AT_ONE_TIME):
-            update, terminate, _, _, defined, time = self._fmu_called(self._fmu.updateDiscreteStates)
-            if terminate:
-                raise self._failed("fmi3UpdateDiscreteStates asks to end the simulation")
-            if not update:
-                self._next_event = float(time) if defined else None
-                self._fmu_called(self._fmu.enterStepMode)
-                return
-        raise self._failed("fmi3UpdateDiscreteStates never comes to an end")
+    _library = FMU3Slave
 
-    def _needs_event_mode(self, variable: Variable) -> bool:
-        return self._description.has_event_mode and variable.variability != "continuous"
+    def _uses(self) -> dict[str, bool]:
+        return {"eventModeUsed": self._description.has_event_mode, "earlyReturnAllowed": True}
 
-    def _fmu_called(self, call: Callable[[], Any]) -> Any:  # noqa: ANN401 whatever the function of FMPy returns
-        try:
-            return call()
-        except FMICallException as error:
-            raise self._failed(f"{error.function} returned {STATUS_NAMES[error.status]}") from error
+    def _enter_initialization(self, start_time: float, stop_time: float | None, start_values: dict[str, Value]) -> None:
+        super()._enter_initialization(start_time, stop_time, start_values)
+        self._steps = Fmi3Steps(self._fmu, self._description)
+        self._stepped(lambda: self._steps.start(start_time))
+
+    def _exit_initialization(self) -> None:
+        """An FMU with Event Mode is in it now."""
+        super()._exit_initialization()
+        self._stepped(self._steps.exit_initialization)

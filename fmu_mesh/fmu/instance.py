@@ -18,6 +18,7 @@ from fmpy.fmi1 import FMICallException
 
 from ..errors import InitializationFailed, LoadFailed, StepFailed
 from ..model.description import ModelDescription, Variable
+from ..model.instance import StepOptions
 from ..model.ring import Part, Ring
 from ..model.types import Value, VariableType, flattened, nested
 from ..model.values import to_value
@@ -25,6 +26,7 @@ from ..simtime import TimeGrid
 from .archive import Terms
 from .buffers import Buffer
 from .sources import extract
+from .state import KeepsFmuState, Standing
 
 __all__ = ["OK", "STATUS_NAMES", "WARNING", "FmuInstance", "LogMessage", "LogSink", "Verb"]
 
@@ -54,7 +56,7 @@ class LogMessage(msgspec.Struct, frozen=True):
 LogSink = Callable[[LogMessage], None]
 
 
-class FmuInstance(ABC):
+class FmuInstance(KeepsFmuState, ABC):
     """One instance of an FMU; see `fmu_mesh.model.instance.Instance` for the call sequence.
 
     Args:
@@ -64,12 +66,13 @@ class FmuInstance(ABC):
         folder: an existing private folder to extract into.
         log: called with every log message, on the thread that calls the FMU.
         terms: what the FMU has to keep to.
+        options: how it is stepped.
 
     Raises:
         LoadFailed: the FMU cannot be extracted, loaded or instantiated.
     """
 
-    def __init__(  # noqa: PLR0913, PLR0917  what an FMU is opened with
+    def __init__(  # noqa: PLR0913, PLR0917 what an instance is made of; all of it is named where it is called
         self,
         path: Path,
         name: str,
@@ -77,8 +80,10 @@ class FmuInstance(ABC):
         folder: Path,
         log: LogSink = lambda _message: None,
         terms: Terms = Terms(),  # noqa: B008 a frozen Struct
+        options: StepOptions = StepOptions(),  # noqa: B008 a frozen Struct
     ) -> None:
         self.name = name
+        self._options = options
         self._log = log
         self._last_messages: list[str] = []
         self._step = -1
@@ -180,7 +185,7 @@ class FmuInstance(ABC):
         if self._state == "closed":
             return
         if self._live:
-            if self._state in ("initialization", "stepping"):
+            if self._state == "stepping":
                 _quietly(self._terminate)
             _quietly(self._free)
         self._live = False
@@ -237,6 +242,15 @@ class FmuInstance(ABC):
     @abstractmethod
     def _call(self, function: Callable[..., int], references: Sequence[int], buffer: Buffer, size: int) -> int:
         """Call a getter or setter on a buffer with ``size`` values; returns the status."""
+
+    # --- the state
+
+    def _standing(self) -> Standing:
+        return Standing(self._step)
+
+    def _stand(self, standing: Standing) -> None:
+        self._step = standing.step
+        self._state = "stepping"
 
     # --- shared by the versions
 

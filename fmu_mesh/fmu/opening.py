@@ -1,28 +1,42 @@
-"""From a model description to the instance that calls that version of FMI."""
+"""From a model description to the instance that calls that version and kind of FMI."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Final, cast
 
-from ..model.description import ModelDescription
+from ..model.description import Kind, ModelDescription
+from ..model.instance import Instance, StepOptions
 from .archive import Terms
+from .extrapolation import LinearInputs, TakesDerivatives
 from .fmi1 import Fmi1Instance
+from .fmi1_model import Fmi1ModelInstance
 from .fmi2 import Fmi2Instance
+from .fmi2_model import Fmi2ModelInstance
 from .fmi3 import Fmi3Instance
+from .fmi3_model import Fmi3ModelInstance
 from .instance import FmuInstance, LogSink
 
-__all__ = ["open_instance"]
+__all__ = ["open_instance", "stepped"]
 
-_BY_VERSION: dict[str, type[FmuInstance]] = {"1": Fmi1Instance, "2": Fmi2Instance, "3": Fmi3Instance}
+_CLASSES: Final[dict[tuple[str, Kind], type[FmuInstance]]] = {
+    ("1", "co_simulation"): Fmi1Instance,
+    ("1", "model_exchange"): Fmi1ModelInstance,
+    ("2", "co_simulation"): Fmi2Instance,
+    ("2", "model_exchange"): Fmi2ModelInstance,
+    ("3", "co_simulation"): Fmi3Instance,
+    ("3", "model_exchange"): Fmi3ModelInstance,
+}
 
 
-def open_instance(  # noqa: PLR0913, PLR0917  what an FMU is opened with
+def open_instance(  # noqa: PLR0913, PLR0917 the parameters of `FmuInstance`
     path: Path,
     name: str,
     description: ModelDescription,
     folder: Path,
     log: LogSink = lambda _message: None,
     terms: Terms = Terms(),  # noqa: B008 a frozen Struct
+    options: StepOptions = StepOptions(),  # noqa: B008 a frozen Struct
 ) -> FmuInstance:
     """Extract the FMU at ``path`` below ``folder``, load it, and make the instance called ``name``.
 
@@ -31,4 +45,11 @@ def open_instance(  # noqa: PLR0913, PLR0917  what an FMU is opened with
     Raises:
         LoadFailed: the FMU cannot be extracted, loaded or instantiated.
     """
-    return _BY_VERSION[description.fmi_version[0]](path, name, description, folder, log, terms)
+    return _CLASSES[description.fmi_version[0], description.kind](path, name, description, folder, log, terms, options)
+
+
+def stepped(instance: FmuInstance, options: StepOptions) -> Instance:
+    """The instance with linear inputs if it has some; ``instance`` stays the one to close."""
+    if not options.linear_inputs:
+        return instance
+    return LinearInputs(cast("TakesDerivatives", instance), options.linear_inputs)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import xml.etree.ElementTree as ET
 from pathlib import Path
+from typing import Any, Literal, cast
 
 import fmpy
 from fmpy.model_description import ModelDescription as FmpyDescription
@@ -15,7 +16,7 @@ from fmpy.model_description import ValidationError as FmpyValidationError
 from fmpy.model_description import read_model_description
 
 from ..errors import LoadFailed
-from ..model.description import DefaultExperiment, ModelDescription
+from ..model.description import Causality, Clock, DefaultExperiment, Kind, ModelDescription
 from .archive import Terms
 from .examining import examine, require_library
 from .variables import variables_of
@@ -23,11 +24,13 @@ from .variables import variables_of
 __all__ = ["read_description"]
 
 _VERSIONS = ("1.0", "2.0", "3.0")
+_WORDS = {"co_simulation": "co-simulation", "model_exchange": "model exchange"}
 
 
 def read_description(
     path: Path,
     terms: Terms = Terms(),  # noqa: B008 a frozen Struct
+    kind: Literal["auto"] | Kind = "auto",
     *,
     to_run: bool = True,
 ) -> ModelDescription:
@@ -36,6 +39,7 @@ def read_description(
     Args:
         path: the .fmu file, or the folder of an unpacked one.
         terms: what it has to keep to.
+        kind: which kind of it is wanted; ``auto``: co-simulation if it has both.
         to_run: whether it must be able to run on this platform.
 
     Raises:
@@ -45,17 +49,34 @@ def read_description(
     source, problems = _parse(path)
     version = source.fmiVersion or ""
     if not version.startswith(_VERSIONS) or "-" in version:  # 3.0-beta.1 is another interface than 3.0
-        raise LoadFailed(f"'{path}' is an FMI {version} FMU; co-simulation of FMI 1.0, 2.0 and 3.0 is what can run.")
-    if source.coSimulation is None:
-        raise LoadFailed(f"'{path}' is for model exchange only; export it for co-simulation.")
+        raise LoadFailed(f"'{path}' is an FMI {version} FMU; FMI 1.0, 2.0 and 3.0 are what can run.")
+    kind = _kind(source, kind, path)
     platforms = tuple(fmpy.supported_platforms(str(path)))
     if to_run:
-        require_library(path, contents.names, source.coSimulation.modelIdentifier or "", version)
+        require_library(path, contents.names, _interface(source, kind).modelIdentifier or "", version)
     root = ET.fromstring(contents.xml["modelDescription.xml"])  # noqa: S314 - `examine` has found it safe
     try:
-        return _convert(source, root, platforms, problems)
+        return _convert(source, kind, root, platforms, problems)
     except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
         raise LoadFailed(f"the modelDescription.xml of '{path}' has a value that cannot be: {error}") from error
+
+
+def _kind(source: FmpyDescription, wanted: str, path: Path) -> Kind:
+    """The kind to use: the wanted one, or the one that there is; co-simulation comes first."""
+    kinds: tuple[Kind, ...] = ("co_simulation", "model_exchange")
+    there = [kind for kind in kinds if _interface(source, kind) is not None]
+    for kind in there:
+        if wanted in ("auto", kind):
+            return kind
+    has = _WORDS[there[0]] if there else "scheduled execution"
+    raise LoadFailed(
+        f"'{path}' is for {has} only, not for {_WORDS.get(wanted, 'co-simulation or model exchange')}.",
+        hint="`kind: auto` takes what there is." if there else None,
+    )
+
+
+def _interface(source: FmpyDescription, kind: Kind) -> Any:  # noqa: ANN401 FMPy is untyped
+    return source.coSimulation if kind == "co_simulation" else source.modelExchange
 
 
 def _parse(path: Path) -> tuple[FmpyDescription, tuple[str, ...]]:
@@ -73,22 +94,22 @@ def _parse(path: Path) -> tuple[FmpyDescription, tuple[str, ...]]:
 
 
 def _convert(
-    source: FmpyDescription, root: ET.Element, platforms: tuple[str, ...], problems: tuple[str, ...]
+    source: FmpyDescription, kind: Kind, root: ET.Element, platforms: tuple[str, ...], problems: tuple[str, ...]
 ) -> ModelDescription:
-    co_simulation = source.coSimulation
+    interface = _interface(source, kind)
     experiment = source.defaultExperiment
     capabilities = root.find("Implementation/*/Capabilities")  # of FMI 1.0, which FMPy does not read
 
     def can(attribute: str) -> bool:
         if capabilities is not None:
             return capabilities.get(attribute) in ("true", "1")
-        return bool(getattr(co_simulation, attribute))
+        return bool(getattr(interface, attribute, False))
 
     return ModelDescription(
         model_name=source.modelName or "",
-        model_identifier=co_simulation.modelIdentifier,
+        model_identifier=interface.modelIdentifier,
         fmi_version=source.fmiVersion or "",
-        kind="co_simulation",
+        kind=kind,
         guid=source.guid or "",
         variables=variables_of(source, root),
         description=source.description,
@@ -100,14 +121,36 @@ def _convert(
             tolerance=_number(getattr(experiment, "tolerance", None)),
         ),
         can_handle_variable_step_size=can("canHandleVariableCommunicationStepSize"),
-        has_event_mode=bool(co_simulation.hasEventMode),
-        can_get_and_set_state=bool(co_simulation.canGetAndSetFMUstate),
-        can_serialize_state=bool(co_simulation.canSerializeFMUstate),
+        can_interpolate_inputs=can("canInterpolateInputs"),
+        has_event_mode=can("hasEventMode"),
+        can_get_and_set_state=bool(interface.canGetAndSetFMUstate),
+        can_serialize_state=bool(interface.canSerializeFMUstate),
         only_once_per_process=can("canBeInstantiatedOnlyOncePerProcess"),
-        needs_execution_tool=bool(co_simulation.needsExecutionTool)
+        needs_execution_tool=bool(interface.needsExecutionTool)
         or root.find("Implementation/CoSimulation_Tool") is not None,
+        # FMI 1.0 has no flag for it, and wants to be told.
+        tell_completed_steps=can("needsCompletedIntegratorStep") or (source.fmiVersion or "").startswith("1."),
+        continuous_states=int(source.numberOfContinuousStates),
+        event_indicators=int(source.numberOfEventIndicators),
+        clocks=tuple(map(_clock, root.iterfind("ModelVariables/Clock"))),
         platforms=platforms,
         problems=problems,
+    )
+
+
+def _clock(element: ET.Element) -> Clock:
+    """A clock; one that has a fraction for an interval counts in units of its resolution (FMI 3.0, 2.2.8.4)."""
+    interval, shift = _number(element.get("intervalDecimal")), _number(element.get("shiftDecimal"))
+    counter, resolution = element.get("intervalCounter"), element.get("resolution")
+    if counter is not None and resolution is not None:
+        interval, shift = int(counter) / int(resolution), int(element.get("shiftCounter", 0)) / int(resolution)
+    return Clock(
+        name=element.attrib["name"],
+        value_reference=int(element.attrib["valueReference"]),
+        causality=cast("Causality", element.get("causality", "local")),
+        interval_variability=element.get("intervalVariability", "triggered"),
+        interval=interval,
+        shift=shift or 0.0,
     )
 
 

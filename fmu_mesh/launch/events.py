@@ -40,6 +40,7 @@ class End(msgspec.Struct, frozen=True, tag="end"):
         seconds: wall-clock time from the first grant to the last point in s.
         rows: rows in the result file.
         profile: where the time went, if that was asked for.
+        ended_by: which FMU asked to end the simulation before its last point, if one did.
     """
 
     status: MeshStatus
@@ -48,6 +49,7 @@ class End(msgspec.Struct, frozen=True, tag="end"):
     result_file: str | None
     error: ErrorReport | None = None
     profile: MeshProfile | None = None
+    ended_by: ErrorReport | None = None
 
 
 Event = Ready | Status | Log | End

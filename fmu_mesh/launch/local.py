@@ -17,8 +17,15 @@ from types import MappingProxyType
 
 import numpy as np
 
-from ..errors import FmuError, FmuMeshError, Interrupted, StepFailed
-from ..fmu import LogMessage, Terms, open_instance
+from ..errors import (
+    ConfigurationError,
+    FmuError,
+    FmuMeshError,
+    Interrupted,
+    StepFailed,
+    TerminationRequested,
+)
+from ..fmu import LogMessage, Terms, open_instance, stepped
 from ..fmu.guard import CallWatch, Guarded, floating_point_changed, restore_floating_point
 from ..model.elements import scaled
 from ..model.fixed_point import FixedPoint
@@ -54,6 +61,7 @@ class LocalMesh:
         point: the last point reached.
         rows: rows in the result file.
         seconds: wall-clock time of the loop.
+        ended_by: which FMU asked to end the simulation before its last point, if one did.
     """
 
     def __init__(  # noqa: PLR0913, PLR0917  what a caller may want to hear of
@@ -68,6 +76,7 @@ class LocalMesh:
         self.point = 0
         self.rows = 0
         self.seconds = 0.0
+        self.ended_by: TerminationRequested | None = None
         self._plan = plan
         self._log = log
         self._progress = progress
@@ -93,13 +102,31 @@ class LocalMesh:
 
         Raises:
             FmuMeshError: an FMU failed, or the run was interrupted; rows up to then are kept.
+            Or this system cannot run in one process.
         """
+        self._check_one_process()
         try:
             self._run()
         except FmuMeshError as error:
             if self.rows and error.hint is None:
                 error.hint = f"What was recorded up to then ({self.rows} rows) is in '{self._plan.system.result_file}'."
             raise
+
+    def _check_one_process(self) -> None:
+        """Two instances of an FMU that allows one per process cannot run here, whatever their groups.
+
+        Raises:
+            ConfigurationError: there are two.
+        """
+        first_of: dict[str, str] = {}
+        for name, instance in self._plan.system.instances.items():
+            if instance.description.only_once_per_process and self._open_instance is None:
+                first = first_of.setdefault(instance.description.guid, name)
+                if first != name:
+                    text = (
+                        f"'{first}' and '{name}' cannot run in one process: their FMU allows one instance per process"
+                    )
+                    raise ConfigurationError(text, hint="Run it without --local.")
 
     def _run(self) -> None:
         plan = self._plan
@@ -133,7 +160,9 @@ class LocalMesh:
             return self._open_instance(name)
         system = self._plan.system.instances[name]
         terms = Terms(self._plan.system.config.limits, self._plan.system.config.instances[name].sha256)
-        return open_instance(Path(system.fmu), name, system.description, folder, self._log, terms)
+        options = self._plan.nodes[system.node].instance(name).options
+        opened = open_instance(Path(system.fmu), name, system.description, folder, self._log, terms, options)
+        return stepped(opened, options)
 
     def _guarded(self, name: str, folder: Path, watch: CallWatch) -> Guarded:
         return Guarded(name, lambda: self._open(name, folder), watch, self._plan.system.config.timeouts)
@@ -211,6 +240,9 @@ class LocalMesh:
                     break
                 for self._stepping, member in members.items():
                     member.step_from(point, members)
+        except TerminationRequested as asked:
+            asked.point, asked.time = self.point, grid.time(self.point)
+            self.ended_by = asked
         except StepFailed as error:
             error.point, error.time = self.point, grid.time(self.point)
             raise

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
+from typing import Literal
 
 import msgspec
 from msgspec.structs import replace
@@ -11,7 +12,7 @@ from msgspec.structs import replace
 from ..errors import ConfigurationError, Finding, LoadFailed
 from ..fmu import PLATFORM, Terms, compile_sources, read_description
 from ..model.config import InstanceConfig, ZenohConfig
-from ..model.description import ModelDescription
+from ..model.description import Kind, ModelDescription
 from ..model.findings import Findings, nearest_file
 from ..model.loading import LoadedConfig, examine
 from ..model.plan import Plan, make_plan
@@ -91,19 +92,19 @@ def _descriptions(
     loaded: LoadedConfig, tell: Callable[[str], None]
 ) -> tuple[dict[str, ModelDescription], Sequence[Finding]]:
     """The description of every instance whose FMU can be read, and a finding for every other."""
-    cache: dict[tuple[Path, Terms], ModelDescription | LoadFailed] = {}
+    cache: dict[tuple[Path, Terms, str], ModelDescription | LoadFailed] = {}
     descriptions: dict[str, ModelDescription] = {}
     findings = []
     for name, instance in loaded.config.instances.items():
         if not instance.fmu:
             continue  # what stands there instead is a finding already
-        path, terms = loaded.resolve(instance.fmu), Terms(loaded.config.limits, instance.sha256)
-        if (path, terms) not in cache:
-            cache[path, terms] = _description(path, terms, tell)
-        found = cache[path, terms]
+        key = (loaded.resolve(instance.fmu), Terms(loaded.config.limits, instance.sha256), instance.kind)
+        if key not in cache:
+            cache[key] = _description(*key, tell)
+        path, found = key[0], cache[key]
         if isinstance(found, LoadFailed):
             text = found.message.rstrip(".") + (f" ({found.hint.rstrip('.')})" if found.hint else "")
-            expected = "a co-simulation FMU of FMI 1.0, 2.0 or 3.0 for this platform"
+            expected = "an FMI 1.0, 2.0 or 3.0 FMU for this platform"
             findings.append(loaded.finding(f"instances.{name}.fmu", text, expected, _similar(path)))
         else:
             descriptions[name] = found
@@ -111,10 +112,12 @@ def _descriptions(
     return descriptions, findings
 
 
-def _description(path: Path, terms: Terms, tell: Callable[[str], None]) -> ModelDescription | LoadFailed:
+def _description(
+    path: Path, terms: Terms, kind: Literal["auto"] | Kind, tell: Callable[[str], None]
+) -> ModelDescription | LoadFailed:
     """The description of an FMU that can run here, once its sources are compiled if it has no binary; or why not."""
     try:
-        description = read_description(path, terms)
+        description = read_description(path, terms, kind)
         if PLATFORM not in description.platforms:
             compile_sources(path, terms, tell)
     except LoadFailed as error:

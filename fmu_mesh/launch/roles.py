@@ -16,11 +16,12 @@ from pathlib import Path
 import msgspec
 
 from ..errors import ConfigurationError, FmuError, FmuMeshError, StepFailed
-from ..fmu import FmuInstance, LogMessage, Terms, open_instance, read_description
+from ..fmu import FmuInstance, LogMessage, Terms, open_instance, read_description, stepped
 from ..fmu.guard import CallWatch, Guarded
 from ..master.master import Master
 from ..master.profiling import GrantWatch
 from ..model.findings import listed, nearest
+from ..model.instance import Instance
 from ..model.loading import load
 from ..model.plan import RECORDER, NodePlan, Plan
 from ..node.node import Node
@@ -118,12 +119,13 @@ class _NodeProcess:
     def _open(self, name: str) -> Guarded:
         item = self._plan.instance(name)
         path, terms = Path(item.fmu), Terms(self._plan.limits, item.sha256)
-        description = read_description(path, terms)
+        description = read_description(path, terms, item.kind)
 
-        def instantiate() -> FmuInstance:
-            instance = open_instance(path, name, description, fmu_folder(self._folder), self._log, terms)
+        def instantiate() -> Instance:
+            folder = fmu_folder(self._folder)
+            instance = open_instance(path, name, description, folder, self._log, terms, item.options)
             self._instances.append(instance)
-            return instance
+            return stepped(instance, item.options)
 
         self._guarded.append(Guarded(name, instantiate, self._watch, self._plan.timeouts))
         return self._guarded[-1]
@@ -218,7 +220,9 @@ def run_master(
             error = ended
         rows = recorder.rows if recorder is not None else 0
         report = error.report() if error is not None else None
-        emit(End(master.last_status(), master.seconds, rows, plan.system.result_file, report, master.profile()))
+        ended_by = master.ended_by.report() if master.ended_by is not None and error is None else None
+        status, result_file = master.last_status(), plan.system.result_file
+        emit(End(status, master.seconds, rows, result_file, report, master.profile(), ended_by))
         if error is not None:
             raise error
 

@@ -4,7 +4,7 @@
 
     wait until every node has registered; answer them all        (ready/ack)
     wait until every node is at point 0                          (Initialization Mode is over)
-    until every node is at the last point:
+    until every node is at the last point, or at the one where an FMU asked to end the simulation:
         grant = min(progress + window)                           (less where the wall clock or a pause holds it back)
         publish the grant if it grew; wait for progress
     tell the nodes to finish; wait for their reports
@@ -26,7 +26,15 @@ import msgspec
 import zenoh
 
 from .. import __version__
-from ..errors import DeadlineExceeded, ErrorReport, FmuMeshError, Interrupted, MeshLost, from_report
+from ..errors import (
+    DeadlineExceeded,
+    ErrorReport,
+    FmuMeshError,
+    Interrupted,
+    MeshLost,
+    TerminationRequested,
+    from_report,
+)
 from ..model.plan import RECORDER, Plan
 from ..wire.inbox import Inbox
 from ..wire.keys import Keys, batched
@@ -78,6 +86,7 @@ class Master:
 
     Attributes:
         watch: set it before `run` for a profile: then nodes measure themselves, and this sums up what holds the grant.
+        ended_by: which FMU asked to end the simulation before its last point, if one did.
 
     Call `run` once, from the main thread.
     """
@@ -103,6 +112,7 @@ class Master:
         self._present: set[str] = set()
         self._reports: dict[str, NodeReport] = {}
         self._failure: FmuMeshError | None = None
+        self.ended_by: TerminationRequested | None = None
         self._state: MeshState = "starting"
         self._grant = 0
         self._hold: int | None = None
@@ -216,12 +226,11 @@ class Master:
             query.drop()
 
     def _grant_to_the_end(self) -> None:
-        last = self._plan.grid.last_point
         self._state = "running"
         self._clock.start()
         self._pacer.start(0)
         self._moved = time.monotonic()
-        while self._slowest < last and not self._stop_asked:
+        while self._slowest < self._last_point and not self._stop_asked:
             self._turn(self._publish_grant())
             silent_s = time.monotonic() - self._moved
             if silent_s > 3 * self._timeouts.step and self._slowest < self._grant and self._hold is None:
@@ -232,14 +241,14 @@ class Master:
                     time=self._plan.grid.time(self._slowest),
                 )
         self._clock.stop()
-        if self._stop_asked and self._slowest < last:
+        if self._stop_asked and self._slowest < self._last_point:
             point = self._slowest
             raise Interrupted("stopped by a command", point=point, time=self._plan.grid.time(point))
 
     def _publish_grant(self) -> float:
         """Publish the grant if it may grow, or as a sign of life; returns how long to wait for the next look, in s."""
         credit = min(map(operator.add, self._progress, self._windows))
-        grant = min(credit, self._plan.grid.last_point)
+        grant = min(credit, self._last_point)
         if self._hold is not None:
             grant = min(grant, self._hold)
         paced, pause = self._pacer.limit(grant, self._slowest)
@@ -255,11 +264,17 @@ class Master:
 
     def _holder(self, credit: int, grant: int) -> str | None:
         """What keeps the grant from growing, for a profile."""
-        if grant == self._plan.grid.last_point:
+        if grant == self._last_point:
             return None
         if grant < credit:
             return PAUSE if grant == self._hold else CLOCK
         return self._nodes[min(range(len(self._nodes)), key=lambda n: self._progress[n] + self._windows[n])]
+
+    @property
+    def _last_point(self) -> int:
+        """The last point, or the one at which an FMU asked to end the simulation."""
+        ended = self.ended_by.point if self.ended_by is not None else None
+        return self._plan.grid.last_point if ended is None else ended
 
     def _wait_for(self, reached: Callable[[], bool], timeout_s: float, what: str) -> None:
         deadline = time.monotonic() + timeout_s
@@ -358,9 +373,15 @@ class Master:
 
     def _take_report(self, query: zenoh.Query) -> None:
         report = msgspec.json.decode(query.payload.to_bytes() if query.payload else b"", type=NodeReport)
-        self._reports[report.node] = report
-        if report.error is not None:
-            self._fail(from_report(report.error))
+        error = from_report(report.error) if report.error is not None else None
+        if isinstance(error, TerminationRequested):
+            # Its node goes on with its other instances, and says so once more at the end.
+            if error.point is not None and error.point < self._last_point:
+                self.ended_by = error
+        else:
+            self._reports[report.node] = report
+            if error is not None:
+                self._fail(error)
         query.reply(query.key_expr, b"")
         query.drop()
 
@@ -453,7 +474,7 @@ class Master:
 
     def last_status(self) -> MeshStatus:
         """The state of the run right now."""
-        point = max(self._slowest, 0)
+        point = min(max(self._slowest, 0), self._last_point)
         elapsed = self._clock.elapsed()
         rate = point / elapsed if elapsed > 0 else 0.0
         failure: ErrorReport | None = self._failure.report() if self._failure is not None else None

@@ -21,6 +21,7 @@ __all__ = [
     "LimitsConfig",
     "RecordConfig",
     "SimulationConfig",
+    "SolverConfig",
     "TimeoutsConfig",
     "ZenohConfig",
 ]
@@ -106,10 +107,46 @@ class SimulationConfig(Base, frozen=True, kw_only=True):
     ] = None
 
 
+class SolverConfig(Base, frozen=True, kw_only=True):
+    """How the continuous states of a model-exchange FMU are solved."""
+
+    name: Annotated[
+        Literal["cvode", "euler"],
+        Meta(description="cvode: variable step and order, finds events exactly; euler: fixed steps, for checks."),
+    ] = "cvode"
+    relative_tolerance: Annotated[
+        float | None,
+        Meta(
+            description="Relative tolerance of cvode; default: that of the FMU's default experiment, or 1e-6.",
+            extra_json_schema=_POSITIVE,
+            examples=[1e-6],
+        ),
+    ] = None
+    maximum_step_size: Annotated[
+        float | None,
+        Meta(
+            description="Longest step of the solver in s; default: the instance's own step size.",
+            extra_json_schema=_POSITIVE,
+        ),
+    ] = None
+
+
 class InstanceConfig(Base, frozen=True, kw_only=True):
     """One instance of an FMU."""
 
     fmu: Annotated[str, Meta(description="Path of the .fmu file, or of an unpacked one, relative to this file.")]
+    kind: Annotated[
+        Literal["auto", "co_simulation", "model_exchange"],
+        Meta(description="Which kind of the FMU to use; auto: co-simulation if it has both."),
+    ] = "auto"
+    solver: Annotated[SolverConfig, Meta(description="The solver of a model-exchange FMU.")] = SolverConfig()
+    retry_discarded_steps: Annotated[
+        bool,
+        Meta(
+            description="Whether a step that an FMI 2.0 FMU discards is tried again in smaller ones; then its state is "
+            "kept before every step. FMI 3.0 needs no such wish."
+        ),
+    ] = False
     start_values: Annotated[
         dict[str, PlainValue],
         Meta(
@@ -190,6 +227,13 @@ class ConnectionConfig(Base, frozen=True, kw_only=True):
     ignore_units: Annotated[bool, Meta(description="true: neither convert nor compare the units of the two ends.")] = (
         False
     )
+    extrapolation: Annotated[
+        Literal["hold", "linear"],
+        Meta(
+            description="hold: the input is constant during a step; linear: it changes with the slope between the last "
+            "two values, for FMUs that take input derivatives."
+        ),
+    ] = "hold"
 
 
 class InitializationConfig(Base, frozen=True, kw_only=True):

@@ -8,6 +8,7 @@ Delays and cycles are `fmu_mesh.model.plan`.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Literal
 
 import msgspec
 from msgspec.structs import replace
@@ -34,6 +35,7 @@ class Connection(msgspec.Struct, frozen=True):
         delay: 0, 1, or None where the algorithm decides.
         path: its place in the configuration file, such as `connections[2]`.
         units: in words what was done about units; empty if nothing was to do.
+        extrapolation: whether the target's input changes linearly within a step.
     """
 
     source_instance: str
@@ -44,6 +46,7 @@ class Connection(msgspec.Struct, frozen=True):
     offset: float
     delay: int | None
     path: str
+    extrapolation: Literal["hold", "linear"] = "hold"
     source_index: tuple[int, ...] = ()
     target_index: tuple[int, ...] = ()
     units: str = ""
@@ -87,6 +90,7 @@ def resolve_connections(
             offset=config.offset,
             delay=config.delay,
             path=path,
+            extrapolation=config.extrapolation,
             source_index=source[1],
             target_index=target[1],
         )

@@ -18,7 +18,9 @@ from .units import BaseUnit
 
 __all__ = [
     "Causality",
+    "Clock",
     "DefaultExperiment",
+    "Kind",
     "ModelDescription",
     "PlainValue",
     "Value",
@@ -32,6 +34,7 @@ Causality = Literal[
 ]
 Variability = Literal["constant", "fixed", "tunable", "discrete", "continuous"]
 Initial = Literal["exact", "approx", "calculated"]
+Kind = Literal["co_simulation", "model_exchange"]
 
 
 class Variable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -106,24 +109,46 @@ class DefaultExperiment(msgspec.Struct, frozen=True, forbid_unknown_fields=True)
     tolerance: float | None = None
 
 
+class Clock(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One clock of an FMI 3.0 model description (FMI 3.0, 2.2.8).
+
+    Attributes:
+        interval_variability: constant, fixed, tunable, changing, countdown or triggered.
+        interval: in s; None where parameters or the FMU decide.
+        shift: time of the first tick after the start, in s.
+    """
+
+    name: str
+    value_reference: int
+    causality: Causality
+    interval_variability: str
+    interval: float | None = None
+    shift: float = 0.0
+
+
 class ModelDescription(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A model description (FMI 2.0, 2.2) as far as the mesh needs it."""
 
     model_name: str
     model_identifier: str
     fmi_version: str
-    kind: Literal["co_simulation"]
+    kind: Kind
     guid: str
     variables: tuple[Variable, ...]
     description: str | None = None
     generation_tool: str | None = None
     default_experiment: DefaultExperiment = DefaultExperiment()
     can_handle_variable_step_size: bool = False
-    has_event_mode: bool = False
     can_get_and_set_state: bool = False
     can_serialize_state: bool = False
     only_once_per_process: bool = False
     needs_execution_tool: bool = False
+    can_interpolate_inputs: bool = False
+    has_event_mode: bool = False
+    tell_completed_steps: bool = False
+    continuous_states: int = 0
+    event_indicators: int = 0
+    clocks: tuple[Clock, ...] = ()
     platforms: tuple[str, ...] = ()
     problems: tuple[str, ...] = ()
 

@@ -16,9 +16,12 @@ from msgspec.structs import replace
 from ..errors import ConfigurationError, Finding
 from ..simtime import TimeGrid
 from .config import InitializationConfig, LimitsConfig, TimeoutsConfig
+from .description import Kind
 from .graph import cycle_through, feedback_edges, strongly_connected, topological_order
 from .initialization import InitializationPlan, Loop, plan_initialization
+from .instance import StepOptions
 from .ring import Layout, rows_for
+from .step_options import linear_inputs
 from .system import Connection, System, SystemInstance
 from .types import PlainValue
 from .values import to_plain
@@ -59,6 +62,8 @@ class InstancePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         inputs: the connected inputs, set before every step.
         initialization: the levels at which connected outputs become known in Initialization Mode, by name.
         interpolation: what the time of a value that is sent to an unconnected input means; None: nothing.
+        kind: which kind of the FMU is used.
+        options: how it is stepped.
     """
 
     name: str
@@ -71,6 +76,8 @@ class InstancePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     initialization: dict[str, int]
     interpolation: Literal["hold", "linear"] | None = None
     sha256: str | None = None
+    kind: Kind = "co_simulation"
+    options: StepOptions = StepOptions()
 
 
 class Link(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -376,6 +383,8 @@ def _instance_plan(plan: Plan, instance: SystemInstance, outputs: Layout) -> Ins
         initialization={variable: level for (owner, variable), level in levels.items() if owner == instance.name},
         interpolation=plan.system.config.instances[instance.name].interpolation,
         sha256=plan.system.config.instances[instance.name].sha256,
+        kind=instance.description.kind,
+        options=replace(instance.options, linear_inputs=linear_inputs(plan.connections, instance.name)),
     )
 
 

@@ -24,8 +24,10 @@ from fmu_mesh.model.connection import (
 from fmu_mesh.model.description import ModelDescription, Value
 from fmu_mesh.model.findings import Findings, nearest_file, shown
 from fmu_mesh.model.grouping import automatic_nodes
+from fmu_mesh.model.instance import StepOptions
 from fmu_mesh.model.loading import LoadedConfig
 from fmu_mesh.model.start_values import resolve_start_values, sized
+from fmu_mesh.model.step_options import capability_warnings, check_extrapolation, resolve_step_options
 from fmu_mesh.model.types import element_name, is_text
 from fmu_mesh.simtime import ENDLESS, TimeGrid, steps_between
 
@@ -44,6 +46,7 @@ class SystemInstance(msgspec.Struct, frozen=True):
         start_values: start values by variable name, converted to the variable's type.
         step_points: its step size as a multiple of the base step size; 1 or more.
         node: name of the node (process) it runs in: its group, that of its cycle (`group: auto`), or its own name.
+        options: how it is stepped; its linear inputs are not known before the delays.
     """
 
     name: str
@@ -52,6 +55,7 @@ class SystemInstance(msgspec.Struct, frozen=True):
     start_values: dict[str, Value]
     step_points: int
     node: str
+    options: StepOptions = StepOptions()
 
 
 class System(msgspec.Struct, frozen=True):
@@ -104,6 +108,7 @@ def build(
     instances = _instances(loaded, descriptions, variables, collected)
     _check_nodes(config, descriptions, collected)
     connections = resolve_connections(config.connections, variables, collected)
+    check_extrapolation(connections, config.instances, descriptions, collected)
     recorded = _recorded(config, variables, collected)
     result_file = _result_file(loaded, collected)
     _check_zenoh(loaded, collected)
@@ -118,6 +123,7 @@ def build(
         instances = {name: replace(own, node=nodes.get(name, own.node)) for name, own in instances.items()}
     warnings = loaded.findings()
     unit_warnings(connections, warnings)
+    capability_warnings(config.instances, descriptions, warnings)
     return System(config, grid, instances, connections, recorded, result_file, tuple(warnings))
 
 
@@ -177,6 +183,7 @@ def _instances(
             start_values=resolve_start_values(name, config, own, findings),
             step_points=step_points,
             node=config.group or name,
+            options=resolve_step_options(name, config, descriptions[name], findings),
         )
     return instances
 

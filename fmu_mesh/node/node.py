@@ -23,7 +23,15 @@ from collections.abc import Callable
 import msgspec
 import zenoh
 
-from ..errors import DeadlineExceeded, FmuMeshError, Interrupted, MeshLost, StepFailed, from_report
+from ..errors import (
+    DeadlineExceeded,
+    FmuMeshError,
+    Interrupted,
+    MeshLost,
+    StepFailed,
+    TerminationRequested,
+    from_report,
+)
 from ..model.instance import Instance
 from ..model.plan import NodePlan
 from ..model.transfer import Transfer
@@ -248,8 +256,11 @@ class Node:
             self._profiler.start()
         while not self._finished:
             stepped = False
-            for unit in self._units:
-                stepped = unit.advance(self._grant) or stepped
+            for unit in tuple(self._units):
+                try:
+                    stepped = unit.advance(self._grant) or stepped
+                except TerminationRequested as asked:
+                    self._end_early(unit, asked)
             taken = False
             while (message := poll()) is not None:
                 self._take(message)
@@ -261,6 +272,16 @@ class Node:
                 self._flush_before_waiting()
                 self._tell_progress()
                 self._wait()
+
+    def _end_early(self, unit: Unit, asked: TerminationRequested) -> None:
+        """An FMU asks to end the simulation: its unit stays where it is, and the master ends the run at its point."""
+        self._units.remove(unit)
+        point = self._runners[asked.instance or ""].covered
+        for runner in unit.runners:
+            runner.last_step = runner.step
+            runner.flush()
+        asked.point, asked.time = point, self._plan.grid.time(point)
+        self._report(asked, self._plan.timeouts.stop)
 
     def _flush_before_waiting(self) -> None:
         """Send what a consumer could be waiting for; rows that are only recorded at least every 50 ms."""

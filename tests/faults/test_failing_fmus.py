@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import signal
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -123,4 +123,33 @@ def test_status_is_answered_while_an_fmu_does_not_return(place: Place, faulty: P
     assert (status["state"], status["point"], status["time"]) == ("running", 1000, 1.0)
     assert "waiting at point" in neighbour["activity"]
     assert launched.wait() == 130
+    place.assert_nothing_left()
+
+
+@pytest.mark.timeout(60)
+@pytest.mark.parametrize("options", [(), ("--local",)], ids=["distributed", "local"])
+def test_an_fmu_that_asks_to_end_the_simulation_is_named_and_nothing_has_failed(
+    place: Place, event_fmu: Callable[..., Path], options: tuple[str, ...]
+) -> None:
+    """Its steps are five points long: the outputs hold to the last point before the step that it did not finish."""
+    config = write_config(
+        place.folder,
+        instances={
+            "pendulum": {"fmu": "DampedPendulum"},
+            "stairs": {
+                "fmu": str(event_fmu("Stairs", 2)),
+                "start_values": {"period": 0.0125, "end": 3},
+                "step_size": 0.005,
+            },
+        },
+        connections=[],
+        stop_time=1000.0,
+    )
+
+    launched = place.run("launch", config, *options)
+
+    assert launched.wait() == 0
+    assert "instance stairs, point 39, t = 0.039 s: the FMU asked to end the simulation" in launched.errors
+    rows = rows_of(config.with_suffix(".csv"))
+    assert [row[0] for row in rows] == [point * 0.001 for point in range(40)]
     place.assert_nothing_left()

@@ -88,7 +88,6 @@ CANNOT_RUN = [
         "which cannot be the name of a library",
         id="an identifier that leaves the folder",
     ),
-    pytest.param(("CoSimulation", "ModelExchange"), "model exchange only", id="model exchange only"),
 ]
 
 
@@ -179,3 +178,12 @@ def test_the_limits_of_the_configuration_hold(tmp_path: Path) -> None:
 
     with pytest.raises(ConfigurationError, match=r"instances\.gain\.fmu: .* entries; the limit is 3"):
         prepare(file)
+
+
+def test_a_model_for_the_other_kind_only_is_refused_with_the_way_out(tmp_path: Path) -> None:
+    path = repacked(tmp_path / "odd.fmu", description=lambda text: text.replace("CoSimulation", "ModelExchange"))
+
+    with pytest.raises(LoadFailed, match="is for model exchange only, not for co-simulation") as refused:
+        read_description(path, kind="co_simulation")
+
+    assert refused.value.hint == "`kind: auto` takes what there is."

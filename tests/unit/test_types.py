@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from fmu_mesh import FMIAdapter
-from fmu_mesh.errors import CallRefused, InitializationFailed, LoadFailed, StepFailed
+from fmu_mesh.errors import CallRefused, InitializationFailed, LoadFailed, StepFailed, TerminationRequested
 from fmu_mesh.fmu import FmuInstance, open_instance, read_description
 from fmu_mesh.model.ring import Layout, Ring
 from fmu_mesh.model.types import INTEGERS, VariableType
@@ -230,13 +230,14 @@ def test_a_step_ends_at_an_event_that_was_announced(opened: FmuInstance) -> None
 
 
 @of("Events3")
-def test_an_fmu_that_wants_to_end_the_simulation_is_a_named_failure(opened: FmuInstance) -> None:
+def test_an_fmu_that_wants_to_end_the_simulation_is_heard_before_the_next_step(opened: FmuInstance) -> None:
     opened.enter_initialization(0.0, 2.0, {"last": 0.5})
     opened.exit_initialization()
     opened.advance(0.0, 0.25)
+    opened.advance(0.25, 0.25)
 
-    with pytest.raises(StepFailed, match="fmi3DoStep asks to end the simulation"):
-        opened.advance(0.25, 0.25)
+    with pytest.raises(TerminationRequested, match="the FMU asked to end the simulation"):
+        opened.advance(0.5, 0.25)
 
 
 def test_a_beta_version_of_fmi_3_is_refused(folder: Path, tmp_path: Path) -> None:

@@ -1,0 +1,111 @@
+"""How instances are to be stepped: `kind`, `solver`, `retry_discarded_steps` and `extrapolation` of a configuration.
+
+Owns which of these wishes an FMU can fulfil, by its capability flags; what it cannot is a finding with the reason.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+from .config import InstanceConfig
+from .connection import Connection
+from .description import ModelDescription
+from .findings import Findings
+from .instance import LinearInput, SolverSettings, StepOptions
+
+__all__ = ["capability_warnings", "check_extrapolation", "linear_inputs", "resolve_step_options"]
+
+_DEFAULT_TOLERANCE = 1e-6
+
+
+def resolve_step_options(
+    name: str, config: InstanceConfig, description: ModelDescription, findings: Findings
+) -> StepOptions:
+    """What the section of an instance says about its stepping; the linear inputs are not known before the delays."""
+    solver = config.solver
+    for key in ("relative_tolerance", "maximum_step_size"):
+        value = getattr(solver, key)
+        if value is not None and not (math.isfinite(value) and value > 0.0):
+            findings.add(f"instances.{name}.solver.{key}", f"{value:g}", "a number > 0")
+    if description.kind == "co_simulation" and solver != InstanceConfig(fmu="").solver:
+        found = f"a solver for '{name}', which runs as co-simulation and has a solver of its own"
+        findings.add(f"instances.{name}.solver", found, "`kind: model_exchange`, or no solver")
+    if config.retry_discarded_steps and (reason := _cannot_retry(description)) is not None:
+        findings.add(f"instances.{name}.retry_discarded_steps", f"true, but {reason}", "false")
+    tolerance = solver.relative_tolerance or description.default_experiment.tolerance or _DEFAULT_TOLERANCE
+    return StepOptions(
+        solver=SolverSettings(solver.name, tolerance, solver.maximum_step_size),
+        retry_discarded_steps=config.retry_discarded_steps,
+    )
+
+
+def check_extrapolation(
+    connections: Sequence[Connection],
+    configs: Mapping[str, InstanceConfig],
+    descriptions: Mapping[str, ModelDescription],
+    findings: Findings,
+) -> None:
+    """Refuse `extrapolation: linear` where the target cannot take the derivative of an input."""
+    for connection in connections:
+        if connection.extrapolation == "linear":
+            target = connection.target_instance
+            retries = configs[target].retry_discarded_steps
+            reason = _cannot_extrapolate(connection, descriptions[target], retries=retries)
+            if reason is not None:
+                found = f"linear for {connection}, but {reason}"
+                findings.add(f"{connection.path}.extrapolation", found, "hold")
+
+
+def linear_inputs(connections: Sequence[Connection], name: str) -> tuple[LinearInput, ...]:
+    """The inputs of an instance that change linearly; the delays of all connections are known."""
+    return tuple(
+        LinearInput(connection.target.name, connection.delay or 0)
+        for connection in connections
+        if connection.target_instance == name and connection.extrapolation == "linear"
+    )
+
+
+def capability_warnings(
+    config: Mapping[str, InstanceConfig], descriptions: Mapping[str, ModelDescription], findings: Findings
+) -> None:
+    """Note what an FMU needs that this program does not give it."""
+    for name in config:
+        description = descriptions[name]
+        if description.needs_execution_tool:
+            tool = description.generation_tool or "the tool that made it"
+            found = f"the FMU of '{name}' needs an execution tool ({tool})"
+            findings.add(f"instances.{name}.fmu", found, f"{tool} installed on the host that runs it")
+
+
+def _cannot_retry(description: ModelDescription) -> str | None:
+    if description.kind == "model_exchange":
+        return "a model-exchange FMU has no steps of its own to discard"
+    if not description.can_handle_variable_step_size:
+        return "the FMU does not handle a variable communication step size"
+    if description.fmi_version.startswith("1."):
+        return "FMI 1.0 has no FMU state to go back to"
+    if description.fmi_version.startswith("2.") and not description.can_get_and_set_state:
+        return "the FMU cannot get and set its state, so it cannot go back to where the step began"
+    return None
+
+
+def _cannot_extrapolate(connection: Connection, description: ModelDescription, *, retries: bool) -> str | None:
+    target = connection.target
+    if target.type != "Float64" or target.shape or connection.target_index:
+        return f"'{target.name}' is no scalar Real input"
+    if target.variability != "continuous":
+        return f"'{target.name}' is a {target.variability} input"
+    if description.kind == "model_exchange":
+        return None
+    if description.fmi_version.startswith("3."):
+        reason = "co-simulation in FMI 3.0 takes no input derivatives (it would run as model exchange)"
+    elif description.fmi_version.startswith("1."):
+        reason = "co-simulation in FMI 1.0 gets no input derivatives here (it would run as model exchange)"
+    elif not description.can_interpolate_inputs:
+        reason = f"the FMU of '{connection.target_instance}' does not interpolate inputs (canInterpolateInputs)"
+    elif retries:
+        reason = "discarded steps of its target are retried, and a part of a step has no input derivatives of its own"
+    else:
+        return None
+    return reason

@@ -1,0 +1,101 @@
+"""Model exchange, events and linear inputs over processes: every float is that of a run in one process.
+
+The FMUs abort the process on a call that the state machine of their FMI version forbids, so these runs prove the
+calling sequences, too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from fmu_mesh.launch.local import LocalMesh
+from fmu_mesh.launch.preparing import Options, prepare
+from tests.fmus.event_fmus import Version
+from tests.helpers import Place
+
+EventFmu = Callable[..., Path]
+
+
+def both_ways(place: Place, content: Mapping[str, Any], *arguments: str) -> tuple[bytes, bytes]:
+    """The result of a launched run, and that of the same plan in this process."""
+    config = place.folder / "mesh.yaml"
+    config.write_text(yaml.safe_dump({"mesh": "m", **content}, sort_keys=False), encoding="utf-8")
+    launched = place.start("launch", config, "--no-progress", "--output", place.folder / "launched.csv", *arguments)
+    assert launched.wait(50.0) == 0, launched.errors
+    LocalMesh(prepare(config, Options(output=place.folder / "local.csv"))).run()
+    return (place.folder / "launched.csv").read_bytes(), (place.folder / "local.csv").read_bytes()
+
+
+def system(event_fmu: EventFmu, kinds: Mapping[str, tuple[Version, str]], **connection: str) -> dict[str, Any]:
+    """A ball, whose height drives an oscillator, whose state is integrated; and stairs that go up by its events."""
+    solver = {"relative_tolerance": 1e-7}
+    models = {"ball": "Ball", "oscillator": "Oscillator", "integral": "Integral", "stairs": "Stairs"}
+    instances = {}
+    for name, model in models.items():
+        version, kind = kinds[name]
+        section: dict[str, Any] = {"fmu": str(event_fmu(model, version)), "kind": kind}
+        if kind == "model_exchange":
+            section["solver"] = solver
+        instances[name] = section
+    instances["stairs"]["start_values"] = {"period": 0.31}
+    return {
+        "simulation": {"stop_time": 3.0, "step_size": 0.01},
+        "instances": instances,
+        "connections": [
+            {"from": "ball.h", "to": "oscillator.u", **connection},
+            {"from": "oscillator.x", "to": "integral.u", **connection},
+            "integral.above -> stairs.increment",
+        ],
+    }
+
+
+Kinds = dict[str, tuple[Version, str]]
+NAMES = ("ball", "oscillator", "integral", "stairs")
+ALL_1: Kinds = dict.fromkeys(NAMES, (1, "model_exchange"))
+ALL_2: Kinds = dict.fromkeys(NAMES, (2, "model_exchange"))
+ALL_3: Kinds = dict.fromkeys(NAMES, (3, "model_exchange"))
+MIXED: Kinds = {
+    "ball": (3, "co_simulation"),
+    "oscillator": (1, "model_exchange"),
+    "integral": (2, "co_simulation"),
+    "stairs": (3, "co_simulation"),
+}
+
+
+@pytest.mark.parametrize("kinds", [ALL_1, ALL_2, ALL_3, MIXED], ids=["FMI 1", "FMI 2", "FMI 3", "mixed"])
+def test_a_chain_with_events_gives_the_same_floats(
+    kinds: Mapping[str, tuple[Version, str]], place: Place, event_fmu: EventFmu
+) -> None:
+    launched, local = both_ways(place, system(event_fmu, kinds))
+
+    assert launched == local
+    assert len(launched.splitlines()) == 302
+
+
+@pytest.mark.parametrize("algorithm", ["jacobi", "gauss_seidel"])
+def test_linear_inputs_give_the_same_floats(algorithm: str, place: Place, event_fmu: EventFmu) -> None:
+    kinds: Kinds = {**ALL_3, "integral": (2, "co_simulation")}
+    content = system(event_fmu, kinds, extrapolation="linear")
+    content["simulation"] |= {"algorithm": algorithm, "window": 7}
+
+    launched, local = both_ways(place, content)
+
+    assert launched == local
+
+
+def test_an_fmu_that_asks_to_end_ends_the_run_at_its_point_for_all(place: Place, event_fmu: EventFmu) -> None:
+    content = system(event_fmu, ALL_2)
+    content["instances"]["stairs"]["start_values"] |= {"end": 3, "increment": 1}
+    content["connections"].pop()
+    content["simulation"]["stop_time"] = 1000.0
+
+    launched, local = both_ways(place, content)
+
+    # The third stair is at 0.93 s: the step that begins at 0.92 s is the last complete one.
+    assert launched == local
+    assert launched.splitlines()[-1].startswith(b"0.93,")
