@@ -7,6 +7,16 @@ The engine is an extra and is imported when one is opened; nothing else of the p
 from .mujoco import MujocoInstance
 from .mujoco_model import describe_world
 from .pid import PidInstance, describe_pid
-from .rendering import Picture
+from .rendering import Film, Picture, Window, check_film, check_window
 
-__all__ = ["MujocoInstance", "Picture", "PidInstance", "describe_pid", "describe_world"]
+__all__ = [
+    "Film",
+    "MujocoInstance",
+    "Picture",
+    "PidInstance",
+    "Window",
+    "check_film",
+    "check_window",
+    "describe_pid",
+    "describe_world",
+]
