@@ -150,7 +150,7 @@ class MujocoInstance:
         self._start_time, self._points, self._base = grid.start_time, points, grid.step_size
         self._substeps = self._config.physics_steps or _fewest_steps(points * grid.step_size, self._timestep)
         self._model.opt.timestep = points * grid.step_size / self._substeps
-        self._step = step
+        self._step, self._last_step = step, grid.last_point // points
         self._inputs = inputs
         taken = [self._entries[name] for name in inputs.layout.reals]
         self._takes = _grouped(taken)
@@ -316,6 +316,8 @@ class MujocoInstance:
                 row[columns] = self._arrays[where][places]
         if self._picture is not None:
             self._picture.show(self._model, self._data, self._start_time + step * self._points * self._base)
+            if step == self._last_step:
+                self._picture.finish()
 
     def _remembered(self) -> list[Floats]:
         """What `mj_getState` leaves out: the mesh's inputs, and what was found in the last step."""

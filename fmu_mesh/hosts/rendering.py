@@ -9,6 +9,8 @@ from __future__ import annotations
 import ctypes.util
 import importlib
 import importlib.util
+import logging
+import math
 import os
 import time
 from contextlib import suppress
@@ -19,6 +21,8 @@ from ..errors import ConfigurationError, LoadFailed
 from .mujoco_model import engine
 
 __all__ = ["Film", "Picture", "Window", "check_film", "check_window"]
+
+log = logging.getLogger(__name__)
 
 WIDTH: Final = 640
 HEIGHT: Final = 480
@@ -31,14 +35,22 @@ _BACKENDS = (("egl", "EGL"), ("osmesa", "OSMesa"))
 
 
 class Picture(Protocol):
-    """What is shown a world at points; `close` once at the end."""
+    """What is shown a world at points: `finish` after the last one, `close` at the end of every run."""
 
     def show(self, model: Any, data: Any, time_s: float) -> None:  # noqa: ANN401  mujoco has no types
         """Show the world as it is at ``time_s``; may do nothing."""
         ...
 
+    def finish(self) -> None:
+        """Nothing more will be shown: write what is to be written.
+
+        Raises:
+            LoadFailed: it cannot be written.
+        """
+        ...
+
     def close(self) -> None:
-        """Finish. Never raises."""
+        """End, also where a run ended early. Never raises; may be called twice."""
         ...
 
 
@@ -91,37 +103,52 @@ class Film:
         if self._first is None:
             self._first = time_s
             self._start(model)
-        # Half a picture of tolerance: a point may miss the time of a picture by the last bit.
-        due = int((time_s - self._first) * self._rate + 1e-6) + 1
+        # A point may miss the time of its picture by the last bit.
+        due = math.floor((time_s - self._first) * self._rate * (1.0 + 1e-12)) + 1
         if due <= self._pictures:
             return
         self._renderer.update_scene(data, camera=0 if model.ncam else -1)
+        # Five times the time of all the rest where the processor has to draw them.
+        self._renderer.scene.flags[engine().mjtRndFlag.mjRND_SHADOW] = 0
         picture = self._renderer.render()
         for _ in range(due - self._pictures):
             self._writer.append_data(picture)
         self._pictures = due
 
+    def finish(self) -> None:
+        """Write the file."""
+        writer, self._writer = self._writer, None
+        renderer, self._renderer = self._renderer, None
+        if renderer is not None:
+            renderer.close()
+        if writer is not None:
+            try:
+                writer.close()
+            except Exception as error:
+                raise self._failed(error) from error
+
     def close(self) -> None:
-        """Finish the file."""
-        for thing in (self._writer, self._renderer):
-            if thing is not None:
-                with suppress(Exception):
-                    thing.close()
-        self._writer = self._renderer = None
+        """Write what there is of the file."""
+        try:
+            self.finish()
+        except LoadFailed as error:
+            log.warning("film_not_written", extra={"error": str(error)})
 
     def _start(self, model: Any) -> None:  # noqa: ANN401  mujoco has no types
         imageio = importlib.import_module("imageio.v2")
-        options = {"loop": 0} if self._path.suffix == ".gif" else {"codec": "libx264", "macro_block_size": 16}
         try:
             self._path.parent.mkdir(parents=True, exist_ok=True)
             self._renderer = engine().Renderer(model, HEIGHT, WIDTH)
             if self._path.suffix == ".gif":
                 self._writer = imageio.get_writer(self._path, duration=1000 / self._rate, loop=0)
             else:
-                self._writer = imageio.get_writer(self._path, fps=self._rate, **options)
+                self._writer = imageio.get_writer(self._path, fps=self._rate, codec="libx264")
         except Exception as error:
-            reason = " ".join(str(error).split())
-            raise LoadFailed(f"the film '{self._path}' cannot be made: {reason}", instance=self._instance) from error
+            raise self._failed(error) from error
+
+    def _failed(self, error: Exception) -> LoadFailed:
+        reason = " ".join(str(error).split())
+        return LoadFailed(f"the film '{self._path}' cannot be made: {reason}", instance=self._instance)
 
 
 class Window:
@@ -141,6 +168,9 @@ class Window:
             self._viewer = importlib.import_module("mujoco.viewer").launch_passive(model, data)
         if self._viewer.is_running():
             self._viewer.sync()
+
+    def finish(self) -> None:
+        """The window stays until the run has ended."""
 
     def close(self) -> None:
         """Close the window."""
