@@ -85,7 +85,7 @@ def _instances(plan: Plan) -> list[str]:
     rows = [
         [
             instance.name,
-            f"{Path(instance.fmu).name} (FMI {instance.description.fmi_version})",
+            _model(instance),
             f"step {_number(instance.step_points * plan.grid.step_size)} s",
             "a process of its own" if instance.node == instance.name else f"group {instance.node}",
             _start_values(instance),
@@ -93,6 +93,14 @@ def _instances(plan: Plan) -> list[str]:
         for instance in plan.system.instances.values()
     ]
     return table(rows, indent=2)
+
+
+def _model(instance: SystemInstance) -> str:
+    """The file of an instance, and what it is a model of."""
+    description = instance.description
+    if instance.hosted is None:
+        return f"{Path(instance.fmu).name} (FMI {description.fmi_version})"
+    return f"{Path(instance.fmu).name or description.model_name} ({description.generation_tool})"
 
 
 def _start_values(instance: SystemInstance) -> str:

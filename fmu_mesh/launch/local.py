@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import FmuMeshError, Interrupted, StepFailed
-from ..fmu import Fmi2Instance, LogMessage
+from ..fmu import LogMessage
 from ..model.description import Value
 from ..model.instance import Instance
 from ..model.plan import Plan
@@ -23,6 +23,7 @@ from ..model.ring import Layout, Ring
 from ..record.csv_file import CsvFile
 from ..record.recorder import unwritable
 from ..simtime import TimeGrid
+from .opening import Showing, open_instance
 
 __all__ = ["LocalMesh"]
 
@@ -36,7 +37,8 @@ class LocalMesh:
         plan: the plan; its processes and window play no part.
         log: called with every log message of an FMU.
         progress: called with the point now and then.
-        open_instance: opens an instance by name, where it is not the FMU of the plan; this closes it.
+        open_instance: opens an instance by name, where it is not that of the plan; this closes it.
+        showing: whether and how a physics engine shows its world.
 
     Attributes:
         point: the last point reached.
@@ -50,6 +52,7 @@ class LocalMesh:
         log: Callable[[LogMessage], None] = lambda _message: None,
         progress: Callable[[int], None] = lambda _point: None,
         open_instance: Callable[[str], Instance] | None = None,
+        showing: Showing = Showing(),  # noqa: B008  a frozen Struct
     ) -> None:
         self.point = 0
         self.rows = 0
@@ -58,6 +61,7 @@ class LocalMesh:
         self._log = log
         self._progress = progress
         self._open_instance = open_instance
+        self._showing = showing
         self._stop: str | None = None
         self._folder: Path | None = None
 
@@ -111,8 +115,7 @@ class LocalMesh:
     def _open(self, name: str, folder: Path) -> Instance:
         if self._open_instance is not None:
             return self._open_instance(name)
-        system = self._plan.system.instances[name]
-        return Fmi2Instance(Path(system.fmu), name, system.description, folder, self._log)
+        return open_instance(self._plan.system.instances[name], folder, self._log, self._showing)
 
     def _initialize(self, members: dict[str, _Member]) -> None:
         grid = self._plan.grid

@@ -9,13 +9,13 @@ import msgspec
 from msgspec.structs import replace
 
 from ..errors import ConfigurationError, Finding, LoadFailed
-from ..fmu import read_description
-from ..model.config import ZenohConfig
+from ..model.config import InstanceConfig, MujocoConfig, PidConfig, ZenohConfig
 from ..model.description import ModelDescription
 from ..model.findings import nearest_file
 from ..model.loading import LoadedConfig, examine
 from ..model.plan import Plan, make_plan
 from ..model.system import build
+from .opening import Showing, check_showing, describe, expected_model
 
 __all__ = ["Options", "prepare", "zenoh_section"]
 
@@ -29,6 +29,7 @@ class Options(msgspec.Struct, frozen=True):
         output: the result file instead of the configured one.
         connect: Zenoh endpoints instead of the configured ones.
         profile: whether the nodes measure where their time goes.
+        showing: whether and how a physics engine shows its world.
     """
 
     start_values: tuple[str, ...] = ()
@@ -36,6 +37,7 @@ class Options(msgspec.Struct, frozen=True):
     output: Path | None = None
     connect: tuple[str, ...] = ()
     profile: bool = False
+    showing: Showing = Showing()
 
 
 def prepare(path: Path, options: Options = Options()) -> Plan:  # noqa: B008 a frozen Struct
@@ -49,6 +51,7 @@ def prepare(path: Path, options: Options = Options()) -> Plan:  # noqa: B008 a f
     descriptions, unreadable = _descriptions(loaded)
     findings.merge(unreadable)
     system = build(loaded, descriptions, tuple(findings))
+    check_showing(system, options.showing)
     return make_plan(system, window=options.window, file=str(path))
 
 
@@ -68,24 +71,25 @@ def _with_options(loaded: LoadedConfig, options: Options) -> LoadedConfig:
 
 
 def _descriptions(loaded: LoadedConfig) -> tuple[dict[str, ModelDescription], Sequence[Finding]]:
-    """The description of every instance whose FMU can be read, and a finding for every other."""
+    """The description of every instance whose model can be read, and a finding for every other."""
     cache: dict[Path, ModelDescription | LoadFailed] = {}
     descriptions: dict[str, ModelDescription] = {}
     findings = []
     for name, instance in loaded.config.instances.items():
-        if not instance.fmu:
+        if not instance.path and not isinstance(instance, PidConfig):
             continue  # what stands there instead is a finding already
-        path = loaded.resolve(instance.fmu)
-        if path not in cache:
+        path = loaded.resolve(instance.path)
+        if path not in cache or not isinstance(instance, InstanceConfig):
             try:
-                cache[path] = read_description(path)
+                cache[path] = describe(path, instance)
             except LoadFailed as error:
                 cache[path] = error
         found = cache[path]
         if isinstance(found, LoadFailed):
             text = found.message.rstrip(".") + (f" ({found.hint.rstrip('.')})" if found.hint else "")
-            expected = "an FMI 2.0 co-simulation FMU for this platform"
-            findings.append(loaded.finding(f"instances.{name}.fmu", text, expected, _similar(path)))
+            key = "mujoco" if isinstance(instance, MujocoConfig) else "fmu"
+            place = f"instances.{name}.{key}"
+            findings.append(loaded.finding(place, text, expected_model(instance), _similar(path)))
         else:
             descriptions[name] = found
     return descriptions, findings

@@ -15,10 +15,11 @@ from pathlib import Path
 import msgspec
 
 from ..errors import ConfigurationError, FmuMeshError, StepFailed
-from ..fmu import Fmi2Instance, LogMessage, read_description
+from ..fmu import Fmi2Instance, LogMessage
 from ..master.master import Master
 from ..master.profiling import GrantWatch
 from ..model.findings import listed, nearest
+from ..model.instance import Instance
 from ..model.loading import load
 from ..model.plan import RECORDER, NodePlan, Plan
 from ..node.node import Node
@@ -27,6 +28,7 @@ from ..wire.runtime import MeshNote, leave_run_folder, run_folder, socket_endpoi
 from ..wire.session import open_session, own_endpoints
 from ..wire.views import LogLine, MeshStatus
 from .events import End, Event, Log, Ready, Status
+from .opening import open_instance
 from .preparing import Options, prepare, zenoh_section
 from .process import die_with_parent, ended_by_signals
 from .wiring import MASTER, wiring
@@ -71,7 +73,8 @@ class _NodeProcess:
         self._plan = plan
         self._zenoh = zenoh_section(load(config_file), options)
         self._folder = folder
-        self._instances: list[Fmi2Instance] = []
+        self._options = options
+        self._instances: list[Instance] = []
         self._node: Node | None = None
         self._interrupted: str | None = None
 
@@ -96,10 +99,8 @@ class _NodeProcess:
                 error.told = child and node.failure_is_known
                 raise
 
-    def _open(self, name: str) -> Fmi2Instance:
-        item = self._plan.instance(name)
-        path = Path(item.fmu)
-        instance = Fmi2Instance(path, name, read_description(path), self._folder / "fmus", self._log)
+    def _open(self, name: str) -> Instance:
+        instance = open_instance(self._plan.instance(name), self._folder / "fmus", self._log, self._options.showing)
         self._instances.append(instance)
         return instance
 
@@ -121,7 +122,8 @@ class _NodeProcess:
     def _clean_up(self) -> None:
         """From another thread, when the main thread does not come back from an FMU."""
         for instance in self._instances:
-            instance.remove_files()
+            if isinstance(instance, Fmi2Instance):
+                instance.remove_files()
         leave_run_folder(self._folder)
 
     def _exit_hung(self) -> None:

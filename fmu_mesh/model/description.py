@@ -73,7 +73,7 @@ class ModelDescription(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     model_name: str
     model_identifier: str
     fmi_version: str
-    kind: Literal["co_simulation"]
+    kind: Literal["co_simulation", "physics_engine", "controller"]
     guid: str
     variables: tuple[Variable, ...]
     description: str | None = None

@@ -14,7 +14,7 @@ from msgspec.structs import replace
 
 from ..errors import ConfigurationError, Finding
 from ..simtime import TimeGrid
-from .config import TimeoutsConfig
+from .config import HostConfig, TimeoutsConfig
 from .description import Value
 from .graph import cycle_through, feedback_edges, strongly_connected, topological_order
 from .initialization import InitializationPlan, plan_initialization
@@ -58,6 +58,7 @@ class InstancePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         initialization: the levels at which connected outputs become known in Initialization Mode, by name.
         held: connected inputs that keep their start value in Initialization Mode, because their connection closes a
             loop there.
+        hosted: the section of the configuration of an instance that is no FMU.
     """
 
     name: str
@@ -69,6 +70,7 @@ class InstancePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     feeds: tuple[Feed, ...]
     initialization: dict[str, int]
     held: tuple[str, ...] = ()
+    hosted: HostConfig | None = None
 
 
 class Link(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -357,6 +359,7 @@ def _instance_plan(plan: Plan, instance: SystemInstance, outputs: Layout) -> Ins
         feeds=tuple(Feed(source=s, delay=d, columns=tuple(columns)) for (s, d), columns in sorted(feeds.items())),
         initialization={variable: level for (owner, variable), level in levels.items() if owner == instance.name},
         held=tuple(variable for owner, variable in plan.initialization.held if owner == instance.name),
+        hosted=instance.hosted,
     )
 
 

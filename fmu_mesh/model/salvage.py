@@ -12,7 +12,7 @@ from collections.abc import Set as AbstractSet
 
 import msgspec
 
-from fmu_mesh.model.config import Config
+from fmu_mesh.model.config import KIND, Config
 from fmu_mesh.model.yaml_text import Plain
 
 __all__ = ["salvage"]
@@ -73,9 +73,23 @@ def _simulation(section: Plain, wrong: AbstractSet[str]) -> dict[str, Plain]:
 def _with_fmu(section: Plain) -> dict[str, Plain]:
     instances = section if isinstance(section, dict) else {}
     return {
-        name: {"fmu": "", **instance} if isinstance(instance, dict) else {"fmu": ""}
+        name: _with_model(instance) if isinstance(instance, dict) else {KIND: "fmu", "fmu": ""}
         for name, instance in instances.items()
     }
+
+
+def _with_model(instance: dict[str, Plain]) -> dict[str, Plain]:
+    """``instance`` with an empty path where its model is missing; without a controller it is an FMU that is missing."""
+    match instance.get(KIND):
+        case "mujoco":
+            return {"mujoco": "", **instance}
+        case "controller" if "controller" not in instance:
+            shared = {key: instance[key] for key in ("step_size", "group", "host") if key in instance}
+            return {KIND: "fmu", "fmu": "", **shared}
+        case "controller":
+            return instance
+        case _:
+            return {"fmu": "", **instance}
 
 
 def _with_ends(section: Plain) -> list[Plain]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from fmu_mesh.model.config import InstanceConfig
+from fmu_mesh.model.config import AnyInstanceConfig
 from fmu_mesh.model.description import Value, Variable
 from fmu_mesh.model.findings import Findings, listed, nearest, shown
 
@@ -18,7 +18,7 @@ _INTEGER_RANGE = (-(2**31), 2**31 - 1)
 
 
 def resolve_start_values(
-    name: str, config: InstanceConfig, variables: Mapping[str, Variable], findings: Findings
+    name: str, config: AnyInstanceConfig, variables: Mapping[str, Variable], findings: Findings
 ) -> dict[str, Value]:
     """The start values of the instance ``name``, converted to the types of its variables.
 
