@@ -10,8 +10,8 @@ One own step from n to n + 1, in pseudocode::
     refresh what is read at the point: positions, velocities, sensors
     outputs into row n + 1
 
-The host owns what is applied: every step starts from zero, never from what the last one left. Positions and velocities are
-those of the point; accelerations and forces are those of the engine's last step. Variables and their names are
+The host owns what is applied: every step starts from zero, never from what the last one left. Positions and velocities
+are those of the point; accelerations and forces are those of the engine's last step. Variables and their names are
 `fmu_mesh.hosts.mujoco_model`, changes of axes `fmu_mesh.hosts.frames`.
 """
 

@@ -3,6 +3,9 @@
 Owns names, units and meaning of the variables; the only module that loads a model. What happens in a step is
 `fmu_mesh.hosts.mujoco`.
 
+The last part of a name tells the kind of the variable, and what is before it is unique among the model's names of that
+kind: no two variables have one name.
+
 | variable | causality | what |
 |---|---|---|
 | `<joint>.position`, `.velocity` | output | of a revolute or prismatic joint at the communication point |
@@ -14,7 +17,7 @@ Owns names, units and meaning of the variables; the only module that loads a mod
 | `<body>.linear_velocity_…`, `.angular_velocity_…` | output | of the body's origin, in world axes |
 | `<body>.wind_…`, `.relative_velocity_…` | output | the wind, and the origin's velocity against it, in body axes |
 | `<body>.force_…`, `.moment_…` | input | acting at the body's origin, and about it, in body axes |
-| `<sensor>.value`, `<sensor>.value[1]` … | output | at the point; sensors of forces and accelerations: of the last step |
+| `<sensor>.value`, `<sensor>.value[1]` … | output | at the point; of forces and accelerations: of the last step |
 | `<actuator>.control` / `.force` | input / output | an actuator of the model / its force in the last step |
 | `wind_x/y/z` | input | velocity of the medium in world axes |
 """
@@ -22,7 +25,6 @@ Owns names, units and meaning of the variables; the only module that loads a mod
 from __future__ import annotations
 
 import hashlib
-import importlib.util
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
@@ -118,10 +120,6 @@ def load_world(path: Path, config: MujocoConfig) -> World:
         msgspec.structs.replace(entry, variable=msgspec.structs.replace(entry.variable, value_reference=number))
         for number, entry in enumerate(entries)
     )
-    names = [entry.variable.name for entry in numbered]
-    if len(set(names)) < len(names):
-        twice = next(name for number, name in enumerate(names) if name in names[:number])
-        raise LoadFailed(f"'{path}' makes the variable '{twice}' twice", hint="Rename what it is named after.")
     free = {actuator.joint for actuator in config.actuators if actuator.disable_velocity_effort_limits}
     description = ModelDescription(
         model_name=_text(model, 0) or path.stem,
@@ -144,9 +142,13 @@ def engine() -> ModuleType:
     Raises:
         LoadFailed: it is not installed.
     """
-    if importlib.util.find_spec("mujoco") is None:
-        raise LoadFailed("MuJoCo is not installed", hint="Install it with `pip install 'fmu-mesh[physics]'`.")
-    return importlib.import_module("mujoco")
+    try:
+        import mujoco  # noqa: PLC0415  an extra, and slow to import
+    except ImportError as error:
+        text = f"MuJoCo is not installed ({error})"
+        raise LoadFailed(text, hint="Install it with `pip install 'fmu-mesh[physics]'`.") from error
+    module: ModuleType = mujoco
+    return module
 
 
 def _keyframe(model: Any, name: str | None, path: Path) -> int | None:  # noqa: ANN401  mujoco has no types
@@ -251,7 +253,7 @@ def _variable(name: str, causality: Causality, unit: str | None, text: str, star
 def _limits(mujoco: ModuleType, model: Any, free: set[str]) -> Iterator[tuple[int, float, float]]:  # noqa: ANN401  mujoco has no types
     for number in range(model.njnt):
         joint = model.joint(number)
-        scalar = joint.type[0] in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+        scalar = int(joint.type[0]) in (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
         if scalar and model.jnt_actfrclimited[number] and joint.name not in free:
             lower, upper = model.jnt_actfrcrange[number]
             yield int(joint.dofadr[0]), float(lower), float(upper)

@@ -7,7 +7,6 @@ points: a film costs time, but no value.
 from __future__ import annotations
 
 import ctypes.util
-import importlib
 import importlib.util
 import logging
 import math
@@ -135,7 +134,8 @@ class Film:
             log.warning("film_not_written", extra={"error": str(error)})
 
     def _start(self, model: Any) -> None:  # noqa: ANN401  mujoco has no types
-        imageio = importlib.import_module("imageio.v2")
+        import imageio.v2 as imageio  # noqa: PLC0415  an extra, and slow to import
+
         try:
             self._path.parent.mkdir(parents=True, exist_ok=True)
             self._renderer = engine().Renderer(model, HEIGHT, WIDTH)
@@ -165,7 +165,9 @@ class Window:
             return
         self._last = now
         if self._viewer is None:
-            self._viewer = importlib.import_module("mujoco.viewer").launch_passive(model, data)
+            import mujoco.viewer  # noqa: PLC0415  an extra, and it needs a screen
+
+            self._viewer = mujoco.viewer.launch_passive(model, data)
         if self._viewer.is_running():
             self._viewer.sync()
 

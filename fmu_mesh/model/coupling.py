@@ -1,8 +1,8 @@
 """What `controllers`, `actuators` and `fluid_dynamics` of a physics engine mean as connections.
 
-Owns the variable names of the two `gazebo-fmi` plugins and of controllers. The order is theirs, too: what comes from the
-engine has a delay of one point, so that within a step the controller is first, then the actuator, then the engine with
-the fresh effort.
+Owns the variable names of the two `gazebo-fmi` plugins and of controllers. The order is theirs, too: what comes from
+the engine has a delay of one point, so that within a step the controller is first, then the actuator, then the engine
+with the fresh effort.
 """
 
 from __future__ import annotations
@@ -105,7 +105,7 @@ def _connect(
     engine = variables[coupling.engine]
     if engine is None or not _part_exists(coupling, engine, findings) or own is None:
         return []
-    connections = []
+    connections: list[Connection] = []
     for default, variable in own.items():
         if default == "actuatorInput":
             connections += _command(coupling, coupling.reads[default], variable, others)
@@ -114,15 +114,16 @@ def _connect(
             ends = (coupling.engine, source, coupling.config.instance, variable)
             connections.append(Connection(*ends, factor=1.0, offset=0.0, delay=1, path=coupling.path))
         else:
-            target = engine[coupling.drives[default]]
-            ends = (coupling.config.instance, variable, coupling.engine, target)
+            driven = engine[coupling.drives[default]]
+            ends = (coupling.config.instance, variable, coupling.engine, driven)
             connections.append(Connection(*ends, factor=1.0, offset=0.0, delay=None, path=coupling.path))
     taken = {(other.target_instance, other.target.name): other for other in others}
     for connection in connections:
         other = taken.get((connection.target_instance, connection.target.name))
         if other is not None:
-            found = f"a second source for the input '{connection.target_instance}.{connection.target.name}': {connection}"
-            findings.add(coupling.path, f"{found}, after {other} ({other.path})", "one source for an input")
+            target = f"{connection.target_instance}.{connection.target.name}"
+            found = f"a second source for the input '{target}': {connection}, after {other} ({other.path})"
+            findings.add(coupling.path, found, "one source for an input")
     return connections
 
 

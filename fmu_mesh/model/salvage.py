@@ -57,11 +57,16 @@ def _without(value: Plain, wrong: AbstractSet[str], path: str) -> Plain:
         }
     if isinstance(value, list):
         places_of_items = [f"{path}[{index}]" for index in range(len(value))]
-        if path != "connections" and any(place in wrong for place in places_of_items):
+        if path != "connections" and any(_is_wrong(place, wrong) for place in places_of_items):
             return []
         pairs = zip(value, places_of_items, strict=True)
         return [None if place in wrong else _without(item, wrong, place) for item, place in pairs]
     return value
+
+
+def _is_wrong(place: str, wrong: AbstractSet[str]) -> bool:
+    """Whether an item of a list, or anything in it, is wrong."""
+    return any(path == place or path.startswith(f"{place}.") for path in wrong)
 
 
 def _simulation(section: Plain, wrong: AbstractSet[str]) -> dict[str, Plain]:
@@ -84,7 +89,7 @@ def _with_model(instance: dict[str, Plain]) -> dict[str, Plain]:
         case "mujoco":
             return {"mujoco": "", **instance}
         case "controller" if "controller" not in instance:
-            shared = {key: instance[key] for key in ("step_size", "group", "host") if key in instance}
+            shared: dict[str, Plain] = {key: instance[key] for key in ("step_size", "group", "host") if key in instance}
             return {KIND: "fmu", "fmu": "", **shared}
         case "controller":
             return instance
