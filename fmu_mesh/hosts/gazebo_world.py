@@ -1,8 +1,8 @@
 """An SDF world as a model description, and where the value of each of its variables lies.
 
-Owns names, units and meaning of the variables, which are those of `fmu_mesh.hosts.mujoco_model`, so that one configuration
-serves both engines; there are no sensors and no actuators of the model. It reads the file itself: Gazebo is needed to
-run a world, not to check a configuration. What happens in a step is `fmu_mesh.hosts.gazebo_classic`.
+Owns names, units and meaning of the variables, which are those of `fmu_mesh.hosts.mujoco_model`, so that one
+configuration serves both engines; there are no sensors and no actuators of the model. It reads the file itself: Gazebo
+is needed to run a world, not to check a configuration. What happens in a step is `fmu_mesh.hosts.gazebo_classic`.
 
 A joint or link is named as in the file where that name is unique, and `model::name` where it is not.
 """
@@ -28,7 +28,9 @@ __all__ = ["GazeboWorld", "Joint", "Link", "Place", "describe_gazebo_world", "lo
 JOINT_STATE, LINK_STATE = 3, 13
 """Numbers per joint (position, velocity, acceleration) and link (position, attitude, two velocities) in a state."""
 
-Where = Literal["state", "effort_applied", "effort_command", "effort", "wrench", "wind", "body_wind", "relative_velocity"]
+Where = Literal[
+    "state", "effort_applied", "effort_command", "effort", "wrench", "wind", "body_wind", "relative_velocity"
+]
 
 _DEFAULT_STEP_SIZE = 1e-3
 """s; of SDF (physics, max_step_size)."""
