@@ -319,7 +319,13 @@ def test_from_a_state_the_same_steps_give_the_same_floats(tmp_path: Path) -> Non
     sensors = "<sensor><accelerometer name='feel' site='s'/></sensor>"
     path = write_world(tmp_path, sledge + body("cube"), rest=sensors)
     inputs = ["slide.effort", "cube.force_x", "cube.moment_z", "wind_x"]
-    names = ["slide.position", "slide.acceleration", "slide.effort_applied", "feel.value[1]", "cube.relative_velocity_x"]
+    names = [
+        "slide.position",
+        "slide.acceleration",
+        "slide.effort_applied",
+        "feel.value[1]",
+        "cube.relative_velocity_x",
+    ]
     world = Driven(path, inputs, names)
     given = {"slide_effort": 3.0, "cube_force_x": 1.0, "cube_moment_z": 0.5, "wind_x": 0.25}
     world.go(7, **given)
