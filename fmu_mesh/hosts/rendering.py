@@ -6,6 +6,7 @@ points: a film costs time, but no value.
 
 from __future__ import annotations
 
+import copy
 import ctypes.util
 import importlib.util
 import logging
@@ -152,10 +153,15 @@ class Film:
 
 
 class Window:
-    """A window of MuJoCo's own viewer; when a person closes it, the run goes on."""
+    """A window of MuJoCo's own viewer; when a person closes it, the run goes on.
+
+    It shows a copy of the world: what a person pulls, pushes or resets there does not reach the run.
+    """
 
     def __init__(self) -> None:
         self._viewer: Any = None
+        self._model: Any = None
+        self._data: Any = None
         self._last = 0.0
 
     def show(self, model: Any, data: Any, time_s: float) -> None:  # noqa: ANN401, ARG002  mujoco has no types; the Protocol's
@@ -167,8 +173,15 @@ class Window:
         if self._viewer is None:
             import mujoco.viewer  # noqa: PLC0415  an extra, and it needs a screen
 
-            self._viewer = mujoco.viewer.launch_passive(model, data)
+            self._model = copy.copy(model)
+            self._data = mujoco.MjData(self._model)
+            self._viewer = mujoco.viewer.launch_passive(
+                self._model, self._data, show_left_ui=False, show_right_ui=False
+            )
+            if model.ncam:
+                self._viewer.cam.type, self._viewer.cam.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, 0
         if self._viewer.is_running():
+            engine().mj_copyData(self._data, model, data)
             self._viewer.sync()
 
     def finish(self) -> None:
