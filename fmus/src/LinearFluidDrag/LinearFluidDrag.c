@@ -26,7 +26,8 @@ static fmi2Status initialise(Instance *instance, ModelState *s, double start_tim
     (void)start_time;
     /* Negated, so that NaN is refused as well. */
     if (!(s->gain >= 0.0 && isfinite(s->gain)))
-        return report(instance, fmi2Error, "gain is %.17g N.s/m but has to be finite and not negative", s->gain);
+        return report(instance, fmi2Error, "gain is %.17g N.s/m but has to be finite and not negative",
+                      s->gain);
     return fmi2OK;
 }
 
