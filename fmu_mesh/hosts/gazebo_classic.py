@@ -55,7 +55,9 @@ class GazeboClassicInstance:
         self._config = config
         try:
             self._process = GazeboProcess(
-                world.text, [(joint.scoped, joint.free) for joint in world.joints], [link.scoped for link in world.links]
+                world.text,
+                [(joint.scoped, joint.free) for joint in world.joints],
+                [link.scoped for link in world.links],
             )
         except GazeboGone as error:
             raise LoadFailed(

@@ -28,7 +28,9 @@ __all__ = ["GazeboWorld", "Joint", "Link", "Place", "describe_gazebo_world", "lo
 JOINT_STATE, LINK_STATE = 3, 13
 """Numbers per joint (position, velocity, acceleration) and link (position, attitude, two velocities) in a state."""
 
-Where = Literal["state", "effort_applied", "effort_command", "effort", "wrench", "wind", "body_wind", "relative_velocity"]
+Where = Literal[
+    "state", "effort_applied", "effort_command", "effort", "wrench", "wind", "body_wind", "relative_velocity"
+]
 
 _DEFAULT_STEP_SIZE = 1e-3
 """s; of SDF (physics, max_step_size)."""

@@ -152,6 +152,16 @@ def test_a_command_is_applied_where_no_actuator_stands_between(tmp_path: Path) -
     assert disabled.go(**given) == {"slide.effort_applied": 9.0}
 
 
+def test_a_command_that_is_set_where_an_actuator_stands_between_is_told(tmp_path: Path) -> None:
+    driven = Driven(write_world(tmp_path, slider()), config=actuator())
+
+    driven.instance.set_values({"slide.effort_command": 1.0})
+
+    assert driven.messages == [
+        "'slide.effort_command' was set, but the joint has an actuator: set the actuator's own input"
+    ]
+
+
 def test_the_effort_keeps_the_limits_of_the_joint_unless_they_are_disabled(tmp_path: Path) -> None:
     path = write_world(tmp_path, slider("axis='1 0 0' actuatorfrcrange='-3 5'"))
     limited = Driven(path, ["slide.effort"], ["slide.effort_applied"], config=actuator())
@@ -250,6 +260,14 @@ def test_velocities_are_how_positions_change(tmp_path: Path, seed: int) -> None:
 
     # Over 1 us a velocity of a few m/s changes by some 1e-6 of itself, and a position of 1 m is exact to 1e-16 m.
     assert (after[:3] - before[:3]) / 1e-6 == pytest.approx(before[3:], abs=1e-4)
+
+
+def test_a_wind_that_is_connected_is_felt_at_the_first_point(tmp_path: Path) -> None:
+    description = describe_world(write_world(tmp_path, body()), SECTION)
+
+    felt = {v.name for v in description.variables if v.dependencies == ("wind_x", "wind_y", "wind_z")}
+
+    assert felt == {f"cube.{what}_{axis}" for what in ("wind", "relative_velocity") for axis in "xyz"}
 
 
 # --- time and steps
