@@ -54,7 +54,7 @@ class Driven:
         picture: a film, if it is to be shown.
     """
 
-    def __init__(  # noqa: PLR0913  each is one part of a run
+    def __init__(
         self,
         path: Path,
         inputs: Sequence[str] = (),

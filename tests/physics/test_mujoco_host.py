@@ -1,7 +1,7 @@
 """What the host makes of a MuJoCo model: variables, the effort it owns, forces on bodies, states and errors.
 
-Most worlds here are without gravity and damping and are integrated by MuJoCo's Euler method, whose step is known on paper:
-``v' = v + h F/m`` and ``q' = q + h v'``. Where that is one rounded product the floats are equal; `approx` stands where
+Most worlds here are without gravity and damping and are integrated by MuJoCo's Euler method, whose step is known on
+paper: ``v' = v + h F/m`` and ``q' = q + h v'``. Where that is one rounded product the floats are equal; `approx` stands where
 MuJoCo solves a linear system on the way and rounds once or twice more.
 """
 
@@ -97,7 +97,7 @@ def test_without_mujoco_the_way_out_is_told(tmp_path: Path, monkeypatch: pytest.
 def test_an_unknown_keyframe_is_refused_with_the_nearest(tmp_path: Path) -> None:
     path = write_world(tmp_path, slider(), rest="<keyframe><key name='moving' qvel='1'/></keyframe>")
 
-    with pytest.raises(LoadFailed, match="no keyframe 'movin', but moving.*Did you mean 'moving'"):
+    with pytest.raises(LoadFailed, match=r"no keyframe 'movin', but moving.*Did you mean 'moving'"):
         describe_world(path, MujocoConfig(mujoco="world.xml", keyframe="movin"))
 
 

@@ -1,13 +1,13 @@
 """The chapter's runs with a physics engine, against solutions of other solvers and what the publications report.
 
-The configurations run as they are kept, or with one thing changed. A tolerance is the one that the run was asked to keep,
-and says what causes the difference.
+The configurations run as they are kept, or with one thing changed. A tolerance is the one that the run was asked to
+keep, and says what causes the difference.
 """
 
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -40,7 +40,7 @@ def columns_of(path: Path) -> Columns:
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
+def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
     """Run a kept configuration in this process, with parts of it and of its world replaced; the columns by name."""
     known: dict[tuple[object, ...], Columns] = {}
 
@@ -54,7 +54,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
             known[key] = columns_of(output)
         return known[key]
 
-    yield result
+    return result
 
 
 def changed(name: str, folder: Path, replaced: tuple[tuple[str, str], ...]) -> Path:

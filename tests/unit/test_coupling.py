@@ -149,8 +149,10 @@ def test_other_variable_names_take_the_place_of_the_default_ones() -> None:
 
 def test_a_missing_variable_is_refused_by_name() -> None:
     assert findings("actuators: [{name: m, joint: hip, instance: other}]") == [
-        "instances.world.actuators[0]: 'other', which has no variable 'actuatorInput'; "
-        "expected a Real input for 'actuatorInput' ('m'); it may have another name in `variable_names`; None"
+        (
+            "instances.world.actuators[0]: 'other', which has no variable 'actuatorInput'; "
+            "expected a Real input for 'actuatorInput' ('m'); it may have another name in `variable_names`; None"
+        )
     ]
 
 
@@ -172,12 +174,18 @@ def test_an_unknown_joint_body_or_instance_is_refused_with_the_nearest() -> None
     )
 
     assert found == [
-        "instances.world.fluid_dynamics[0].link: the unknown body 'bote' of 'world'; "
-        "expected one of its bodies: boat; boat",
-        "instances.world.actuators[0].instance: the unknown instance 'motr'; "
-        "expected one of the instances world, motor, other, fluid, pid; motor",
-        "instances.world.actuators[0].joint: the unknown joint 'hipp' of 'world'; "
-        "expected one of its revolute and prismatic joints: hip, knee; hip",
+        (
+            "instances.world.fluid_dynamics[0].link: the unknown body 'bote' of 'world'; "
+            "expected one of its bodies: boat; boat"
+        ),
+        (
+            "instances.world.actuators[0].instance: the unknown instance 'motr'; "
+            "expected one of the instances world, motor, other, fluid, pid; motor"
+        ),
+        (
+            "instances.world.actuators[0].joint: the unknown joint 'hipp' of 'world'; "
+            "expected one of its revolute and prismatic joints: hip, knee; hip"
+        ),
     ]
 
 
