@@ -1,8 +1,8 @@
 """What the host makes of a MuJoCo model: variables, the effort it owns, forces on bodies, states and errors.
 
 Most worlds here are without gravity and damping and are integrated by MuJoCo's Euler method, whose step is known on
-paper: ``v' = v + h F/m`` and ``q' = q + h v'``. Where that is one rounded product the floats are equal; `approx` stands where
-MuJoCo solves a linear system on the way and rounds once or twice more.
+paper: ``v' = v + h F/m`` and ``q' = q + h v'``. Where that is one rounded product the floats are equal; `approx` stands
+where MuJoCo solves a linear system on the way and rounds once or twice more.
 """
 
 from __future__ import annotations

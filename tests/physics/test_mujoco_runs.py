@@ -226,19 +226,32 @@ def test_a_cube_in_a_wind_ends_up_with_its_velocity(run: Run) -> None:
 # --- distributed
 
 
-@pytest.mark.parametrize("name", ["electrical_actuator", "fluid_body"])
-def test_every_instance_in_a_process_of_its_own_gives_the_same_floats(place: Place, run: Run, name: str) -> None:
-    short = (
-        ("stop_time: 20.0", "stop_time: 0.2")
-        if name == "electrical_actuator"
-        else ("stop_time: 2.0", "stop_time: 0.2"),
-    )
-    alone = changed(name, place.folder, (*short, ("group: auto", "group: null")))
+SLOW_DAMPER = ("    start_values: {d: 0.1}", "    step_size: 0.005\n    start_values: {d: 0.1}")
+SLOW_WORLD = ("    mujoco: worlds/", "    step_size: 0.002\n    mujoco: worlds/")
+SHORT = {"electrical_actuator": "20.0", "fluid_body": "2.0", "damped_pendulum": "10.0"}
+
+
+@pytest.mark.parametrize(
+    ("name", "replaced"),
+    [
+        pytest.param("electrical_actuator", (), id="controllers and actuators"),
+        pytest.param("fluid_body", (), id="fluid dynamics"),
+        pytest.param("damped_pendulum", (SLOW_DAMPER,), id="a slower actuator"),
+        pytest.param("damped_pendulum", (SLOW_WORLD,), id="a slower world"),
+    ],
+)
+def test_every_instance_in_a_process_of_its_own_gives_the_same_floats(
+    place: Place, run: Run, name: str, replaced: tuple[tuple[str, str], ...]
+) -> None:
+    short = (f"stop_time: {SHORT[name]}", "stop_time: 0.2")
+    grouped = (("group: auto", "group: null"),) if name != "damped_pendulum" else ()
+    alone = changed(name, place.folder, (short, *replaced, *grouped))
     output = place.folder / "result.csv"
 
-    place.run("launch", alone, "--no-progress", "--output", output)
+    launched = place.run("launch", alone, "--no-progress", "--output", output)
 
-    expected = run(name, *short)
+    assert launched.wait() == 0, launched.errors
+    expected = run(name, short, *replaced)
     assert {key: column.tolist() for key, column in columns_of(output).items()} == {
         key: column.tolist() for key, column in expected.items()
     }
