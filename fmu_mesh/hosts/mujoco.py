@@ -187,19 +187,20 @@ class MujocoInstance:
         self._finish(step + 1)
 
     def get_state(self) -> bytes:
-        """All that the next steps and the outputs of this point depend on, for `set_state` of an equal instance."""
+        """All that the next steps and the outputs of this point depend on."""
         mujoco = self._mujoco
         size = mujoco.mj_stateSize(self._model, mujoco.mjtState.mjSTATE_INTEGRATION)
         state = np.zeros(size)
         mujoco.mj_getState(self._model, self._data, state, mujoco.mjtState.mjSTATE_INTEGRATION)
         return b"".join(part.tobytes() for part in (state, *self._remembered()))
 
-    def set_state(self, state: bytes) -> None:
-        """Go back to what `get_state` returned.
+    def set_state(self, state: object) -> None:
+        """Go back to what `get_state` of this or an equal instance returned.
 
         Raises:
             StepFailed: it is no state of this model.
         """
+        assert isinstance(state, bytes)
         mujoco = self._mujoco
         kept = self._remembered()
         size = mujoco.mj_stateSize(self._model, mujoco.mjtState.mjSTATE_INTEGRATION)
@@ -215,6 +216,18 @@ class MujocoInstance:
             size += part.size
         acting = np.flatnonzero(self._own["wrench"]) // 6
         self._driven = tuple(sorted({*self._driven, *acting.tolist()}))
+
+    def free_state(self, state: object) -> None:
+        """Nothing to free: a state is bytes."""
+
+    def serialize_state(self, state: object) -> bytes:
+        """The state as bytes, which it is."""
+        assert isinstance(state, bytes)
+        return state
+
+    def deserialize_state(self, data: bytes) -> object:
+        """The state of these bytes, which they are; `set_state` checks them."""
+        return data
 
     def close(self) -> None:
         """End the film or window. Never raises; may be called twice."""

@@ -87,9 +87,28 @@ def test_a_film_shows_the_world_from_the_first_point_to_the_last(
     place.assert_nothing_left(5.0)
 
 
+@pytest.mark.usefixtures("renderer")
+@pytest.mark.parametrize("suffix", [".mp4", ".gif"])
+def test_a_film_that_cannot_be_written_ends_the_run_with_the_reason(place: Place, suffix: str) -> None:
+    (place.folder / "file").touch()
+    film = place.folder / "file" / f"film{suffix}"
+
+    launched = place.run("launch", CONFIGS / "fluid_body.yaml", "--local", "--no-progress", "--video", film)
+
+    assert launched.wait() == 3
+    assert f"the film '{film}' cannot be made: " in launched.message
+
+
 def test_a_film_of_an_unknown_format_is_refused() -> None:
     with pytest.raises(ConfigurationError, match=r"film.avi: a film is one of \.mp4, \.gif"):
         check_film(Path("film.avi"))
+
+
+def test_a_folder_is_no_film(tmp_path: Path) -> None:
+    (tmp_path / "film.mp4").mkdir()
+
+    with pytest.raises(ConfigurationError, match="a folder, not a file"):
+        check_film(tmp_path / "film.mp4")
 
 
 def test_a_mesh_without_a_world_has_no_film(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
