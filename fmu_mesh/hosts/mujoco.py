@@ -109,6 +109,7 @@ class MujocoInstance:
             "actuator_force": data.actuator_force,
         }
         self._driven: tuple[int, ...] = ()
+        self._bound = False
         self._set_limits()
         self._mujoco.set_mju_user_warning(_warnings.append)
 
@@ -128,6 +129,7 @@ class MujocoInstance:
     def exit_initialization(self) -> None:
         """Compute what can be read at the first point: positions, velocities, and sensors without any effort."""
         _warnings.clear()
+        self._model.opt.wind[:] = self._own["wind"]
         self._mujoco.mj_forward(self._model, self._data)
         if _warnings:
             raise InitializationFailed(f"MuJoCo says: {' '.join(_warnings[0].split())}", instance=self.name)
@@ -137,6 +139,9 @@ class MujocoInstance:
         for name, value in values.items():
             entry = self._entries[name]
             self._arrays[entry.where][entry.index] = value
+            if entry.where == "effort_command" and not self._direct[entry.index] and self._bound:
+                text = f"'{name}' was set, but the joint has an actuator: set the actuator's own input"
+                self._log("warning", text, self._step)
         self._drive(self._entries[name] for name in values)
 
     def get_values(self, names: Sequence[str]) -> list[Value]:
@@ -161,6 +166,7 @@ class MujocoInstance:
         self._reads_sensors = any(entry.where == "sensor" for entry in read)
         self._reads_bodies = tuple(sorted(_bodies_of(read)))
         self._finish(step)
+        self._bound = True
 
     def do_step(self, step: int) -> None:
         """Take the inputs of row ``step``, advance to own step ``step + 1``, write the outputs to row ``step + 1``."""
@@ -181,19 +187,20 @@ class MujocoInstance:
         self._finish(step + 1)
 
     def get_state(self) -> bytes:
-        """All that the next steps and the outputs of this point depend on, for `set_state` of an equal instance."""
+        """All that the next steps and the outputs of this point depend on."""
         mujoco = self._mujoco
         size = mujoco.mj_stateSize(self._model, mujoco.mjtState.mjSTATE_INTEGRATION)
         state = np.zeros(size)
         mujoco.mj_getState(self._model, self._data, state, mujoco.mjtState.mjSTATE_INTEGRATION)
         return b"".join(part.tobytes() for part in (state, *self._remembered()))
 
-    def set_state(self, state: bytes) -> None:
-        """Go back to what `get_state` returned.
+    def set_state(self, state: object) -> None:
+        """Go back to what `get_state` of this or an equal instance returned.
 
         Raises:
             StepFailed: it is no state of this model.
         """
+        assert isinstance(state, bytes)
         mujoco = self._mujoco
         kept = self._remembered()
         size = mujoco.mj_stateSize(self._model, mujoco.mjtState.mjSTATE_INTEGRATION)
@@ -209,6 +216,18 @@ class MujocoInstance:
             size += part.size
         acting = np.flatnonzero(self._own["wrench"]) // 6
         self._driven = tuple(sorted({*self._driven, *acting.tolist()}))
+
+    def free_state(self, state: object) -> None:
+        """Nothing to free: a state is bytes."""
+
+    def serialize_state(self, state: object) -> bytes:
+        """The state as bytes, which it is."""
+        assert isinstance(state, bytes)
+        return state
+
+    def deserialize_state(self, data: bytes) -> object:
+        """The state of these bytes, which they are; `set_state` checks them."""
+        return data
 
     def close(self) -> None:
         """End the film or window. Never raises; may be called twice."""

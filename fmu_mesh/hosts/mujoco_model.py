@@ -60,6 +60,7 @@ Where = Literal[
 ]
 
 _WORLD_BODY = 0
+_WIND = ("wind_x", "wind_y", "wind_z")
 
 
 class Entry(msgspec.Struct, frozen=True):
@@ -246,7 +247,8 @@ def _variable(name: str, causality: Causality, unit: str | None, text: str, star
         start=start,
         unit=unit,
         description=text,
-        dependencies=(),  # at the first point the engine has not taken a step: nothing depends on an input
+        # At the first point the engine has not taken a step: only the wind of that moment makes a difference.
+        dependencies=_WIND if ".wind_" in name or ".relative_velocity_" in name else (),
     )
 
 

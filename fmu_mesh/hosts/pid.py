@@ -120,13 +120,26 @@ class PidInstance:
         self._write(step + 1)
 
     def get_state(self) -> bytes:
-        """The state as bytes, for `set_state`."""
+        """All that the next steps depend on."""
         return msgspec.json.encode(_State(self._values, self._integral))
 
-    def set_state(self, state: bytes) -> None:
-        """Go back to what `get_state` returned."""
+    def set_state(self, state: object) -> None:
+        """Go back to what `get_state` of this or another controller returned."""
+        assert isinstance(state, bytes)
         decoded = msgspec.json.decode(state, type=_State)
         self._values, self._integral = dict(decoded.values), decoded.integral
+
+    def free_state(self, state: object) -> None:
+        """Nothing to free: a state is bytes."""
+
+    def serialize_state(self, state: object) -> bytes:
+        """The state as bytes, which it is."""
+        assert isinstance(state, bytes)
+        return state
+
+    def deserialize_state(self, data: bytes) -> object:
+        """The state of these bytes, which they are."""
+        return data
 
     def close(self) -> None:
         """Nothing to free."""

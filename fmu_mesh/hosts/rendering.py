@@ -6,6 +6,7 @@ points: a film costs time, but no value.
 
 from __future__ import annotations
 
+import copy
 import ctypes.util
 import importlib.util
 import logging
@@ -57,10 +58,12 @@ def check_film(path: Path) -> None:
     """See whether a film can be made, before a run.
 
     Raises:
-        ConfigurationError: the suffix is not known, or something is not installed; says what.
+        ConfigurationError: it cannot be a film, or something is not installed; says what.
     """
     if path.suffix not in FILM_RATES:
         raise ConfigurationError(f"--video {path}: a film is one of {', '.join(FILM_RATES)}")
+    if path.is_dir():
+        raise ConfigurationError(f"--video {path}: a folder, not a file")
     if importlib.util.find_spec("imageio") is None:
         raise ConfigurationError("films need imageio.", hint="Install it with `pip install 'fmu-mesh[physics]'`.")
     _choose_backend()
@@ -101,17 +104,21 @@ class Film:
         """Add as many pictures as the time since the last one asks for."""
         if self._first is None:
             self._first = time_s
-            self._start(model)
         # A point may miss the time of its picture by the last bit.
         due = math.floor((time_s - self._first) * self._rate * (1.0 + 1e-12)) + 1
         if due <= self._pictures:
             return
-        self._renderer.update_scene(data, camera=0 if model.ncam else -1)
-        # Five times the time of all the rest where the processor has to draw them.
-        self._renderer.scene.flags[engine().mjtRndFlag.mjRND_SHADOW] = 0
-        picture = self._renderer.render()
-        for _ in range(due - self._pictures):
-            self._writer.append_data(picture)
+        try:
+            if self._renderer is None:
+                self._start(model)
+            self._renderer.update_scene(data, camera=0 if model.ncam else -1)
+            # Five times the time of all the rest where the processor has to draw them.
+            self._renderer.scene.flags[engine().mjtRndFlag.mjRND_SHADOW] = 0
+            picture = self._renderer.render()
+            for _ in range(due - self._pictures):
+                self._writer.append_data(picture)
+        except Exception as error:
+            raise self._failed(error) from error
         self._pictures = due
 
     def finish(self) -> None:
@@ -136,15 +143,12 @@ class Film:
     def _start(self, model: Any) -> None:  # noqa: ANN401  mujoco has no types
         import imageio.v2 as imageio  # noqa: PLC0415  an extra, and slow to import
 
-        try:
-            self._path.parent.mkdir(parents=True, exist_ok=True)
-            self._renderer = engine().Renderer(model, HEIGHT, WIDTH)
-            if self._path.suffix == ".gif":
-                self._writer = imageio.get_writer(self._path, duration=1000 / self._rate, loop=0)
-            else:
-                self._writer = imageio.get_writer(self._path, fps=self._rate, codec="libx264")
-        except Exception as error:
-            raise self._failed(error) from error
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        self._renderer = engine().Renderer(model, HEIGHT, WIDTH)
+        if self._path.suffix == ".gif":
+            self._writer = imageio.get_writer(self._path, duration=1000 / self._rate, loop=0)
+        else:
+            self._writer = imageio.get_writer(self._path, fps=self._rate, codec="libx264")
 
     def _failed(self, error: Exception) -> LoadFailed:
         reason = " ".join(str(error).split())
@@ -152,10 +156,15 @@ class Film:
 
 
 class Window:
-    """A window of MuJoCo's own viewer; when a person closes it, the run goes on."""
+    """A window of MuJoCo's own viewer; when a person closes it, the run goes on.
+
+    It shows a copy of the world: what a person pulls, pushes or resets there does not reach the run.
+    """
 
     def __init__(self) -> None:
         self._viewer: Any = None
+        self._model: Any = None
+        self._data: Any = None
         self._last = 0.0
 
     def show(self, model: Any, data: Any, time_s: float) -> None:  # noqa: ANN401, ARG002  mujoco has no types; the Protocol's
@@ -167,8 +176,15 @@ class Window:
         if self._viewer is None:
             import mujoco.viewer  # noqa: PLC0415  an extra, and it needs a screen
 
-            self._viewer = mujoco.viewer.launch_passive(model, data)
+            self._model = copy.copy(model)
+            self._data = mujoco.MjData(self._model)
+            self._viewer = mujoco.viewer.launch_passive(
+                self._model, self._data, show_left_ui=False, show_right_ui=False
+            )
+            if model.ncam:
+                self._viewer.cam.type, self._viewer.cam.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, 0
         if self._viewer.is_running():
+            engine().mj_copyData(self._data, model, data)
             self._viewer.sync()
 
     def finish(self) -> None:

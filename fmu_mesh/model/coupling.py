@@ -59,7 +59,19 @@ def coupled_connections(
     # Controllers first: what they ask for is what actuators take.
     for coupling in sorted(couplings, key=lambda coupling: isinstance(coupling.config, ActuatorConfig)):
         found += _connect(coupling, variables, [*explicit, *found], findings)
+        if isinstance(coupling.config, ActuatorConfig):
+            _check_command(config, coupling, findings)
     return tuple(found)
+
+
+def _check_command(config: Config, coupling: _Coupling, findings: Findings) -> None:
+    """With an actuator the engine has no use for a command; a start value for it would do nothing."""
+    command = coupling.reads["actuatorInput"]
+    if command in config.instances[coupling.engine].start_values:
+        own = coupling.config.variable_names.get("actuatorInput", "actuatorInput")
+        found = f"a start value for '{command}', although the joint has the actuator '{coupling.config.name}'"
+        path = f"instances.{coupling.engine}.start_values.{command}"
+        findings.add(path, found, f"a start value of '{coupling.config.instance}.{own}'")
 
 
 def _couplings(config: Config) -> Iterator[_Coupling]:

@@ -54,7 +54,7 @@ class Driven:
         picture: a film, if it is to be shown.
     """
 
-    def __init__(  # noqa: PLR0913  each is one part of a run
+    def __init__(
         self,
         path: Path,
         inputs: Sequence[str] = (),
@@ -82,7 +82,7 @@ class Driven:
         self.instance.exit_initialization()
         self.instance.bind(self.inputs, (self.outputs,), self.grid, 1)
 
-    def go(self, steps: int = 1, **values: float) -> dict[str, float]:
+    def go(self, steps: int = 1, /, **values: float) -> dict[str, float]:
         """Take steps with these inputs (`_` stands for a dot), all others 0; the outputs after the last."""
         given = {name: values.get(name.replace(".", "_"), 0.0) for name in self.inputs.layout.reals}
         assert len(values) == sum(name.replace(".", "_") in values for name in given)

@@ -26,21 +26,22 @@ quaternions = (
 )
 
 
-def matrix_of(quaternion: Floats) -> Floats:
+def matrix_of(quaternion: Floats) -> list[float]:
     """The rotation of a quaternion as MuJoCo makes it, row by row."""
     matrix = np.zeros(9)
     mujoco.mju_quat2Mat(matrix, quaternion)
-    return matrix
+    return [*matrix.tolist()]
 
 
 @given(quaternions, vectors)
 def test_a_vector_in_world_axes_is_the_rotated_one_in_body_axes(
     quaternion: Floats, vector: tuple[float, float, float]
 ) -> None:
-    matrix = matrix_of(quaternion)
+    rotation = matrix_of(quaternion)
+    matrix = np.reshape(rotation, (3, 3))
 
-    assert to_world(matrix, vector) == pytest.approx(matrix.reshape(3, 3) @ vector, abs=ROUNDING)
-    assert to_body(matrix, vector) == pytest.approx(matrix.reshape(3, 3).T @ vector, abs=ROUNDING)
+    assert to_world(rotation, vector) == pytest.approx(matrix @ vector, abs=ROUNDING)
+    assert to_body(rotation, vector) == pytest.approx(matrix.T @ vector, abs=ROUNDING)
 
 
 @given(quaternions, vectors)
@@ -75,7 +76,7 @@ def test_a_force_at_the_origin_has_the_same_moment_about_every_point(
 
     acting, about_center = wrench_at_center(rotation, lever, force, moment)
 
-    matrix = rotation.reshape(3, 3)
+    matrix = np.reshape(rotation, (3, 3))
     assert acting == pytest.approx(matrix @ force, abs=ROUNDING)
     about_origin = np.array(about_center) + np.cross(-np.array(lever), acting)
     assert about_origin == pytest.approx(matrix @ moment, abs=10 * ROUNDING)

@@ -1,8 +1,8 @@
 """What the host makes of a MuJoCo model: variables, the effort it owns, forces on bodies, states and errors.
 
-Most worlds here are without gravity and damping and are integrated by MuJoCo's Euler method, whose step is known on paper:
-``v' = v + h F/m`` and ``q' = q + h v'``. Where that is one rounded product the floats are equal; `approx` stands where
-MuJoCo solves a linear system on the way and rounds once or twice more.
+Most worlds here are without gravity and damping and are integrated by MuJoCo's Euler method, whose step is known on
+paper: ``v' = v + h F/m`` and ``q' = q + h v'``. Where that is one rounded product the floats are equal; `approx` stands
+where MuJoCo solves a linear system on the way and rounds once or twice more.
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ def test_without_mujoco_the_way_out_is_told(tmp_path: Path, monkeypatch: pytest.
 def test_an_unknown_keyframe_is_refused_with_the_nearest(tmp_path: Path) -> None:
     path = write_world(tmp_path, slider(), rest="<keyframe><key name='moving' qvel='1'/></keyframe>")
 
-    with pytest.raises(LoadFailed, match="no keyframe 'movin', but moving.*Did you mean 'moving'"):
+    with pytest.raises(LoadFailed, match=r"no keyframe 'movin', but moving.*Did you mean 'moving'"):
         describe_world(path, MujocoConfig(mujoco="world.xml", keyframe="movin"))
 
 
@@ -150,6 +150,16 @@ def test_a_command_is_applied_where_no_actuator_stands_between(tmp_path: Path) -
     assert bare.go(**given) == {"slide.effort_applied": 9.0}
     assert driven.go(**given) == {"slide.effort_applied": 1.0}
     assert disabled.go(**given) == {"slide.effort_applied": 9.0}
+
+
+def test_a_command_that_is_set_where_an_actuator_stands_between_is_told(tmp_path: Path) -> None:
+    driven = Driven(write_world(tmp_path, slider()), config=actuator())
+
+    driven.instance.set_values({"slide.effort_command": 1.0})
+
+    assert driven.messages == [
+        "'slide.effort_command' was set, but the joint has an actuator: set the actuator's own input"
+    ]
 
 
 def test_the_effort_keeps_the_limits_of_the_joint_unless_they_are_disabled(tmp_path: Path) -> None:
@@ -252,6 +262,14 @@ def test_velocities_are_how_positions_change(tmp_path: Path, seed: int) -> None:
     assert (after[:3] - before[:3]) / 1e-6 == pytest.approx(before[3:], abs=1e-4)
 
 
+def test_a_wind_that_is_connected_is_felt_at_the_first_point(tmp_path: Path) -> None:
+    description = describe_world(write_world(tmp_path, body()), SECTION)
+
+    felt = {v.name for v in description.variables if v.dependencies == ("wind_x", "wind_y", "wind_z")}
+
+    assert felt == {f"cube.{what}_{axis}" for what in ("wind", "relative_velocity") for axis in "xyz"}
+
+
 # --- time and steps
 
 
@@ -319,7 +337,13 @@ def test_from_a_state_the_same_steps_give_the_same_floats(tmp_path: Path) -> Non
     sensors = "<sensor><accelerometer name='feel' site='s'/></sensor>"
     path = write_world(tmp_path, sledge + body("cube"), rest=sensors)
     inputs = ["slide.effort", "cube.force_x", "cube.moment_z", "wind_x"]
-    names = ["slide.position", "slide.acceleration", "slide.effort_applied", "feel.value[1]", "cube.relative_velocity_x"]
+    names = [
+        "slide.position",
+        "slide.acceleration",
+        "slide.effort_applied",
+        "feel.value[1]",
+        "cube.relative_velocity_x",
+    ]
     world = Driven(path, inputs, names)
     given = {"slide_effort": 3.0, "cube_force_x": 1.0, "cube_moment_z": 0.5, "wind_x": 0.25}
     world.go(7, **given)
