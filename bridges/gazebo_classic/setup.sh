@@ -14,7 +14,7 @@ folder=${1:?"usage: $0 FOLDER"}
 if [[ ! -d $folder ]]; then
   command -v debootstrap >/dev/null || { echo "there is no debootstrap (apt-get install debootstrap)" >&2; exit 1; }
   mirror=${MIRROR:-$(apt-get indextargets --format '$(SITE)' 'Created-By: Packages' | grep '/debian/*$' | sort -u |
-    head -n 1)}
+    head -n 1 || true)}
   [[ -n $mirror ]] || { echo "this system has no Debian mirror; set MIRROR" >&2; exit 1; }
   draft=$folder.draft
   rm -rf "$draft"
