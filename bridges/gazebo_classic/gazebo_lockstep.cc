@@ -7,19 +7,20 @@
 // 17 digits, so that they arrive as they were sent:
 //
 //   > world <bytes>                         and then so many bytes of SDF
-//   > joint <model>::<joint> limited|free   any number of times; free: whatever limits of velocity its file says
+//   > joint <model>::<joint> limited|free   any number of times; free: whatever velocity limit its file says
 //   > link <model>::<link>                  any number of times
 //   > go                                    loads the world
 //   < gazebo <version> <engine>
-//   < <state>                  the state as loaded
+//   < <state>                               the state as loaded
 //   > step_size <s>                         from now on; no answer
-//   > step <count> <effort of each joint> <force x y z, moment x y z of each link>
-//   < <state>                  after so many steps, with these efforts, forces and moments in each of them
+//   > step <count> <numbers>                the effort of each joint; force x y z and moment x y z of each link
+//   < <state>                               after so many steps, with these numbers in each of them
 //
-// A state has for each joint position, velocity and the acceleration of the last step, and for each link the position x y z of its
-// origin, its attitude w x y z, its linear velocity and its angular velocity, all in world axes and SI units. Forces act at the
-// origin of their link, and they and the moments are in its axes. Efforts are applied as they are: limits of effort are the
-// other side's. "error <text>" is the last answer of all; the end of standard input ends the program.
+// A state has for each joint position, velocity and the acceleration of the last step, and for each link the position
+// x y z of its origin, its attitude w x y z, its linear velocity and its angular velocity, all in world axes and SI
+// units. Forces act at the origin of their link, and they and the moments are in its axes. Efforts are applied as they
+// are: limits of effort are the other side's. "error <text>" is the last answer of all; the end of standard input ends
+// the program.
 
 #include <unistd.h>
 
@@ -141,13 +142,16 @@ class World {
   }
 
  private:
-  // By component: a vector as a whole is written rounded.
+  // By component: as a whole, vectors are equal up to 1e-3.
+  static bool acts(const Vector3d &v) { return v.X() != 0.0 || v.Y() != 0.0 || v.Z() != 0.0; }
+
+  // By component: as a whole, a vector is written rounded.
   static void write(std::ostream &text, const Vector3d &v) { text << v.X() << ' ' << v.Y() << ' ' << v.Z() << ' '; }
 
   static void push(const LinkPtr &link, const double *wrench) {
     const Vector3d force(wrench[0], wrench[1], wrench[2]), moment(wrench[3], wrench[4], wrench[5]);
-    if (force != Vector3d::Zero) link->AddLinkForce(force);
-    if (moment != Vector3d::Zero) link->AddRelativeTorque(moment);
+    if (acts(force)) link->AddLinkForce(force);
+    if (acts(moment)) link->AddRelativeTorque(moment);
   }
 
   WorldPtr world_;
@@ -184,7 +188,8 @@ Asked read_asked() {
 // strtod and not a stream, which would refuse what is no finite number.
 std::vector<double> read_numbers(std::istringstream &words, size_t count) {
   std::vector<double> numbers;
-  for (std::string word; numbers.size() < count && words >> word;) numbers.push_back(std::strtod(word.c_str(), nullptr));
+  for (std::string word; numbers.size() < count && words >> word;)
+    numbers.push_back(std::strtod(word.c_str(), nullptr));
   if (numbers.size() != count) throw std::runtime_error("a step with too few numbers");
   return numbers;
 }
@@ -194,9 +199,9 @@ void serve(std::FILE *answers) {
     std::fprintf(answers, "%s\n", text.c_str());
     std::fflush(answers);
   };
-  const PrivateFolder folder;
-  for (const char *variable : {"HOME", "TMPDIR", "GAZEBO_LOG_PATH"}) setenv(variable, folder.path.c_str(), 1);
   try {
+    const PrivateFolder folder;
+    for (const char *variable : {"HOME", "TMPDIR", "GAZEBO_LOG_PATH"}) setenv(variable, folder.path.c_str(), 1);
     const Asked asked = read_asked();
     if (!gazebo::setupServer()) throw std::runtime_error("Gazebo's server does not start");
     World world(asked, folder.path);

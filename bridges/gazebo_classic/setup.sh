@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# A folder with Gazebo classic 11 and the lock-step program, from the packages of Debian 11 (bullseye), on a Debian or Ubuntu
-# that has no such packages of its own. Needs root, debootstrap and about 3 GB; a folder that is complete is kept.
+# A folder with Gazebo classic 11 and the lock-step program, from the packages of Debian 11 (bullseye), on a Debian
+# that has no such packages of its own. Needs root, debootstrap and 3 GB; a folder that is complete is kept.
 #
 #   bridges/gazebo_classic/setup.sh FOLDER
 #   export FMU_MESH_GAZEBO="chroot FOLDER /opt/fmu_mesh/gazebo_lockstep"
@@ -9,20 +9,26 @@
 set -euo pipefail
 here=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)
 folder=${1:?"usage: $0 FOLDER"}
-mirror=${MIRROR:-$(apt-get indextargets --format '$(SITE)' 'Created-By: Packages' | grep '/debian/*$' | sort -u | head -n 1)}
+[[ $(id -u) -eq 0 ]] || { echo "only root can make a system in a folder" >&2; exit 1; }
 
-if [[ ! -e $folder/.complete ]]; then
-  [[ -n $mirror ]] || { echo "no Debian mirror found; set MIRROR" >&2; exit 1; }
-  debootstrap --variant=minbase bullseye "$folder" "$mirror"
-  # No services in there, and names that Gazebo looks up.
-  printf '#!/bin/sh\nexit 101\n' >"$folder/usr/sbin/policy-rc.d"
-  chmod +x "$folder/usr/sbin/policy-rc.d"
-  cp /etc/hosts "$folder/etc/hosts"
-  DEBIAN_FRONTEND=noninteractive LC_ALL=C chroot "$folder" apt-get install --yes --no-install-recommends \
+if [[ ! -d $folder ]]; then
+  command -v debootstrap >/dev/null || { echo "there is no debootstrap (apt-get install debootstrap)" >&2; exit 1; }
+  mirror=${MIRROR:-$(apt-get indextargets --format '$(SITE)' 'Created-By: Packages' | grep '/debian/*$' | sort -u |
+    head -n 1)}
+  [[ -n $mirror ]] || { echo "this system has no Debian mirror; set MIRROR" >&2; exit 1; }
+  draft=$folder.draft
+  rm -rf "$draft"
+  mkdir -p "$draft"
+  debootstrap --variant=minbase bullseye "$draft" "$mirror"
+  # No services in there, and the names that Gazebo looks up.
+  printf '#!/bin/sh\nexit 101\n' >"$draft/usr/sbin/policy-rc.d"
+  chmod +x "$draft/usr/sbin/policy-rc.d"
+  cp /etc/hosts "$draft/etc/hosts"
+  DEBIAN_FRONTEND=noninteractive LC_ALL=C chroot "$draft" apt-get install --yes --no-install-recommends \
     -o Dpkg::Options::=--force-unsafe-io libgazebo-dev g++ make pkg-config
-  chroot "$folder" apt-get clean
-  touch "$folder/.complete"
+  chroot "$draft" apt-get clean
+  mv "$draft" "$folder"
 fi
 mkdir -p "$folder/opt/fmu_mesh"
-cp "$here/gazebo_lockstep.cc" "$here/Makefile" "$folder/opt/fmu_mesh/"
+cp --preserve=timestamps "$here/gazebo_lockstep.cc" "$here/Makefile" "$folder/opt/fmu_mesh/"
 LC_ALL=C chroot "$folder" make --silent --directory /opt/fmu_mesh CXXFLAGS="-O2 -w"

@@ -9,9 +9,9 @@ One own step from n to n + 1, in pseudocode::
         one step of the engine
     outputs into row n + 1
 
-The engine is a process of its own (`fmu_mesh.hosts.gazebo_process`), which no step ever leaves: it owns the applied effort as
-the MuJoCo host does. Positions and velocities are those of the point; accelerations are those of the engine's last step.
-There is no way to take a step of Gazebo back, so this instance has no state to get and set.
+The engine is a process of its own (`fmu_mesh.hosts.gazebo_process`) that moves only within a step. The host owns what
+is applied, as that of MuJoCo does. Positions and velocities are those of the point; accelerations are those of the
+engine's last step. A step of Gazebo cannot be taken back, so this instance has no state to get and set.
 """
 
 from __future__ import annotations
@@ -76,6 +76,8 @@ class GazeboClassicInstance:
             "body_wind": np.zeros(3 * links),
             "relative_velocity": np.zeros(3 * links),
         }
+        inputs = world.description.with_causality("input")
+        self._inputs_by_name = {variable.name: world.places[variable.name] for variable in inputs}
         self._limits = np.array([joint.effort_limit for joint in world.joints], dtype=np.float64)
         driven = {actuator.joint for actuator in config.actuators if actuator.enabled}
         self._direct = np.array([joint.name not in driven for joint in world.joints], dtype=bool)
@@ -96,11 +98,11 @@ class GazeboClassicInstance:
     def set_values(self, values: Mapping[str, Value]) -> None:
         """Set inputs by name."""
         for name, value in values.items():
-            place = self._world.places[name]
-            if self._world.description.variable(name).causality != "input":
+            if name not in self._inputs_by_name:
                 raise InitializationFailed(
                     f"'{name}' is what the file says: Gazebo starts a world as it is", instance=self.name, variable=name
                 )
+            place = self._inputs_by_name[name]
             self._arrays[place.where][place.index] = value
 
     def get_values(self, names: Sequence[str]) -> list[Value]:
@@ -154,8 +156,7 @@ class GazeboClassicInstance:
 
     def _culprit(self) -> str | None:
         """The first input that is no finite number."""
-        inputs = [variable.name for variable in self._world.description.with_causality("input")]
-        bad = (name for name in inputs if not math.isfinite(self._value(self._world.places[name])))
+        bad = (name for name, place in self._inputs_by_name.items() if not math.isfinite(self._value(place)))
         return next(bad, None)
 
     def _value(self, place: Place) -> float:

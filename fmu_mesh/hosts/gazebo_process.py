@@ -48,8 +48,8 @@ def find_program() -> list[str]:
 class GazeboProcess:
     """One world in one process.
 
-    Call sequence: the constructor, which loads the world and leaves its state in ``state``; then `step`; at the end, and
-    after any exception, `close`.
+    Call sequence: the constructor, which loads the world and leaves its state in ``state``; then `set_step_size` and
+    `step`; at the end, and after any exception, `close`.
 
     Args:
         text: the SDF file.
@@ -158,8 +158,10 @@ def _environment() -> dict[str, str]:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
+    # In a system of its own (chroot) there may be no such folder, and Gazebo's libraries look for it before all else.
+    own = {name: value for name, value in os.environ.items() if name != "TMPDIR"}
     return {
-        **os.environ,
+        **own,
         "GAZEBO_IP": "127.0.0.1",
         "GAZEBO_MASTER_URI": f"http://127.0.0.1:{port}",
         "GAZEBO_MODEL_DATABASE_URI": "",

@@ -1,8 +1,8 @@
 """An SDF world as a model description, and where the value of each of its variables lies.
 
-Owns names, units and meaning of the variables, which are those of `fmu_mesh.hosts.mujoco_model`, so that one configuration
-serves both engines; there are no sensors and no actuators of the model. It reads the file itself: Gazebo is needed to
-run a world, not to check a configuration. What happens in a step is `fmu_mesh.hosts.gazebo_classic`.
+Owns names, units and meaning of the variables, which are those of `fmu_mesh.hosts.mujoco_model`, so that one
+configuration serves both engines; there are no sensors and no actuators of the model. It reads the file itself: Gazebo
+is needed to run a world, not to check a configuration. What happens in a step is `fmu_mesh.hosts.gazebo_classic`.
 
 A joint or link is named as in the file where that name is unique, and `model::name` where it is not.
 """

@@ -12,8 +12,18 @@ import msgspec
 
 from ..errors import ConfigurationError
 from ..fmu import Fmi2Instance, LogMessage, read_description
-from ..hosts import Film, MujocoInstance, Picture, PidInstance, Window, describe_pid, describe_world
-from ..model.config import AnyInstanceConfig, MujocoConfig, PidConfig
+from ..hosts import (
+    Film,
+    GazeboClassicInstance,
+    MujocoInstance,
+    Picture,
+    PidInstance,
+    Window,
+    describe_gazebo_world,
+    describe_pid,
+    describe_world,
+)
+from ..model.config import AnyInstanceConfig, GazeboClassicConfig, MujocoConfig, PidConfig
 from ..model.description import ModelDescription
 from ..model.findings import listed
 from ..model.instance import Instance
@@ -48,6 +58,8 @@ def describe(path: Path, config: AnyInstanceConfig) -> ModelDescription:
     match config:
         case MujocoConfig():
             return describe_world(path, config)
+        case GazeboClassicConfig():
+            return describe_gazebo_world(path, config)
         case PidConfig():
             return describe_pid()
         case _:
@@ -58,6 +70,8 @@ def expected_model(config: AnyInstanceConfig) -> str:
     """In words what an instance's file should be."""
     if isinstance(config, MujocoConfig):
         return "a MuJoCo model (MJCF or URDF)"
+    if isinstance(config, GazeboClassicConfig):
+        return "an SDF world for Gazebo classic 11"
     return "an FMI 2.0 co-simulation FMU for this platform"
 
 
@@ -85,6 +99,8 @@ def open_instance(
                 log(LogMessage(item.name, status, "engine", text, step))
 
             return MujocoInstance(Path(item.fmu), item.name, config, log_engine, _picture(item.name, showing))
+        case GazeboClassicConfig() as config:
+            return GazeboClassicInstance(Path(item.fmu), item.name, config)
         case PidConfig():
             return PidInstance(item.name)
         case None:

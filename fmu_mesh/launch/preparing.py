@@ -9,7 +9,7 @@ import msgspec
 from msgspec.structs import replace
 
 from ..errors import ConfigurationError, Finding, LoadFailed
-from ..model.config import InstanceConfig, MujocoConfig, PidConfig, ZenohConfig
+from ..model.config import AnyInstanceConfig, GazeboClassicConfig, InstanceConfig, MujocoConfig, PidConfig, ZenohConfig
 from ..model.description import ModelDescription
 from ..model.findings import nearest_file
 from ..model.loading import LoadedConfig, examine
@@ -87,12 +87,22 @@ def _descriptions(loaded: LoadedConfig) -> tuple[dict[str, ModelDescription], Se
         found = cache[path]
         if isinstance(found, LoadFailed):
             text = found.message.rstrip(".") + (f" ({found.hint.rstrip('.')})" if found.hint else "")
-            key = "mujoco" if isinstance(instance, MujocoConfig) else "fmu"
-            place = f"instances.{name}.{key}"
+            place = f"instances.{name}.{_key_of_path(instance)}"
             findings.append(loaded.finding(place, text, expected_model(instance), _similar(path)))
         else:
             descriptions[name] = found
     return descriptions, findings
+
+
+def _key_of_path(instance: AnyInstanceConfig) -> str:
+    """Where the file of an instance stands in its section."""
+    match instance:
+        case MujocoConfig():
+            return "mujoco"
+        case GazeboClassicConfig():
+            return "gazebo_classic"
+        case _:
+            return "fmu"
 
 
 def _similar(path: Path) -> str | None:

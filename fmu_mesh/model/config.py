@@ -19,7 +19,9 @@ __all__ = [
     "Config",
     "ConnectionConfig",
     "ControllerConfig",
+    "EngineConfig",
     "FluidDynamicsConfig",
+    "GazeboClassicConfig",
     "HostConfig",
     "InstanceConfig",
     "MujocoConfig",
@@ -185,6 +187,33 @@ class MujocoConfig(Base, frozen=True, kw_only=True, tag_field=KIND, tag="mujoco"
         return self.mujoco
 
 
+class GazeboClassicConfig(Base, frozen=True, kw_only=True, tag_field=KIND, tag="gazebo_classic"):
+    """A world that the simulator Gazebo classic 11 computes: its joints and links are variables."""
+
+    gazebo_classic: Annotated[str, Meta(description="Path of the SDF world, relative to this file.")]
+    physics_steps: Annotated[
+        Annotated[int, Meta(ge=1)] | None,
+        Meta(
+            description="Steps of the engine per own step; default: as few as make none longer than the world's "
+            "max_step_size.",
+        ),
+    ] = None
+    controllers: Annotated[list[ControllerConfig], Meta(description="Controllers of joints.")] = []
+    actuators: Annotated[list[ActuatorConfig], Meta(description="Actuators of joints, as in gazebo-fmi.")] = []
+    fluid_dynamics: Annotated[
+        list[FluidDynamicsConfig], Meta(description="Fluid dynamics of single links, as in gazebo-fmi.")
+    ] = []
+    start_values: StartValues = {}
+    step_size: StepSize = None
+    group: Group = None
+    host: Host = None
+
+    @property
+    def path(self) -> str:
+        """The file of the world, relative to the configuration."""
+        return self.gazebo_classic
+
+
 class PidConfig(Base, frozen=True, kw_only=True, tag_field=KIND, tag="controller"):
     """A controller that needs no FMU."""
 
@@ -203,8 +232,9 @@ class PidConfig(Base, frozen=True, kw_only=True, tag_field=KIND, tag="controller
         return ""
 
 
-HostConfig = MujocoConfig | PidConfig
-AnyInstanceConfig = InstanceConfig | MujocoConfig | PidConfig
+EngineConfig = MujocoConfig | GazeboClassicConfig
+HostConfig = EngineConfig | PidConfig
+AnyInstanceConfig = InstanceConfig | MujocoConfig | GazeboClassicConfig | PidConfig
 
 
 class ConnectionConfig(Base, frozen=True, kw_only=True):

@@ -13,7 +13,7 @@ from typing import Literal
 import msgspec
 from msgspec.structs import replace
 
-from .config import ActuatorConfig, Config, ControllerConfig, FluidDynamicsConfig, MujocoConfig
+from .config import ActuatorConfig, Config, ControllerConfig, EngineConfig, FluidDynamicsConfig
 from .connection import Connection, Variables
 from .description import Variable
 from .findings import Findings, listed, nearest
@@ -76,7 +76,7 @@ def _check_command(config: Config, coupling: _Coupling, findings: Findings) -> N
 
 def _couplings(config: Config) -> Iterator[_Coupling]:
     for name, engine in config.instances.items():
-        if not isinstance(engine, MujocoConfig):
+        if not isinstance(engine, EngineConfig):
             continue
         sections: tuple[tuple[str, Sequence[AnyCoupling]], ...] = (
             ("controllers", engine.controllers),

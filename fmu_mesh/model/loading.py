@@ -182,7 +182,7 @@ def _with_kinds(data: dict[str, Plain]) -> dict[str, Plain]:
     written: dict[str, Plain] = {}
     for name, instance in instances.items():
         if isinstance(instance, dict):
-            kind = next((key for key in ("fmu", "mujoco", "controller") if key in instance), "fmu")
+            kind = next((key for key in ("fmu", "mujoco", "gazebo_classic", "controller") if key in instance), "fmu")
             written[name] = {**instance, KIND: kind}
         else:
             written[name] = instance

@@ -88,6 +88,8 @@ def _with_model(instance: dict[str, Plain]) -> dict[str, Plain]:
     match instance.get(KIND):
         case "mujoco":
             return {"mujoco": "", **instance}
+        case "gazebo_classic":
+            return {"gazebo_classic": "", **instance}
         case "controller" if "controller" not in instance:
             shared: dict[str, Plain] = {key: instance[key] for key in ("step_size", "group", "host") if key in instance}
             return {KIND: "fmu", "fmu": "", **shared}
