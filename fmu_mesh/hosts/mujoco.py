@@ -108,6 +108,11 @@ class MujocoInstance:
             "sensor": data.sensordata,
             "actuator_force": data.actuator_force,
         }
+        # MuJoCo's own memory, looked up once: each access to an attribute makes an array.
+        self._memory: dict[str, Floats] = {
+            **{name: getattr(data, name) for name in ("qfrc_applied", "xfrc_applied", "ctrl", "qacc")},
+            "wind": self._model.opt.wind,
+        }
         self._driven: tuple[int, ...] = ()
         self._bound = False
         self._set_limits()
@@ -183,7 +188,7 @@ class MujocoInstance:
             if _warnings:
                 self._look_at_warnings()
         self._step = step + 1
-        self._own["acceleration"][:] = self._data.qacc
+        self._own["acceleration"][:] = self._memory["qacc"]
         self._finish(step + 1)
 
     def get_state(self) -> bytes:
@@ -257,14 +262,14 @@ class MujocoInstance:
 
     def _apply(self) -> None:
         """What holds for a whole own step: efforts of joints, controls of the model's actuators, the wind."""
-        own, data = self._own, self._data
+        own, memory = self._own, self._memory
         effort = own["effort"] + np.where(self._direct, own["effort_command"], 0.0)
         if self._limited:
             effort = np.clip(effort, self._least, self._most)
-        data.qfrc_applied[:] = own["effort_applied"][:] = effort
-        data.xfrc_applied[:] = 0.0
-        data.ctrl[:] = own["control"]
-        self._model.opt.wind[:] = own["wind"]
+        memory["qfrc_applied"][:] = own["effort_applied"][:] = effort
+        memory["xfrc_applied"][:] = 0.0
+        memory["ctrl"][:] = own["control"]
+        memory["wind"][:] = own["wind"]
 
     def _push(self) -> None:
         """Forces and moments of bodies as MuJoCo takes them: in world axes, at the centre of mass."""
