@@ -30,7 +30,7 @@ from ..model.description import ModelDescription, Value
 from ..model.ring import Ring
 from ..simtime import TimeGrid, steps_between
 from .frames import relative_velocity, to_body, wrench_at_center
-from .mujoco_model import Entry, engine, load_world
+from .mujoco_model import Entry, engine, load_world, warnings
 from .rendering import Picture
 
 __all__ = ["MujocoInstance"]
@@ -44,9 +44,6 @@ _OF_VELOCITIES = frozenset({"linear_velocity", "angular_velocity", "body_wind", 
 _OF_JOINTS = frozenset({"position", "velocity", "acceleration", "effort_applied", "actuator_force"})
 """What needs no refreshing at the point."""
 _INPUTS = frozenset({"effort", "effort_command", "wrench", "control", "wind"})
-
-_warnings: list[str] = []
-"""What MuJoCo warned of in the call that is running; it has one handler for the process."""
 
 
 class MujocoInstance:
@@ -116,7 +113,6 @@ class MujocoInstance:
         self._driven: tuple[int, ...] = ()
         self._bound = False
         self._set_limits()
-        self._mujoco.set_mju_user_warning(_warnings.append)
 
     @property
     def description(self) -> ModelDescription:
@@ -133,11 +129,11 @@ class MujocoInstance:
 
     def exit_initialization(self) -> None:
         """Compute what can be read at the first point: positions, velocities, and sensors without any effort."""
-        _warnings.clear()
+        warnings.clear()
         self._model.opt.wind[:] = self._own["wind"]
         self._mujoco.mj_forward(self._model, self._data)
-        if _warnings:
-            raise InitializationFailed(f"MuJoCo says: {' '.join(_warnings[0].split())}", instance=self.name)
+        if warnings:
+            raise InitializationFailed(f"MuJoCo says: {' '.join(warnings[0].split())}", instance=self.name)
 
     def set_values(self, values: Mapping[str, Value]) -> None:
         """Set inputs by name, and before the first point positions and velocities of joints."""
@@ -180,12 +176,12 @@ class MujocoInstance:
             self._arrays[where][places] = row[columns]
         self._data.time = self._start_time + step * self._points * self._base
         self._apply()
-        _warnings.clear()
+        warnings.clear()
         for _ in range(self._substeps):
             if self._driven:
                 self._push()
             self._mujoco.mj_step(self._model, self._data)
-            if _warnings:
+            if warnings:
                 self._look_at_warnings()
         self._step = step + 1
         self._own["acceleration"][:] = self._memory["qacc"]
@@ -287,8 +283,8 @@ class MujocoInstance:
         Raises:
             StepFailed: names the input or the joint that is not finite or huge.
         """
-        texts = [" ".join(text.split()) for text in _warnings]
-        _warnings.clear()
+        texts = [" ".join(text.split()) for text in warnings]
+        warnings.clear()
         kinds = self._mujoco.mjtWarning
         bad = (kinds.mjWARN_BADQPOS, kinds.mjWARN_BADQVEL, kinds.mjWARN_BADQACC, kinds.mjWARN_BADCTRL)
         if any(self._data.warning[int(kind)].number for kind in bad):

@@ -37,7 +37,7 @@ from ..model.config import MujocoConfig
 from ..model.description import Causality, DefaultExperiment, ModelDescription, Variable
 from ..model.findings import listed, nearest
 
-__all__ = ["Entry", "Where", "World", "describe_world", "load_world"]
+__all__ = ["Entry", "Where", "World", "describe_world", "engine", "load_world", "warnings"]
 
 Where = Literal[
     "position",
@@ -58,6 +58,9 @@ Where = Literal[
     "actuator_force",
     "wind",
 ]
+
+warnings: list[str] = []
+"""What MuJoCo warned of since somebody cleared this; it has one handler for the process, which would write a file."""
 
 _WORLD_BODY = 0
 _WIND = ("wind_x", "wind_y", "wind_z")
@@ -111,6 +114,7 @@ def load_world(path: Path, config: MujocoConfig) -> World:
     mujoco = engine()
     try:
         data = path.read_bytes()
+        warnings.clear()
         model = mujoco.MjModel.from_xml_path(str(path))
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else " ".join(str(error).split())
@@ -133,6 +137,7 @@ def load_world(path: Path, config: MujocoConfig) -> World:
         default_experiment=DefaultExperiment(step_size=float(model.opt.timestep)),
         can_get_and_set_state=True,
         can_serialize_state=True,
+        problems=tuple(" ".join(text.split()) for text in warnings),
     )
     return World(model, description, numbered, tuple(_limits(mujoco, model, free)), keyframe)
 
@@ -148,6 +153,7 @@ def engine() -> ModuleType:
     except ImportError as error:
         text = f"MuJoCo is not installed ({error})"
         raise LoadFailed(text, hint="Install it with `pip install 'fmu-mesh[physics]'`.") from error
+    mujoco.set_mju_user_warning(warnings.append)
     module: ModuleType = mujoco
     return module
 

@@ -108,6 +108,7 @@ record: {file: flies.csv, variables: [world.engine.position]}
     assert "instance world.engine.acceleration, point " in launched.message
     assert "MuJoCo says: " in launched.message
     assert len(rows_of(config.with_suffix(".csv"))) >= 1
+    assert not (place.folder / "MUJOCO_LOG.TXT").exists()
     place.assert_nothing_left(5.0)
 
 
