@@ -88,7 +88,7 @@ def _instances(plan: Plan) -> list[str]:
     rows = [
         [
             instance.name,
-            f"{Path(instance.fmu).name} (FMI {instance.description.fmi_version}{_solver(instance)})",
+            _model(instance),
             f"step {_number(instance.step_points * plan.grid.step_size)} s",
             "a process of its own" if instance.node == instance.name else f"group {instance.node}",
             _start_values(instance),
@@ -105,6 +105,14 @@ def _solver(instance: SystemInstance) -> str:
     solver = instance.options.solver
     tolerance = f" {solver.relative_tolerance:g}" if solver.name == "cvode" else ""
     return f" model exchange, {solver.name}{tolerance}"
+
+
+def _model(instance: SystemInstance) -> str:
+    """The file of an instance, and what it is a model of."""
+    description = instance.description
+    if instance.hosted is None:
+        return f"{Path(instance.fmu).name} (FMI {description.fmi_version}{_solver(instance)})"
+    return f"{Path(instance.fmu).name or description.model_name} ({description.generation_tool})"
 
 
 def _start_values(instance: SystemInstance) -> str:

@@ -102,13 +102,14 @@ def mesh_info(info: MeshInfo) -> list[str]:
 
 def instance_info(info: InstanceInfo) -> list[str]:
     """What an instance is, with its variables."""
+    fmi = f"FMI {info.fmi_version}, " if info.fmi_version else ""
     facts = pairs(
         [
             ("instance", info.instance),
-            ("model", f"{info.model_name} (FMI {info.fmi_version}, {info.kind})"),
+            ("model", f"{info.model_name} ({fmi}{info.kind})"),
             ("description", info.description or ""),
             ("made by", info.generation_tool or ""),
-            ("FMU", info.fmu),
+            ("FMU" if fmi else "file", info.fmu),
             ("step size", seconds(info.step_size)),
             (
                 "can",

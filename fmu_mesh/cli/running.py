@@ -13,9 +13,11 @@ from typing import Any
 
 from ..errors import ConfigurationError, FmuError, FmuMeshError
 from ..fmu import LogMessage
+from ..hosts import check_film, check_window
 from ..launch.events import End, Event, EventWriter
 from ..launch.launcher import Launcher
 from ..launch.local import LocalMesh
+from ..launch.opening import Showing
 from ..launch.preparing import Options, prepare
 from ..launch.process import ended_by_signals
 from ..launch.roles import BY_HAND, run_master, run_node
@@ -38,12 +40,14 @@ def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.Arg
     launch.add_argument("--local", action="store_true", help="run everything in this one process")
     launch.add_argument("--plot", type=Path, metavar="FILE.png", help="plot the result when done")
     launch.add_argument("--no-progress", action="store_true", help="no progress line")
+    _add_showing(launch)
     add_profile(launch)
     launch.set_defaults(run_command=_launch)
 
     node = commands.add_parser("node", parents=[common], help="run one node by hand")
     _add_config(node)
     node.add_argument("node", metavar="INSTANCE", help="name of the instance, or of its group")
+    _add_showing(node)
     node.add_argument("--plan", type=Path, help=argparse.SUPPRESS)
     node.add_argument("--run", default=BY_HAND, help=argparse.SUPPRESS)
     node.set_defaults(run_command=_node)
@@ -74,6 +78,26 @@ def _add_config(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def _add_showing(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--view", action="store_true", help="show the world of the physics engine in a window")
+    parser.add_argument(
+        "--video", type=Path, metavar="FILE.mp4", help="make a film of it, .mp4 or .gif; needs no screen"
+    )
+
+
+def _showing(arguments: argparse.Namespace) -> Showing:
+    """What `--view` and `--video` ask for, if it can be done here."""
+    video: Path | None = getattr(arguments, "video", None)
+    showing = Showing(view=getattr(arguments, "view", False), video=video.absolute() if video is not None else None)
+    if showing.view and showing.video is not None:
+        raise ConfigurationError("--view and --video do not go together", hint="Leave one of them out.")
+    if showing.view:
+        check_window()
+    if showing.video is not None:
+        check_film(showing.video)
+    return showing
+
+
 def _options(arguments: argparse.Namespace) -> Options:
     return Options(
         start_values=tuple(arguments.set),
@@ -81,6 +105,7 @@ def _options(arguments: argparse.Namespace) -> Options:
         output=arguments.output,
         connect=tuple(arguments.connect),
         profile=getattr(arguments, "profile", None) is not None,
+        showing=_showing(arguments),
     )
 
 
@@ -94,13 +119,15 @@ def _launch(arguments: argparse.Namespace) -> int:
     profile: MeshProfile | None = None
     with Display(plan, show_progress=not arguments.no_progress) as display:
         if arguments.local:
-            point, seconds, rows = _run_local(plan, display)
+            point, seconds, rows = _run_local(plan, display, options.showing)
         else:
             launcher = Launcher(plan, arguments.config, options, display.event, display.output)
             end = run_launcher(launcher)
             point, seconds, rows, profile = end.status.point, end.seconds, end.rows, end.profile
     if profile is not None:
         show_profile(plan, profile, seconds, arguments.profile)
+    if arguments.video is not None:
+        print(f"video: {arguments.video}")
     close(plan, point, seconds, rows, arguments.plot)
     return 0
 
@@ -119,7 +146,7 @@ def run_launcher(launcher: Launcher) -> End:
             signal.signal(number, handler)
 
 
-def _run_local(plan: Plan, display: Display) -> tuple[int, float, int]:
+def _run_local(plan: Plan, display: Display, showing: Showing) -> tuple[int, float, int]:
     def log(message: LogMessage) -> None:
         line = LogLine(message.instance, message.status, message.category, message.message, mesh.point)
         display.log(line)
@@ -139,7 +166,7 @@ def _run_local(plan: Plan, display: Display) -> tuple[int, float, int]:
     enter_run_folder(folder, f"local {os.getpid()}")
     fmus = fmu_folder(folder)
     fmus.mkdir(parents=True, exist_ok=True)
-    mesh = LocalMesh(plan, log, display.progress, on_hang=end, parent=fmus)
+    mesh = LocalMesh(plan, log, display.progress, on_hang=end, parent=fmus, showing=showing)
     try:
         with stdout_as_stderr(), ended_by_signals(mesh.interrupt, clean_up, watch_stdin=False):
             mesh.run()

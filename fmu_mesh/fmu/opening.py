@@ -45,7 +45,8 @@ def open_instance(  # noqa: PLR0913, PLR0917 the parameters of `FmuInstance`
     Raises:
         LoadFailed: the FMU cannot be extracted, loaded or instantiated.
     """
-    return _CLASSES[description.fmi_version[0], description.kind](path, name, description, folder, log, terms, options)
+    kind = cast("Kind", description.kind)
+    return _CLASSES[description.fmi_version[0], kind](path, name, description, folder, log, terms, options)
 
 
 def stepped(instance: FmuInstance, options: StepOptions) -> Instance:

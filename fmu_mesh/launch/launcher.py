@@ -22,6 +22,7 @@ from typing import IO
 import msgspec
 
 from ..errors import FmuError, FmuMeshError, Interrupted, MeshLost, from_report
+from ..model.config import MujocoConfig
 from ..model.plan import RECORDER, Plan
 from ..wire.runtime import MeshNote, remove_run_folder, remove_stale_folders, run_folder, runtime_folder, write_note
 from .events import End, Event, Ready, Status, decode_event
@@ -116,7 +117,14 @@ class Launcher:
                 continue
             plan_file = folder / f"{number}.json"
             plan_file.write_bytes(msgspec.json.encode(plan))
-            self._spawn(node, ["node", config_file, node, *common, "--plan", str(plan_file)], folder)
+            shown = self._showing() if any(isinstance(i.hosted, MujocoConfig) for i in plan.instances) else []
+            self._spawn(node, ["node", config_file, node, *common, *shown, "--plan", str(plan_file)], folder)
+
+    def _showing(self) -> list[str]:
+        """The options of the node with the physics engine."""
+        showing = self._options.showing
+        video = [f"--video={showing.video}"] if showing.video is not None else []
+        return [*(["--view"] if showing.view else []), *video]
 
     def _spawn(self, name: str, arguments: Sequence[str], folder: Path) -> None:
         process = _Process(name, [sys.executable, "-m", "fmu_mesh", *arguments], self._happened.put)

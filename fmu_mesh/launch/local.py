@@ -25,7 +25,7 @@ from ..errors import (
     StepFailed,
     TerminationRequested,
 )
-from ..fmu import LogMessage, Terms, open_instance, stepped
+from ..fmu import LogMessage, Terms
 from ..fmu.guard import CallWatch, Guarded, floating_point_changed, restore_floating_point
 from ..model.elements import scaled
 from ..model.fixed_point import FixedPoint
@@ -37,6 +37,7 @@ from ..model.types import DTYPES, Value, VariableType
 from ..record.csv_file import CsvFile
 from ..record.recorder import unwritable
 from ..simtime import TimeGrid
+from .opening import Showing, open_instance, stepped
 
 __all__ = ["LocalMesh"]
 
@@ -56,6 +57,7 @@ class LocalMesh:
         on_hang: called on another thread when an FMU does not return in time, with what was recorded up to then in the
             result file; the thread in the FMU cannot be got back, so only the end of the process is left to do.
         parent: an existing folder to extract FMUs into; by default that for temporary files.
+        showing: whether and how a physics engine shows its world.
 
     Attributes:
         point: the last point reached.
@@ -72,6 +74,7 @@ class LocalMesh:
         open_instance: Callable[[str], Instance] | None = None,
         on_hang: Callable[[FmuError], None] = lambda error: log.error("%s", error),
         parent: Path | None = None,
+        showing: Showing = Showing(),  # noqa: B008  a frozen Struct
     ) -> None:
         self.point = 0
         self.rows = 0
@@ -85,6 +88,7 @@ class LocalMesh:
         self._parent = parent
         self._stepping = ""
         self._save: Callable[[], None] = lambda: None
+        self._showing = showing
         self._stop: str | None = None
         self._folder: Path | None = None
 
@@ -158,11 +162,9 @@ class LocalMesh:
     def _open(self, name: str, folder: Path) -> Instance:
         if self._open_instance is not None:
             return self._open_instance(name)
-        system = self._plan.system.instances[name]
-        terms = Terms(self._plan.system.config.limits, self._plan.system.config.instances[name].sha256)
-        options = self._plan.nodes[system.node].instance(name).options
-        opened = open_instance(Path(system.fmu), name, system.description, folder, self._log, terms, options)
-        return stepped(opened, options)
+        item = self._plan.nodes[self._plan.node_of(name)].instance(name)
+        terms = Terms(self._plan.system.config.limits, item.sha256)
+        return stepped(open_instance(item, folder, self._log, terms, self._showing), item)
 
     def _guarded(self, name: str, folder: Path, watch: CallWatch) -> Guarded:
         return Guarded(name, lambda: self._open(name, folder), watch, self._plan.system.config.timeouts)

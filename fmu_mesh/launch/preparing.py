@@ -4,19 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Literal
 
 import msgspec
 from msgspec.structs import replace
 
 from ..errors import ConfigurationError, Finding, LoadFailed
-from ..fmu import PLATFORM, Terms, compile_sources, read_description
-from ..model.config import InstanceConfig, ZenohConfig
-from ..model.description import Kind, ModelDescription
+from ..fmu import Terms
+from ..model.config import AnyInstanceConfig, GazeboClassicConfig, InstanceConfig, MujocoConfig, PidConfig, ZenohConfig
+from ..model.description import ModelDescription
 from ..model.findings import Findings, nearest_file
 from ..model.loading import LoadedConfig, examine
 from ..model.plan import Plan, make_plan
 from ..model.system import build
+from .opening import Showing, check_showing, describe, expected_model
 
 __all__ = ["Options", "planned", "prepare", "zenoh_section"]
 
@@ -30,6 +30,7 @@ class Options(msgspec.Struct, frozen=True):
         output: the result file instead of the configured one.
         connect: Zenoh endpoints instead of the configured ones.
         profile: whether the nodes measure where their time goes.
+        showing: whether and how a physics engine shows its world.
     """
 
     start_values: tuple[str, ...] = ()
@@ -37,6 +38,7 @@ class Options(msgspec.Struct, frozen=True):
     output: Path | None = None
     connect: tuple[str, ...] = ()
     profile: bool = False
+    showing: Showing = Showing()
 
 
 def prepare(
@@ -70,6 +72,7 @@ def planned(
     descriptions, unreadable = _descriptions(loaded, tell)
     findings.merge(unreadable)
     system = build(loaded, descriptions, tuple(findings))
+    check_showing(system, options.showing)
     return make_plan(system, window=options.window, file=str(loaded.file))
 
 
@@ -91,48 +94,58 @@ def _with_options(loaded: LoadedConfig, options: Options) -> LoadedConfig:
 def _descriptions(
     loaded: LoadedConfig, tell: Callable[[str], None]
 ) -> tuple[dict[str, ModelDescription], Sequence[Finding]]:
-    """The description of every instance whose FMU can be read, and a finding for every other."""
+    """The description of every instance whose model can be read, and a finding for every other."""
     cache: dict[tuple[Path, Terms, str], ModelDescription | LoadFailed] = {}
     descriptions: dict[str, ModelDescription] = {}
     findings = []
     for name, instance in loaded.config.instances.items():
-        if not instance.fmu:
+        if not instance.path and not isinstance(instance, PidConfig):
             continue  # what stands there instead is a finding already
-        key = (loaded.resolve(instance.fmu), Terms(loaded.config.limits, instance.sha256), instance.kind)
-        if key not in cache:
-            cache[key] = _description(*key, tell)
-        path, found = key[0], cache[key]
+        path, key = loaded.resolve(instance.path), None
+        if isinstance(instance, InstanceConfig):
+            terms = Terms(loaded.config.limits, instance.sha256)
+            key = (path, terms, instance.kind)
+        else:
+            terms = Terms()
+        found = cache.get(key) if key is not None else None
+        if found is None:
+            try:
+                found = describe(path, instance, terms, tell)
+            except LoadFailed as error:
+                found = error
+        if key is not None:
+            cache[key] = found
         if isinstance(found, LoadFailed):
             text = found.message.rstrip(".") + (f" ({found.hint.rstrip('.')})" if found.hint else "")
-            expected = "an FMI 1.0, 2.0 or 3.0 FMU for this platform"
-            findings.append(loaded.finding(f"instances.{name}.fmu", text, expected, _similar(path)))
+            place = f"instances.{name}.{_key_of_path(instance)}"
+            findings.append(loaded.finding(place, text, expected_model(instance), _similar(path)))
         else:
             descriptions[name] = found
             findings += _strict_findings(loaded, name, instance, found)
     return descriptions, findings
 
 
-def _description(
-    path: Path, terms: Terms, kind: Literal["auto"] | Kind, tell: Callable[[str], None]
-) -> ModelDescription | LoadFailed:
-    """The description of an FMU that can run here, once its sources are compiled if it has no binary; or why not."""
-    try:
-        description = read_description(path, terms, kind)
-        if PLATFORM not in description.platforms:
-            compile_sources(path, terms, tell)
-    except LoadFailed as error:
-        return error
-    return description
-
-
 def _strict_findings(
-    loaded: LoadedConfig, name: str, instance: InstanceConfig, description: ModelDescription
+    loaded: LoadedConfig, name: str, instance: AnyInstanceConfig, description: ModelDescription
 ) -> Iterable[Finding]:
     """The problems of an FMU, where the configuration says that they are errors."""
+    if not isinstance(instance, InstanceConfig):
+        return
     strict = instance.strict if instance.strict is not None else loaded.config.strict
     for problem in description.problems if strict else ():
         text = " ".join(problem.split())
         yield loaded.finding(f"instances.{name}.fmu", text, "an FMU without problems, or `strict: false`")
+
+
+def _key_of_path(instance: AnyInstanceConfig) -> str:
+    """Where the file of an instance stands in its section."""
+    match instance:
+        case MujocoConfig():
+            return "mujoco"
+        case GazeboClassicConfig():
+            return "gazebo_classic"
+        case _:
+            return "fmu"
 
 
 def _similar(path: Path) -> str | None:

@@ -16,7 +16,7 @@ from pathlib import Path
 import msgspec
 
 from ..errors import ConfigurationError, FmuError, FmuMeshError, StepFailed
-from ..fmu import FmuInstance, LogMessage, Terms, open_instance, read_description, stepped
+from ..fmu import FmuInstance, LogMessage, Terms
 from ..fmu.guard import CallWatch, Guarded
 from ..master.master import Master
 from ..master.profiling import GrantWatch
@@ -39,6 +39,7 @@ from ..wire.runtime import (
 from ..wire.session import open_session, own_endpoints
 from ..wire.views import LogLine, MeshStatus
 from .events import End, Event, Log, Ready, Status
+from .opening import open_instance, stepped
 from .preparing import Options, prepare, zenoh_section
 from .process import die_with_parent, ended_by_signals
 from .wiring import MASTER, wiring
@@ -85,7 +86,8 @@ class _NodeProcess:
         self._plan = plan
         self._zenoh = zenoh_section(load(config_file), options)
         self._folder = folder
-        self._instances: list[FmuInstance] = []
+        self._options = options
+        self._instances: list[Instance] = []
         self._guarded: list[Guarded] = []
         self._child = False
         self._node: Node | None = None
@@ -118,14 +120,12 @@ class _NodeProcess:
 
     def _open(self, name: str) -> Guarded:
         item = self._plan.instance(name)
-        path, terms = Path(item.fmu), Terms(self._plan.limits, item.sha256)
-        description = read_description(path, terms, item.kind)
+        terms = Terms(self._plan.limits, item.sha256)
 
         def instantiate() -> Instance:
-            folder = fmu_folder(self._folder)
-            instance = open_instance(path, name, description, folder, self._log, terms, item.options)
+            instance = open_instance(item, fmu_folder(self._folder), self._log, terms, self._options.showing)
             self._instances.append(instance)
-            return stepped(instance, item.options)
+            return stepped(instance, item)
 
         self._guarded.append(Guarded(name, instantiate, self._watch, self._plan.timeouts))
         return self._guarded[-1]
@@ -148,7 +148,8 @@ class _NodeProcess:
     def _clean_up(self) -> None:
         """From another thread, when the main thread does not come back from an FMU."""
         for instance in self._instances:
-            instance.remove_files()
+            if isinstance(instance, FmuInstance):
+                instance.remove_files()
         leave_run_folder(self._folder)
 
     def _take_hang(self, error: FmuError) -> None:

@@ -14,11 +14,20 @@ from msgspec import Meta
 from fmu_mesh.model.types import PlainValue
 
 __all__ = [
+    "ActuatorConfig",
+    "AnyInstanceConfig",
     "Config",
     "ConnectionConfig",
+    "ControllerConfig",
+    "EngineConfig",
+    "FluidDynamicsConfig",
+    "GazeboClassicConfig",
+    "HostConfig",
     "InitializationConfig",
     "InstanceConfig",
     "LimitsConfig",
+    "MujocoConfig",
+    "PidConfig",
     "RecordConfig",
     "SimulationConfig",
     "SolverConfig",
@@ -131,7 +140,28 @@ class SolverConfig(Base, frozen=True, kw_only=True):
     ] = None
 
 
-class InstanceConfig(Base, frozen=True, kw_only=True):
+KIND = "@kind"
+"""What tells the kinds of instances apart once a file is read; nobody writes it, the keys of a section say it."""
+
+StartValues = Annotated[
+    dict[str, PlainValue],
+    Meta(
+        description="Start values of parameters, inputs and initial values, by variable name. "
+        "An Enumeration takes the item's name or its number, an array nested lists row by row, Binary base64."
+    ),
+]
+StepSize = Annotated[
+    float | None,
+    Meta(
+        description="Step size of this instance in s: a whole multiple of the base step size (default).",
+        extra_json_schema=_POSITIVE,
+    ),
+]
+Group = Annotated[Name | None, Meta(description="Instances of one group share one node (one process).")]
+Host = Annotated[str | None, Meta(description="Host the node is meant to run on; `launch` starts those without.")]
+
+
+class InstanceConfig(Base, frozen=True, kw_only=True, tag_field=KIND, tag="fmu"):
     """One instance of an FMU."""
 
     fmu: Annotated[str, Meta(description="Path of the .fmu file, or of an unpacked one, relative to this file.")]
@@ -147,20 +177,10 @@ class InstanceConfig(Base, frozen=True, kw_only=True):
             "kept before every step. FMI 3.0 needs no such wish."
         ),
     ] = False
-    start_values: Annotated[
-        dict[str, PlainValue],
-        Meta(
-            description="Start values of parameters, inputs and initial values, by variable name. "
-            "An Enumeration takes the item's name or its number, an array nested lists row by row, Binary base64."
-        ),
-    ] = {}
-    step_size: Annotated[
-        float | None,
-        Meta(
-            description="Step size of this instance in s: a whole multiple of the base step size (default).",
-            extra_json_schema=_POSITIVE,
-        ),
-    ] = None
+    start_values: StartValues = {}
+    step_size: StepSize = None
+    group: Group = None
+    host: Host = None
     interpolation: Annotated[
         Literal["hold", "linear"] | None,
         Meta(
@@ -169,7 +189,6 @@ class InstanceConfig(Base, frozen=True, kw_only=True):
             "next point on."
         ),
     ] = None
-    group: Annotated[Name | None, Meta(description="Instances of one group share one node (one process).")] = None
     sha256: Annotated[
         Sha256 | None, Meta(description="SHA-256 that the .fmu file must have; any other is refused.")
     ] = None
@@ -177,9 +196,125 @@ class InstanceConfig(Base, frozen=True, kw_only=True):
         bool | None,
         Meta(description="Whether problems that a strict validation finds in the FMU are errors (default: top level)."),
     ] = None
-    host: Annotated[
-        str | None, Meta(description="Host the node is meant to run on; `launch` starts those without.")
+
+    @property
+    def path(self) -> str:
+        """The file of the model, relative to the configuration."""
+        return self.fmu
+
+
+class CouplingConfig(Base, frozen=True, kw_only=True):
+    """Another instance that reads and drives a part of a physics engine."""
+
+    name: Annotated[str, Meta(description="Name of this coupling, for messages.")]
+    instance: Annotated[Name, Meta(description="The instance that is coupled.")]
+    enabled: Annotated[bool, Meta(description="false: as if it were not there.")] = True
+    variable_names: Annotated[
+        dict[str, str],
+        Meta(description="The instance's own names of variables, by their default names."),
+    ] = {}
+
+
+class ControllerConfig(CouplingConfig, frozen=True, kw_only=True):
+    """A controller of a joint: `position` and `velocity` to `effort`."""
+
+    joint: Annotated[str, Meta(description="Name of the joint, revolute or prismatic.")]
+
+
+class ActuatorConfig(CouplingConfig, frozen=True, kw_only=True):
+    """An actuator of a joint: `actuatorInput`, `jointPosition`, `jointVelocity`, `jointAcceleration` to `jointTorque`.
+
+    What a controller asks for goes to the actuator, and the joint gets the actuator's effort instead.
+    """
+
+    joint: Annotated[str, Meta(description="Name of the joint, revolute or prismatic.")]
+    disable_velocity_effort_limits: Annotated[
+        bool, Meta(description="true: the effort of the joint is not limited, whatever the model says.")
+    ] = False
+
+
+class FluidDynamicsConfig(CouplingConfig, frozen=True, kw_only=True):
+    """Fluid dynamics of one body: `relativeVelocity_x/y/z` to `fluidDynamicForce_…` and `fluidDynamicMoment_…`."""
+
+    link: Annotated[str, Meta(description="Name of the body.")]
+
+
+class MujocoConfig(Base, frozen=True, kw_only=True, tag_field=KIND, tag="mujoco"):
+    """A world that the physics engine MuJoCo computes: its joints and bodies are variables."""
+
+    mujoco: Annotated[str, Meta(description="Path of the model (MJCF or URDF), relative to this file.")]
+    physics_steps: Annotated[
+        Annotated[int, Meta(ge=1)] | None,
+        Meta(
+            description="Steps of the engine per own step; default: as few as make none longer than the model's "
+            "timestep.",
+        ),
     ] = None
+    keyframe: Annotated[str | None, Meta(description="The model's keyframe to start from.")] = None
+    controllers: Annotated[list[ControllerConfig], Meta(description="Controllers of joints.")] = []
+    actuators: Annotated[list[ActuatorConfig], Meta(description="Actuators of joints, as in gazebo-fmi.")] = []
+    fluid_dynamics: Annotated[
+        list[FluidDynamicsConfig], Meta(description="Fluid dynamics of single bodies, as in gazebo-fmi.")
+    ] = []
+    start_values: StartValues = {}
+    step_size: StepSize = None
+    group: Group = None
+    host: Host = None
+
+    @property
+    def path(self) -> str:
+        """The file of the model, relative to the configuration."""
+        return self.mujoco
+
+
+class GazeboClassicConfig(Base, frozen=True, kw_only=True, tag_field=KIND, tag="gazebo_classic"):
+    """A world that the simulator Gazebo classic 11 computes: its joints and links are variables."""
+
+    gazebo_classic: Annotated[str, Meta(description="Path of the SDF world, relative to this file.")]
+    physics_steps: Annotated[
+        Annotated[int, Meta(ge=1)] | None,
+        Meta(
+            description="Steps of the engine per own step; default: as few as make none longer than the world's "
+            "max_step_size.",
+        ),
+    ] = None
+    controllers: Annotated[list[ControllerConfig], Meta(description="Controllers of joints.")] = []
+    actuators: Annotated[list[ActuatorConfig], Meta(description="Actuators of joints, as in gazebo-fmi.")] = []
+    fluid_dynamics: Annotated[
+        list[FluidDynamicsConfig], Meta(description="Fluid dynamics of single links, as in gazebo-fmi.")
+    ] = []
+    start_values: StartValues = {}
+    step_size: StepSize = None
+    group: Group = None
+    host: Host = None
+
+    @property
+    def path(self) -> str:
+        """The file of the world, relative to the configuration."""
+        return self.gazebo_classic
+
+
+class PidConfig(Base, frozen=True, kw_only=True, tag_field=KIND, tag="controller"):
+    """A controller that needs no FMU."""
+
+    controller: Annotated[
+        Literal["position_pid"],
+        Meta(description="position_pid: gains p, i, d; inputs target, position, velocity; output effort."),
+    ]
+    start_values: StartValues = {}
+    step_size: StepSize = None
+    group: Group = None
+    host: Host = None
+
+    @property
+    def path(self) -> str:
+        """There is no file."""
+        return ""
+
+
+EngineConfig = MujocoConfig | GazeboClassicConfig
+HostConfig = EngineConfig | PidConfig
+AnyInstanceConfig = InstanceConfig | MujocoConfig | GazeboClassicConfig | PidConfig
 
 
 class LimitsConfig(Base, frozen=True, kw_only=True):
@@ -347,7 +482,7 @@ class Config(Base, frozen=True, kw_only=True):
     mesh: Annotated[Name, Meta(description="Name of the mesh; part of every key.")]
     simulation: SimulationConfig
     instances: Annotated[
-        dict[Name, InstanceConfig],
+        dict[Name, AnyInstanceConfig],
         Meta(min_length=1, description="The instances by name; `mesh` is reserved."),
     ]
     group: Annotated[

@@ -20,6 +20,7 @@ __all__ = [
     "Causality",
     "Clock",
     "DefaultExperiment",
+    "HostKind",
     "Kind",
     "ModelDescription",
     "PlainValue",
@@ -35,6 +36,8 @@ Causality = Literal[
 Variability = Literal["constant", "fixed", "tunable", "discrete", "continuous"]
 Initial = Literal["exact", "approx", "calculated"]
 Kind = Literal["co_simulation", "model_exchange"]
+HostKind = Literal["physics_engine", "controller"]
+"""What an instance is that is no FMU."""
 
 
 class Variable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -132,7 +135,7 @@ class ModelDescription(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     model_name: str
     model_identifier: str
     fmi_version: str
-    kind: Kind
+    kind: Kind | HostKind
     guid: str
     variables: tuple[Variable, ...]
     description: str | None = None

@@ -14,7 +14,7 @@ import msgspec
 from msgspec import inspect
 
 from fmu_mesh.errors import Finding
-from fmu_mesh.model.config import Config
+from fmu_mesh.model.config import KIND, Config
 from fmu_mesh.model.findings import Findings, listed, locate, nearest, nearest_file, shown
 from fmu_mesh.model.salvage import salvage
 from fmu_mesh.model.structure import check
@@ -120,7 +120,7 @@ def _examine(text: str, path: Path, overrides: Sequence[str]) -> tuple[LoadedCon
         findings.raise_any()
     if isinstance(data, dict):
         data = _with_long_connections(data, findings)
-        data = _with_overrides(data, overrides, replaced, findings)
+        data = _with_kinds(_with_overrides(data, overrides, replaced, findings))
     check(data, inspect.type_info(Config), "", findings)
     config = salvage(data, findings.places) if len(findings) else msgspec.convert(data, Config)
     if config is None:
@@ -172,6 +172,21 @@ def _with_long_connections(data: dict[str, Plain], findings: Findings) -> dict[s
             findings.add(f"connections[{index}]", shown(connection), _SHORT_FORM, _arrow_meant(connection))
             written.append({"from": "", "to": ""})
     return {**data, "connections": written}
+
+
+def _with_kinds(data: dict[str, Plain]) -> dict[str, Plain]:
+    """``data`` with the kind of every instance, as its keys say it: that of an FMU where they say nothing."""
+    instances = data.get("instances")
+    if not isinstance(instances, dict):
+        return data
+    written: dict[str, Plain] = {}
+    for name, instance in instances.items():
+        if isinstance(instance, dict):
+            kind = next((key for key in ("fmu", "mujoco", "gazebo_classic", "controller") if key in instance), "fmu")
+            written[name] = {**instance, KIND: kind}
+        else:
+            written[name] = instance
+    return {**data, "instances": written}
 
 
 def _arrow_meant(connection: Plain) -> str | None:

@@ -15,8 +15,8 @@ from msgspec.structs import replace
 
 from ..errors import ConfigurationError, Finding
 from ..simtime import TimeGrid
-from .config import InitializationConfig, LimitsConfig, TimeoutsConfig
-from .description import Kind
+from .config import HostConfig, InitializationConfig, InstanceConfig, LimitsConfig, TimeoutsConfig
+from .description import HostKind, Kind
 from .graph import cycle_through, feedback_edges, strongly_connected, topological_order
 from .initialization import InitializationPlan, Loop, plan_initialization
 from .instance import StepOptions
@@ -64,6 +64,7 @@ class InstancePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         interpolation: what the time of a value that is sent to an unconnected input means; None: nothing.
         kind: which kind of the FMU is used.
         options: how it is stepped.
+        hosted: the section of the configuration of an instance that is no FMU.
     """
 
     name: str
@@ -76,8 +77,9 @@ class InstancePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     initialization: dict[str, int]
     interpolation: Literal["hold", "linear"] | None = None
     sha256: str | None = None
-    kind: Kind = "co_simulation"
+    kind: Kind | HostKind = "co_simulation"
     options: StepOptions = StepOptions()
+    hosted: HostConfig | None = None
 
 
 class Link(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -365,6 +367,7 @@ def _output_layout(plan: Plan, name: str) -> Layout:
 
 def _instance_plan(plan: Plan, instance: SystemInstance, outputs: Layout) -> InstancePlan:
     incoming = [c for c in plan.connections if c.target_instance == instance.name]
+    section = plan.system.config.instances[instance.name]
     feeds: dict[tuple[str, int], list[tuple[str, str, float, float]]] = {}
     for c in incoming:
         feeds.setdefault((c.source_instance, c.delay or 0), []).append(
@@ -381,10 +384,11 @@ def _instance_plan(plan: Plan, instance: SystemInstance, outputs: Layout) -> Ins
         inputs=Layout.of(v for v in instance.description.variables if v.name in connected),
         feeds=tuple(Feed(source=s, delay=d, columns=tuple(columns)) for (s, d), columns in sorted(feeds.items())),
         initialization={variable: level for (owner, variable), level in levels.items() if owner == instance.name},
-        interpolation=plan.system.config.instances[instance.name].interpolation,
-        sha256=plan.system.config.instances[instance.name].sha256,
+        interpolation=section.interpolation if isinstance(section, InstanceConfig) else None,
+        sha256=section.sha256 if isinstance(section, InstanceConfig) else None,
         kind=instance.description.kind,
         options=replace(instance.options, linear_inputs=linear_inputs(plan.connections, instance.name)),
+        hosted=instance.hosted,
     )
 
 

@@ -12,7 +12,7 @@ from collections.abc import Set as AbstractSet
 
 import msgspec
 
-from fmu_mesh.model.config import Config
+from fmu_mesh.model.config import KIND, Config
 from fmu_mesh.model.yaml_text import Plain
 
 __all__ = ["salvage"]
@@ -59,11 +59,16 @@ def _without(value: Plain, wrong: AbstractSet[str], path: str) -> Plain:
         }
     if isinstance(value, list):
         places_of_items = [f"{path}[{index}]" for index in range(len(value))]
-        if path != "connections" and any(place in wrong for place in places_of_items):
+        if path != "connections" and any(_is_wrong(place, wrong) for place in places_of_items):
             return []
         pairs = zip(value, places_of_items, strict=True)
         return [None if place in wrong else _without(item, wrong, place) for item, place in pairs]
     return value
+
+
+def _is_wrong(place: str, wrong: AbstractSet[str]) -> bool:
+    """Whether an item of a list, or anything in it, is wrong."""
+    return any(path == place or path.startswith(f"{place}.") for path in wrong)
 
 
 def _simulation(section: Plain, wrong: AbstractSet[str]) -> dict[str, Plain]:
@@ -75,9 +80,25 @@ def _simulation(section: Plain, wrong: AbstractSet[str]) -> dict[str, Plain]:
 def _with_fmu(section: Plain) -> dict[str, Plain]:
     instances = section if isinstance(section, dict) else {}
     return {
-        name: {"fmu": "", **instance} if isinstance(instance, dict) else {"fmu": ""}
+        name: _with_model(instance) if isinstance(instance, dict) else {KIND: "fmu", "fmu": ""}
         for name, instance in instances.items()
     }
+
+
+def _with_model(instance: dict[str, Plain]) -> dict[str, Plain]:
+    """``instance`` with an empty path where its model is missing; without a controller it is an FMU that is missing."""
+    match instance.get(KIND):
+        case "mujoco":
+            return {"mujoco": "", **instance}
+        case "gazebo_classic":
+            return {"gazebo_classic": "", **instance}
+        case "controller" if "controller" not in instance:
+            shared: dict[str, Plain] = {key: instance[key] for key in ("step_size", "group", "host") if key in instance}
+            return {KIND: "fmu", "fmu": "", **shared}
+        case "controller":
+            return instance
+        case _:
+            return {"fmu": "", **instance}
 
 
 def _with_ends(section: Plain) -> list[Plain]:

@@ -7,10 +7,11 @@ schema: a file that keeps it can still be refused by `fmu_mesh.model.system`.
 from __future__ import annotations
 
 import json
+from typing import Any
 
 import msgspec
 
-from fmu_mesh.model.config import Config
+from fmu_mesh.model.config import KIND, Config
 
 __all__ = ["SCHEMA_ID", "json_schema", "schema_text"]
 
@@ -31,6 +32,7 @@ def json_schema() -> dict[str, object]:
     config["properties"]["connections"]["items"] = {
         "anyOf": [_SHORT_CONNECTION, config["properties"]["connections"]["items"]]
     }
+    _without_kinds(config, definitions)
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "$id": SCHEMA_ID,
@@ -38,6 +40,14 @@ def json_schema() -> dict[str, object]:
         "$ref": reference["$ref"],
         "$defs": definitions,
     }
+
+
+def _without_kinds(config: dict[str, Any], definitions: dict[str, Any]) -> None:
+    """Take out what tells the kinds of instances apart in the program: in a file their own keys do."""
+    del config["properties"]["instances"]["additionalProperties"]["discriminator"]
+    for section in definitions.values():
+        if section["properties"].pop(KIND, None) is not None:
+            section["required"].remove(KIND)
 
 
 def schema_text() -> str:

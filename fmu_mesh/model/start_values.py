@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from fmu_mesh.model.config import InstanceConfig
+from fmu_mesh.model.config import AnyInstanceConfig
 from fmu_mesh.model.description import ModelDescription, Value, Variable
 from fmu_mesh.model.findings import Findings, listed, nearest, shown
 from fmu_mesh.model.types import MAX_ELEMENTS
@@ -17,7 +17,7 @@ from fmu_mesh.model.values import ValueRefused, to_value
 __all__ = ["resolve_start_values", "sized"]
 
 
-def sized(name: str, description: ModelDescription, config: InstanceConfig, findings: Findings) -> ModelDescription:
+def sized(name: str, description: ModelDescription, config: AnyInstanceConfig, findings: Findings) -> ModelDescription:
     """A model description with the shapes that its arrays get by the structural parameters of the configuration.
 
     Args:
@@ -42,7 +42,7 @@ def sized(name: str, description: ModelDescription, config: InstanceConfig, find
 
 
 def resolve_start_values(
-    name: str, config: InstanceConfig, variables: Mapping[str, Variable], findings: Findings
+    name: str, config: AnyInstanceConfig, variables: Mapping[str, Variable], findings: Findings
 ) -> dict[str, Value]:
     """The start values of the instance ``name``, converted to the types of its variables.
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
-from .config import InstanceConfig
+from .config import AnyInstanceConfig, InstanceConfig
 from .connection import Connection
 from .description import ModelDescription
 from .findings import Findings
@@ -20,9 +20,11 @@ _DEFAULT_TOLERANCE = 1e-6
 
 
 def resolve_step_options(
-    name: str, config: InstanceConfig, description: ModelDescription, findings: Findings
+    name: str, config: AnyInstanceConfig, description: ModelDescription, findings: Findings
 ) -> StepOptions:
     """What the section of an instance says about its stepping; the linear inputs are not known before the delays."""
+    if not isinstance(config, InstanceConfig):
+        return StepOptions()
     solver = config.solver
     for key in ("relative_tolerance", "maximum_step_size"):
         value = getattr(solver, key)
@@ -42,7 +44,7 @@ def resolve_step_options(
 
 def check_extrapolation(
     connections: Sequence[Connection],
-    configs: Mapping[str, InstanceConfig],
+    configs: Mapping[str, AnyInstanceConfig],
     descriptions: Mapping[str, ModelDescription],
     findings: Findings,
 ) -> None:
@@ -50,7 +52,8 @@ def check_extrapolation(
     for connection in connections:
         if connection.extrapolation == "linear":
             target = connection.target_instance
-            retries = configs[target].retry_discarded_steps
+            section = configs[target]
+            retries = isinstance(section, InstanceConfig) and section.retry_discarded_steps
             reason = _cannot_extrapolate(connection, descriptions[target], retries=retries)
             if reason is not None:
                 found = f"linear for {connection}, but {reason}"
@@ -67,7 +70,7 @@ def linear_inputs(connections: Sequence[Connection], name: str) -> tuple[LinearI
 
 
 def capability_warnings(
-    config: Mapping[str, InstanceConfig], descriptions: Mapping[str, ModelDescription], findings: Findings
+    config: Mapping[str, AnyInstanceConfig], descriptions: Mapping[str, ModelDescription], findings: Findings
 ) -> None:
     """Note what an FMU needs that this program does not give it."""
     for name in config:

@@ -65,6 +65,8 @@ def describe(kind: inspect.Type) -> str:
     match kind:
         case inspect.Metadata():
             words = str((kind.extra_json_schema or {}).get("title") or describe(kind.type))
+        case inspect.UnionType(types=(inspect.StructType() as usual, *_)):
+            words = describe(usual)
         case inspect.UnionType():
             numbers = any(isinstance(option, inspect.FloatType) for option in kind.types)
             options = [
@@ -91,6 +93,8 @@ def _check_struct(value: dict[str, Plain], kind: inspect.StructType, path: str, 
     absent = [name for name in fields if name not in value]
     meant: set[str | None] = set()
     for key, item in value.items():
+        if key == kind.tag_field:
+            continue
         place = f"{path}.{key}" if path else key
         if key in fields:
             check(item, fields[key].type, place, findings)
@@ -118,6 +122,8 @@ def _check_mapping(value: dict[str, Plain], kind: inspect.DictType, path: str, f
 
 def _check_union(value: Plain, kind: inspect.UnionType, path: str, findings: Findings) -> None:
     options = _options(kind)
+    if isinstance(value, dict):
+        options = [option for option in options if _is_of_kind(value, option)] or options
     for option in options:
         container = isinstance(option, inspect.StructType | inspect.DictType) and isinstance(value, dict)
         if container or (isinstance(option, inspect.ListType) and isinstance(value, list)):
@@ -127,6 +133,13 @@ def _check_union(value: Plain, kind: inspect.UnionType, path: str, findings: Fin
         words = [word for option in options for word in _words(option)]
         suggestion = nearest(value, words) if isinstance(value, str) else None
         findings.add(path, shown(value), describe(kind), suggestion)
+
+
+def _is_of_kind(value: dict[str, Plain], option: inspect.Type) -> bool:
+    """Whether ``option`` is the Struct that a mapping of a tagged union says it is."""
+    return isinstance(option, inspect.StructType) and (
+        option.tag_field is not None and value.get(option.tag_field) == option.tag
+    )
 
 
 def _options(kind: inspect.UnionType) -> list[inspect.Type]:

@@ -13,7 +13,7 @@ import msgspec
 from msgspec.structs import replace
 
 from fmu_mesh.errors import Finding
-from fmu_mesh.model.config import Config, InstanceConfig
+from fmu_mesh.model.config import AnyInstanceConfig, Config, HostConfig, InstanceConfig
 from fmu_mesh.model.connection import (
     Connection,
     Variables,
@@ -21,6 +21,7 @@ from fmu_mesh.model.connection import (
     resolve_variable,
     unit_warnings,
 )
+from fmu_mesh.model.coupling import coupled_connections
 from fmu_mesh.model.description import ModelDescription, Value
 from fmu_mesh.model.findings import Findings, nearest_file, shown
 from fmu_mesh.model.grouping import automatic_nodes
@@ -41,12 +42,13 @@ class SystemInstance(msgspec.Struct, frozen=True):
 
     Attributes:
         name: instance name.
-        fmu: absolute path of the FMU.
+        fmu: absolute path of the FMU, or of the model of a physics engine; empty where there is no file.
         description: its model description.
         start_values: start values by variable name, converted to the variable's type.
         step_points: its step size as a multiple of the base step size; 1 or more.
         node: name of the node (process) it runs in: its group, that of its cycle (`group: auto`), or its own name.
         options: how it is stepped; its linear inputs are not known before the delays.
+        hosted: its section of the configuration if it is no FMU.
     """
 
     name: str
@@ -56,6 +58,7 @@ class SystemInstance(msgspec.Struct, frozen=True):
     step_points: int
     node: str
     options: StepOptions = StepOptions()
+    hosted: HostConfig | None = None
 
 
 class System(msgspec.Struct, frozen=True):
@@ -109,6 +112,7 @@ def build(
     _check_nodes(config, descriptions, collected)
     connections = resolve_connections(config.connections, variables, collected)
     check_extrapolation(connections, config.instances, descriptions, collected)
+    connections += coupled_connections(config, variables, connections, collected)
     recorded = _recorded(config, variables, collected)
     result_file = _result_file(loaded, collected)
     _check_zenoh(loaded, collected)
@@ -178,17 +182,18 @@ def _instances(
             continue
         instances[name] = SystemInstance(
             name=name,
-            fmu=str(loaded.resolve(config.fmu)),
+            fmu=str(loaded.resolve(config.path)) if config.path else "",
             description=descriptions[name],
             start_values=resolve_start_values(name, config, own, findings),
             step_points=step_points,
             node=config.group or name,
             options=resolve_step_options(name, config, descriptions[name], findings),
+            hosted=None if isinstance(config, InstanceConfig) else config,
         )
     return instances
 
 
-def _step_points(name: str, config: InstanceConfig, base: float, findings: Findings) -> int:
+def _step_points(name: str, config: AnyInstanceConfig, base: float, findings: Findings) -> int:
     """The step size of an instance in points; 1 after a finding."""
     path, step = f"instances.{name}.step_size", config.step_size
     if step is None:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from fmu_mesh.errors import LoopNotConverged
 from fmu_mesh.launch.local import LocalMesh
-from fmu_mesh.model.config import Config
+from fmu_mesh.model.config import KIND, Config
 from fmu_mesh.model.connection import Connection
 from fmu_mesh.model.description import Causality, ModelDescription, Value, Variable, VariableType
 from fmu_mesh.model.plan import Plan, make_plan
@@ -253,7 +253,7 @@ def planned(drawn: Drawn) -> Plan:
         {
             "mesh": "random",
             "simulation": {"stop_time": 1.0, "step_size": STEP_SIZE, "algorithm": drawn.algorithm},
-            "instances": {name: {"fmu": "none.fmu"} for name in names},
+            "instances": {name: {KIND: "fmu", "fmu": "none.fmu"} for name in names},
             "initialization": {"iterations": ITERATIONS},
         },
         Config,

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import msgspec
 
 from fmu_mesh.launch.local import LocalMesh
-from fmu_mesh.model.config import Config
+from fmu_mesh.model.config import KIND, Config
 from fmu_mesh.model.connection import Connection
 from fmu_mesh.model.description import ModelDescription, Value, Variable
 from fmu_mesh.model.plan import Plan, make_plan
@@ -65,7 +65,7 @@ class Scenario:
             {
                 "mesh": "scenario",
                 "simulation": {"stop_time": self.points, "step_size": 1.0, "algorithm": self.algorithm},
-                "instances": {name: {"fmu": "none.fmu"} for name in names},
+                "instances": {name: {KIND: "fmu", "fmu": "none.fmu"} for name in names},
             },
             Config,
         )

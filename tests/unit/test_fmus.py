@@ -62,7 +62,8 @@ def members(path: Path, *, without: str = "\0") -> dict[str, bytes]:
 def test_every_model_folder_has_a_kept_fmu() -> None:
     models = sorted(path.parent.name for path in (FMUS / "src").glob("*/modelDescription.xml"))
 
-    assert models == list(KEPT_FMUS) == ["Adder", "DampedPendulum", "Gain", "Integrator", "TransportDelay"]
+    assert models == list(KEPT_FMUS)
+    assert "DampedPendulum" in models
 
 
 @every_fmu
@@ -146,7 +147,7 @@ def test_a_build_of_an_unknown_model_names_the_models_there_are(capsys: pytest.C
     message = capsys.readouterr().err
     assert code == 1
     assert "no model Gian" in message
-    assert "Adder, DampedPendulum, Gain" in message
+    assert ", ".join(KEPT_FMUS) in message
 
 
 @needs_compiler

@@ -89,7 +89,7 @@ def test_plain_scalars_follow_the_core_schema_of_yaml_1_2(text: str, value: obje
 
 def test_an_escape_in_two_halves_is_one_character() -> None:
     loaded = parse(changed("fmu: delay.fmu", 'fmu: "\\ud83d\\ude00.fmu"'), Path("mesh.yaml"))
-    assert loaded.config.instances["delay"].fmu == "\N{GRINNING FACE}.fmu"
+    assert loaded.config.instances["delay"].path == "\N{GRINNING FACE}.fmu"
 
 
 def test_an_alias_stands_for_the_value_of_its_anchor() -> None:

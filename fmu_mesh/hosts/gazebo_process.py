@@ -1,0 +1,168 @@
+"""Gazebo classic as a process that steps when it is told to.
+
+Owns the process, its pipes and the deadline of every answer; the protocol is described in
+``bridges/gazebo_classic/gazebo_lockstep.cc``. What the numbers mean is not known here.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import shlex
+import shutil
+import socket
+import subprocess
+import tempfile
+import time
+from collections.abc import Sequence
+
+__all__ = ["PROGRAM_VARIABLE", "GazeboGone", "GazeboProcess", "find_program"]
+
+PROGRAM_VARIABLE = "FMU_MESH_GAZEBO"
+"""The environment variable with the command of the lock-step program, as a shell would split it."""
+
+PROGRAM = "gazebo_lockstep"
+
+_START_S, _STEP_S, _END_S = 60.0, 60.0, 5.0
+_TAIL = 2000
+"""Bytes of what Gazebo wrote last that an error quotes from."""
+
+
+class GazeboGone(Exception):
+    """The process is not there, does not answer, or has given up; the message says which."""
+
+
+def find_program() -> list[str]:
+    """The command of the lock-step program: ``$FMU_MESH_GAZEBO``, or ``gazebo_lockstep`` on the path.
+
+    Raises:
+        GazeboGone: there is none.
+    """
+    command = shlex.split(os.environ.get(PROGRAM_VARIABLE, "")) or [PROGRAM]
+    if shutil.which(command[0]) is None:
+        raise GazeboGone(f"there is no '{command[0]}'")
+    return command
+
+
+class GazeboProcess:
+    """One world in one process.
+
+    Call sequence: the constructor, which loads the world and leaves its state in ``state``; then `set_step_size` and
+    `step`; at the end, and after any exception, `close`.
+
+    Args:
+        text: the SDF file.
+        joints: scoped name, and whether it has no limits.
+        links: scoped names.
+
+    Attributes:
+        version: of Gazebo, and its engine.
+        state: the last state, as the protocol has it.
+
+    Raises:
+        GazeboGone: by every method but `close`.
+    """
+
+    def __init__(self, text: bytes, joints: Sequence[tuple[str, bool]], links: Sequence[str]) -> None:
+        self._received = b""
+        with contextlib.ExitStack() as stack:
+            self._errors = stack.enter_context(tempfile.TemporaryFile())
+            self._process = subprocess.Popen(
+                find_program(),
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=self._errors,
+                bufsize=0,
+                env=_environment(),
+                start_new_session=True,  # Ctrl-C is for the node, which then closes it
+            )
+            stack.callback(self.close)
+            parts = [f"joint {name} {'free' if free else 'limited'}\n" for name, free in joints]
+            parts += [f"link {name}\n" for name in links]
+            self._send(b"world %d\n%b%b" % (len(text), text, "".join([*parts, "go\n"]).encode()))
+            self.version = self._answer(_START_S).removeprefix("gazebo ")
+            self.state = self._numbers(_START_S)
+            stack.pop_all()
+
+    def set_step_size(self, step_size: float) -> None:
+        """Let every step of the engine take ``step_size`` seconds."""
+        self._send(f"step_size {step_size!r}\n".encode())
+
+    def step(self, count: int, efforts: Sequence[float], wrenches: Sequence[float]) -> None:
+        """Take ``count`` steps with the efforts of all joints and force and moment of all links; then ``state``."""
+        numbers = " ".join(map(repr, (*efforts, *wrenches)))
+        self._send(f"step {count} {numbers}\n".encode())
+        self.state = self._numbers(_STEP_S)
+
+    def close(self) -> None:
+        """End the process. Never raises; may be called twice."""
+        with contextlib.suppress(OSError):
+            if self._process.stdin is not None:
+                self._process.stdin.close()
+        try:
+            self._process.wait(_END_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        if self._process.stdout is not None:
+            self._process.stdout.close()
+        self._errors.close()
+
+    def _send(self, data: bytes) -> None:
+        pipe = self._process.stdin
+        if pipe is None or pipe.closed:
+            raise GazeboGone("it was ended")
+        try:
+            while data:
+                data = data[pipe.write(data) or 0 :]
+        except OSError as error:
+            raise GazeboGone(self._last_words()) from error
+
+    def _numbers(self, deadline_s: float) -> list[float]:
+        return [float(word) for word in self._answer(deadline_s).split()]
+
+    def _answer(self, deadline_s: float) -> str:
+        """The next line."""
+        pipe = self._process.stdout
+        if pipe is None:
+            raise GazeboGone("it was ended")
+        end = time.monotonic() + deadline_s
+        while b"\n" not in self._received:
+            readable, _, _ = select.select([pipe], [], [], max(0.0, end - time.monotonic()))
+            if not readable:
+                raise GazeboGone(f"it has not answered for {deadline_s:g} s")
+            data = pipe.read(1 << 16)
+            if not data:
+                raise GazeboGone(self._last_words())
+            self._received += data
+        line, _, self._received = self._received.partition(b"\n")
+        text = line.decode(errors="replace")
+        if text.startswith("error "):
+            raise GazeboGone(text.removeprefix("error "))
+        return text
+
+    def _last_words(self) -> str:
+        """That the process has ended, with the last line that it wrote."""
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._process.wait(_END_S)
+        size = os.fstat(self._errors.fileno()).st_size
+        tail = os.pread(self._errors.fileno(), _TAIL, max(0, size - _TAIL)).decode(errors="replace")
+        lines = [line.strip() for line in tail.splitlines() if line.strip()]
+        words = f"; the last it wrote is: {lines[-1]}" if lines else ""
+        return f"its process has ended with {self._process.returncode}{words}"
+
+
+def _environment() -> dict[str, str]:
+    """What Gazebo needs to know: a server of its own on this host, and no model database."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    # In a system of its own (chroot) there may be no such folder, and Gazebo's libraries look for it before all else.
+    own = {name: value for name, value in os.environ.items() if name != "TMPDIR"}
+    return {
+        **own,
+        "GAZEBO_IP": "127.0.0.1",
+        "GAZEBO_MASTER_URI": f"http://127.0.0.1:{port}",
+        "GAZEBO_MODEL_DATABASE_URI": "",
+    }

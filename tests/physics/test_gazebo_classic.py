@@ -1,0 +1,98 @@
+"""Real Gazebo classic 11 against MuJoCo and against paper, where it is installed (docs/gazebo.md)."""
+
+from __future__ import annotations
+
+import csv
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from fmu_mesh.hosts.gazebo_process import PROGRAM_VARIABLE, GazeboGone, find_program
+from fmu_mesh.launch.local import LocalMesh
+from fmu_mesh.launch.preparing import Options, prepare
+from tests.helpers import Place, rows_of
+
+CONFIGS = Path(__file__).resolve().parents[2] / "configs"
+
+Array = NDArray[np.float64]
+
+
+def _why_not() -> str | None:
+    try:
+        find_program()
+    except GazeboGone as error:
+        given = os.environ.get(PROGRAM_VARIABLE)
+        return f"Gazebo classic is not installed here: {error} (${PROGRAM_VARIABLE} = {given!r})"
+    return None
+
+
+WHY_NOT = _why_not()
+
+pytestmark = [pytest.mark.skipif(WHY_NOT is not None, reason=str(WHY_NOT)), pytest.mark.timeout(300)]
+
+
+def columns(config: Path, output: Path, *start_values: str) -> dict[str, Array]:
+    """The result of a run in this process."""
+    LocalMesh(prepare(config, Options(start_values=start_values, output=output))).run()
+    with output.open(newline="") as file:
+        header, *rows = csv.reader(file)
+    table = np.array(rows, dtype=np.float64)
+    return {name: table[:, column] for column, name in enumerate(header)}
+
+
+def with_gazebo(name: str, folder: Path, stop_time: float | None = None) -> Path:
+    """The configuration of a MuJoCo run with the world's twin for Gazebo."""
+    lines = (CONFIGS / f"{name}.yaml").read_text(encoding="utf-8").splitlines()
+    text = "\n".join(line for line in lines if "keyframe:" not in line).replace("../fmus", f"{CONFIGS.parent}/fmus")
+    text = text.replace(f"mujoco: worlds/{name}.xml", f"gazebo_classic: {CONFIGS}/worlds/{name}.sdf")
+    if stop_time is not None:
+        text = text.replace("stop_time: 20.0", f"stop_time: {stop_time}")
+    path = folder / f"{name}.yaml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_the_actuator_example_is_that_of_mujoco_within_a_milliradian(tmp_path: Path) -> None:
+    pytest.importorskip("mujoco", reason="MuJoCo is not installed")
+
+    gazebo = columns(CONFIGS / "electrical_actuator_gazebo.yaml", tmp_path / "gazebo.csv")
+    mujoco = columns(CONFIGS / "electrical_actuator.yaml", tmp_path / "mujoco.csv")
+
+    assert gazebo.keys() == mujoco.keys()
+    for name, values in gazebo.items():
+        assert np.abs(values - mujoco[name]).max() < 1e-3, name
+    peaks = [gazebo[f"world.{joint}.position"].max() for joint in ("bare", "weak", "tuned")]
+    assert peaks == pytest.approx([1.171, 1.229, 1.113], rel=1e-2)
+
+
+def test_a_pendulum_that_the_engine_damps_is_that_with_the_damper_fmu_in_every_float(tmp_path: Path) -> None:
+    result = columns(with_gazebo("damped_pendulum", tmp_path), tmp_path / "gazebo.csv")
+
+    engine, fmu = result["world.engine.position"], result["world.fmu.position"]
+    assert (engine == fmu).all()
+    # The ODE reference of the MuJoCo run; the engine is of first order, at 1 ms.
+    reference = [-2.894207, -0.682642, -1.152221, -2.478352]
+    assert [fmu[point] for point in (1000, 2000, 5000, 10_000)] == pytest.approx(reference, abs=3e-3)
+
+
+def test_a_cube_is_braked_by_the_drag_and_a_free_one_is_not(tmp_path: Path) -> None:
+    result = columns(with_gazebo("fluid_body", tmp_path), tmp_path / "gazebo.csv")
+
+    assert 0.096 < result["world.cube.position_x"][-1] < 0.1
+    assert result["world.free_cube.position_x"][-1] == pytest.approx(2.0, abs=1e-3)
+
+
+def test_a_distributed_run_equals_the_one_in_one_process_in_every_float(place: Place, tmp_path: Path) -> None:
+    config = with_gazebo("electrical_actuator", tmp_path, stop_time=1.0)
+    results: list[list[tuple[float, ...]]] = []
+    for options in ([], ["--local"]):
+        output = tmp_path / f"{len(results)}.csv"
+        launched = place.start("launch", config, *options, "--output", output)
+        assert launched.wait(120.0) == 0, launched.errors
+        results.append(rows_of(output))
+
+    assert len(results[0]) == 1001
+    assert results[0] == results[1]
