@@ -132,7 +132,7 @@ def lines_of(stream: TextIO) -> asyncio.Queue[str | None]:
 
 def pyzeros(orders: dict[str, Any]) -> None:
     """Be a node of pyzeros."""
-    import asyncio_for_robotics as afor  # noqa: PLC0415  only one of the two is used
+    import asyncio_for_robotics as robotics  # noqa: PLC0415  only one of the two is used
     import pyzeros as zeros  # noqa: PLC0415  likewise
     from pyzeros.builtin_msgs import Attachment  # noqa: PLC0415  likewise
 
@@ -147,9 +147,9 @@ def pyzeros(orders: dict[str, Any]) -> None:
         async for own in subscriber.listen_reliable(queue_size=10_000):
             collected.take(topic, own)
 
-    @afor.scoped  # type: ignore[untyped-decorator]  # pyzeros is not always there, so mypy leaves it out
+    @robotics.scoped  # type: ignore[untyped-decorator]  # pyzeros is not always there, so mypy leaves it out
     async def talk() -> None:
-        group = afor.Scope.current().task_group
+        group = robotics.Scope.current().task_group
         for topic, kind in orders["subscribe"].items():
             group.create_task(listen(topic, zeros.Sub(message_class(kind), topic)))
         publishers = {kind: zeros.Pub(message_class(kind), topic) for topic, kind in orders["publish"].items()}
@@ -160,7 +160,7 @@ def pyzeros(orders: dict[str, Any]) -> None:
             number += 1
             for kind, publisher in publishers.items():
                 publisher.publish(message(kind, number))
-        afor.Scope.current().cancel()
+        robotics.Scope.current().cancel()
 
     config = zenoh.Config()
     config.insert_json5("mode", '"client"')

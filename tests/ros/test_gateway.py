@@ -123,6 +123,14 @@ def test_a_mesh_runs_on_where_nobody_of_ros_is_there(place: Place, ros: Ros) -> 
     assert ros.samples == {}
 
 
+def test_the_kept_configuration_with_topics_runs(place: Place) -> None:
+    config = Path(__file__).resolve().parents[2] / "configs" / "ros.yaml"
+
+    assert place.run("launch", config, "--output", place.folder / "ros.csv", "--no-progress").wait() == 0
+
+    assert len(rows_of(place.folder / "ros.csv")) == 1001
+
+
 def test_the_gateway_by_hand_says_what_is_missing(place: Place) -> None:
     gateway = place.run("gateway", write_config(place.folder))
 
