@@ -151,7 +151,13 @@ def _in_shape(value: Any, port: Port) -> Value:  # noqa: ANN401 a field of any m
     return nested(plain, port.variable.shape)
 
 
-def _with_length(elements: Any, length: int, types: MessageTypes, name: str, path: str) -> list[Any]:  # noqa: ANN401
+def _with_length(
+    elements: Any,  # noqa: ANN401 an array or a list
+    length: int,
+    types: MessageTypes,
+    name: str,
+    path: str,
+) -> list[Any]:
     """The elements as a list, with zeros up to ``length`` where a sequence is shorter."""
     listed = elements if isinstance(elements, list) else list(elements)  # the list that another port has already
     kind = types.field(name, path[: path.rfind("[")])

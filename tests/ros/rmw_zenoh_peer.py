@@ -201,7 +201,8 @@ def parameters(orders: dict[str, Any]) -> None:
         )
 
     def double(number: float) -> Any:  # noqa: ANN401 a message
-        return value(3, False, 0, number, "", *(np.zeros(0, kind) for kind in ("u1", "?", "i8", "f8")), [])  # noqa: FBT003
+        no = False
+        return value(3, no, 0, number, "", *(np.zeros(0, kind) for kind in ("u1", "?", "i8", "f8")), [])
 
     def get(*names: str) -> list[tuple[int, float]]:
         answer = getter.call(names=list(names))

@@ -49,7 +49,14 @@ def ros() -> Iterator[Ros]:
         yield Ros(session, port)
 
 
-def configured(place: Place, ros: Ros, *, factor: float, stop_time: float = 3.0, **more: Any) -> Path:  # noqa: ANN401
+def configured(
+    place: Place,
+    ros: Ros,
+    *,
+    factor: float,
+    stop_time: float = 3.0,
+    **more: Any,  # noqa: ANN401 keys of the section
+) -> Path:
     return write_config(
         place.folder,
         name="lab",
@@ -124,7 +131,7 @@ def test_a_mesh_runs_on_where_nobody_of_ros_is_there(place: Place, ros: Ros) -> 
 
 
 def test_the_kept_configuration_with_topics_runs(place: Place) -> None:
-    config = Path(__file__).resolve().parents[2] / "configs" / "ros.yaml"
+    config = Path(__file__).resolve().parents[2] / "configs" / "pendulum_ros.yaml"
 
     assert place.run("launch", config, "--output", place.folder / "ros.csv", "--no-progress").wait() == 0
 

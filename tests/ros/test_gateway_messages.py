@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from random import Random
 from typing import Any, Literal
 
 import pytest
@@ -79,7 +80,7 @@ def test_a_sample_that_is_lost_costs_its_own_message_only() -> None:
 
 
 @given(st.integers(1, 4), st.integers(1, 4), st.randoms(use_true_random=False))
-def test_any_order_of_arrival_gives_the_same_messages(fast: int, slow: int, random: Any) -> None:  # noqa: ANN401
+def test_any_order_of_arrival_gives_the_same_messages(fast: int, slow: int, random: Random) -> None:
     last = 12
     arrivals = [list(range(0, last + 1, steps)) for steps in (fast, slow)]
     assembler = Assembler(topic(TWIST, port("twist.linear.x", steps=fast), port("twist.angular.z", steps=slow)), TYPES)

@@ -252,7 +252,7 @@ TEXTS = [
     pytest.param(
         "- 1\n",
         "mesh.yaml:1: a list; expected a mapping with mesh, simulation, instances, group, connections, record, "
-        "zenoh, timeouts and 1 more",
+        "zenoh, timeouts and 2 more",
         id="a list",
     ),
     pytest.param(
