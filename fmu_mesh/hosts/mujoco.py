@@ -122,7 +122,7 @@ class MujocoInstance:
     def enter_initialization(
         self,
         start_time: float,
-        stop_time: float | None,
+        stop_time: float | None,  # noqa: ARG002  as in the Protocol
         start_values: Mapping[str, Value],
     ) -> None:
         """Start from the keyframe or the model's own position, with ``start_values`` on top (time in s)."""

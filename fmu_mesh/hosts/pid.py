@@ -87,8 +87,8 @@ class PidInstance:
 
     def enter_initialization(
         self,
-        start_time: float,
-        stop_time: float | None,
+        start_time: float,  # noqa: ARG002  as in the Protocol
+        stop_time: float | None,  # noqa: ARG002  as in the Protocol
         start_values: Mapping[str, Value],
     ) -> None:
         """Set ``start_values``."""

@@ -16,6 +16,7 @@ from ..model.findings import Findings, nearest_file
 from ..model.loading import LoadedConfig, examine
 from ..model.plan import Plan, make_plan
 from ..model.system import build
+from ..ros.mapping import resolve as resolve_ros
 from .opening import Showing, check_showing, describe, expected_model
 
 __all__ = ["Options", "planned", "prepare", "zenoh_section"]
@@ -71,6 +72,7 @@ def planned(
     loaded = _with_options(loaded, options)
     descriptions, unreadable = _descriptions(loaded, tell)
     findings.merge(unreadable)
+    resolve_ros(loaded, descriptions, findings)
     system = build(loaded, descriptions, tuple(findings))
     check_showing(system, options.showing)
     return make_plan(system, window=options.window, file=str(loaded.file))

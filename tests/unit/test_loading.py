@@ -253,7 +253,7 @@ TEXTS = [
     pytest.param(
         "- 1\n",
         "mesh.yaml:1: a list; expected a mapping with mesh, simulation, instances, group, connections, initialization, "
-        "record, zenoh and 4 more",
+        "record, zenoh and 5 more",
         id="a list",
     ),
     pytest.param(
