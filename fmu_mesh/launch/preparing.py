@@ -16,6 +16,7 @@ from ..model.findings import nearest_file
 from ..model.loading import LoadedConfig, examine
 from ..model.plan import Plan, make_plan
 from ..model.system import build
+from ..ros.mapping import resolve as resolve_ros
 
 __all__ = ["Options", "prepare", "zenoh_section"]
 
@@ -48,6 +49,7 @@ def prepare(path: Path, options: Options = Options()) -> Plan:  # noqa: B008 a f
     loaded = _with_options(loaded, options)
     descriptions, unreadable = _descriptions(loaded)
     findings.merge(unreadable)
+    resolve_ros(loaded, descriptions, findings)
     system = build(loaded, descriptions, tuple(findings))
     return make_plan(system, window=options.window, file=str(path))
 
