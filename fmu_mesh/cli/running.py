@@ -17,6 +17,7 @@ from ..launch.launcher import Launcher
 from ..launch.local import LocalMesh
 from ..launch.preparing import Options, prepare
 from ..launch.process import ended_by_signals
+from ..launch.results import result_opener
 from ..launch.roles import BY_HAND, run_master, run_node
 from ..model.plan import Plan
 from ..wire.profile import MeshProfile
@@ -34,6 +35,7 @@ def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.Arg
     launch = commands.add_parser("launch", parents=[common], help="run a mesh: one process per node, and the master")
     _add_config(launch)
     launch.add_argument("--local", action="store_true", help="run everything in this one process")
+    _add_paused(launch)
     launch.add_argument("--plot", type=Path, metavar="FILE.png", help="plot the result when done")
     launch.add_argument("--no-progress", action="store_true", help="no progress line")
     add_profile(launch)
@@ -48,6 +50,7 @@ def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.Arg
 
     master = commands.add_parser("master", parents=[common], help="run the master and the recorder by hand")
     _add_config(master)
+    _add_paused(master)
     master.add_argument("--plot", type=Path, metavar="FILE.png", help="plot the result when done")
     master.add_argument("--no-progress", action="store_true", help="no progress line")
     add_profile(master)
@@ -72,6 +75,10 @@ def _add_config(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def _add_paused(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--paused", action="store_true", help="rest at the first point until `resume`, `step` or `play`")
+
+
 def _options(arguments: argparse.Namespace) -> Options:
     return Options(
         start_values=tuple(arguments.set),
@@ -79,6 +86,7 @@ def _options(arguments: argparse.Namespace) -> Options:
         output=arguments.output,
         connect=tuple(arguments.connect),
         profile=getattr(arguments, "profile", None) is not None,
+        paused=getattr(arguments, "paused", False),
     )
 
 
@@ -86,13 +94,15 @@ def _launch(arguments: argparse.Namespace) -> int:
     if arguments.plot is not None:
         require_matplotlib()
     options = _options(arguments)
+    if arguments.local and options.paused:
+        raise ConfigurationError("--paused is for a mesh that others can reach, and --local has none of it.")
     if arguments.local and options.profile:
         raise ConfigurationError("--profile measures nodes, and --local has none", hint="Leave one of them out.")
     plan = prepare(arguments.config, options)
     profile: MeshProfile | None = None
     with Display(plan, show_progress=not arguments.no_progress) as display:
         if arguments.local:
-            point, seconds, rows = _run_local(plan, display)
+            point, seconds, rows = _run_local(plan, arguments.config, display)
         else:
             launcher = Launcher(plan, arguments.config, options, display.event, display.output)
             end = _run_launcher(launcher)
@@ -117,12 +127,12 @@ def _run_launcher(launcher: Launcher) -> End:
             signal.signal(number, handler)
 
 
-def _run_local(plan: Plan, display: Display) -> tuple[int, float, int]:
+def _run_local(plan: Plan, config: Path, display: Display) -> tuple[int, float, int]:
     def log(message: LogMessage) -> None:
         line = LogLine(message.instance, message.status, message.category, message.message, mesh.point)
         display.log(line)
 
-    mesh = LocalMesh(plan, log, display.progress)
+    mesh = LocalMesh(plan, log, display.progress, open_result=result_opener(config, plan.system))
     with ended_by_signals(mesh.interrupt, mesh.clean_up, watch_stdin=False):
         mesh.run()
     return mesh.point, mesh.seconds, mesh.rows

@@ -23,6 +23,7 @@ import msgspec
 
 from ..errors import FmuMeshError, Interrupted, MeshLost, from_report
 from ..model.plan import RECORDER, Plan
+from ..ros.bag import is_bag
 from ..wire.runtime import MeshNote, remove_run_folder, remove_stale_folders, run_folder, runtime_folder, write_note
 from .events import End, Event, Ready, Status, decode_event
 from .preparing import Options
@@ -107,6 +108,8 @@ class Launcher:
             changes.append(f"--output={self._options.output}")
         if self._options.profile:
             changes.append("--profile")
+        if self._options.paused:
+            changes.append("--paused")
         self._spawn(_MASTER, ["master", config_file, *common, *changes, "--events"], folder)
         for number, (node, plan) in enumerate(self._plan.nodes.items()):
             if node == RECORDER:
@@ -248,6 +251,8 @@ class Launcher:
         name = self._plan.system.result_file
         if self._point is None or name is None or not Path(name).is_file():
             return 0
+        if is_bag(name):  # it has no lines to count
+            return self._end.rows if self._end is not None else 0
         rows, end, offset = -1, 0, 0
         with Path(name).open("r+b") as file:
             while chunk := file.read(1 << 20):

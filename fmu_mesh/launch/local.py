@@ -22,6 +22,7 @@ from ..model.plan import Plan
 from ..model.ring import Layout, Ring
 from ..record.csv_file import CsvFile
 from ..record.recorder import unwritable
+from ..record.result_file import OpenResult, ResultFile
 from ..simtime import TimeGrid
 
 __all__ = ["LocalMesh"]
@@ -37,6 +38,7 @@ class LocalMesh:
         log: called with every log message of an FMU.
         progress: called with the point now and then.
         open_instance: opens an instance by name, where it is not the FMU of the plan; this closes it.
+        open_result: opens the result file.
 
     Attributes:
         point: the last point reached.
@@ -50,6 +52,7 @@ class LocalMesh:
         log: Callable[[LogMessage], None] = lambda _message: None,
         progress: Callable[[int], None] = lambda _point: None,
         open_instance: Callable[[str], Instance] | None = None,
+        open_result: OpenResult = CsvFile,
     ) -> None:
         self.point = 0
         self.rows = 0
@@ -58,6 +61,7 @@ class LocalMesh:
         self._log = log
         self._progress = progress
         self._open_instance = open_instance
+        self._open_result = open_result
         self._stop: str | None = None
         self._folder: Path | None = None
 
@@ -91,7 +95,7 @@ class LocalMesh:
         members: dict[str, _Member] = {}
         with tempfile.TemporaryDirectory(prefix="fmu_mesh-") as folder:
             self._folder = Path(folder)
-            file = CsvFile(Path(plan.system.result_file), columns) if plan.system.result_file is not None else None
+            file = self._open_result(Path(plan.system.result_file), columns) if plan.system.result_file else None
             try:
                 for name in plan.order:
                     members[name] = _Member(plan, name, self._open(name, Path(folder)))
@@ -129,7 +133,7 @@ class LocalMesh:
             member.instance.exit_initialization()
             member.bind(grid)
 
-    def _loop(self, members: dict[str, _Member], file: CsvFile | None) -> None:
+    def _loop(self, members: dict[str, _Member], file: ResultFile | None) -> None:
         plan, grid = self._plan, self._plan.grid
         recorded = [(members[instance], variable) for instance, variable in plan.system.recorded]
         buffer: list[list[Value]] = []
@@ -212,7 +216,7 @@ def _scaled(value: Value, factor: float, offset: float) -> Value:
     return value * factor + offset
 
 
-def _write(file: CsvFile, grid: TimeGrid, first: int, rows: list[list[Value]]) -> None:
+def _write(file: ResultFile, grid: TimeGrid, first: int, rows: list[list[Value]]) -> None:
     times = grid.times(first, first + len(rows))
     try:
         file.write(times, [np.array(column) for column in zip(*rows, strict=True)])
@@ -220,7 +224,7 @@ def _write(file: CsvFile, grid: TimeGrid, first: int, rows: list[list[Value]]) -
         raise unwritable(file.path, error) from error
 
 
-def _close(file: CsvFile) -> None:
+def _close(file: ResultFile) -> None:
     try:
         file.close()
     except OSError as error:

@@ -17,6 +17,7 @@ from ..model.loading import LoadedConfig, examine
 from ..model.plan import Plan, make_plan
 from ..model.system import build
 from ..ros.mapping import resolve as resolve_ros
+from .results import check_results
 
 __all__ = ["Options", "prepare", "zenoh_section"]
 
@@ -30,6 +31,7 @@ class Options(msgspec.Struct, frozen=True):
         output: the result file instead of the configured one.
         connect: Zenoh endpoints instead of the configured ones.
         profile: whether the nodes measure where their time goes.
+        paused: whether the run starts at rest at its first point.
     """
 
     start_values: tuple[str, ...] = ()
@@ -37,6 +39,7 @@ class Options(msgspec.Struct, frozen=True):
     output: Path | None = None
     connect: tuple[str, ...] = ()
     profile: bool = False
+    paused: bool = False
 
 
 def prepare(path: Path, options: Options = Options()) -> Plan:  # noqa: B008 a frozen Struct
@@ -51,6 +54,7 @@ def prepare(path: Path, options: Options = Options()) -> Plan:  # noqa: B008 a f
     findings.merge(unreadable)
     resolve_ros(loaded, descriptions, findings)
     system = build(loaded, descriptions, tuple(findings))
+    check_results(loaded, system)
     return make_plan(system, window=options.window, file=str(path))
 
 
