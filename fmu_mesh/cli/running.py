@@ -1,4 +1,4 @@
-"""`launch`, `node`, `master` and `router`: the commands that run something."""
+"""`launch`, `node`, `master`, `gateway` and `router`: the commands that run something."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from typing import Any
 
 from ..errors import ConfigurationError, FmuMeshError
 from ..fmu import LogMessage
-from ..launch.events import End, Event, EventWriter
+from ..launch.events import End, Event, EventWriter, Ready
+from ..launch.gateway import run_gateway
 from ..launch.launcher import Launcher
 from ..launch.local import LocalMesh
 from ..launch.preparing import Options, prepare
@@ -57,6 +58,12 @@ def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.Arg
     master.add_argument("--events", action="store_true", help=argparse.SUPPRESS)
     master.add_argument("--run", default=BY_HAND, help=argparse.SUPPRESS)
     master.set_defaults(run_command=_master)
+
+    gateway = commands.add_parser("gateway", parents=[common], help="run the gateway to ROS by hand")
+    _add_config(gateway)
+    gateway.add_argument("--events", action="store_true", help=argparse.SUPPRESS)
+    gateway.add_argument("--run", default=BY_HAND, help=argparse.SUPPRESS)
+    gateway.set_defaults(run_command=_gateway)
 
     router = commands.add_parser("router", parents=[common], help="run a Zenoh router")
     router.add_argument("--listen", action="append", metavar="ENDPOINT", help="default: tcp/127.0.0.1:7447")
@@ -176,6 +183,16 @@ def _master(arguments: argparse.Namespace) -> int:
     if ends[0].profile is not None:
         show_profile(plan, ends[0].profile, ends[0].seconds, arguments.profile)
     _close(plan, ends[0].status.point, ends[0].seconds, ends[0].rows, arguments.plot)
+    return 0
+
+
+def _gateway(arguments: argparse.Namespace) -> int:
+    def show(event: Event) -> None:
+        if isinstance(event, Ready):
+            print(f"topics of ROS at {', '.join(event.endpoints)}", flush=True)
+
+    emit = EventWriter() if arguments.events else show
+    run_gateway(arguments.config, _options(arguments), emit, run=arguments.run)
     return 0
 
 

@@ -31,6 +31,7 @@ from .preparing import Options
 __all__ = ["Launcher", "Output"]
 
 _MASTER = "the master"
+_GATEWAY = "the gateway to ROS"
 _REPORT_S = 1.5
 _INTERRUPT_S = 0.9
 _KILL_S = 0.7
@@ -70,6 +71,7 @@ class Launcher:
         self._quiet = False
         self._ending = False
         self._interrupted_at: float | None = None
+        self._spawn_nodes: Callable[[], None] = lambda: None
 
     def run(self) -> End:
         """Start everything, wait for the end, clean up.
@@ -111,18 +113,28 @@ class Launcher:
         if self._options.paused:
             changes.append("--paused")
         self._spawn(_MASTER, ["master", config_file, *common, *changes, "--events"], folder)
+        self._spawn_nodes = partial(self._spawn_each_node, folder, common)
+        if self._plan.system.config.ros is not None:
+            # The nodes follow when it is ready: then it misses nothing.
+            self._spawn(_GATEWAY, ["gateway", config_file, *common, *changes, "--events"], folder)
+        else:
+            self._spawn_nodes()
+
+    def _spawn_each_node(self, folder: Path, common: Sequence[str]) -> None:
         for number, (node, plan) in enumerate(self._plan.nodes.items()):
             if node == RECORDER:
                 continue
             plan_file = folder / f"{number}.json"
             plan_file.write_bytes(msgspec.json.encode(plan))
-            self._spawn(node, ["node", config_file, node, *common, "--plan", str(plan_file)], folder)
+            self._spawn(node, ["node", str(self._config_file), node, *common, "--plan", str(plan_file)], folder)
 
     def _spawn(self, name: str, arguments: Sequence[str], folder: Path) -> None:
         process = _Process(name, [sys.executable, "-m", "fmu_mesh", *arguments], self._happened.put)
         self._processes[name] = process
         if name == _MASTER:
             process.start(lambda line: self._take_event(line, folder), self._take_output, self._take_exit)
+        elif name == _GATEWAY:
+            process.start(self._take_gateway_line, self._take_output, self._take_exit)
         else:
             process.start(lambda line: self._take_output(name, line), self._take_output, self._take_exit)
 
@@ -153,6 +165,14 @@ class Launcher:
         elif isinstance(event, End):
             self._end = event
         self._on_event(event)
+
+    def _take_gateway_line(self, line: bytes) -> None:
+        try:
+            decode_event(line)  # the only one that it has: it is ready
+        except msgspec.DecodeError:
+            self._take_output(_GATEWAY, line)
+            return
+        self._spawn_nodes()
 
     def _take_output(self, name: str, line: bytes) -> None:
         self._on_output(name, line.decode(errors="replace").rstrip())
@@ -239,8 +259,8 @@ class Launcher:
             text = "the master was lost: its process does not answer any more"
             return MeshLost(text, point=point, time=self._plan.grid.time(point))
         name = named[0][0]
-        if name == _MASTER:
-            text = f"the master was lost: its process {self._how[name]}"
+        if name in (_MASTER, _GATEWAY):
+            text = f"{name} was lost: its process {self._how[name]}"
             return MeshLost(text, point=point, time=self._plan.grid.time(point))
         instances = ", ".join(item.name for item in self._plan.nodes[name].instances)
         text = f"node '{name}' was lost: its process {self._how[name]}"

@@ -1,0 +1,95 @@
+"""What the process of the gateway to ROS does from its start to its end."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+
+from ..errors import ConfigurationError, Interrupted
+from ..model.loading import LoadedConfig, load
+from ..model.plan import Plan
+from ..ros.gateway import Gateway
+from ..ros.mapping import message_types, resolve
+from ..ros.serving import open_profiles, parameter_services
+from ..ros.topics import RosPlan
+from ..ros.types import MessageTypes
+from ..wire.keys import Keys
+from ..wire.runtime import leave_run_folder, run_folder, socket_endpoint
+from ..wire.session import Wiring, open_session
+from .events import Event, Ready
+from .preparing import Options, prepare
+from .process import die_with_parent, ended_by_signals
+from .wiring import MASTER
+
+__all__ = ["run_gateway"]
+
+_BY_HAND = "hand"
+
+
+def run_gateway(config_file: Path, options: Options, emit: Callable[[Event], None], *, run: str = _BY_HAND) -> None:
+    """Be the gateway of a mesh, from before its first point until it ends.
+
+    Args:
+        config_file: the configuration file.
+        options: what the command line changes.
+        emit: called once, when everything is declared and no sample is missed any more.
+        run: name of the run; the launcher's process id when it started this process.
+
+    Raises:
+        FmuMeshError: the gateway could not start, or was interrupted.
+    """
+    child = run != _BY_HAND
+    if child:
+        die_with_parent()
+    plan = prepare(config_file, options)
+    loaded = load(config_file)
+    section = loaded.config.ros
+    if section is None:
+        raise ConfigurationError(f"{config_file}: there is no section `ros`", hint="It says which topics there are.")
+    types, ros_plan = _ros_plan(loaded, plan)
+    folder = run_folder(loaded.config.mesh, run)
+    interrupted: list[str] = []
+    gateway: Gateway | None = None
+
+    def interrupt(reason: str) -> None:
+        interrupted.append(reason)
+        if gateway is not None:
+            gateway.end()
+
+    with ended_by_signals(interrupt, lambda: leave_run_folder(folder), watch_stdin=child), ExitStack() as stack:
+        stack.callback(leave_run_folder, folder)
+        if child or not (connect := options.connect or _client_endpoints(loaded)):
+            connect = (socket_endpoint(folder, MASTER),)
+        mesh = open_session(Wiring(mode="client", connect=connect))
+        stack.callback(mesh.close)
+        ros = open_session(Wiring(mode="peer", listen=tuple(section.listen), connect=tuple(section.connect)))
+        stack.callback(ros.close)
+        keys = Keys(loaded.config.zenoh.key_prefix, loaded.config.mesh)
+        profiles = stack.enter_context(open_profiles(section, ros, types, ros_plan))
+        stack.enter_context(parameter_services(ros_plan, types, mesh, keys, profiles))
+        gateway = Gateway(ros_plan, types, mesh, keys, plan.grid, profiles)
+        stack.callback(gateway.close)
+        gateway.open()
+        emit(Ready((*section.connect, *section.listen)))
+        if not interrupted:
+            gateway.run()
+        if interrupted:
+            raise Interrupted(interrupted[0])
+
+
+def _ros_plan(loaded: LoadedConfig, plan: Plan) -> tuple[MessageTypes, RosPlan]:
+    """The topics of a configuration that was checked before."""
+    findings = loaded.findings()
+    types = message_types(loaded, findings)
+    ros_plan = resolve(loaded, {name: own.description for name, own in plan.system.instances.items()}, findings)
+    findings.raise_any()
+    assert types is not None
+    assert ros_plan is not None
+    return types, ros_plan
+
+
+def _client_endpoints(loaded: LoadedConfig) -> tuple[str, ...]:
+    """The router, where all processes of the mesh are clients of one."""
+    section = loaded.config.zenoh
+    return tuple(section.connect) if section.mode == "client" else ()

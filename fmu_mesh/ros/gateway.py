@@ -1,0 +1,345 @@
+"""The gateway: what flows between the mesh and ROS while a mesh runs.
+
+It is a Zenoh client of the mesh like any other (docs/key-space.md), in a process and with a session towards ROS of its
+own: whatever becomes of ROS, no node and no master ever waits for it. All work is done on the thread that calls `run`;
+callbacks only put into a bounded queue. What does not fit is left out, counted and told.
+"""
+
+from __future__ import annotations
+
+import heapq
+import itertools
+import logging
+import queue
+import time
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+
+import msgspec
+import zenoh
+
+from ..model.description import Value
+from ..simtime import TimeGrid
+from ..wire.keys import Keys
+from ..wire.session import undeclare_all
+from ..wire.values import decode_stamp, encode_value, json_encoding
+from .cdr import CdrError, Codec
+from .messages import Assembler, Disassembler
+from .profile import Profile, Put
+from .stamp import to_stamp
+from .topics import Port, RosPlan, Topic
+from .types import CLOCK, MessageTypes
+
+__all__ = ["Gateway"]
+
+log = logging.getLogger(__name__)
+
+_WAITING_EVENTS = 1 << 16
+_HELD_MESSAGES = 1 << 12
+_REPEAT_S = 1.0
+
+Event = Callable[[], None]
+
+
+class Gateway:
+    """Carries topics between one mesh and ROS.
+
+    Args:
+        plan: the topics.
+        types: the message types.
+        mesh: a session that reaches the mesh; stays the caller's.
+        keys: the keys of the mesh.
+        grid: the communication points of the run.
+        profiles: the profile of every topic, by name, that of the clock first; they stay the caller's.
+
+    Call `open`, then `run`, then `close`.
+    """
+
+    def __init__(  # noqa: PLR0913, PLR0917  the parts that it brings together
+        self,
+        plan: RosPlan,
+        types: MessageTypes,
+        mesh: zenoh.Session,
+        keys: Keys,
+        grid: TimeGrid,
+        profiles: dict[str, Profile],
+    ) -> None:
+        self._plan = plan
+        self._types = types
+        self._mesh = mesh
+        self._keys = keys
+        self._grid = grid
+        self._profiles = profiles
+        self._events: queue.SimpleQueue[Event] = queue.SimpleQueue()
+        self._left_out = 0
+        self._ended = False
+        self._entities: list[zenoh.Subscriber[None]] = []
+        self._publishers: dict[str, zenoh.Publisher] = {}
+        self._watches: dict[str, _Watch] = {}
+        self._clock: _Clock | None = None
+        self._stamped: list[_Input] = []
+        self._reached = -1
+        self._complete = -1
+        self._now = -1
+
+    def open(self) -> None:
+        """Declare everything; from now on nothing is missed."""
+        for topic in self._plan.topics:
+            if topic.direction == "out":
+                self._open_output(topic)
+            else:
+                self._open_input(topic)
+        if not self._watches and self._plan.time_source is not None and (self._stamped or self._plan.clock_points):
+            self._watch(self._plan.time_source)
+        if self._plan.clock_points is not None:
+            profile = next(iter(self._profiles.values()))
+            self._clock = _Clock(
+                profile.publish(_clock_topic(self._plan)), self._types, self._plan.clock_points, self._grid
+            )
+        for key, watch in self._watches.items():
+            self._entities.append(self._mesh.declare_subscriber(key, partial(self._value_arrived, watch)))
+        self._entities.append(
+            self._mesh.liveliness().declare_subscriber(self._keys.master, self._token_changed, history=True)
+        )
+
+    def run(self) -> None:
+        """Carry until the mesh ends, or until `end` is called."""
+        due = time.monotonic() + _REPEAT_S
+        while not self._ended:
+            now = time.monotonic()
+            if now >= due:
+                due = now + _REPEAT_S
+                self._tell_left_out()
+                if self._clock is not None:
+                    self._clock.repeat()
+            try:
+                event = self._events.get(timeout=due - now if due > now else 0)
+            except queue.Empty:
+                continue
+            event()
+
+    def end(self) -> None:
+        """From any thread: let `run` return once everything that has come is carried."""
+        self._events.put(self._end)
+
+    def close(self) -> None:
+        """Undeclare what belongs to the mesh."""
+        self._tell_left_out()
+        undeclare_all(self._entities, self._publishers.values())
+
+    # --- from the mesh to ROS
+
+    def _open_output(self, topic: Topic) -> None:
+        output = _Output(Assembler(topic, self._types), self._profiles[topic.profile].publish(topic))
+        for index, port in enumerate(topic.ports):
+            self._watch(port).outputs.append((output, index))
+
+    def _watch(self, port: Port) -> _Watch:
+        key = self._keys.variable(port.instance, port.kind, port.variable.name)
+        return self._watches.setdefault(key, _Watch(f"{port.instance}.{port.variable.name}", port.step_points))
+
+    def _value_arrived(self, watch: _Watch, sample: zenoh.Sample) -> None:
+        if sample.attachment is None:  # what somebody puts on the key of an input
+            return
+        self._post(partial(self._take_value, watch, sample.payload.to_bytes(), sample.attachment.to_bytes()))
+
+    def _take_value(self, watch: _Watch, data: bytes, attachment: bytes) -> None:
+        try:
+            stamp = decode_stamp(attachment)
+            value: Value = msgspec.json.decode(data)
+        except msgspec.DecodeError as error:
+            watch.complain(f"a value that is not understood: {error}")
+            return
+        for output, port in watch.outputs:
+            try:
+                for message, stamp_s in output.assembler.add(port, stamp.point, stamp.time, value):
+                    output.put(message, stamp_s)
+            except CdrError as error:
+                watch.complain(f"{value!r} cannot be sent on '{output.assembler.topic.name}': {error}")
+        self._went_on(watch, stamp.point)
+
+    def _went_on(self, watch: _Watch, point: int) -> None:
+        """Everything up to a point that no watched variable is behind has been published."""
+        was_last = watch.holds_until <= self._complete
+        watch.point = point
+        self._reached = max(self._reached, point)
+        if was_last:
+            self._complete = min(other.holds_until for other in self._watches.values())
+        now = min(self._reached, self._complete)
+        if now > self._now:
+            self._now = now
+            if self._clock is not None:
+                self._clock.advance(now)
+            for own in self._stamped:
+                self._set_all(own, own.due(self._grid.time(now)))
+
+    # --- from ROS to the mesh
+
+    def _open_input(self, topic: Topic) -> None:
+        own = _Input(Disassembler(topic, self._types), self._grid.stop_time)
+        if topic.stamped:
+            self._stamped.append(own)
+        for port in topic.ports:
+            key = self._keys.variable(port.instance, port.kind, port.variable.name)
+            if key not in self._publishers:
+                self._publishers[key] = self._mesh.declare_publisher(
+                    key, encoding=json_encoding, congestion_control=zenoh.CongestionControl.BLOCK
+                )
+            own.keys.append(key)
+
+        def take(data: bytes) -> None:
+            self._post(partial(self._take_message, own, data))
+
+        self._profiles[topic.profile].subscribe(topic, take)
+
+    def _take_message(self, own: _Input, data: bytes) -> None:
+        try:
+            values, stamp = own.disassembler.values(data)
+        except CdrError as error:
+            own.complain(f"a message of {len(data)} bytes is no '{own.topic.message}': {error}")
+            return
+        if stamp is None or not self._watches:
+            self._set_all(own, [values])
+        else:
+            own.hold(stamp, values)
+            self._set_all(own, own.due(self._grid.time(max(self._now, 0))))
+
+    def _set_all(self, own: _Input, messages: Sequence[list[Value]]) -> None:
+        for values in messages:
+            for key, value in zip(own.keys, values, strict=True):
+                self._publishers[key].put(encode_value(value))
+
+    # --- the queue
+
+    def _post(self, event: Event) -> None:
+        """On a foreign thread: enqueue what came, unless too much is waiting already."""
+        if self._events.qsize() < _WAITING_EVENTS:
+            self._events.put(event)
+        else:
+            self._left_out += 1
+
+    def _tell_left_out(self) -> None:
+        count, self._left_out = self._left_out, 0
+        if count:
+            log.warning("%d samples were left out: the mesh is faster than ROS can be told", count)
+
+    def _token_changed(self, sample: zenoh.Sample) -> None:
+        if sample.kind == zenoh.SampleKind.DELETE:
+            self.end()
+
+    def _end(self) -> None:
+        self._ended = True
+
+
+class _Complaints:
+    """Warns of each thing once, however often it happens."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self._told: set[str] = set()
+
+    def complain(self, text: str) -> None:
+        """Warn, unless the same was told before."""
+        if text not in self._told and len(self._told) < 10:
+            self._told.add(text)
+            log.warning("'%s': %s", self._name, text)
+
+
+class _Output:
+    """A published topic."""
+
+    def __init__(self, assembler: Assembler, put: Put) -> None:
+        self.assembler = assembler
+        self.put = put
+
+
+class _Watch(_Complaints):
+    """A variable that is watched, for the topics that need it.
+
+    Attributes:
+        point: the last that was seen.
+        outputs: the topics, and which of their ports it is.
+    """
+
+    def __init__(self, name: str, step_points: int) -> None:
+        super().__init__(name)
+        self.step_points = step_points
+        self.point = -1
+        self.outputs: list[tuple[_Output, int]] = []
+
+    @property
+    def holds_until(self) -> int:
+        """The last point at which the value that was seen still holds."""
+        return self.point + self.step_points - 1 if self.point >= 0 else -1
+
+
+class _Input(_Complaints):
+    """A subscribed topic, and its messages whose time has not come yet."""
+
+    def __init__(self, disassembler: Disassembler, stop_time: float) -> None:
+        super().__init__(disassembler.topic.name)
+        self.disassembler = disassembler
+        self.topic = disassembler.topic
+        self.keys: list[str] = []
+        self._stop_time = stop_time
+        self._held: list[tuple[float, int, list[Value]]] = []
+        self._number = itertools.count()
+        self._last = -1.0
+
+    def hold(self, stamp: float, values: list[Value]) -> None:
+        """Keep a message until its time."""
+        if stamp > self._stop_time:
+            self.complain(
+                "its stamps are behind the end of the simulation, so its messages hold as they come; "
+                "does its publisher run with use_sim_time?"
+            )
+            stamp = self._last
+        if len(self._held) >= _HELD_MESSAGES:
+            self.complain(f"more than {_HELD_MESSAGES} messages wait for their time; the others are left out")
+        elif stamp < self._last:
+            self.complain("a message is older than the one before, and left out")
+        else:
+            heapq.heappush(self._held, (stamp, next(self._number), values))
+
+    def due(self, time_s: float) -> list[list[Value]]:
+        """The messages whose time has come, in the order of their stamps."""
+        messages = []
+        while self._held and self._held[0][0] <= time_s:
+            self._last, _, values = heapq.heappop(self._held)
+            messages.append(values)
+        return messages
+
+
+class _Clock:
+    """`/clock`: the time of every n-th point, once everything up to it has been published."""
+
+    def __init__(self, put: Put, types: MessageTypes, stride: int, grid: TimeGrid) -> None:
+        self._put = put
+        self._codec = Codec(types, CLOCK)
+        self._stride = stride
+        self._grid = grid
+        self._next = 0
+        self._moved = False
+
+    def advance(self, point: int) -> None:
+        """Everything up to ``point`` has been published."""
+        while self._next <= point:
+            self._publish(self._next)
+            self._next += self._stride
+            self._moved = True
+
+    def repeat(self) -> None:
+        """Tell the time to those who came while it stood still."""
+        if self._next and not self._moved:
+            self._publish(self._next - self._stride)
+        self._moved = False
+
+    def _publish(self, point: int) -> None:
+        time_s = self._grid.time(point)
+        self._put(self._codec.encode({"clock": to_stamp(time_s)}), time_s)
+
+
+def _clock_topic(plan: RosPlan) -> Topic:
+    profile: Any = plan.topics[0].profile if plan.topics else "ros2dds"
+    return Topic("/clock", CLOCK, "out", (), profile, stamped=False, frame_id="", reliability="reliable")
