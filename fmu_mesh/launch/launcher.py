@@ -108,13 +108,13 @@ class Launcher:
             changes.append(f"--window={self._options.window}")
         if self._options.output is not None:
             changes.append(f"--output={self._options.output}")
-        if self._options.profile:
-            changes.append("--profile")
+        granting = ["--profile"] if self._options.profile else []
         if self._options.paused:
-            changes.append("--paused")
-        self._spawn(_MASTER, ["master", config_file, *common, *changes, "--events"], folder)
+            granting.append("--paused")
+        self._spawn(_MASTER, ["master", config_file, *common, *changes, *granting, "--events"], folder)
         self._spawn_nodes = partial(self._spawn_each_node, folder, common)
-        if self._plan.system.config.ros is not None:
+        section = self._plan.system.config.ros
+        if section is not None and section.profile != "rclpy":
             # The nodes follow when it is ready: then it misses nothing.
             self._spawn(_GATEWAY, ["gateway", config_file, *common, *changes, "--events"], folder)
         else:

@@ -425,7 +425,7 @@ class _PacedTime:
 
 def _reserved() -> set[str]:
     """Names of parameters that a node has without its FMU."""
-    return {*PARAMETERS, "autostart", "config", "use_sim_time", "start_type_description_service"}
+    return {*PARAMETERS, "autostart", "config", "connect", "use_sim_time", "start_type_description_service"}
 
 
 def _joined(executor: ThreadPoolExecutor) -> list[threading.Thread]:

@@ -5,6 +5,7 @@ Nodes of one test share an executor that the test itself turns, until what it wa
 
 from __future__ import annotations
 
+import gc
 import importlib.util
 import os
 import time
@@ -66,11 +67,16 @@ class Ros:
         return self
 
     def __exit__(self, *_: object) -> None:
+        node = None
         for node in self._nodes:
-            if hasattr(node, "fmu_node"):
-                node.fmu_node.close()
+            if hasattr(node, "managed"):
+                node.managed.close()
             self._executor.remove_node(node)
             node.destroy_node()
+        # A lifecycle node keeps its ROS node, which others would still see, until the last reference is gone.
+        del node
+        self._nodes.clear()
+        gc.collect()
         self._executor.shutdown()
         self._rclpy.shutdown(context=self.context)
 

@@ -124,7 +124,7 @@ def test_every_variable_is_a_parameter_and_those_that_are_set_initialize_the_fmu
     names = ("a", "der_a_", "der_a_2_", "l", "d", "g")
     assert [node.has_parameter(name) for name in names] == [True] * 6
     assert node.get_parameter("g").value is None
-    driver = node.fmu_node._driver
+    driver = node.managed._driver
     assert [driver.get_value(name) for name in ("l", "d", "a", "g")] == [2.0, 0.001, 1.3, 9.81]
 
 
@@ -184,14 +184,14 @@ def test_a_node_that_is_not_active_takes_no_step_and_publishes_nothing(ros: Ros)
     node.trigger_deactivate()
     ros.turn(0.05)
     messages.clear()
-    steps = node.fmu_node._driver._steps
+    steps = node.managed._driver._steps
     time.set(5000)
     ros.turn(0.1)
 
-    assert (before, messages, node.fmu_node._driver._steps) == ([], [], steps)
+    assert (before, messages, node.managed._driver._steps) == ([], [], steps)
     node.trigger_activate()
     time.set(5010)
-    ros.until(lambda: node.fmu_node._driver._steps == steps + 1, "the step after the pause")
+    ros.until(lambda: node.managed._driver._steps == steps + 1, "the step after the pause")
 
 
 def test_the_lifecycle_is_driven_by_the_services_of_a_managed_node(ros: Ros) -> None:
@@ -304,7 +304,7 @@ def test_an_input_holds_from_the_stamp_of_its_message_and_a_second_one_with_that
     start(node)
     ros.matched(publisher)
     time.set(1000)
-    driver = node.fmu_node._driver
+    driver = node.managed._driver
     ros.until(lambda: driver.started, "the start")
     for value in (5.0, 7.0):
         message = PointStamped()
@@ -327,7 +327,7 @@ def test_catching_up_is_bounded_per_update_and_told(ros: Ros, said: Said) -> Non
     time = SimulatedTime(ros, node)
     start(node)
     time.set(1000)
-    driver = node.fmu_node._driver
+    driver = node.managed._driver
     ros.until(lambda: driver.started, "the start")
 
     time.set(1450)
@@ -367,7 +367,7 @@ def test_every_type_has_its_topic_and_its_parameter(ros: Ros, tmp_path: Path) ->
         publishers[name].publish(getattr(std_msgs.msg, kind)(data=value))
 
     ros.until(lambda: got == {name: value for name, (_, value) in values.items()}, f"all values, but {got}")
-    driver = node.fmu_node._driver
+    driver = node.managed._driver
     names = ("integer_parameter", "string_parameter", "enumeration_parameter")
     assert [driver.get_value(name) for name in names] == [5, "x", 3]
 
@@ -482,7 +482,7 @@ def test_the_fmu_is_called_from_one_thread_only(ros: Ros, monkeypatch: pytest.Mo
         monkeypatch.setattr(Fmi2Instance, method, watched)
     node = ros.fmu(fmu_path=PENDULUM)
     start(node)
-    ros.until(lambda: node.fmu_node._driver._steps > 3, "some steps")
+    ros.until(lambda: node.managed._driver._steps > 3, "some steps")
 
     node.trigger_deactivate()
     node.trigger_cleanup()
