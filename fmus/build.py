@@ -1,6 +1,6 @@
 """Builds the example FMUs from their C sources.
 
-Owns the way from a model's folder to a ``.fmu`` file. It needs a C compiler and the FMI 2.0 headers that FMPy
+Owns the way from a model's folder to a ``.fmu`` file. It needs a C compiler and the FMI headers that FMPy
 ships, and knows nothing about running FMUs.
 
 A model's folder holds ``modelDescription.xml`` and the C files that its ``SourceFiles`` lists; what is
@@ -29,7 +29,11 @@ __all__ = ["BuildError", "build", "find_compiler"]
 
 HERE = Path(__file__).resolve().parent
 SKELETON = HERE / "src" / "skeleton"
-FMI_HEADERS = ("fmi2Functions.h", "fmi2FunctionTypes.h", "fmi2TypesPlatform.h")
+FMI_HEADERS = {
+    "1": ("fmi1Functions.h",),
+    "2": ("fmi2Functions.h", "fmi2FunctionTypes.h", "fmi2TypesPlatform.h"),
+    "3": ("fmi3Functions.h", "fmi3FunctionTypes.h", "fmi3PlatformTypes.h"),
+}
 GUID_PLACEHOLDER = "@GUID@"
 
 # -ffp-contract=off: a fused multiply-add would make the numbers depend on the processor the build was for.
@@ -42,16 +46,19 @@ class BuildError(Exception):
 
 @dataclass(frozen=True)
 class Platform:
-    """What FMI 2.0, 2.3 calls a platform, and how to link a shared library there."""
+    """What FMI 2.0, 2.3 and FMI 3.0, 2.5.1.4 call a platform, and how to link a shared library there."""
 
     name: str
+    name_in_fmi3: str
     suffix: str
     link_flags: tuple[str, ...]
 
 
-LINUX = Platform("linux64", ".so", ("-fPIC", "-shared", "-s", "-Wl,--build-id=none", "-Wl,--no-undefined"))
-MACOS = Platform("darwin64", ".dylib", ("-fPIC", "-dynamiclib", "-Wl,-x"))
-WINDOWS = Platform("win64", ".dll", ("-shared", "-s", "-static-libgcc"))
+LINUX = Platform(
+    "linux64", "x86_64-linux", ".so", ("-fPIC", "-shared", "-s", "-Wl,--build-id=none", "-Wl,--no-undefined")
+)
+MACOS = Platform("darwin64", "x86_64-darwin", ".dylib", ("-fPIC", "-dynamiclib", "-Wl,-x"))
+WINDOWS = Platform("win64", "x86_64-windows", ".dll", ("-shared", "-s", "-static-libgcc"))
 
 
 def build(model_dir: Path, output_dir: Path) -> Path:
@@ -71,17 +78,18 @@ def build(model_dir: Path, output_dir: Path) -> Path:
     if not description.is_file():
         raise BuildError(f"{description} is missing: a model's folder holds its modelDescription.xml and C files")
     template = description.read_text(encoding="utf-8")
-    identifier, source_names = read_code_names(template, description)
+    version, identifier, source_names = read_code_names(template, description)
     sources = collect_sources(model_dir, source_names)
     guid = guid_of(template, sources)
     sources["fmu_guid.h"] = f'#define FMU_GUID "{guid}"\n'.encode()
-    sources |= fmi_headers()
+    sources |= fmi_headers(version)
 
     platform = this_platform()
     library = compile_library(identifier, source_names, sources, platform)
     members = {f"sources/{name}": content for name, content in sources.items()}
     members["modelDescription.xml"] = template.replace(GUID_PLACEHOLDER, guid).encode()
-    members[f"binaries/{platform.name}/{identifier}{platform.suffix}"] = library
+    platform_name = platform.name_in_fmi3 if version == "3" else platform.name
+    members[f"binaries/{platform_name}/{identifier}{platform.suffix}"] = library
     return write_archive(output_dir / f"{identifier}.fmu", members)
 
 
@@ -100,19 +108,26 @@ def find_compiler() -> list[str]:
     raise BuildError(f"no C compiler found (looked for {names}): install gcc or clang, or set CC")
 
 
-def read_code_names(template: str, path: Path) -> tuple[str, list[str]]:
-    """Return the model identifier and the C files, in the order of ``SourceFiles``."""
+def read_code_names(template: str, path: Path) -> tuple[str, str, list[str]]:
+    """Return the FMI version, the model identifier and the C files, in the order of ``SourceFiles``.
+
+    FMI 1.0 and 3.0 list no files in the description; there it is all C files of the model's folder.
+    """
     try:
-        unit = ET.fromstring(template).find("CoSimulation")  # noqa: S314 - our own file
+        root = ET.fromstring(template)  # noqa: S314 - our own file
     except ET.ParseError as error:
         raise BuildError(f"{path} is not well-formed XML: {error}") from error
-    identifier = None if unit is None else unit.get("modelIdentifier")
-    if unit is None or identifier is None:
+    version = (root.get("fmiVersion") or "2")[0]
+    units = [root] if version == "1" else root.findall("CoSimulation") + root.findall("ModelExchange")
+    identifier = next((name for unit in units if (name := unit.get("modelIdentifier"))), None)
+    if identifier is None:
         raise BuildError(f"{path} has no CoSimulation element with a modelIdentifier")
-    names = [name for file in unit.findall("SourceFiles/File") if (name := file.get("name"))]
+    names = [name for file in units[0].findall("SourceFiles/File") if (name := file.get("name"))]
+    if version != "2":
+        names = sorted(file.name for file in path.parent.glob("*.c"))
     if not names:
         raise BuildError(f"{path} lists no SourceFiles")
-    return identifier, names
+    return version, identifier, names
 
 
 def collect_sources(model_dir: Path, source_names: Sequence[str]) -> dict[str, bytes]:
@@ -123,7 +138,7 @@ def collect_sources(model_dir: Path, source_names: Sequence[str]) -> dict[str, b
         if not found:
             raise BuildError(f"{name} is neither in {model_dir} nor in {SKELETON}")
         sources[name] = read_source(found[0])
-    for folder in (SKELETON, model_dir):
+    for folder in (SKELETON, model_dir.parent, model_dir):
         sources |= {header.name: read_source(header) for header in sorted(folder.glob("*.h"))}
     return sources
 
@@ -133,16 +148,16 @@ def read_source(path: Path) -> bytes:
     return path.read_bytes().replace(b"\r\n", b"\n")
 
 
-def fmi_headers() -> dict[str, bytes]:
-    """Return the FMI 2.0 headers by name; they are FMPy's, under the 2-clause BSD licence in their text."""
+def fmi_headers(version: str = "2") -> dict[str, bytes]:
+    """Return the headers of an FMI version by name; they are FMPy's, under the 2-clause BSD licence in their text."""
     package = importlib.util.find_spec("fmpy")
     if package is None or package.origin is None:
         raise BuildError("FMPy is missing, and with it the FMI headers: pip install fmpy")
     folder = Path(package.origin).parent / "c-code"
-    missing = [name for name in FMI_HEADERS if not (folder / name).is_file()]
+    missing = [name for name in FMI_HEADERS[version] if not (folder / name).is_file()]
     if missing:
         raise BuildError(f"FMPy in {folder.parent} has no {', '.join(missing)}: use another release of FMPy")
-    return {name: read_source(folder / name) for name in FMI_HEADERS}
+    return {name: read_source(folder / name) for name in FMI_HEADERS[version]}
 
 
 def guid_of(template: str, sources: dict[str, bytes]) -> str:

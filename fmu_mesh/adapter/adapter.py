@@ -18,11 +18,12 @@ from contextlib import contextmanager
 from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
-from typing import Literal, Self
+from typing import Any, Literal, Self
 
 from ..errors import FmuError
-from ..fmu import Fmi2Instance, LogMessage, read_description
+from ..fmu import FmuInstance, LogMessage, open_instance, read_description
 from ..model.description import ModelDescription, Value
+from ..model.types import is_float
 from .arguments import Arguments
 from .times import Clock, Instant, RosTime, SecondsClock, Time, clock_from
 from .trajectory import Trajectory
@@ -36,7 +37,7 @@ _HALF = Fraction(1, 2)
 
 
 class FMIAdapter:
-    """One FMI 2.0 co-simulation FMU, stepped by the program that owns this object.
+    """One co-simulation FMU of FMI 1.0, 2.0 or 3.0, stepped by the program that owns this object.
 
     Call sequence: `set_initial_value` as often as needed, `exit_initialization_mode`, then `do_step` or
     `do_steps_until` with `set_input_value` and `get_output_value` in between; `close`, or the end of a `with` block, at
@@ -87,7 +88,7 @@ class FMIAdapter:
         self._point = 0
         folder = Path(tempfile.mkdtemp(prefix="fmu_mesh-"))
         try:
-            self._instance = Fmi2Instance(path, name, description, folder, _forward)
+            self._instance = open_instance(path, name, description, folder, _forward)
             self._release = weakref.finalize(self, _release, self._instance, folder)
         except BaseException:
             shutil.rmtree(folder, ignore_errors=True)
@@ -178,8 +179,11 @@ class FMIAdapter:
         converted = self._arguments.value(variable, value)
         if not self._entered:
             self._start_values[name] = converted
+            if variable.causality == "structuralParameter":  # arrays have other shapes now
+                self._arguments = Arguments(self._arguments.instance, self._description.sized(self._start_values))
             return
-        if variable.causality != "input" and variable.initial != "exact":  # FMI 2.0, 4.2.4
+        early = variable.causality == "structuralParameter" or variable.initial != "exact"
+        if variable.causality != "input" and early:  # FMI 2.0, 4.2.4
             raise self._arguments.refusal("it can only be set before the first value is read.", variable=name)
         with self._fmu_called():
             self._instance.set_values({name: converted})
@@ -283,7 +287,7 @@ class FMIAdapter:
             self._step(self._step_size)
         return self.simulation_time
 
-    def get_output_value(self, name: str) -> Value:
+    def get_output_value(self, name: str) -> Any:  # noqa: ANN401 what type it is, the FMU says
         """The current value of an output; before the first step, its initial value.
 
         Raises:
@@ -293,7 +297,7 @@ class FMIAdapter:
         self._arguments.output(name)
         return self.get_value(name)
 
-    def get_value(self, name: str) -> Value:
+    def get_value(self, name: str) -> Any:  # noqa: ANN401 what type it is, the FMU says
         """The current value of any variable.
 
         Raises:
@@ -345,7 +349,7 @@ class FMIAdapter:
 
     def _begin_trajectory(self, name: str, *, initial: bool) -> Trajectory:
         """A new trajectory, whose first value is the initial one at 0.0 if ``initial`` is true."""
-        linear = self._interpolate_input and self._arguments.inputs[name].type == "Real"
+        linear = self._interpolate_input and is_float(self._arguments.inputs[name].type)
         self._trajectories[name] = trajectory = Trajectory(linear=linear)
         if initial:
             trajectory.add(0.0, self._initial_inputs[name])
@@ -382,6 +386,6 @@ def _forward(message: LogMessage) -> None:
     log.log(level, "fmu_message instance=%s category=%s: %s", message.instance, message.category, message.message)
 
 
-def _release(instance: Fmi2Instance, folder: Path) -> None:
+def _release(instance: FmuInstance, folder: Path) -> None:
     instance.close()
     shutil.rmtree(folder, ignore_errors=True)

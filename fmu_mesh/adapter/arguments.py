@@ -13,11 +13,10 @@ import numpy as np
 from ..errors import CallRefused
 from ..model.description import Causality, ModelDescription, Value, Variable
 from ..model.findings import listed, nearest
+from ..model.values import ValueRefused, to_value
 from .times import Instant, RosStamp, RosTime, Time, instant_of
 
 __all__ = ["Arguments"]
-
-_INT32 = range(-(2**31), 2**31)
 
 
 class Arguments:
@@ -29,7 +28,7 @@ class Arguments:
     """
 
     def __init__(self, instance: str, description: ModelDescription) -> None:
-        self._instance = instance
+        self.instance = instance
         self._description = description
         self.all = {variable.name: variable for variable in description.variables}
         self.inputs = self._having("input")
@@ -60,15 +59,16 @@ class Arguments:
 
     def value(self, variable: Variable, value: Value) -> Value:
         """``value`` as a value of the variable's type and within its range."""
-        converted = _converted(_plain(value), variable)
-        if converted is None:
-            items = [f"'{item}' ({number})" for item, number in variable.items]
-            expected = f"a value of type {variable.type}" + (f": {listed(items)}" if items else "")
-            raise self.refusal(f"{value!r} cannot be its value; expected {expected}.", variable=variable.name)
-        low, high = variable.minimum, variable.maximum
-        if not isinstance(converted, str) and not _within(converted, low, high):
-            raise self.refusal(f"{value!r} is out of its range, {low} to {high}.", variable=variable.name)
-        return converted
+        try:
+            return to_value(value, variable)
+        except ValueRefused as refused:
+            if refused.out_of_range:
+                low, high = variable.minimum, variable.maximum
+                text = f"{value!r} is out of its range, {low} to {high}."
+            else:
+                kind = f"a value of type {variable.type_name}"
+                text = f"{value!r} cannot be its value; expected {kind}: {refused.expected}."
+            raise self.refusal(text, variable=variable.name) from refused
 
     def time(self, value: Time) -> Instant:
         """``value`` as a time in its exact form."""
@@ -76,7 +76,7 @@ class Arguments:
 
     def seconds(self, value: float | RosTime, what: str) -> float:
         """``value``, which is called ``what``, as a finite number."""
-        number: object = value.nanoseconds / 1e9 if isinstance(value, RosTime) else _plain(value)
+        number = value.nanoseconds / 1e9 if isinstance(value, RosTime) else _plain(value)
         if isinstance(number, bool) or not isinstance(number, int | float) or not math.isfinite(number):
             raise self.refusal(f"the {what} is {value!r}; expected a finite number of seconds.")
         return float(number)
@@ -104,7 +104,7 @@ class Arguments:
 
     def refusal(self, message: str, hint: str | None = None, variable: str | None = None) -> CallRefused:
         """An error that names this instance."""
-        return CallRefused(message, instance=self._instance, variable=variable, hint=hint)
+        return CallRefused(message, instance=self.instance, variable=variable, hint=hint)
 
     def _having(self, causality: Causality) -> dict[str, Variable]:
         return {variable.name: variable for variable in self._description.with_causality(causality)}
@@ -121,32 +121,6 @@ class Arguments:
         raise self.refusal(f"there is no variable '{name}'.", f"Did you mean '{near}'?" if near else expected)
 
 
-def _plain(value: Value) -> Value:
+def _plain(value: object) -> object:
     """A scalar of numpy, which robot programs are full of, as the Python value it stands for."""
-    plain: Value = value.item() if isinstance(value, np.generic) else value
-    return plain
-
-
-def _converted(value: Value, variable: Variable) -> Value | None:
-    """``value`` as a value of the variable's type, or None if it is none."""
-    converted: Value | None = None
-    match variable.type, value:
-        case "Boolean", bool():
-            converted = value
-        case _, bool():
-            pass  # which Python would take for a number
-        case "Real", int() | float():
-            converted = float(value)
-        case "Integer", int() if value in _INT32:
-            converted = value
-        case "Enumeration", int() if not variable.items or value in dict(variable.items).values():
-            converted = value
-        case "Enumeration", str():
-            converted = dict(variable.items).get(value)
-        case "String", str():
-            converted = value
-    return converted
-
-
-def _within(value: float, low: float | None, high: float | None) -> bool:
-    return (low is None or value >= low) and (high is None or value <= high)
+    return value.item() if isinstance(value, np.generic) else value

@@ -45,6 +45,17 @@ class Trajectory:
         start, value = self._times[place], self._values[place]
         if not self._linear or place + 1 == len(self._times) or start >= time - resolution:
             return value
-        end, left, right = self._times[place + 1], float(value), float(self._values[place + 1])
-        # With a weight below 1 this never leaves the range of the two values, which may be the limits of the FMU.
-        return left + (right - left) * ((time - start) / (end - start))
+        end, right = self._times[place + 1], self._values[place + 1]
+        return _between(value, right, (time - start) / (end - start))
+
+
+def _between(left: Value, right: Value, weight: float) -> Value:
+    """The value between two, of an array element by element.
+
+    With a weight below 1 this never leaves the range of the two values, which may be the limits of the FMU.
+    """
+    if isinstance(left, list) and isinstance(right, list):
+        return [_between(one, other, weight) for one, other in zip(left, right, strict=True)]
+    assert isinstance(left, float)
+    assert isinstance(right, float)
+    return left + (right - left) * weight

@@ -115,10 +115,10 @@ def _arithmetic(c: Connection) -> str:
     """What a connection calculates; empty if it hands the value on as it is."""
     if (c.factor, c.offset) == (1.0, 0.0):
         return ""
-    product = f"{_number(c.factor)} * {c.source.name}" if c.factor != 1.0 else c.source.name
+    product = f"{_number(c.factor)} * {c.source_name}" if c.factor != 1.0 else c.source_name
     sign = "-" if c.offset < 0.0 else "+"
     sum_ = f"{product} {sign} {_number(abs(c.offset))}" if c.offset else product
-    return f"{c.target.name} = {sum_}"
+    return f"{c.target_name} = {sum_}"
 
 
 def _order(plan: Plan) -> list[str]:
@@ -162,7 +162,7 @@ def _initialization(plan: Plan) -> list[str]:
     lines = [f"  level {level}: {', '.join(names)}" for level, names in sorted(levels.items())]
     for name, variable in plan.initialization.held:
         instance = plan.system.instances[name]
-        described = instance.description.variable(variable)
+        described = instance.description.variable_of(variable)
         start = instance.start_values.get(variable, described.start if described is not None else None)
         value = f" {shown(start)}{_unit(described)}" if start is not None else ""
         lines.append(f"  {name}.{variable} keeps its start value{value} until the first step")
@@ -175,8 +175,9 @@ def _recorded(plan: Plan) -> list[str]:
     instances = plan.system.instances
     rows = []
     for name, variable in plan.system.recorded:
-        described = instances[name].description.variable(variable)
-        rows.append([f"{name}.{variable}", described.type if described else "", _unit(described).strip()])
+        described = instances[name].description.variable_of(variable)
+        type_ = described.type_name.partition("[")[0] if described is not None else ""
+        rows.append([f"{name}.{variable}", type_, _unit(described).strip()])
     return [*table(rows, indent=2), f"  into {_short(plan.system.result_file)}"]
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import csv
 import importlib.util
+import re
 from array import array
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
@@ -19,6 +20,7 @@ from ..errors import ConfigurationError
 from ..model.description import Variable
 from ..model.findings import listed, nearest
 from ..model.plan import Plan
+from ..model.types import is_float
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -26,7 +28,8 @@ if TYPE_CHECKING:
 __all__ = ["Results", "add_commands", "draw", "plot_results", "read_results", "reduced", "require_matplotlib"]
 
 _TIME = "time"
-_WORDS = {"true": 1.0, "false": 0.0, "": float("nan")}
+_WORDS = {"true": 1.0, "false": 0.0, "": float("nan"), '""': float("nan")}
+_QUOTED = re.compile(r'"(?:[^"]|"")*"')
 _MAX_POINTS = 4000
 """Points drawn per line: more than twice the pixels of the picture's width would show nothing new."""
 
@@ -89,7 +92,7 @@ def plot_results(result: Path, plot: Path, plan: Plan | None) -> None:
         return
     variables = {}
     for instance, name in plan.system.recorded:
-        variable = plan.system.instances[instance].description.variable(name)
+        variable = plan.system.instances[instance].description.variable_of(name)
         if variable is not None:
             variables[f"{instance}.{name}"] = variable
     draw(results, plot, title=plan.system.config.mesh, variables=variables)
@@ -116,7 +119,8 @@ def read_results(path: Path, wanted: Sequence[str] | None = None) -> Results:
         raise ConfigurationError(f"'{path}' is no result file: {error}.") from error
     chosen = _chosen(path, names[1:], wanted)
     table = np.frombuffer(values, np.float64).reshape(-1, len(names))
-    columns = {name: table[:, names.index(name, 1)] for name in chosen}
+    quoted = {name for name, text in zip(names, first, strict=False) if text == '""'}
+    columns = {name: table[:, names.index(name, 1)] for name in chosen if name not in quoted}
     texts = {name: text for name, text in zip(names, first, strict=False) if name in columns}
     flags = frozenset(name for name, text in texts.items() if text in ("true", "false"))
     whole = frozenset(name for name, text in texts.items() if text.removeprefix("-").isdecimal())
@@ -133,9 +137,12 @@ def _read(path: Path, file: TextIO) -> tuple[list[str], list[str], array[float]]
     values: array[float] = array("d")
     first: list[str] = []
     for number, line in enumerate(file, 2):
-        if not line.endswith("\n"):  # the last row, cut off perhaps within a number
+        text = line
+        while text.count('"') % 2 and (more := next(file, "")):  # text with line ends in it
+            text += more
+        if not text.endswith("\n") or text.count('"') % 2:  # the last row, cut off perhaps within a number
             break
-        row = line.rstrip("\r\n").split(",")
+        row = _QUOTED.sub('""', text.rstrip("\r\n")).split(",")
         if len(row) != len(names):
             found = f"{len(row)} values where the heading has {len(names)}"
             raise ConfigurationError(f"'{path}' is no result file: line {number}: {found}.")
@@ -201,7 +208,7 @@ def _axis_of(name: str, results: Results, variables: Mapping[str, Variable]) -> 
         return "true (1) or false (0)"
     if variable is None:
         return "value"
-    if variable.type != "Real":
+    if not is_float(variable.type):
         return "number"
     return f"value in {variable.unit}" if variable.unit else "value, no unit"
 

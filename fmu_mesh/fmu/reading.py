@@ -1,27 +1,28 @@
 """Reading the model description of an FMU into the mesh's own Structs, without extracting or loading it.
 
-Owns the judgement what can run (FMI 2.0 co-simulation with a binary for this platform) and what is only odd: problems
-that a strict validator finds are kept in `ModelDescription.problems`, and the FMU runs.
+Owns the judgement what can run (co-simulation of FMI 1.0, 2.0 and 3.0 with a binary for this platform) and what is only
+odd: problems that a strict validator finds are kept in `ModelDescription.problems`, and the FMU runs.
 """
 
 from __future__ import annotations
 
+import xml.etree.ElementTree as ET
 import zipfile
 from pathlib import Path
-from typing import cast
 
 import fmpy
 from fmpy.model_description import ModelDescription as FmpyDescription
-from fmpy.model_description import ModelVariable, read_model_description
 from fmpy.model_description import ValidationError as FmpyValidationError
+from fmpy.model_description import read_model_description
 
 from ..errors import LoadFailed
-from ..model.description import DefaultExperiment, ModelDescription, Value, Variable, VariableType
+from ..model.description import DefaultExperiment, ModelDescription
+from .variables import variables_of
 
 __all__ = ["read_description"]
 
 _MAX_DESCRIPTION_SIZE = 64 * 2**20
-_TYPES: tuple[VariableType, ...] = ("Real", "Integer", "Boolean", "String", "Enumeration")
+_VERSIONS = ("1.0", "2.0", "3.0")
 
 
 def read_description(path: Path) -> ModelDescription:
@@ -37,8 +38,9 @@ def read_description(path: Path) -> ModelDescription:
             hint="An FMU that was zipped inside a folder of its own must be zipped again without that folder.",
         )
     source, problems = _parse(path)
-    if source.fmiVersion is None or not source.fmiVersion.startswith("2."):
-        raise LoadFailed(f"'{path}' is an FMI {source.fmiVersion} FMU; FMI 2.0 co-simulation is what can run today.")
+    version = source.fmiVersion or ""
+    if not version.startswith(_VERSIONS) or "-" in version:  # 3.0-beta.1 is another interface than 3.0
+        raise LoadFailed(f"'{path}' is an FMI {version} FMU; co-simulation of FMI 1.0, 2.0 and 3.0 is what can run.")
     if source.coSimulation is None:
         raise LoadFailed(f"'{path}' is for model exchange only; export it for co-simulation.")
     platforms = tuple(fmpy.supported_platforms(str(path)))
@@ -48,13 +50,18 @@ def read_description(path: Path) -> ModelDescription:
             f"'{path}' has no binary for this platform ({fmpy.platform}); it has: {there}.",
             hint="Export it for this platform, or compile its sources into it if it has some.",
         )
-    library = f"binaries/{fmpy.platform}/{source.coSimulation.modelIdentifier}{fmpy.sharedLibraryExtension}"
+    identifier = source.coSimulation.modelIdentifier
+    folder = fmpy.platform_tuple if version.startswith("3.") else fmpy.platform
+    library = f"binaries/{folder}/{identifier}{fmpy.sharedLibraryExtension}"
     if library not in names:
         raise LoadFailed(
             f"'{path}' has no '{library}', although its model identifier is "
-            f"'{source.coSimulation.modelIdentifier}' (FMI 2.0, 2.3: the library must have that name)."
+            f"'{identifier}' (FMI 2.0, 2.3: the library must have that name)."
         )
-    return _convert(source, platforms, problems)
+    try:
+        return _convert(source, _root(path), platforms, problems)
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+        raise LoadFailed(f"the modelDescription.xml of '{path}' has a value that cannot be: {error}") from error
 
 
 def _archive_names(path: Path) -> frozenset[str]:
@@ -90,25 +97,32 @@ def _parse(path: Path) -> tuple[FmpyDescription, tuple[str, ...]]:
         raise LoadFailed(f"the modelDescription.xml of '{path}' cannot be read: {error}") from error
 
 
-def _convert(source: FmpyDescription, platforms: tuple[str, ...], problems: tuple[str, ...]) -> ModelDescription:
+def _root(path: Path) -> ET.Element:
+    """The XML itself, for what FMPy leaves out; it was parsed before."""
+    with zipfile.ZipFile(path) as archive:
+        text = archive.read("modelDescription.xml")
+    return ET.fromstring(text)  # noqa: S314  expat limits how far entities expand, and nothing external is resolved
+
+
+def _convert(
+    source: FmpyDescription, root: ET.Element, platforms: tuple[str, ...], problems: tuple[str, ...]
+) -> ModelDescription:
     co_simulation = source.coSimulation
     experiment = source.defaultExperiment
-    dependencies = {
-        unknown.variable.name: None
-        if unknown.dependencies is None
-        else tuple(variable.name for variable in unknown.dependencies)
-        for unknown in source.initialUnknowns
-        if unknown.variable is not None
-    }
+    capabilities = root.find("Implementation/*/Capabilities")  # of FMI 1.0, which FMPy does not read
+
+    def can(attribute: str) -> bool:
+        if capabilities is not None:
+            return capabilities.get(attribute) in ("true", "1")
+        return bool(getattr(co_simulation, attribute))
+
     return ModelDescription(
         model_name=source.modelName or "",
         model_identifier=co_simulation.modelIdentifier,
         fmi_version=source.fmiVersion or "",
         kind="co_simulation",
         guid=source.guid or "",
-        variables=tuple(
-            _variable(variable, dependencies) for variable in source.modelVariables if variable.type in _TYPES
-        ),
+        variables=variables_of(source, root),
         description=source.description,
         generation_tool=source.generationTool,
         default_experiment=DefaultExperiment(
@@ -117,34 +131,15 @@ def _convert(source: FmpyDescription, platforms: tuple[str, ...], problems: tupl
             step_size=_number(getattr(experiment, "stepSize", None)),
             tolerance=_number(getattr(experiment, "tolerance", None)),
         ),
-        can_handle_variable_step_size=bool(co_simulation.canHandleVariableCommunicationStepSize),
+        can_handle_variable_step_size=can("canHandleVariableCommunicationStepSize"),
+        has_event_mode=bool(co_simulation.hasEventMode),
         can_get_and_set_state=bool(co_simulation.canGetAndSetFMUstate),
         can_serialize_state=bool(co_simulation.canSerializeFMUstate),
-        only_once_per_process=bool(co_simulation.canBeInstantiatedOnlyOncePerProcess),
-        needs_execution_tool=bool(co_simulation.needsExecutionTool),
+        only_once_per_process=can("canBeInstantiatedOnlyOncePerProcess"),
+        needs_execution_tool=bool(co_simulation.needsExecutionTool)
+        or root.find("Implementation/CoSimulation_Tool") is not None,
         platforms=platforms,
         problems=problems,
-    )
-
-
-def _variable(source: ModelVariable, dependencies: dict[str, tuple[str, ...] | None]) -> Variable:
-    type_ = cast("VariableType", source.type)
-    declared = source.declaredType
-    items = tuple((item.name, int(item.value)) for item in declared.items) if declared and declared.items else ()
-    return Variable(
-        name=source.name,
-        value_reference=int(source.valueReference),
-        type=type_,
-        causality=source.causality or "local",
-        variability=source.variability or ("continuous" if type_ == "Real" else "discrete"),
-        initial=source.initial,
-        start=_start(type_, source.start),
-        unit=source.unit or (declared.unit if declared is not None else None),
-        description=source.description,
-        minimum=_number(source.min),
-        maximum=_number(source.max),
-        dependencies=dependencies.get(source.name, ()),
-        items=items,
     )
 
 
@@ -153,23 +148,5 @@ def _number(text: str | float | None) -> float | None:
         return None
     try:
         return float(text)
-    except ValueError:
-        return None
-
-
-def _start(type_: VariableType, text: str | None) -> Value | None:
-    """The start value as a Python value, or None if there is none or it is not of the type."""
-    if text is None:
-        return None
-    try:
-        match type_:
-            case "Real":
-                return float(text)
-            case "Integer" | "Enumeration":
-                return int(text)
-            case "Boolean":
-                return text in ("true", "1")
-            case "String":
-                return text
     except ValueError:
         return None

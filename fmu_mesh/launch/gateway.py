@@ -25,6 +25,7 @@ from .wiring import MASTER
 __all__ = ["run_gateway"]
 
 _BY_HAND = "hand"
+_ANY_LOOPBACK_PORT = "tcp/127.0.0.1:0"
 
 
 def run_gateway(config_file: Path, options: Options, emit: Callable[[Event], None], *, run: str = _BY_HAND) -> None:
@@ -68,7 +69,10 @@ def run_gateway(config_file: Path, options: Options, emit: Callable[[Event], Non
             connect = (socket_endpoint(folder, MASTER),)
         mesh = open_session(Wiring(mode="client", connect=connect))
         stack.callback(mesh.close)
-        ros = open_session(Wiring(mode="peer", listen=tuple(section.listen), connect=tuple(section.connect)))
+        # A peer that gossips, as the nodes of ROS are: a router passes nothing on between peers, it makes them meet.
+        listen = tuple(section.listen) or (_ANY_LOOPBACK_PORT,)
+        wiring = Wiring(mode="peer", listen=listen, connect=tuple(section.connect), gossip=True)
+        ros = open_session(wiring)
         stack.callback(ros.close)
         keys = Keys(loaded.config.zenoh.key_prefix, loaded.config.mesh)
         profiles = stack.enter_context(open_profiles(section, ros, types, ros_plan))

@@ -9,17 +9,18 @@ from __future__ import annotations
 import shutil
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from ..errors import FmuMeshError, Interrupted, StepFailed
-from ..fmu import Fmi2Instance, LogMessage
-from ..model.description import Value
+from ..fmu import LogMessage, open_instance
+from ..model.elements import scaled
 from ..model.instance import Instance
 from ..model.plan import Plan
 from ..model.ring import Layout, Ring
+from ..model.types import DTYPES, Value, VariableType
 from ..record.csv_file import CsvFile
 from ..record.recorder import unwritable
 from ..record.result_file import OpenResult, ResultFile
@@ -90,8 +91,8 @@ class LocalMesh:
     def _run(self) -> None:
         plan = self._plan
         recorded = plan.system.recorded if plan.system.result_file is not None else ()
-        types = {name: {v.name: v.type for v in i.description.variables} for name, i in plan.system.instances.items()}
-        columns = [(f"{instance}.{variable}", types[instance][variable]) for instance, variable in recorded]
+        layouts = {name: Layout.of(i.description.variables) for name, i in plan.system.instances.items()}
+        columns = [(f"{instance}.{name}", layouts[instance].column(name).type) for instance, name in recorded]
         members: dict[str, _Member] = {}
         with tempfile.TemporaryDirectory(prefix="fmu_mesh-") as folder:
             self._folder = Path(folder)
@@ -116,7 +117,7 @@ class LocalMesh:
         if self._open_instance is not None:
             return self._open_instance(name)
         system = self._plan.system.instances[name]
-        return Fmi2Instance(Path(system.fmu), name, system.description, folder, self._log)
+        return open_instance(Path(system.fmu), name, system.description, folder, self._log)
 
     def _initialize(self, members: dict[str, _Member]) -> None:
         grid = self._plan.grid
@@ -136,6 +137,7 @@ class LocalMesh:
     def _loop(self, members: dict[str, _Member], file: ResultFile | None) -> None:
         plan, grid = self._plan, self._plan.grid
         recorded = [(members[instance], variable) for instance, variable in plan.system.recorded]
+        types = [member.type_of(variable) for member, variable in recorded]
         buffer: list[list[Value]] = []
         first = 0
         try:
@@ -144,7 +146,7 @@ class LocalMesh:
                 if file is not None:
                     buffer.append([member.value_at(point, variable) for member, variable in recorded])
                     if len(buffer) == _ROWS:
-                        _write(file, grid, first, buffer)
+                        _write(file, grid, first, buffer, types)
                         first, buffer = point + 1, []
                         self._progress(point)
                 if self._stop is not None:
@@ -158,7 +160,7 @@ class LocalMesh:
             raise
         finally:
             if file is not None and buffer:
-                _write(file, grid, first, buffer)
+                _write(file, grid, first, buffer, types)
         self._progress(self.point)
 
 
@@ -178,16 +180,34 @@ class _Member:
 
     def set_initial_inputs(self, known: dict[tuple[str, str], Value]) -> None:
         """Set every connected input whose source is known."""
-        values = {}
+        values: dict[str, Value] = {}
         for c in self.connections:
             key = (c.source_instance, c.source.name)
-            if key in known and c.target.name not in self.plan.held:
-                values[c.target.name] = _scaled(known[key], c.factor, c.offset)
+            if key not in known or c.target_name in self.plan.held:
+                continue
+            value = scaled(_at(known[key], c.source_index), c.factor, c.offset)
+            if not c.target_index:
+                values[c.target.name] = value
+                continue
+            if c.target.name not in values:
+                values[c.target.name] = self.instance.get_values([c.target.name])[0]
+            row = values[c.target.name]
+            for i in c.target_index[:-1]:
+                row = _at(row, (i,))
+            assert isinstance(row, list)
+            row[c.target_index[-1]] = value
         if values:
             self.instance.set_values(values)
 
     def bind(self, grid: TimeGrid) -> None:
+        arrays = [column.name for column in self.plan.inputs.columns if column.shape]
+        for name, value in zip(arrays, self.instance.get_values(arrays) if arrays else [], strict=True):
+            self._inputs.put(0, name, value)  # what is not connected keeps it
         self.instance.bind(self._inputs, (self._outputs,), grid, self.plan.step_points)
+
+    def type_of(self, variable: str) -> VariableType:
+        """The type of an output, or of an element of it."""
+        return self.plan.outputs.column(variable).type
 
     def value_at(self, point: int, variable: str) -> Value:
         """The output at ``point``: that of the last own point at or before it."""
@@ -198,28 +218,29 @@ class _Member:
         points = self.plan.step_points
         if (point + 1) % points:
             return
-        layout: Layout = self._inputs.layout
         for c in self.connections:
             taken_at = point + 1 - points if c.delay else point + 1
-            value = _scaled(members[c.source_instance].value_at(taken_at, c.source.name), c.factor, c.offset)
-            if c.target.name in layout.reals:
-                self._inputs.reals[0, layout.reals.index(c.target.name)] = value
-            else:
-                self._inputs.integers[0, layout.integers.index(c.target.name)] = value
+            value = members[c.source_instance].value_at(taken_at, c.source_name)
+            self._inputs.put(0, c.target_name, scaled(value, c.factor, c.offset))
         self.instance.do_step(self.step)
         self.step += 1
 
 
-def _scaled(value: Value, factor: float, offset: float) -> Value:
-    if isinstance(value, str) or (factor, offset) == (1.0, 0.0):
-        return value
-    return value * factor + offset
+def _at(value: Value, index: tuple[int, ...]) -> Value:
+    """An element of an array; without an index the value itself."""
+    for number in index:
+        assert isinstance(value, list)
+        value = value[number]
+    return value
 
 
-def _write(file: ResultFile, grid: TimeGrid, first: int, rows: list[list[Value]]) -> None:
+def _write(
+    file: ResultFile, grid: TimeGrid, first: int, rows: list[list[Value]], types: Sequence[VariableType]
+) -> None:
     times = grid.times(first, first + len(rows))
     try:
-        file.write(times, [np.array(column) for column in zip(*rows, strict=True)])
+        columns = zip(zip(*rows, strict=True), types, strict=True)
+        file.write(times, [np.array(column, dtype=DTYPES[type_]) for column, type_ in columns])
     except OSError as error:
         raise unwritable(file.path, error) from error
 

@@ -15,7 +15,7 @@ from pathlib import Path
 import msgspec
 
 from ..errors import ConfigurationError, FmuMeshError, StepFailed
-from ..fmu import Fmi2Instance, LogMessage, read_description
+from ..fmu import FmuInstance, LogMessage, open_instance, read_description
 from ..master.master import Master
 from ..master.profiling import GrantWatch
 from ..model.findings import listed, nearest
@@ -72,7 +72,7 @@ class _NodeProcess:
         self._plan = plan
         self._zenoh = zenoh_section(load(config_file), options)
         self._folder = folder
-        self._instances: list[Fmi2Instance] = []
+        self._instances: list[FmuInstance] = []
         self._node: Node | None = None
         self._interrupted: str | None = None
 
@@ -97,10 +97,10 @@ class _NodeProcess:
                 error.told = child and node.failure_is_known
                 raise
 
-    def _open(self, name: str) -> Fmi2Instance:
+    def _open(self, name: str) -> FmuInstance:
         item = self._plan.instance(name)
         path = Path(item.fmu)
-        instance = Fmi2Instance(path, name, read_description(path), self._folder / "fmus", self._log)
+        instance = open_instance(path, name, read_description(path), self._folder / "fmus", self._log)
         self._instances.append(instance)
         return instance
 

@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from fmu_mesh.model.description import Value
+from fmu_mesh.model.types import PlainValue
 
 __all__ = [
     "Config",
@@ -87,10 +87,10 @@ class InstanceConfig(Base, frozen=True, kw_only=True):
 
     fmu: Annotated[str, Meta(description="Path of the .fmu file, relative to this file.")]
     start_values: Annotated[
-        dict[str, Value],
+        dict[str, PlainValue],
         Meta(
             description="Start values of parameters, inputs and initial values, by variable name. "
-            "An Enumeration takes the item's name or its number."
+            "An Enumeration takes the item's name or its number, an array nested lists row by row, Binary base64."
         ),
     ] = {}
     step_size: Annotated[
@@ -132,7 +132,7 @@ class RecordConfig(Base, frozen=True, kw_only=True):
     ] = "results/{mesh}.csv"
     variables: Annotated[
         list[str] | None,
-        Meta(description="`instance.variable` of outputs; default: all outputs of all instances but Strings."),
+        Meta(description="`instance.variable` of outputs; default: all outputs but those of type String and Binary."),
     ] = None
 
 

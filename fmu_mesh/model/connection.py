@@ -14,19 +14,20 @@ import msgspec
 from fmu_mesh.model.config import ConnectionConfig
 from fmu_mesh.model.description import Variable
 from fmu_mesh.model.findings import Findings, listed, nearest
+from fmu_mesh.model.types import FMI2_TYPES, TYPES, VariableType, element_name, is_float, split_element, takes
 
 __all__ = ["Connection", "Variables", "resolve_connections", "resolve_variable", "unit_warnings"]
 
 Variables = Mapping[str, Mapping[str, Variable] | None]
 """The variables of every instance by name; None where the model description could not be read."""
 
-_LOSSLESS = {("Integer", "Real"), ("Boolean", "Integer"), ("Enumeration", "Integer")}
-
 
 class Connection(msgspec.Struct, frozen=True):
     """One connection: `target = factor * source + offset`.
 
     Attributes:
+        source_index: the element of the source array that is connected, counted from 0; empty for all of it.
+        target_index: as ``source_index``, for the target.
         delay: 0, 1, or None where the algorithm decides.
         path: its place in the configuration file, such as `connections[2]`.
     """
@@ -39,9 +40,21 @@ class Connection(msgspec.Struct, frozen=True):
     offset: float
     delay: int | None
     path: str
+    source_index: tuple[int, ...] = ()
+    target_index: tuple[int, ...] = ()
+
+    @property
+    def source_name(self) -> str:
+        """The name of the source, as `y` or `y[2]`."""
+        return element_name(self.source.name, self.source_index) if self.source_index else self.source.name
+
+    @property
+    def target_name(self) -> str:
+        """The name of the target, as `u` or `u[1,3]`."""
+        return element_name(self.target.name, self.target_index) if self.target_index else self.target.name
 
     def __str__(self) -> str:
-        return f"{self.source_instance}.{self.source.name} -> {self.target_instance}.{self.target.name}"
+        return f"{self.source_instance}.{self.source_name} -> {self.target_instance}.{self.target_name}"
 
 
 def resolve_connections(
@@ -62,13 +75,15 @@ def resolve_connections(
             continue
         connection = Connection(
             source_instance=config.source.partition(".")[0],
-            source=source,
+            source=source[0],
             target_instance=config.target.partition(".")[0],
-            target=target,
+            target=target[0],
             factor=config.factor,
             offset=config.offset,
             delay=config.delay,
             path=path,
+            source_index=source[1],
+            target_index=target[1],
         )
         if _causality_is_right(connection, findings):
             _check_types(connection, findings)
@@ -79,8 +94,13 @@ def resolve_connections(
 
 def resolve_variable(
     reference: str, path: str, variables: Variables, causality: str, findings: Findings
-) -> Variable | None:
+) -> tuple[Variable, tuple[int, ...]] | None:
     """The variable that `instance.variable` names, or None where that cannot be told.
+
+    `instance.array[1,2]` names an element of an array, counted from 1, unless a variable has that very name.
+
+    Returns:
+        The variable, and the index of the element, counted from 0; empty for the variable as a whole.
 
     Args:
         reference: instance name and FMI variable name; the first dot is between them.
@@ -101,11 +121,13 @@ def resolve_variable(
     if own is None:
         return None
     if name not in own:
+        if (parts := split_element(name)) is not None and parts[0] in own:
+            return _element(own[parts[0]], parts[1], path, reference, findings)
         names = [variable.name for variable in own.values() if variable.causality == causality]
         expected = f"one of the {causality}s of '{instance}': {listed(names)}"
         findings.add(path, f"the unknown variable '{name}' of instance '{instance}'", expected, nearest(name, names))
         return None
-    return own[name]
+    return own[name], ()
 
 
 def unit_warnings(connections: Sequence[Connection], findings: Findings) -> None:
@@ -155,18 +177,55 @@ def _causality_is_right(connection: Connection, findings: Findings) -> bool:
 
 
 def _check_types(connection: Connection, findings: Findings) -> None:
-    source, target = connection.source.type, connection.target.type
-    if "String" in (source, target):
-        found = f"{connection} connects {_a(source)} to {_a(target)}"
-        findings.add(connection.path, found, "another type: String connections are not supported yet")
-    elif source != target and (source, target) not in _LOSSLESS:
-        accepted = [target, *(one for one, other in sorted(_LOSSLESS) if other == target)]
-        found = f"{connection} connects {_a(source)} to {_a(target)}"
-        findings.add(connection.path, found, f"a source of type {' or '.join(accepted)}")
-    elif target != "Real" and not _is_identity(connection):
+    source, target = connection.source, connection.target
+    items = tuple(number for _, number in source.items)
+    have, want = _end(source, connection.source_index), _end(target, connection.target_index)
+    if not takes(target.type, source.type, items):
+        accepted = [_name_of(type_, target) for type_ in _sources_for(target.type, source)]
+        found = f"{connection} connects {_a(have)} to {_a(want)}"
+        findings.add(connection.path, found, f"a source of type {' or '.join(dict.fromkeys(accepted))}")
+    elif (source.shape if not connection.source_index else ()) != (target.shape if not connection.target_index else ()):
+        found = f"{connection} connects {_a(have)} to {_a(want)}"
+        expected = "ends of the same shape: two arrays of the same dimensions, or one element as in y[1]"
+        findings.add(connection.path, found, expected)
+    elif not is_float(target.type) and not _is_identity(connection):
         conversion = f"factor {connection.factor:g} and offset {connection.offset:g}"
-        found = f"{conversion} for the {target} '{connection.target.name}'"
-        findings.add(connection.path, found, "factor and offset on Real inputs only")
+        name = f"the {target.type_name} '{connection.target_name}'"
+        findings.add(connection.path, f"{conversion} for {name}", "factor and offset on Real inputs only")
+
+
+def _sources_for(target: VariableType, source: Variable) -> list[VariableType]:
+    """All types that an input of this type takes, its own first; as far as the source's version of FMI has them."""
+    known = TYPES if source.declared_type is None else FMI2_TYPES.values()
+    return [target, *(type_ for type_ in known if type_ != target and takes(target, type_))]
+
+
+def _name_of(type_: VariableType, like: Variable) -> str:
+    """A type in the words of the FMI version of a variable."""
+    if like.declared_type is None:
+        return type_
+    return next((name for name, own in FMI2_TYPES.items() if own == type_), type_)
+
+
+def _end(variable: Variable, index: tuple[int, ...]) -> str:
+    """The type at one end: that of the variable, or of one element of it."""
+    return variable.type_name.partition("[")[0] if index else variable.type_name
+
+
+def _element(
+    variable: Variable, index: tuple[int, ...], path: str, reference: str, findings: Findings
+) -> tuple[Variable, tuple[int, ...]] | None:
+    """The element of an array, if it has one with this index."""
+    if len(index) == len(variable.shape) and all(0 <= i < size for i, size in zip(index, variable.shape, strict=True)):
+        return variable, index
+    if not variable.shape:
+        expected = "an element of an array only: this variable is a scalar"
+    else:
+        last = ",".join(map(str, variable.shape))
+        first = ",".join("1" for _ in variable.shape)
+        expected = f"an index from [{first}] to [{last}]"
+    findings.add(path, f"'{reference}' of the {variable.type_name} '{variable.name}'", expected)
+    return None
 
 
 def _check_delay(connection: Connection, findings: Findings) -> None:

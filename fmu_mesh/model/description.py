@@ -6,31 +6,44 @@ in `fmu_mesh.fmu` (and later the hosts) fill them.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from typing import Literal
 
 import msgspec
+from msgspec.structs import replace
+
+from .types import PlainValue, Value, VariableType, element_names, split_element
 
 __all__ = [
     "Causality",
     "DefaultExperiment",
     "ModelDescription",
+    "PlainValue",
     "Value",
     "Variability",
     "Variable",
     "VariableType",
 ]
 
-Causality = Literal["parameter", "calculatedParameter", "input", "output", "local", "independent"]
+Causality = Literal[
+    "parameter", "calculatedParameter", "structuralParameter", "input", "output", "local", "independent"
+]
 Variability = Literal["constant", "fixed", "tunable", "discrete", "continuous"]
 Initial = Literal["exact", "approx", "calculated"]
-VariableType = Literal["Real", "Integer", "Boolean", "String", "Enumeration"]
-Value = float | int | bool | str
 
 
 class Variable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One scalar variable of a model description (FMI 2.0, 2.2.7).
+    """One variable of a model description (FMI 2.0, 2.2.7; FMI 3.0, 2.4.7).
 
     Attributes:
+        type: the type, in the words of FMI 3.0 for all versions.
+        declared_type: the type in the words of FMI 1.0 and 2.0, such as Real; None for FMI 3.0.
+        dimensions: of each dimension its size, or the name of the structural parameter that is its size; empty for a
+            scalar (FMI 3.0, 2.4.7.5.1).
+        shape: the sizes of all dimensions.
+        negated: whether it is an FMI 1.0 alias with the opposite sign of the value behind its value reference.
+        max_size: most bytes of a Binary, if known.
         dependencies: names of the knowns an output depends on in Initialization Mode; None if it may depend on all
             (FMI 2.0, 2.2.8, InitialUnknowns). Empty for a variable that is not an initial unknown.
         items: item names and values of an Enumeration.
@@ -49,13 +62,34 @@ class Variable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     maximum: float | None = None
     dependencies: tuple[str, ...] | None = None
     items: tuple[tuple[str, int], ...] = ()
+    declared_type: str | None = None
+    dimensions: tuple[int | str, ...] = ()
+    shape: tuple[int, ...] = ()
+    negated: bool = False
+    max_size: int | None = None
+
+    @property
+    def type_name(self) -> str:
+        """The type as a reader knows it from the FMU, with the sizes of its dimensions: `Real`, `Float64[2,3]`."""
+        name = self.declared_type or self.type
+        return f"{name}[{','.join(map(str, self.shape))}]" if self.shape else name
+
+    @property
+    def size(self) -> int:
+        """How many elements it has; 1 for a scalar."""
+        return math.prod(self.shape)
+
+    @property
+    def elements(self) -> tuple[str, ...]:
+        """The names of its elements, as `y[1,2]`; of a scalar, its own name."""
+        return element_names(self.name, self.shape)
 
     @property
     def settable_before_start(self) -> bool:
         """Whether a start value may be given (FMI 2.0, 2.2.7: initial is exact or approx, or it is an input)."""
         if self.variability == "constant" or self.causality == "independent":
             return False
-        return self.causality == "input" or self.initial in ("exact", "approx")
+        return self.causality in ("input", "structuralParameter") or self.initial in ("exact", "approx")
 
 
 class DefaultExperiment(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -80,6 +114,7 @@ class ModelDescription(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     generation_tool: str | None = None
     default_experiment: DefaultExperiment = DefaultExperiment()
     can_handle_variable_step_size: bool = False
+    has_event_mode: bool = False
     can_get_and_set_state: bool = False
     can_serialize_state: bool = False
     only_once_per_process: bool = False
@@ -91,6 +126,31 @@ class ModelDescription(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """The variable with this name, or None."""
         return next((variable for variable in self.variables if variable.name == name), None)
 
+    def variable_of(self, name: str) -> Variable | None:
+        """The variable that ``name`` means, where ``name`` may also be that of an element of an array, as `y[1,2]`."""
+        found = self.variable(name)
+        if found is None and (parts := split_element(name)) is not None:
+            found = self.variable(parts[0])
+        return found
+
     def with_causality(self, *causalities: Causality) -> tuple[Variable, ...]:
         """All variables with one of these causalities, in the order of the model description."""
         return tuple(variable for variable in self.variables if variable.causality in causalities)
+
+    def sized(self, start_values: Mapping[str, Value]) -> ModelDescription:
+        """With the shapes that its arrays have if structural parameters get these values (FMI 3.0, 2.2.8)."""
+        if not any(isinstance(size, str) for variable in self.variables for size in variable.dimensions):
+            return self
+        sizes = {v.name: v.start for v in self.variables if v.causality in ("structuralParameter", "parameter")}
+        sizes.update({name: value for name, value in start_values.items() if name in sizes})
+
+        def size_of(dimension: int | str) -> int:
+            value = dimension if isinstance(dimension, int) else sizes.get(dimension)
+            return value if isinstance(value, int) and value > 0 else 1
+
+        return replace(
+            self,
+            variables=tuple(
+                replace(v, shape=tuple(map(size_of, v.dimensions))) if v.dimensions else v for v in self.variables
+            ),
+        )

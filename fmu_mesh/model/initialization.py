@@ -25,7 +25,7 @@ class InitializationPlan(msgspec.Struct, frozen=True):
 
     Attributes:
         levels: level by (instance, output).
-        held: (instance, input) of connections that are not propagated in Initialization Mode.
+        held: (instance, input, or element of an input) of connections that are not propagated in Initialization Mode.
     """
 
     levels: dict[Key, int]
@@ -46,7 +46,7 @@ def plan_initialization(
             break
         looping = {key: number for number, part in enumerate(loops) for key in part}
         cut = [c for c in used if c.delay == 1 and _inside(c, looping, edges)]
-        held += [(c.target_instance, c.target.name) for c in cut]
+        held += [(c.target_instance, c.target_name) for c in cut]
         used = [c for c in used if c not in cut]
     levels: dict[Key, int] = {}
     predecessors: dict[Key, list[Key]] = {key: [] for key in outputs}

@@ -206,8 +206,8 @@ def _with_overrides(
             findings.add(option, f"the unknown instance '{name}'", expected, nearest(name, instances))
             continue
         value = read(text, ignored := Findings(option), {})
-        if len(ignored) or not isinstance(value, bool | int | float | str):
-            findings.add(option, f"the value {shown(text)}", "a number, text, true or false")
+        if len(ignored) or not isinstance(value, bool | int | float | str | list):
+            findings.add(option, f"the value {shown(text)}", "a number, text, true or false, or a list")
             continue
         _set_start_value(instances, name, variable, value)
         replaced[f"instances.{name}.start_values.{variable}"] = option

@@ -15,11 +15,12 @@ from msgspec.structs import replace
 from ..errors import ConfigurationError, Finding
 from ..simtime import TimeGrid
 from .config import TimeoutsConfig
-from .description import Value
 from .graph import cycle_through, feedback_edges, strongly_connected, topological_order
 from .initialization import InitializationPlan, plan_initialization
 from .ring import Layout, rows_for
 from .system import Connection, System, SystemInstance
+from .types import PlainValue
+from .values import to_plain
 
 __all__ = ["RECORDER", "Feed", "InstancePlan", "Link", "NodePlan", "Plan", "make_plan"]
 
@@ -40,7 +41,7 @@ class Feed(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """How one source instance feeds one instance, all connections with the same delay together.
 
     Attributes:
-        columns: (source variable, target variable, factor, offset) of each connection.
+        columns: (source, target, factor, offset) of each connection; an end is a variable, or an element as `y[2]`.
     """
 
     source: str
@@ -56,13 +57,13 @@ class InstancePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         outputs: the columns read after every step: connected or recorded outputs.
         inputs: the connected inputs, set before every step.
         initialization: the levels at which connected outputs become known in Initialization Mode, by name.
-        held: connected inputs that keep their start value in Initialization Mode, because their connection closes a
-            loop there.
+        held: connected inputs, or elements of them, that keep their start value in Initialization Mode, because their
+            connection closes a loop there.
     """
 
     name: str
     fmu: str
-    start_values: dict[str, Value]
+    start_values: dict[str, PlainValue]
     step_points: int
     outputs: Layout
     inputs: Layout
@@ -258,7 +259,7 @@ def _window(system: System) -> int:
     configured = system.config.simulation.window
     if configured != "auto":
         return configured
-    widest = max(8 * len(instance.description.variables) for instance in system.instances.values())
+    widest = max(Layout.of(instance.description.variables).row_size for instance in system.instances.values())
     return max(16, min(AUTO_WINDOW_POINTS, AUTO_WINDOW_BYTES // max(widest, 1)))
 
 
@@ -333,9 +334,9 @@ def _output_layout(plan: Plan, name: str) -> Layout:
     """Connected and recorded outputs of an instance, in the order of its model description."""
     wanted = {c.source.name for c in plan.connections if c.source_instance == name}
     if plan.system.result_file is not None:
-        wanted |= {variable for instance, variable in plan.system.recorded if instance == name}
+        wanted |= {_base(plan, instance, variable) for instance, variable in plan.system.recorded if instance == name}
     variables = plan.system.instances[name].description.variables
-    return Layout.of([(v.name, v.type) for v in variables if v.name in wanted])
+    return Layout.of(v for v in variables if v.name in wanted)
 
 
 def _instance_plan(plan: Plan, instance: SystemInstance, outputs: Layout) -> InstancePlan:
@@ -343,17 +344,17 @@ def _instance_plan(plan: Plan, instance: SystemInstance, outputs: Layout) -> Ins
     feeds: dict[tuple[str, int], list[tuple[str, str, float, float]]] = {}
     for c in incoming:
         feeds.setdefault((c.source_instance, c.delay or 0), []).append(
-            (c.source.name, c.target.name, c.factor, c.offset)
+            (c.source_name, c.target_name, c.factor, c.offset)
         )
     connected = {c.target.name for c in incoming}
     levels = plan.initialization.levels
     return InstancePlan(
         name=instance.name,
         fmu=instance.fmu,
-        start_values=instance.start_values,
+        start_values={variable: to_plain(value) for variable, value in instance.start_values.items()},
         step_points=instance.step_points,
         outputs=outputs,
-        inputs=Layout.of([(v.name, v.type) for v in instance.description.variables if v.name in connected]),
+        inputs=Layout.of(v for v in instance.description.variables if v.name in connected),
         feeds=tuple(Feed(source=s, delay=d, columns=tuple(columns)) for (s, d), columns in sorted(feeds.items())),
         initialization={variable: level for (owner, variable), level in levels.items() if owner == instance.name},
         held=tuple(variable for owner, variable in plan.initialization.held if owner == instance.name),
@@ -369,13 +370,13 @@ def _links(plan: Plan) -> tuple[Link, ...]:
             needed.setdefault((c.source_instance, target_node), set()).add(c.source.name)
     if plan.system.result_file is not None:
         for name, variable in plan.system.recorded:
-            needed.setdefault((name, RECORDER), set()).add(variable)
+            needed.setdefault((name, RECORDER), set()).add(_base(plan, name, variable))
     links = []
     ends = sorted(needed, key=lambda end: (end[0], end[1] == RECORDER, end[1]))
     for index, (source, target_node) in enumerate(ends):
         names = needed[source, target_node]
         instance = plan.system.instances[source]
-        layout = Layout.of([(v.name, v.type) for v in instance.description.variables if v.name in names])
+        layout = Layout.of(v for v in instance.description.variables if v.name in names)
         levels = plan.initialization.levels
         links.append(
             Link(
@@ -391,3 +392,9 @@ def _links(plan: Plan) -> tuple[Link, ...]:
             )
         )
     return tuple(links)
+
+
+def _base(plan: Plan, instance: str, name: str) -> str:
+    """The name of the variable that a recorded column is, or is an element of."""
+    variable = plan.system.instances[instance].description.variable_of(name)
+    return variable.name if variable is not None else name

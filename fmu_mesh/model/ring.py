@@ -6,78 +6,153 @@ layout and nothing else: no FMI, no Zenoh.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+import math
+from collections.abc import Iterable
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from .description import Value, VariableType
+from .description import Variable
+from .types import (
+    DTYPES,
+    TYPES,
+    Value,
+    VariableType,
+    element_names,
+    flattened,
+    is_text,
+    nested,
+    split_element,
+    zero,
+)
 
-__all__ = ["Layout", "Ring", "is_real", "rows_for"]
+__all__ = ["Column", "Layout", "Part", "Place", "Ring", "Rows", "rows_for"]
+
+Rows = tuple[NDArray[Any], ...]
+"""Consecutive rows: one array of shape (rows, elements) for each part of a layout."""
+
+_TEXT_BYTES = 64
+"""What a String or Binary is taken for where memory and frames are planned, if it does not say how long it can be."""
 
 
-def is_real(type_: VariableType) -> bool:
-    """Whether values of this type live in the float64 part of a row; all others live in the int32 part."""
-    return type_ == "Real"
+class Column(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One variable in a row; an array takes as many neighbouring elements as it has, row by row."""
+
+    name: str
+    type: VariableType
+    shape: tuple[int, ...] = ()
+    max_size: int | None = None
+
+    @property
+    def size(self) -> int:
+        """How many elements it has."""
+        return math.prod(self.shape)
+
+    @property
+    def elements(self) -> tuple[str, ...]:
+        """The names of its elements, as `y[1,2]`; of a scalar, its own name."""
+        return element_names(self.name, self.shape)
+
+
+class Part(NamedTuple):
+    """The columns of one type, which lie in one array.
+
+    Attributes:
+        width: how many elements they have together.
+    """
+
+    type: VariableType
+    columns: tuple[Column, ...]
+    width: int
+
+
+class Place(NamedTuple):
+    """Where a variable, or one element of an array, lies in a row: elements ``first .. first + size - 1`` of a part."""
+
+    part: int
+    first: int
+    size: int
+    shape: tuple[int, ...]
 
 
 class Layout(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The columns of a row: first the Real ones (float64), then Integer, Boolean and Enumeration (int32).
+    """The columns of a row, those of each type together: first Float64, then the others in the order of `TYPES`.
 
-    Attributes:
-        reals: names of the Real columns.
-        integers: names of the int32 columns.
-        integer_types: their types, in the same order.
+    Make it by `of`, which puts the columns in that order.
     """
 
-    reals: tuple[str, ...] = ()
-    integers: tuple[str, ...] = ()
-    integer_types: tuple[VariableType, ...] = ()
+    columns: tuple[Column, ...] = ()
 
     @classmethod
-    def of(cls, columns: Sequence[tuple[str, VariableType]]) -> Layout:
-        """The layout that holds these (name, type) columns, keeping their order within each part."""
-        others = [(name, type_) for name, type_ in columns if not is_real(type_)]
-        return cls(
-            reals=tuple(name for name, type_ in columns if is_real(type_)),
-            integers=tuple(name for name, _ in others),
-            integer_types=tuple(type_ for _, type_ in others),
-        )
+    def of(
+        cls, columns: Iterable[tuple[str, VariableType] | tuple[str, VariableType, tuple[int, ...]] | Variable]
+    ) -> Layout:
+        """The layout that holds these variables, or (name, type) or (name, type, shape), in their order per type."""
+        made = [Column(c.name, c.type, c.shape, c.max_size) if isinstance(c, Variable) else Column(*c) for c in columns]
+        return cls(tuple(sorted(made, key=lambda column: TYPES.index(column.type))))
 
     @property
     def names(self) -> tuple[str, ...]:
-        """All column names, Real ones first."""
-        return self.reals + self.integers
+        """All column names, Float64 ones first."""
+        return tuple(column.name for column in self.columns)
 
     @property
     def row_size(self) -> int:
-        """Size of one row in bytes when packed."""
-        return 8 * len(self.reals) + 4 * len(self.integers)
+        """Size of one row in bytes when packed; for String and Binary an estimate."""
+        return sum(
+            column.size * (column.max_size or _TEXT_BYTES if is_text(column.type) else _itemsize(column.type))
+            for column in self.columns
+        )
 
-    def types(self) -> tuple[VariableType, ...]:
-        """The types of all columns, in the order of `names`."""
-        real: VariableType = "Real"
-        return (*(real for _ in self.reals), *self.integer_types)
+    @property
+    def parts(self) -> tuple[Part, ...]:
+        """The parts that have columns, in the order in which they lie in memory and in a frame."""
+        by_type: dict[VariableType, list[Column]] = {}
+        for column in self.columns:
+            by_type.setdefault(column.type, []).append(column)
+        return tuple(Part(type_, tuple(own), sum(c.size for c in own)) for type_, own in by_type.items())
 
-    def place(self, name: str) -> tuple[int, int]:
-        """Part (0: Real, 1: others) and column of a variable."""
-        if name in self.reals:
-            return 0, self.reals.index(name)
-        return 1, self.integers.index(name)
+    def column(self, name: str) -> Column:
+        """The column of a variable, or of the array that ``name`` is an element of.
+
+        Raises:
+            KeyError: there is none.
+        """
+        by_name = {column.name: column for column in self.columns}
+        if name not in by_name and (parts := split_element(name)) is not None:
+            return by_name[parts[0]]
+        return by_name[name]
+
+    def place(self, name: str) -> Place:
+        """Where a variable lies, or an element of an array such as `y[2]`; a variable of that very name comes first.
+
+        Raises:
+            KeyError: there is no such column.
+        """
+        wanted = self.column(name)
+        for number, part in enumerate(self.parts):
+            first = 0
+            for column in part.columns:
+                if column == wanted:
+                    if name == column.name:
+                        return Place(number, first, column.size, column.shape)
+                    _, index = split_element(name) or ("", ())
+                    return Place(number, first + int(np.ravel_multi_index(index, column.shape)), 1, ())
+                first += column.size
+        raise KeyError(name)
 
 
 class Ring:
-    """A ring of rows in two preallocated arrays.
+    """A ring of rows, with one preallocated array for each part of its layout.
 
     Args:
         layout: the columns.
         rows: how many rows; a power of two.
 
     Attributes:
-        reals: float64 array of shape (rows, number of Real columns).
-        integers: int32 array of shape (rows, number of other columns).
+        parts: arrays of shape (rows, elements), in the order of ``layout.parts``; text as Python objects.
         mask: ``rows - 1``; the slot of row ``n`` is ``n & mask``.
     """
 
@@ -88,23 +163,40 @@ class Ring:
         self.layout = layout
         self.rows = rows
         self.mask = rows - 1
-        self.reals: NDArray[np.float64] = np.zeros((rows, len(layout.reals)), dtype=np.float64)
-        self.integers: NDArray[np.int32] = np.zeros((rows, len(layout.integers)), dtype=np.int32)
+        self._types = tuple(part.type for part in layout.parts)
+        self._places: dict[str, Place] = {}
+        self.parts: Rows = tuple(
+            np.full((rows, part.width), zero(part.type), dtype=DTYPES[part.type]) for part in layout.parts
+        )
 
-    def parts(self) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Both arrays, Real part first."""
-        return self.reals, self.integers
+    def part(self, type_: VariableType) -> NDArray[Any]:
+        """The array of one type, of shape (rows, elements); without elements if no column has it."""
+        if type_ in self._types:
+            return self.parts[self._types.index(type_)]
+        return np.zeros((self.rows, 0), dtype=DTYPES[type_])
 
     def value(self, row: int, name: str) -> Value:
-        """The value of one column of ``row`` as the Python type of its variable."""
-        slot = row & self.mask
-        if name in self.layout.reals:
-            return float(self.reals[slot, self.layout.reals.index(name)])
-        column = self.layout.integers.index(name)
-        value = int(self.integers[slot, column])
-        return bool(value) if self.layout.integer_types[column] == "Boolean" else value
+        """The value of a column of ``row``, or of an element of it, as Python has it."""
+        part, first, size, shape = self._place(name)
+        return nested(self.parts[part][row & self.mask, first : first + size].tolist(), shape)
+
+    def put(self, row: int, name: str, value: Value) -> None:
+        """Give a column of ``row``, or an element of it, a value that its type can hold."""
+        part, first, _, shape = self._place(name)
+        with np.errstate(over="ignore"):  # beyond the range of a Float32 is an infinity, as in C
+            for place, element in enumerate(flattened(value, len(shape)), first):
+                self.parts[part][row & self.mask, place] = element
+
+    def _place(self, name: str) -> Place:
+        if name not in self._places:
+            self._places[name] = self.layout.place(name)
+        return self._places[name]
 
 
 def rows_for(window: int) -> int:
     """Rows that a ring needs so that no row is overwritten while a node runs ``window`` points ahead."""
     return 1 << (window + 3).bit_length()
+
+
+def _itemsize(type_: VariableType) -> int:
+    return np.dtype(DTYPES[type_]).itemsize

@@ -1,7 +1,7 @@
 """Start values of the configuration to values of the variables' types.
 
-Owns what may be set before the start, and which plain value stands for which value of an FMI type
-(FMI 2.0, 2.2.7). Knows one instance at a time.
+Owns what may be set before the start (FMI 2.0, 2.2.7). Knows one instance at a time; which plain value stands for which
+value is `fmu_mesh.model.values`.
 """
 
 from __future__ import annotations
@@ -9,12 +9,22 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from fmu_mesh.model.config import InstanceConfig
-from fmu_mesh.model.description import Value, Variable
+from fmu_mesh.model.description import ModelDescription, Value, Variable
 from fmu_mesh.model.findings import Findings, listed, nearest, shown
+from fmu_mesh.model.values import ValueRefused, to_value
 
-__all__ = ["resolve_start_values"]
+__all__ = ["resolve_start_values", "sized"]
 
-_INTEGER_RANGE = (-(2**31), 2**31 - 1)
+
+def sized(description: ModelDescription, config: InstanceConfig) -> ModelDescription:
+    """A model description with the shapes that its arrays get by the structural parameters of the configuration."""
+    sizes: dict[str, Value] = {}
+    for variable in description.with_causality("structuralParameter"):
+        try:
+            sizes[variable.name] = to_value(config.start_values[variable.name], variable)
+        except (KeyError, ValueRefused):
+            continue  # it keeps its own, or `resolve_start_values` finds it
+    return description.sized(sizes)
 
 
 def resolve_start_values(
@@ -39,74 +49,15 @@ def resolve_start_values(
         elif not variable.settable_before_start:
             found = f"'{variable_name}', {_role(variable)} that cannot be set before the start"
             findings.add(path, found, f"one of {listed(settable)}")
-        elif (converted := _convert(value, variable)) is None:
-            suggestion = nearest(value, [item for item, _ in variable.items]) if isinstance(value, str) else None
-            found = f"{shown(value)} for the {variable.type} '{variable_name}'"
-            findings.add(path, found, _expected(variable), suggestion)
-        elif not _within(converted, variable):
-            found = f"{shown(value)} for '{variable_name}', which is out of its range"
-            findings.add(path, found, f"a value {_range(variable)}")
         else:
-            values[variable_name] = converted
+            try:
+                values[variable_name] = to_value(value, variable)
+            except ValueRefused as refused:
+                found = f"{shown(value)} for the {variable.type_name} '{variable_name}'"
+                if refused.out_of_range:
+                    found = f"{shown(value)} for '{variable_name}', which is out of its range"
+                findings.add(path, found, refused.expected, refused.suggestion)
     return values
-
-
-def _convert(value: Value, variable: Variable) -> Value | None:
-    """``value`` as a value of the variable's type, or None if it is none."""
-    converted: Value | None = None
-    match variable.type:
-        case "Real" if type(value) in (int, float):
-            converted = float(value)
-        case "Integer" if type(value) is int and _fits_integer(value):
-            converted = value
-        case "Boolean" if isinstance(value, bool):
-            converted = value
-        case "String" if isinstance(value, str):
-            converted = value
-        case "Enumeration":
-            converted = _convert_item(value, dict(variable.items))
-    return converted
-
-
-def _convert_item(value: Value, items: Mapping[str, int]) -> int | None:
-    """The number of an item that is given by its name or its number."""
-    if isinstance(value, str):
-        return items.get(value)
-    if type(value) is not int or not _fits_integer(value):
-        return None
-    return value if not items or value in items.values() else None
-
-
-def _fits_integer(value: int) -> bool:
-    return _INTEGER_RANGE[0] <= value <= _INTEGER_RANGE[1]
-
-
-def _within(value: Value, variable: Variable) -> bool:
-    if isinstance(value, str | bool):
-        return True
-    above = variable.minimum is None or value >= variable.minimum
-    return above and (variable.maximum is None or value <= variable.maximum)
-
-
-def _expected(variable: Variable) -> str:
-    match variable.type:
-        case "Real":
-            return "a finite number"
-        case "Integer":
-            return f"a whole number from {_INTEGER_RANGE[0]} to {_INTEGER_RANGE[1]}"
-        case "Boolean":
-            return "true or false"
-        case "String":
-            return "text"
-        case "Enumeration":
-            items = [f"{item} ({number})" for item, number in variable.items]
-            return f"one of {listed(items)}" if items else "the number of an item"
-
-
-def _range(variable: Variable) -> str:
-    if variable.minimum is None:
-        return f"<= {variable.maximum:g}"
-    return f">= {variable.minimum:g}" + (f" and <= {variable.maximum:g}" if variable.maximum is not None else "")
 
 
 def _role(variable: Variable) -> str:

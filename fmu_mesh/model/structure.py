@@ -147,6 +147,8 @@ def _fits(value: Plain, kind: inspect.Type) -> bool:
             fits = number and _within(value, kind)
         case inspect.IntType():
             fits = type(value) is int and _within(value, kind)
+        case inspect.AnyType():  # an element of a list of values, which may be a list itself
+            fits = isinstance(value, bool | int | float | str | list)
         case inspect.StrType(pattern=str(pattern)):
             fits = isinstance(value, str) and re.fullmatch(pattern, value) is not None
         case _:

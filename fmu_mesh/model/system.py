@@ -25,7 +25,8 @@ from fmu_mesh.model.description import ModelDescription, Value
 from fmu_mesh.model.findings import Findings, nearest_file, shown
 from fmu_mesh.model.grouping import automatic_nodes
 from fmu_mesh.model.loading import LoadedConfig
-from fmu_mesh.model.start_values import resolve_start_values
+from fmu_mesh.model.start_values import resolve_start_values, sized
+from fmu_mesh.model.types import element_name, is_text
 from fmu_mesh.simtime import TimeGrid, steps_between
 
 __all__ = ["Connection", "System", "SystemInstance", "build"]
@@ -59,7 +60,8 @@ class System(msgspec.Struct, frozen=True):
 
     Attributes:
         instances: in the order of the file.
-        recorded: the recorded outputs as (instance, variable), in the order of the result columns.
+        recorded: the recorded outputs as (instance, variable), in the order of the result columns; of an array every
+            element is a column of its own, as `y[1,2]`.
         result_file: absolute path of the result CSV, or None if nothing is recorded.
         warnings: what is odd but can run, such as connections between different units.
     """
@@ -90,6 +92,11 @@ def build(
     config = loaded.config
     collected = loaded.findings()
     collected.merge(findings)
+    descriptions = {
+        name: sized(description, config.instances[name])
+        for name, description in descriptions.items()
+        if name in config.instances
+    }
     variables: Variables = {
         name: {variable.name: variable for variable in descriptions[name].variables} if name in descriptions else None
         for name in config.instances
@@ -219,30 +226,31 @@ def _check_nodes(config: Config, descriptions: Mapping[str, ModelDescription], f
 
 
 def _recorded(config: Config, variables: Variables, findings: Findings) -> tuple[tuple[str, str], ...]:
-    """The recorded outputs; by default all that are no String."""
+    """The recorded outputs; by default all that are no String and no Binary."""
     if config.record.variables is None:
         return tuple(
-            (name, variable.name)
+            (name, element)
             for name, own in variables.items()
             for variable in (own or {}).values()
-            if variable.causality == "output" and variable.type != "String"
+            if variable.causality == "output" and not is_text(variable.type)
+            for element in variable.elements
         )
     recorded: dict[tuple[str, str], str] = {}
     for index, reference in enumerate(config.record.variables):
         path = f"record.variables[{index}]"
         instance, _, name = reference.partition(".")
-        if (instance, name) in recorded:
-            found = f"'{reference}' a second time (first: {recorded[instance, name]})"
-            findings.add(path, found, "every variable at most once")
-            continue
-        recorded[instance, name] = path
-        variable = resolve_variable(reference, path, variables, "output", findings)
-        if variable is None:
-            continue
-        if variable.causality != "output":
-            findings.add(path, f"'{reference}', whose causality is {variable.causality}", "an output")
-        elif variable.type == "String":
-            findings.add(path, f"the String '{reference}'", "a Real, Integer, Boolean or Enumeration output")
+        first = recorded.get((instance, name))
+        end = None if first else resolve_variable(reference, path, variables, "output", findings)
+        names: tuple[str, ...] = (name,)
+        if end is not None:
+            variable, element = end
+            names = (element_name(variable.name, element),) if element else variable.elements
+            first = next((recorded[instance, one] for one in names if (instance, one) in recorded), None)
+            if variable.causality != "output":
+                findings.add(path, f"'{reference}', whose causality is {variable.causality}", "an output")
+        if first:
+            findings.add(path, f"'{reference}' a second time (first: {first})", "every variable at most once")
+        recorded.update(dict.fromkeys([(instance, one) for one in names], first or path))
     return tuple(recorded)
 
 

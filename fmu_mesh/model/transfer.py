@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .plan import Feed
-from .ring import Layout, Ring
+from .ring import Layout, Ring, Rows
 
 __all__ = ["Transfer"]
 
@@ -47,9 +47,9 @@ class Transfer:
         """The source's own step whose row feeds own step ``step`` of the target."""
         return (step * self._target_points + self._lead) // self._source_points
 
-    def from_rows(self, first: int, reals: NDArray[np.float64], integers: NDArray[np.int32]) -> None:
-        """Take what the source's rows from own step ``first`` on feed; arrays of shape (rows, columns)."""
-        low, high = self.ready(first), self.ready(first + len(reals))
+    def from_rows(self, first: int, rows: Rows) -> None:
+        """Take what the source's rows from own step ``first`` on feed."""
+        low, high = self.ready(first), self.ready(first + len(rows[0]))
         if low >= high:
             return
         if self._same_rate:
@@ -58,23 +58,23 @@ class Transfer:
         else:
             steps = np.arange(low, high)
             picked = (steps * self._target_points + self._lead) // self._source_points - first
-        self._write(low, high, (reals[picked], integers[picked] if len(integers) else integers))
+        self._write(low, high, tuple(part[picked] for part in rows))
 
     def from_ring(self, source: Ring, low: int, high: int) -> None:
         """Feed own steps ``low .. high - 1`` of the target from the rows of ``source``."""
         steps = np.arange(low, high)
         slots = ((steps * self._target_points + self._lead) // self._source_points) & source.mask
-        self._write(low, high, (source.reals[slots], source.integers[slots]))
+        self._write(low, high, tuple(part[slots] for part in source.parts))
 
     def step_from_ring(self, source: Ring, step: int) -> None:
         """Feed one own step of the target from ``source``; the cheap way for one row."""
         slot = ((step * self._target_points + self._lead) // self._source_points) & source.mask
-        rows = (source.reals[slot], source.integers[slot])
         target = step & self._inputs.mask
         for copy in self._copies:
-            copy.part[target, copy.columns] = copy.convert(rows[copy.source_part][copy.source_columns])
+            values = source.parts[copy.source_part][slot]
+            copy.part[target, copy.columns] = copy.convert(values[copy.source_columns])
 
-    def _write(self, low: int, high: int, rows: tuple[NDArray[Any], NDArray[Any]]) -> None:
+    def _write(self, low: int, high: int, rows: Rows) -> None:
         """Write rows of own steps ``low .. high - 1``, in two pieces where the ring wraps."""
         size, mask = self._inputs.rows, self._inputs.mask
         start = low & mask
@@ -99,11 +99,17 @@ class _Copy:
         self.scale = scale
 
     def convert(self, values: NDArray[Any]) -> NDArray[Any]:
-        """Apply factor and offset, one rounding each, as any program would."""
+        """Apply factor and offset in Float64, one rounding each, as any program would; a Float32 is rounded once more.
+
+        Types that differ are converted by the assignment that follows; `check` has seen to it that nothing is lost.
+        """
         if self.scale is None:
             return values
         factor, offset = self.scale
         scaled: NDArray[Any] = values * factor + offset
+        if self.part.dtype == np.float32:
+            with np.errstate(over="ignore"):
+                return scaled.astype(np.float32)
         return scaled
 
 
@@ -111,22 +117,15 @@ def _copies(feed: Feed, source: Layout, inputs: Ring) -> list[_Copy]:
     """Group the columns by part of source and target, and by whether they are scaled: others stay as they are."""
     groups: dict[tuple[int, int, bool], list[tuple[int, int, float, float]]] = {}
     for source_name, target_name, factor, offset in feed.columns:
-        source_part, source_column = source.place(source_name)
-        target_part, target_column = inputs.layout.place(target_name)
+        have, want = source.place(source_name), inputs.layout.place(target_name)
         scaled = (factor, offset) != (1.0, 0.0)
-        groups.setdefault((source_part, target_part, scaled), []).append((source_column, target_column, factor, offset))
+        group = groups.setdefault((have.part, want.part, scaled), [])
+        group += [(have.first + place, want.first + place, factor, offset) for place in range(want.size)]
     copies = []
     for (source_part, target_part, scaled), columns in groups.items():
         scale = (np.array([c[2] for c in columns]), np.array([c[3] for c in columns])) if scaled else None
-        copies.append(
-            _Copy(
-                source_part,
-                _index([c[0] for c in columns]),
-                inputs.parts()[target_part],
-                _index([c[1] for c in columns]),
-                scale,
-            )
-        )
+        sources, targets = _index([c[0] for c in columns]), _index([c[1] for c in columns])
+        copies.append(_Copy(source_part, sources, inputs.parts[target_part], targets, scale))
     return copies
 
 

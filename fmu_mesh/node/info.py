@@ -6,6 +6,7 @@ import os
 import socket
 
 from ..model.plan import NodePlan
+from ..model.values import to_plain
 from ..wire.keys import escape
 from ..wire.views import ConnectionView, InstanceInfo, VariableView
 from .stepping import Runner
@@ -36,12 +37,13 @@ def instance_info(plan: NodePlan, runner: Runner) -> InstanceInfo:
             VariableView(
                 v.name,
                 f"{kind}/{escape(v.name)}",
-                v.type,
+                v.declared_type or v.type,
                 v.causality,
                 v.variability,
                 v.unit,
-                v.start,
+                to_plain(v.start) if v.start is not None else None,
                 v.description,
+                v.shape,
             )
             for v in description.variables
             if (kind := kind_of(v)) is not None

@@ -6,8 +6,9 @@ import time
 from collections.abc import Callable, Collection
 
 from ..errors import DeadlineExceeded
-from ..model.description import Value
+from ..model.elements import element_of, merged, scaled
 from ..model.plan import Link, NodePlan
+from ..model.types import Value
 from ..wire.frames import initial_values, needed_levels
 from .stepping import Runner
 
@@ -27,7 +28,7 @@ class Initialization:
         self._wait = wait
         self._links = {link.source: link for link in plan.links_in}
         self._own = {instance.name: instance for instance in plan.instances}
-        self._known: dict[tuple[str, str], float | int] = {}
+        self._known: dict[tuple[str, str], Value] = {}
 
     def take(self, link: Link, level: int, data: bytes) -> None:
         """Take an INITIAL message of another node."""
@@ -57,35 +58,34 @@ class Initialization:
             for source, target, factor, offset in feed.columns:
                 early = below is None or self._level_of(feed.source, source) < below
                 if early and target not in runner.plan.held:
-                    value = self._value(feed.source, source, end)
-                    values[target] = value if (factor, offset) == (1.0, 0.0) else value * factor + offset
+                    values[target] = scaled(self._value(feed.source, source, end), factor, offset)
         if values:
-            runner.instance.set_values(values)
+            runner.instance.set_values(merged(values, runner.plan.inputs, runner.instance.get_values))
 
     def _level_of(self, instance: str, variable: str) -> int:
         if instance in self._own:
-            return self._own[instance].initialization[variable]
+            own = self._own[instance]
+            return own.initialization[own.outputs.column(variable).name]
         link = self._links[instance]
-        return link.levels[link.layout.names.index(variable)]
+        return link.levels[link.layout.columns.index(link.layout.column(variable))]
 
-    def _value(self, instance: str, variable: str, end: float) -> float | int:
-        while (instance, variable) not in self._known:
+    def _value(self, instance: str, variable: str, end: float) -> Value:
+        """The initial value of an output, or of an element of it."""
+        layout = self._own[instance].outputs if instance in self._own else self._links[instance].layout
+        column = layout.column(variable)
+        while (instance, column.name) not in self._known:
             left_s = end - time.monotonic()
             if left_s <= 0:
                 text = f"its initial value did not come within {self._plan.timeouts.initialize:g} s"
                 raise DeadlineExceeded(text, instance=instance, variable=variable)
             self._wait(left_s)
-        return self._known[(instance, variable)]
+        return element_of(self._known[(instance, column.name)], column, variable)
 
     def _get_outputs(self, runner: Runner, level: int) -> None:
         """Get the outputs that are known at a level now, and send them to the nodes that need them."""
         names = [name for name, own in runner.plan.initialization.items() if own == level]
-        numbers: dict[str, float | int] = {
-            name: value
-            for name, value in zip(names, runner.instance.get_values(names), strict=True)
-            if not isinstance(value, str)
-        }
-        self._known.update({(runner.name, name): value for name, value in numbers.items()})
+        values = dict(zip(names, runner.instance.get_values(names), strict=True))
+        self._known.update({(runner.name, name): value for name, value in values.items()})
         for link in runner.out_links:
             if level in needed_levels(link.link):
-                link.send_initial(level, numbers)
+                link.send_initial(level, values)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-import numpy as np
+from collections.abc import Mapping
+
 import zenoh
 
 from ..model.plan import LAZY_ROWS, RECORDER, Link
-from ..model.ring import Ring
-from ..wire.messages import FRAME, INITIAL, encode_rows
+from ..model.ring import Layout, Ring
+from ..model.types import Value
+from ..wire.messages import FRAME, INITIAL
+from ..wire.rows import encode_frames, encode_rows
 
 __all__ = ["OutLink"]
 
@@ -34,8 +37,7 @@ class OutLink:
         self._outputs = outputs
         self.publisher = publisher
         self._put = publisher.put
-        self._reals = _columns(outputs.layout.reals, link.layout.reals)
-        self._integers = _columns(outputs.layout.integers, link.layout.integers)
+        self._picks = _picks(outputs.layout, link.layout)
 
     def flush(self, end: int) -> None:
         """Send the rows of own steps ``sent .. end - 1``."""
@@ -46,32 +48,36 @@ class OutLink:
         while first < end:
             start = first & ring.mask
             cut = min(end - first, ring.rows - start)
-            reals = ring.reals[start : start + cut]
-            integers = ring.integers[start : start + cut]
-            self._put(
-                encode_rows(
-                    FRAME,
-                    self.link.index,
-                    first,
-                    reals if self._reals is None else reals[:, self._reals],
-                    integers if self._integers is None else integers[:, self._integers],
-                )
+            end_slot = start + cut
+            rows = tuple(
+                ring.parts[part][start:end_slot] if picked is None else ring.parts[part][start:end_slot, picked]
+                for part, picked in self._picks
             )
+            for message in encode_frames(FRAME, self.link.index, first, rows):
+                self._put(message)
             first += cut
         self.sent = end
 
-    def send_initial(self, level: int, values: dict[str, float | int]) -> None:
+    def send_initial(self, level: int, values: Mapping[str, Value]) -> None:
         """Send the values that became known at one level of Initialization Mode; other columns are zero."""
-        layout = self.link.layout
-        reals = np.array([[values.get(name, 0.0) for name in layout.reals]], dtype=np.float64)
-        integers = np.array([[values.get(name, 0) for name in layout.integers]], dtype=np.int32)
-        self._put(encode_rows(INITIAL, self.link.index, level, reals, integers))
+        row = Ring(self.link.layout, 1)
+        for name in row.layout.names:
+            if name in values:
+                row.put(0, name, values[name])
+        self._put(encode_rows(INITIAL, self.link.index, level, row.parts))
 
     def close(self) -> None:
         """Undeclare the publisher."""
         self.publisher.undeclare()
 
 
-def _columns(have: tuple[str, ...], want: tuple[str, ...]) -> list[int] | None:
-    """Indices of the wanted columns, or None if all are wanted."""
-    return None if have == want else [have.index(name) for name in want]
+def _picks(have: Layout, want: Layout) -> list[tuple[int, list[int] | None]]:
+    """For each wanted part: its number in the ring, and the elements to pick, or None if all are wanted."""
+    types = [part.type for part in have.parts]
+    picks: list[tuple[int, list[int] | None]] = []
+    for part in want.parts:
+        number = types.index(part.type)
+        places = [have.place(column.name) for column in part.columns]
+        elements = [element for place in places for element in range(place.first, place.first + place.size)]
+        picks.append((number, None if len(elements) == have.parts[number].width else elements))
+    return picks

@@ -295,9 +295,9 @@ class Node:
             receiver, feeds = self._remote[number]
             new = receiver.take(point, count, data)
             if new is not None:
-                first, (reals, integers) = new
+                first, rows = new
                 for feed in feeds:
-                    feed.transfer.from_rows(first, reals, integers)
+                    feed.transfer.from_rows(first, rows)
                     feed.ready = feed.transfer.ready(receiver.received)
         elif kind == GRANT:
             self._heard = time.monotonic()

@@ -31,7 +31,8 @@ def checked_setting(runner: Runner, root: str, key: str, data: bytes) -> tuple[V
     if variable is None or kind_of(variable) != kind:
         raise ValueRefused(f"'{runner.name}' has no variable '{name}' under '{kind}'")
     if kind == "in" and name in runner.plan.inputs.names:
-        feed = next(feed for feed in runner.plan.feeds if name in {column[1] for column in feed.columns})
+        layout = runner.plan.inputs
+        feed = next(f for f in runner.plan.feeds if name in {layout.column(column[1]).name for column in f.columns})
         raise ValueRefused(
             f"'{runner.name}.{name}' is connected to '{feed.source}'; only unconnected inputs can be set"
         )

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from time import perf_counter
 
+from ..model.elements import fill_unconnected
 from ..model.instance import Instance
 from ..model.plan import InstancePlan
 from ..model.ring import Layout, Ring
@@ -64,13 +65,16 @@ class Runner:
 
     def bind(self) -> None:
         """Let the instance work on the rings, and read the current outputs. Call after Initialization Mode."""
+        if self.step == 0 and self.watched is None:
+            connected = [target for feed in self.plan.feeds for _, target, _, _ in feed.columns]
+            fill_unconnected(self.inputs, connected, self.instance.get_values)
         outputs = (self.outputs,) if self.watched is None else (self.outputs, self.watched)
         self.instance.bind(self.inputs, outputs, self._grid, self.plan.step_points, self.step)
 
     def watch(self, names: Sequence[str]) -> None:
         """From now on also read these outputs after every step; they are not among the plan's columns."""
-        types = {variable.name: variable.type for variable in self.instance.description.variables}
-        self.watched = Ring(Layout.of([(name, types[name]) for name in names]), self.outputs.rows) if names else None
+        variables = {variable.name: variable for variable in self.instance.description.variables}
+        self.watched = Ring(Layout.of(variables[name] for name in names), self.outputs.rows) if names else None
         self.bind()
 
     @property

@@ -13,7 +13,7 @@ import numpy as np
 import zenoh
 from numpy.typing import NDArray
 
-from ..model.description import Value, Variable
+from ..model.description import Variable
 from ..simtime import TimeGrid
 from ..wire.keys import Keys, VariableKind
 from ..wire.session import matches, undeclare_all
@@ -63,12 +63,11 @@ class InstanceStreams:
         self._grid = grid
         self._next = 0
         self._active: tuple[str, ...] = ()
-        self._booleans = {v.name for v in runner.instance.description.variables if v.type == "Boolean"}
         self._publishers: dict[str, zenoh.Publisher] = {}
         self._listeners: list[zenoh.MatchingListener[Any]] = []
         for variable in runner.instance.description.variables:
             kind = kind_of(variable)
-            if kind is None or variable.type == "String":  # a row has no place for text: a GET answers, no stream
+            if kind is None:
                 continue
             publisher = session.declare_publisher(
                 keys.variable(runner.name, kind, variable.name),
@@ -112,23 +111,19 @@ class InstanceStreams:
         ring = self.runner.outputs
         if name not in ring.layout.names and self.runner.watched is not None:
             ring = self.runner.watched
-        part, column = ring.layout.place(name)
-        values: NDArray[Any] = ring.parts()[part][steps & ring.mask, column]
-        return values
+        part, first, size, shape = ring.layout.place(name)
+        values: NDArray[Any] = ring.parts[part][steps & ring.mask, first : first + size]
+        return values.reshape(len(steps), *shape)
 
     def publish(self, first: int, columns: dict[str, NDArray[Any]]) -> None:
         """On the server's thread: publish what `collect` returned."""
         points = self.runner.plan.step_points
-        lists = [(self._publishers[name].put, self._values(name, column)) for name, column in columns.items()]
+        lists = [(self._publishers[name].put, column.tolist()) for name, column in columns.items()]
         for offset in range(len(next(iter(columns.values())))):
             point = (first + offset) * points
             stamp = attachment(point, self._grid.time(point))
             for put, values in lists:
                 put(encode_value(values[offset]), attachment=stamp)
-
-    def _values(self, name: str, column: NDArray[Any]) -> list[Value]:
-        values: list[Value] = column.tolist()
-        return [bool(value) for value in values] if name in self._booleans else values
 
     def take_dropped(self) -> int:
         """How many rows were left out since the last call."""

@@ -1,10 +1,12 @@
 """The result CSV: first column `time`, then `<instance>.<variable>`, floats written shortest-round-trip.
 
-A float is written with as few digits as read back to the same bits; Boolean as `true` or `false`.
+A float is written with as few digits as read back to the same bits; Boolean as `true` or `false`; String as quoted
+text; Binary as base64.
 """
 
 from __future__ import annotations
 
+import base64
 import csv
 import io
 import math
@@ -18,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import ConfigurationError
-from ..model.description import VariableType
+from ..model.types import Value, VariableType, is_text
 
 __all__ = ["CsvFile"]
 
@@ -39,7 +41,7 @@ class CsvFile:
     def __init__(self, path: Path, columns: Sequence[tuple[str, VariableType]]) -> None:
         self.path = path
         self.rows = 0
-        self._booleans = [index for index, (_, type_) in enumerate(columns) if type_ == "Boolean"]
+        self._has_text = any(is_text(type_) for _, type_ in columns)
         self._encode = msgspec.json.Encoder().encode_lines
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -59,7 +61,7 @@ class CsvFile:
         self.close()
 
     def write(self, times: NDArray[np.float64], columns: Sequence[NDArray[Any]]) -> None:
-        """Append one row per time; ``columns`` are arrays of the same length, float64 or int32."""
+        """Append one row per time; ``columns`` are arrays of the same length, of their types' dtypes."""
         for first in range(0, len(times), _CHUNK_ROWS):
             part = slice(first, first + _CHUNK_ROWS)
             chunk = [times[part], *(column[part] for column in columns)]
@@ -75,19 +77,22 @@ class CsvFile:
         self._file.close()
 
     def _format(self, columns: Sequence[NDArray[Any]]) -> bytes:
-        finite = all(np.isfinite(column).all() for column in columns)
-        lists = [column.tolist() for column in columns]
-        for index in self._booleans:
-            lists[index + 1] = [bool(value) for value in lists[index + 1]]
-        rows = zip(*lists, strict=True)
-        if not finite:
+        plain = not self._has_text and all(np.isfinite(column).all() for column in columns)
+        rows = zip(*(column.tolist() for column in columns), strict=True)
+        if not plain:
             return "".join(",".join(map(_text, row)) + "\n" for row in rows).encode()
         # JSON numbers are shortest-round-trip, too, and msgspec writes a hundred times faster than `repr`.
         return self._encode(list(rows)).translate(None, b"[]")
 
 
-def _text(value: float) -> str:
-    """One value where JSON has no word for it: `nan`, `inf` and `-inf`; all others as JSON has them."""
-    if not math.isfinite(value):
-        return repr(value)
-    return msgspec.json.encode(value).decode()
+def _text(value: Value) -> str:
+    """One value where JSON has no word for it: `nan`, `inf`, `-inf`, text; all others as JSON has them."""
+    match value:
+        case str():
+            return '"' + value.replace('"', '""') + '"'
+        case bytes():
+            return base64.b64encode(value).decode()
+        case float() if not math.isfinite(value):
+            return repr(value)
+        case _:
+            return msgspec.json.encode(value).decode()

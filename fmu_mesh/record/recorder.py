@@ -250,11 +250,10 @@ class _Source:
         """The values of a variable at ``points``."""
         ring = self.receiver.kept
         slots = (points // self.receiver.link.step_points) & ring.mask
-        part, column = ring.layout.place(variable)
-        values: NDArray[Any] = ring.parts()[part][slots, column]
+        place = ring.layout.place(variable)
+        values: NDArray[Any] = ring.parts[place.part][slots, place.first]
         return values
 
     def type_of(self, variable: str) -> VariableType:
         """The type of a variable."""
-        layout = self.receiver.link.layout
-        return dict(zip(layout.names, layout.types(), strict=True))[variable]
+        return self.receiver.link.layout.column(variable).type

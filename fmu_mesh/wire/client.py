@@ -141,7 +141,7 @@ class MeshClient:
             value = msgspec.json.decode(payload)
         except msgspec.DecodeError:
             value = None
-        if value is None or (target.variable.type == "String" and not isinstance(value, str)):
+        if value is None or (target.variable.type == "String" and not isinstance(value, str | list)):
             payload = msgspec.json.encode(text)
         return self._view(target.key, SetAnswer, f"'{target.instance}.{target.variable.name}'", payload)
 
@@ -154,12 +154,8 @@ class MeshClient:
     def watch(self, targets: Sequence[Target]) -> Iterator[Iterator[Reading]]:
         """Every value from now on, in the order in which it comes; ends when the mesh does.
 
-        A reader that falls far behind loses the newest samples; the points tell which. Strings are left out.
+        A reader that falls far behind loses the newest samples; the points tell which.
         """
-        watched = [target for target in targets if target.variable.type != "String"]
-        if not watched:
-            names = listed([f"{target.instance}.{target.variable.name}" for target in targets])
-            raise ConfigurationError(f"a String cannot be watched: {names}.", hint="`get` shows its current value.")
         arrived: queue.SimpleQueue[Reading | None] = queue.SimpleQueue()
         with ExitStack() as stack:
             there = threading.Event()
@@ -172,7 +168,7 @@ class MeshClient:
 
             token = self._session.liveliness().declare_subscriber(self.keys.master, changed, history=True)
             stack.callback(token.undeclare)
-            for target in watched:
+            for target in targets:
                 subscriber = self._session.declare_subscriber(target.key, Keeper(target, arrived).keep)
                 stack.callback(subscriber.undeclare)
             yield iter(arrived.get, None) if there.wait(self._timeout_s) else iter(())

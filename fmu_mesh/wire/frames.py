@@ -8,8 +8,9 @@ from numpy.typing import NDArray
 
 from ..errors import FmuMeshError, FrameGap
 from ..model.plan import Link
-from ..model.ring import Ring
-from .messages import Rows, decode_rows
+from ..model.ring import Ring, Rows
+from ..model.types import Value
+from .rows import decode_rows
 
 __all__ = ["FrameReceiver", "initial_values", "needed_levels"]
 
@@ -31,6 +32,7 @@ class FrameReceiver:
         self.link = link
         self.received = 0
         self._target = target
+        self._parts = link.layout.parts
         self.kept = Ring(link.layout, keep)
 
     def take(self, first: int, count: int, data: bytes) -> tuple[int, Rows] | None:
@@ -43,7 +45,7 @@ class FrameReceiver:
             FrameGap: rows are missing before it, or a row came twice with other values.
             FmuMeshError: it is no frame of this link, or larger than any.
         """
-        rows = decode_rows(data, count, self.link.layout)
+        rows = decode_rows(data, count, self._parts)
         if count > self.kept.rows:
             text = f"a frame of '{self.link.source}' holds {count} points where {self.kept.rows} are the most"
             raise FmuMeshError(text, instance=self.link.source, point=first * self.link.step_points)
@@ -56,7 +58,7 @@ class FrameReceiver:
             self._compare(first, known, rows)
             if known == count:
                 return None
-            first, rows = first + known, (rows[0][known:], rows[1][known:])
+            first, rows = first + known, tuple(part[known:] for part in rows)
         self._keep(first, rows)
         self.received = first + len(rows[0])
         return first, rows
@@ -65,18 +67,16 @@ class FrameReceiver:
         kept = self.kept
         start, count = first & kept.mask, len(rows[0])
         cut = min(count, kept.rows - start)
-        parts: list[tuple[NDArray[Any], NDArray[Any]]] = list(zip(kept.parts(), rows, strict=True))
-        for part, new in parts:
-            if len(new):
-                part[start : start + cut] = new[:cut]
-                part[: count - cut] = new[cut:]
+        for part, new in zip(kept.parts, rows, strict=True):
+            part[start : start + cut] = new[:cut]
+            part[: count - cut] = new[cut:]
 
     def _compare(self, first: int, known: int, rows: Rows) -> None:
         """A row that came before must come again with the same bits, as far as it is still kept."""
         for row in range(max(0, self.received - self.kept.rows - first), known):
             slot = (first + row) & self.kept.mask
-            kept = b"".join(_bits(part, slot) for part in self.kept.parts())
-            if kept != b"".join(_bits(part, row) for part in rows):
+            kept = [_bits(part, slot) for part in self.kept.parts]
+            if kept != [_bits(part, row) for part in rows]:
                 raise FrameGap(
                     f"the values of '{self.link.source}' came twice and differ",
                     instance=self.link.source,
@@ -85,15 +85,22 @@ class FrameReceiver:
                 )
 
 
-def _bits(array: NDArray[Any], row: int) -> bytes:
-    return array[row].tobytes() if array.shape[1] else b""
+def _bits(array: NDArray[Any], row: int) -> bytes | list[str | bytes]:
+    """What two rows must have alike: the bits of numbers, which tell -0.0 from 0.0; text as it is."""
+    if array.dtype == object:
+        texts: list[str | bytes] = array[row].tolist()
+        return texts
+    bits: bytes = array[row].tobytes()
+    return bits
 
 
-def initial_values(link: Link, level: int, data: bytes) -> dict[str, float | int]:
+def initial_values(link: Link, level: int, data: bytes) -> dict[str, Value]:
     """The values in an INITIAL message that became known at ``level``."""
-    reals, integers = decode_rows(data, 1, link.layout)
-    row = [*reals[0].tolist(), *(integers[0].tolist() if len(integers) else [])]
-    return {name: value for name, value, own in zip(link.layout.names, row, link.levels, strict=True) if own == level}
+    row = Ring(link.layout, 1)
+    for part, new in zip(row.parts, decode_rows(data, 1, link.layout.parts), strict=True):
+        part[:] = new
+    names = [name for name, own in zip(link.layout.names, link.levels, strict=True) if own == level]
+    return {name: row.value(0, name) for name in names}
 
 
 def needed_levels(link: Link) -> frozenset[int]:

@@ -1,8 +1,8 @@
 """The messages of the synchronization, as bytes.
 
 Every message starts with 16 bytes, little endian: kind (u8), one spare byte, link or node number (u16), count (u32),
-point (i64). A frame follows with its rows: first all Real values (float64, row by row), then all others (int32). Abort
-follows with an `ErrorReport` as JSON. Every decoder checks sizes before it touches anything.
+point (i64). A frame follows with its rows (`fmu_mesh.wire.rows`). Abort follows with an `ErrorReport` as JSON. Every
+decoder checks sizes before it touches anything.
 """
 
 from __future__ import annotations
@@ -11,11 +11,8 @@ import struct
 from typing import Final, TypeVar
 
 import msgspec
-import numpy as np
-from numpy.typing import NDArray
 
-from ..errors import ErrorReport, FmuMeshError
-from ..model.ring import Layout
+from ..errors import ErrorReport
 from .profile import NodeProfile
 
 __all__ = [
@@ -30,12 +27,9 @@ __all__ = [
     "WAKE",
     "NodeReport",
     "Registration",
-    "Rows",
     "decode_abort",
     "decode_json",
-    "decode_rows",
     "encode_abort",
-    "encode_rows",
 ]
 
 HEADER: Final = struct.Struct("<BxHIq")
@@ -50,9 +44,6 @@ WAKE: Final = 7
 MAX_MESSAGE_SIZE: Final = 64 * 2**20
 
 T = TypeVar("T")
-
-Rows = tuple[NDArray[np.float64], NDArray[np.int32]]
-_NO_INTEGERS: Final = np.zeros((0, 0), dtype=np.int32)
 
 
 class Registration(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -71,32 +62,6 @@ class NodeReport(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     point: int
     error: ErrorReport | None = None
     profile: NodeProfile | None = None
-
-
-def encode_rows(kind: int, link: int, first: int, reals: NDArray[np.float64], integers: NDArray[np.int32]) -> bytes:
-    """A FRAME or INITIAL message with consecutive rows; ``first`` is the own step index of the first one."""
-    header = HEADER.pack(kind, link, len(reals), first)
-    if integers.shape[1]:
-        return b"".join((header, reals.tobytes(), integers.tobytes()))
-    return header + reals.tobytes()
-
-
-def decode_rows(data: bytes, count: int, layout: Layout) -> Rows:
-    """The rows of a FRAME or INITIAL message as read-only arrays of shape (count, columns).
-
-    Raises:
-        FmuMeshError: the size does not fit ``count`` rows of ``layout``.
-    """
-    n_reals, n_integers = len(layout.reals), len(layout.integers)
-    expected = HEADER.size + count * (8 * n_reals + 4 * n_integers)
-    if len(data) != expected or len(data) > MAX_MESSAGE_SIZE:
-        text = f"a frame of {count} points has {len(data)} bytes where {expected} are expected"
-        raise FmuMeshError(text, hint="Do all processes run the same version of fmu_mesh and the same configuration?")
-    reals = np.frombuffer(data, np.float64, count * n_reals, HEADER.size).reshape(count, n_reals)
-    if not n_integers:
-        return reals, _NO_INTEGERS
-    integers = np.frombuffer(data, np.int32, count * n_integers, HEADER.size + reals.nbytes)
-    return reals, integers.reshape(count, n_integers)
 
 
 def encode_abort(report: ErrorReport) -> bytes:

@@ -7,7 +7,7 @@ import queue
 import msgspec
 import zenoh
 
-from ..model.description import Value
+from ..model.description import PlainValue
 from .values import decode_stamp
 from .views import VariableView
 
@@ -30,7 +30,7 @@ class Reading(msgspec.Struct, frozen=True, omit_defaults=True):
     key: str
     instance: str
     variable: str
-    value: Value
+    value: PlainValue
     point: int
     time: float
     unit: str | None = None
@@ -42,7 +42,7 @@ def reading_of(target: Target, sample: zenoh.Sample) -> Reading | None:
         return None
     try:
         stamp = decode_stamp(sample.attachment.to_bytes())
-        value: Value = msgspec.json.decode(sample.payload.to_bytes())
+        value: PlainValue = msgspec.json.decode(sample.payload.to_bytes())
     except msgspec.DecodeError:
         return None
     view = target.variable

@@ -7,7 +7,7 @@ from typing import Literal
 import msgspec
 
 from ..errors import ErrorReport
-from ..model.description import DefaultExperiment
+from ..model.description import DefaultExperiment, PlainValue
 
 __all__ = [
     "Command",
@@ -27,7 +27,7 @@ MeshState = Literal["starting", "initializing", "running", "paused", "stopping",
 
 
 class VariableView(msgspec.Struct, frozen=True, omit_defaults=True):
-    """One variable as `info` shows it; ``key`` is where its value is."""
+    """One variable as `info` shows it; ``key`` is where its value is, ``shape`` the sizes of an array's dimensions."""
 
     name: str
     key: str
@@ -35,8 +35,9 @@ class VariableView(msgspec.Struct, frozen=True, omit_defaults=True):
     causality: str
     variability: str
     unit: str | None = None
-    start: float | int | bool | str | None = None
+    start: PlainValue | None = None
     description: str | None = None
+    shape: tuple[int, ...] = ()
 
 
 class ConnectionView(msgspec.Struct, frozen=True):

@@ -19,14 +19,17 @@ FMUS = Path(__file__).resolve().parents[2] / "fmus"
 SOURCES = Path(__file__).resolve().parent / "src"
 
 KEPT_FMUS = tuple(sorted(path.stem for path in FMUS.glob("*.fmu")))
-TEST_FMUS = tuple(sorted(path.parent.name for path in SOURCES.glob("*/modelDescription.xml")))
+TEST_FMUS = tuple(
+    sorted(path.parent.name for path in SOURCES.glob("*/modelDescription.xml") if "skeleton.c" in path.read_text())
+)
+"""The test-only FMUs made of the skeleton, which is of FMI 2.0."""
 
 
 def build_test_fmu(name: str, folder: Path) -> Path:
     """Build a test-only FMU into ``folder`` and return its path; a file that is already there is used again.
 
     Args:
-        name: ``Faulty`` or ``AllTypes``.
+        name: a folder of ``tests/fmus/src``.
         folder: a folder of this test session, made if missing.
 
     Raises:

@@ -106,9 +106,9 @@ GAIN = ModelDescription(
     kind="co_simulation",
     guid="{1}",
     variables=(
-        Variable("u", 0, "Real", "input", "continuous"),
-        Variable("y", 1, "Real", "output", "continuous", "calculated"),
-        Variable("k", 2, "Real", "parameter", "tunable", "exact", minimum=-1.0),
+        Variable("u", 0, "Float64", "input", "continuous"),
+        Variable("y", 1, "Float64", "output", "continuous", "calculated"),
+        Variable("k", 2, "Float64", "parameter", "tunable", "exact", minimum=-1.0),
     ),
 )
 

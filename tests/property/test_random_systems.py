@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -192,12 +193,12 @@ def planned(drawn: Drawn) -> Plan:
         return Variable(name, 0, kind, causality, "discrete", dependencies=dependencies)
 
     def kind(pipe: Pipe) -> VariableType:
-        return "Real" if pipe.real else "Integer"
+        return "Float64" if pipe.real else "Int32"
 
     outputs = [
         {
-            "y": variable("y", "Real", "output", None if drawn.feedthrough[i] else ()),
-            "n": variable("n", "Integer", "output", ()),
+            "y": variable("y", "Float64", "output", None if drawn.feedthrough[i] else ()),
+            "n": variable("n", "Int32", "output", ()),
         }
         for i in range(count)
     ]
@@ -262,8 +263,8 @@ class Mixer:
         self.description = plan.system.instances[name_of(number)].description
         self._drawn = drawn
         self._number = number
-        self._initial: dict[str, Value] = {
-            v.name: 0.0 for v in self.description.variables if v.causality == "input" and v.type == "Real"
+        self._initial: dict[str, Any] = {
+            v.name: 0.0 for v in self.description.variables if v.causality == "input" and v.type == "Float64"
         }
         self._rings: tuple[Ring, Ring] | None = None
 
@@ -289,7 +290,7 @@ class Mixer:
         assert self._rings is not None
         inputs, _ = self._rings
         slot = step & inputs.mask
-        reals, integers = inputs.reals[slot].tolist(), inputs.integers[slot].tolist()
+        reals, integers = inputs.part("Float64")[slot].tolist(), inputs.part("Int32")[slot].tolist()
         self.rows.append(stepped(self.rows[-1], step, reals, integers))
         self._write(step + 1)
 
@@ -304,10 +305,8 @@ class Mixer:
         assert self._rings is not None
         outputs = self._rings[1]
         slot = step & outputs.mask
-        for column, _ in enumerate(outputs.layout.reals):
-            outputs.reals[slot, column] = self.rows[-1][0]
-        for column, _ in enumerate(outputs.layout.integers):
-            outputs.integers[slot, column] = self.rows[-1][1]
+        outputs.part("Float64")[slot] = self.rows[-1][0]
+        outputs.part("Int32")[slot] = self.rows[-1][1]
 
 
 def expected_of(drawn: Drawn, plan: Plan) -> list[list[Row]]:

@@ -7,6 +7,7 @@ import struct
 import tempfile
 import tracemalloc
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -19,67 +20,127 @@ from numpy.typing import NDArray
 from fmu_mesh.errors import ErrorReport, FmuMeshError, FrameGap
 from fmu_mesh.model.description import Value, Variable, VariableType
 from fmu_mesh.model.plan import Link
-from fmu_mesh.model.ring import Layout
+from fmu_mesh.model.ring import Layout, Ring, Rows
+from fmu_mesh.model.types import DTYPES, INTEGERS, TYPES, is_text, nested
 from fmu_mesh.record.csv_file import CsvFile
 from fmu_mesh.wire.frames import FrameReceiver
 from fmu_mesh.wire.keys import Keys, escape, unescape
-from fmu_mesh.wire.messages import FRAME, HEADER, decode_abort, decode_rows, encode_abort, encode_rows
+from fmu_mesh.wire.messages import FRAME, HEADER, decode_abort, encode_abort
+from fmu_mesh.wire.rows import decode_rows, encode_frames, encode_rows
 from fmu_mesh.wire.values import ValueRefused, attachment, decode_stamp, decode_value, encode_value
 
-Rows = tuple[NDArray[np.float64], NDArray[np.int32]]
-
-layouts = st.builds(
-    lambda reals, integers: Layout(
-        tuple(f"r{i}" for i in range(reals)), tuple(f"i{i}" for i in range(integers)), ("Integer",) * integers
-    ),
-    st.integers(0, 5),
-    st.integers(0, 5),
+columns = st.tuples(st.sampled_from(TYPES), st.lists(st.integers(1, 3), max_size=2).map(tuple))
+layouts = st.lists(columns, min_size=1, max_size=6).map(
+    lambda drawn: Layout.of([(f"v{number}", type_, shape) for number, (type_, shape) in enumerate(drawn)])
 )
+"""Rows of any types and shapes."""
 names = st.text(min_size=1, max_size=30)
 any_float = st.integers(0, 2**64 - 1).map(lambda bits: struct.unpack("<d", struct.pack("<Q", bits))[0])
 """Every float with the same probability per exponent, signalling NaNs and denormals included."""
 
 
 def rows_of(layout: Layout, count: int, seed: int) -> Rows:
-    """Rows of random bits."""
+    """Rows of random bits, and of random text."""
     random = np.random.default_rng(seed)
-    reals = np.frombuffer(random.bytes(8 * count * len(layout.reals)), np.float64)
-    integers = np.frombuffer(random.bytes(4 * count * len(layout.integers)), np.int32)
-    return reals.reshape(count, len(layout.reals)), integers.reshape(count, len(layout.integers))
+
+    def element(type_: VariableType) -> str | bytes:
+        data = random.bytes(int(random.integers(0, 9)))
+        return data if type_ == "Binary" else data.decode("latin-1")
+
+    rows: list[NDArray[Any]] = []
+    for part in layout.parts:
+        shape = count, part.width
+        if is_text(part.type):
+            array = np.empty(shape, dtype=np.object_)
+            for place in np.ndindex(shape):
+                array[place] = element(part.type)
+        elif part.type == "Boolean":
+            array = random.integers(0, 2, shape).astype(np.bool_)
+        else:
+            dtype = np.dtype(DTYPES[part.type])
+            array = np.frombuffer(random.bytes(dtype.itemsize * math.prod(shape)), dtype).reshape(shape)
+        rows.append(array)
+    return tuple(rows)
+
+
+def all_bits(rows: Rows) -> list[object]:
+    """What two rows must have alike to be the same in every bit."""
+    return [part.tolist() if part.dtype == np.object_ else part.tobytes() for part in rows]
 
 
 @given(layouts, st.integers(0, 40), st.integers(0, 2**32), st.integers(0, 2**16 - 1), st.integers(0, 2**62))
 def test_rows_come_back_bit_by_bit(layout: Layout, count: int, seed: int, link: int, first: int) -> None:
-    reals, integers = rows_of(layout, count, seed)
+    rows = rows_of(layout, count, seed)
 
-    message = encode_rows(FRAME, link, first, reals, integers)
-    back = decode_rows(message, count, layout)
+    message = encode_rows(FRAME, link, first, rows)
+    back = decode_rows(message, count, layout.parts)
 
     assert HEADER.unpack_from(message) == (FRAME, link, count, first)
-    assert back[0].tobytes() == reals.tobytes()
-    assert back[1].tobytes() == integers.tobytes()
+    assert all_bits(back) == all_bits(rows)
+    assert [part.dtype for part in back] == [part.dtype for part in rows]
+
+
+@given(st.sampled_from(list(INTEGERS)), st.data())
+def test_whole_numbers_at_both_ends_of_their_range_come_back(type_: VariableType, data: st.DataObject) -> None:
+    whole = INTEGERS[type_]
+    ends = data.draw(st.lists(st.sampled_from([whole[0], whole[0] + 1, -1 % whole[-1], whole[-1] - 1, whole[-1]])))
+    ring = Ring(Layout.of([("v", type_, (len(ends) + 1,))]), 1)
+    ring.put(0, "v", [*ends, whole[-1]])
+
+    back = Ring(ring.layout, 1)
+    back.parts[0][:] = decode_rows(encode_rows(FRAME, 0, 0, ring.parts), 1, ring.layout.parts)[0]
+
+    assert back.value(0, "v") == [*ends, whole[-1]]
 
 
 @given(st.binary(max_size=400), st.integers(0, 2**32 - 1), layouts)
-@example(b"", 0, Layout())
-@example(bytes(16), 0, Layout(("r",)))
-@example(bytes(16), 2**32 - 1, Layout())
-@example(bytes(16), 2**32 - 1, Layout(("r",), ("i",), ("Integer",)))
+@example(bytes(16), 0, Layout.of([("r", "Float64")]))
+@example(bytes(16), 2**32 - 1, Layout.of([("r", "Float64"), ("i", "Int32")]))
+@example(bytes(16) + b"\xff" * 8, 1, Layout.of([("s", "String"), ("b", "Binary")]))
+@example(bytes(16) + b"\x01\0\0\0\xff", 1, Layout.of([("s", "String")]))
+@example(bytes(16) + b"\x02", 1, Layout.of([("b", "Boolean")]))
 def test_bytes_that_are_no_rows_are_refused(data: bytes, count: int, layout: Layout) -> None:
     try:
-        reals, integers = decode_rows(data, count, layout)
+        rows = decode_rows(data, count, layout.parts)
     except FmuMeshError:
         return
-    assert reals.nbytes + integers.nbytes == len(data) - HEADER.size
+    assert encode_rows(FRAME, 0, 0, rows)[HEADER.size :] == data[HEADER.size :]
+
+
+@given(layouts, st.integers(1, 5), st.integers(0, 2**32), st.data())
+def test_a_frame_that_is_cut_off_or_too_long_is_refused(
+    layout: Layout, count: int, seed: int, data: st.DataObject
+) -> None:
+    message = encode_rows(FRAME, 0, 0, rows_of(layout, count, seed))
+    cut = data.draw(st.integers(HEADER.size, len(message) - 1))
+
+    for wrong in (message[:cut], message + b"\0"):
+        with pytest.raises(FmuMeshError, match=f"a frame of {count} points has {len(wrong)} bytes where"):
+            decode_rows(wrong, count, layout.parts)
+
+
+def test_rows_too_large_for_one_message_go_in_several(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("fmu_mesh.wire.rows.MAX_MESSAGE_SIZE", 100)
+    layout = Layout.of([("b", "Binary"), ("n", "UInt8")])
+    rows = (np.arange(7, dtype=np.uint8)[:, None], np.array([[b"x" * 30]] * 7, dtype=np.object_))
+
+    messages = list(encode_frames(FRAME, 3, 10, rows))
+
+    heads = [HEADER.unpack_from(message) for message in messages]
+    assert [first for _, _, _, first in heads] == [10, 11, 13, 15]
+    back = [decode_rows(message, head[2], layout.parts) for message, head in zip(messages, heads, strict=True)]
+    assert all_bits(tuple(np.concatenate(parts) for parts in zip(*back, strict=True))) == all_bits(rows)
+    with pytest.raises(FmuMeshError, match="the values of one point take 121 bytes, and 100 are the most"):
+        list(encode_frames(FRAME, 3, 0, (rows[0][:1], np.array([[b"x" * 100]], dtype=np.object_))))
 
 
 def test_a_header_that_promises_more_than_there_is_costs_no_memory() -> None:
-    layout = Layout(tuple(f"r{i}" for i in range(1000)))
+    layout = Layout.of([("r", "Float64", (1000,)), ("s", "String")])
     data = HEADER.pack(FRAME, 0, 2**32 - 1, 0)
     tracemalloc.start()
     try:
         with pytest.raises(FmuMeshError, match="4294967295 points has 16 bytes"):
-            decode_rows(data, 2**32 - 1, layout)
+            decode_rows(data, 2**32 - 1, layout.parts)
         assert tracemalloc.get_traced_memory()[1] < 1_000_000
     finally:
         tracemalloc.stop()
@@ -105,8 +166,8 @@ def test_an_error_report_comes_back(report: ErrorReport) -> None:
     assert decode_abort(encode_abort(report)) == report
 
 
-nested = st.integers(1, 3_000).flatmap(lambda depth: st.sampled_from([b"[" * depth, b'{"a":' * depth]))
-wild = st.binary(max_size=300) | nested | st.text(max_size=100).map(lambda text: b'"' + text.encode() + b'"')
+deep = st.integers(1, 3_000).flatmap(lambda depth: st.sampled_from([b"[" * depth, b'{"a":' * depth]))
+wild = st.binary(max_size=300) | deep | st.text(max_size=100).map(lambda text: b'"' + text.encode() + b'"')
 
 
 @given(wild)
@@ -139,18 +200,18 @@ def variable(kind: VariableType) -> Variable:
     return Variable("v", 0, kind, "input", "discrete", items=(("low", 1), ("high", 2)) if kind == "Enumeration" else ())
 
 
-kinds = st.sampled_from(["Real", "Integer", "Boolean", "String", "Enumeration"])
+kinds = st.sampled_from(TYPES)
 
 
 @given(wild | st.integers().map(lambda number: str(number).encode()), kinds)
-@example(b"[" * 3_000, "Real")
+@example(b"[" * 3_000, "Float64")
 @example(b'{"a":' * 3_000, "String")
-@example(b"1" + b"0" * 400, "Real")
-@example(b"-1" + b"0" * 400, "Real")
-@example(b"1" + b"0" * 5000, "Real")
-@example(b"1" + b"0" * 5000, "Integer")
-@example(b"1e999", "Real")
-@example(b"1" * 2_000_000, "Real")
+@example(b"1" + b"0" * 400, "Float64")
+@example(b"-1" + b"0" * 400, "Float64")
+@example(b"1" + b"0" * 5000, "Float64")
+@example(b"1" + b"0" * 5000, "Int32")
+@example(b"1e999", "Float64")
+@example(b"1" * 2_000_000, "Float64")
 @example(b'"\xff"', "String")
 @example(b'"\\ud800"', "String")
 def test_bytes_that_are_no_value_are_refused_with_a_reason(data: bytes, kind: VariableType) -> None:
@@ -158,19 +219,21 @@ def test_bytes_that_are_no_value_are_refused_with_a_reason(data: bytes, kind: Va
         value = decode_value(data, variable(kind))
     except ValueRefused:
         return
-    expected = {"Real": float, "Boolean": bool, "String": str}.get(kind, int)
+    expected = {"Float64": float, "Float32": float, "Boolean": bool, "String": str, "Binary": bytes}.get(kind, int)
     assert type(value) is expected
 
 
 @given(any_float)
 def test_a_real_comes_back(value: float) -> None:
-    back = decode_value(encode_value(value), variable("Real"))
+    back = decode_value(encode_value(value), variable("Float64"))
 
     assert bits(back) == bits(value) or (math.isnan(value) and isinstance(back, float) and math.isnan(back))
 
 
 @given(
-    st.sampled_from(["Integer", "Boolean", "String"]).flatmap(lambda kind: st.tuples(st.just(kind), values_of(kind)))
+    st.sampled_from([type_ for type_ in TYPES if type_ not in ("Float64", "Enumeration")]).flatmap(
+        lambda kind: st.tuples(st.just(kind), values_of(kind))
+    )
 )
 def test_every_other_value_comes_back(typed: tuple[VariableType, Value]) -> None:
     kind, value = typed
@@ -178,10 +241,33 @@ def test_every_other_value_comes_back(typed: tuple[VariableType, Value]) -> None
     assert decode_value(encode_value(value), variable(kind)) == value
 
 
-def values_of(kind: str) -> st.SearchStrategy[Value]:
-    if kind == "Integer":
-        return st.integers(-(2**31), 2**31 - 1)
-    return st.booleans() if kind == "Boolean" else st.text()
+def values_of(kind: VariableType) -> st.SearchStrategy[Value]:
+    match kind:
+        case "Float32":
+            return st.floats(allow_nan=False, width=32)
+        case "Boolean":
+            return st.booleans()
+        case "String":
+            return st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0"))
+        case "Binary":
+            return st.binary()
+        case _:
+            return st.integers(INTEGERS[kind][0], INTEGERS[kind][-1])
+
+
+@given(
+    st.lists(st.integers(1, 3), min_size=1, max_size=3).flatmap(
+        lambda shape: st.tuples(st.just(tuple(shape)), st.lists(any_float, min_size=27, max_size=27))
+    )
+)
+def test_an_array_comes_back_with_its_shape(drawn: tuple[tuple[int, ...], list[float]]) -> None:
+    shape, elements = drawn
+    value = nested(elements[: math.prod(shape)], shape)
+    array = msgspec.structs.replace(variable("Float64"), shape=shape)
+
+    back = decode_value(encode_value(value), array)
+
+    assert repr(back) == repr(value)
 
 
 # ---- keys
@@ -231,55 +317,53 @@ def link_of(layout: Layout, step_points: int = 1) -> Link:
 @given(layouts, st.lists(st.tuples(st.integers(0, 20), st.integers(1, 16)), max_size=20), st.integers(0, 2**32))
 def test_frames_that_overlap_give_every_row_once(layout: Layout, pieces: list[tuple[int, int]], seed: int) -> None:
     """Each frame starts some rows before the end of what was sent, and is up to 16 rows long."""
-    reals, integers = rows_of(layout, 400, seed)
+    rows = rows_of(layout, 400, seed)
     receiver = FrameReceiver(link_of(layout), "the target", 16)
-    sent, taken_reals, taken_integers = 0, [reals[:0]], [integers[:0]]
+    sent, taken = 0, [tuple(part[:0] for part in rows)]
 
     for back, count in pieces:
         first = max(0, sent - back)
-        part = slice(first, first + count)
-        new = receiver.take(first, count, encode_rows(FRAME, 0, first, reals[part], integers[part]))
+        frame = tuple(part[first : first + count] for part in rows)
+        new = receiver.take(first, count, encode_rows(FRAME, 0, first, frame))
         assert (new is None) == (first + count <= sent)
         if new is not None:
-            start, rows = new
+            start, new_rows = new
             assert start == sent
-            taken_reals.append(rows[0])
-            taken_integers.append(rows[1] if layout.integers else integers[:0])
+            taken.append(new_rows)
             sent = first + count
         assert receiver.received == sent
 
-    assert np.concatenate(taken_reals).tobytes() == reals[:sent].tobytes()
-    assert np.concatenate(taken_integers).tobytes() == integers[:sent].tobytes()
+    together = tuple(np.concatenate(parts) for parts in zip(*taken, strict=True))
+    assert all_bits(together) == all_bits(tuple(part[:sent] for part in rows))
 
 
 @given(layouts, st.integers(0, 16), st.integers(1, 1000), st.integers(1, 4))
 def test_a_gap_is_an_error_that_names_both_ends(layout: Layout, before: int, missing: int, step_points: int) -> None:
     receiver = FrameReceiver(link_of(layout, step_points), "the target", 16)
-    receiver.take(0, before, encode_rows(FRAME, 0, 0, *rows_of(layout, before, 1)))
+    receiver.take(0, before, encode_rows(FRAME, 0, 0, rows_of(layout, before, 1)))
 
     with pytest.raises(FrameGap) as caught:
-        receiver.take(before + missing, 1, encode_rows(FRAME, 0, before + missing, *rows_of(layout, 1, 1)))
+        receiver.take(before + missing, 1, encode_rows(FRAME, 0, before + missing, rows_of(layout, 1, 1)))
 
     assert (caught.value.instance, caught.value.point) == ("source", before * step_points)
     last = (before + missing) * step_points - 1
     assert f"points {before * step_points} to {last} of 'source' never reached the target" in str(caught.value)
 
 
-@given(layouts.filter(lambda layout: bool(layout.names)), st.integers(0, 9), st.integers(0, 7), st.data())
+numbers = layouts.filter(lambda layout: not any(is_text(c.type) or c.type == "Boolean" for c in layout.columns))
+
+
+@given(numbers, st.integers(0, 9), st.integers(0, 7), st.data())
 def test_a_row_that_comes_twice_with_one_other_bit_is_an_error(
     layout: Layout, row: int, bit: int, data: st.DataObject
 ) -> None:
-    reals, integers = rows_of(layout, 10, 3)
-    message = encode_rows(FRAME, 0, 0, reals, integers)
+    message = encode_rows(FRAME, 0, 0, rows_of(layout, 10, 3))
     receiver = FrameReceiver(link_of(layout), "the target", 16)
     receiver.take(0, 10, message)
     assert receiver.take(0, 10, message) is None
     changed = bytearray(message)
-    if layout.reals:
-        place = HEADER.size + row * 8 * len(layout.reals) + data.draw(st.integers(0, 8 * len(layout.reals) - 1))
-    else:
-        place = HEADER.size + row * 4 * len(layout.integers) + data.draw(st.integers(0, 4 * len(layout.integers) - 1))
-    changed[place] ^= 1 << bit
+    size = layout.parts[0].width * np.dtype(DTYPES[layout.parts[0].type]).itemsize
+    changed[HEADER.size + row * size + data.draw(st.integers(0, size - 1))] ^= 1 << bit
 
     with pytest.raises(FrameGap, match="came twice and differ") as caught:
         receiver.take(0, 10, bytes(changed))
@@ -287,14 +371,26 @@ def test_a_row_that_comes_twice_with_one_other_bit_is_an_error(
     assert (caught.value.instance, caught.value.point) == ("source", row)
 
 
+@given(st.lists(st.text(st.characters(exclude_categories=["Cs"])), min_size=2, max_size=2, unique=True))
+def test_text_that_comes_twice_and_differs_is_an_error(texts: list[str]) -> None:
+    layout = Layout.of([("s", "String")])
+    receiver = FrameReceiver(link_of(layout), "the target", 16)
+    first, other = (encode_rows(FRAME, 0, 0, (np.array([[text]], dtype=np.object_),)) for text in texts)
+    receiver.take(0, 1, first)
+    assert receiver.take(0, 1, first) is None
+
+    with pytest.raises(FrameGap, match="came twice and differ"):
+        receiver.take(0, 1, other)
+
+
 @given(st.binary(max_size=200), st.integers(-(2**63), 2**63 - 1), st.integers(0, 2**32 - 1), st.integers(0, 20))
 @example(bytes(16 + 8 * 17), 0, 17, 0)
 @example(bytes(16 + 8 * 40), 0, 40, 0)
 def test_no_frame_breaks_a_receiver(data: bytes, first: int, count: int, before: int) -> None:
-    layout = Layout(("r",))
+    layout = Layout.of([("r", "Float64")])
     receiver = FrameReceiver(link_of(layout), "the target", 16)
     for step in range(before):
-        receiver.take(step, 1, encode_rows(FRAME, 0, step, *rows_of(layout, 1, step)))
+        receiver.take(step, 1, encode_rows(FRAME, 0, step, rows_of(layout, 1, step)))
 
     try:
         new = receiver.take(first, count, data)
@@ -313,9 +409,10 @@ def test_no_frame_breaks_a_receiver(data: bytes, first: int, count: int, before:
 def test_floats_of_a_result_file_read_back_to_the_same_bits(rows: list[tuple[float, float, int, bool]]) -> None:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "result.csv"
-        with CsvFile(path, [("a", "Real"), ("n", "Integer"), ("b", "Boolean")]) as file:
+        with CsvFile(path, [("a", "Float64"), ("n", "Int32"), ("b", "Boolean")]) as file:
             times, reals = (np.array([row[place] for row in rows], dtype=np.float64) for place in (0, 1))
-            integers, booleans = (np.array([row[place] for row in rows], dtype=np.int32) for place in (2, 3))
+            integers = np.array([row[2] for row in rows], dtype=np.int32)
+            booleans = np.array([row[3] for row in rows], dtype=np.bool_)
             file.write(times, [reals, integers, booleans])
         header, *lines = path.read_text().splitlines()
 

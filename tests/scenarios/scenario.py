@@ -30,7 +30,7 @@ _CONNECTION = re.compile(r"(\w+) -> (\w+)(?: \(delay ([01])\))?")
 
 def variable(name: str, causality: str, **more: object) -> Variable:
     """A continuous Real variable."""
-    return Variable(name, 0, "Real", causality, "continuous", **more)  # type: ignore[arg-type] # chosen by the tests
+    return Variable(name, 0, "Float64", causality, "continuous", **more)  # type: ignore[arg-type] # chosen by the tests
 
 
 def text(lines: Sequence[str]) -> str:
@@ -206,8 +206,8 @@ class Counter:
         self._write(step)
 
     def do_step(self, step: int) -> None:
-        row = self._inputs.reals[step & self._inputs.mask]
-        used = ", ".join(f"{n}@{value:g}" for n, value in zip(self._inputs.layout.reals, row, strict=True))
+        row = self._inputs.part("Float64")[step & self._inputs.mask]
+        used = ", ".join(f"{n}@{value:g}" for n, value in zip(self._inputs.layout.names, row, strict=True))
         first = step * self._points
         self._steps.append(f"{self._name}: {first} -> {first + self._points}" + (f" uses {used}" if used else ""))
         self._write(step + 1)
@@ -216,7 +216,7 @@ class Counter:
         return
 
     def _write(self, step: int) -> None:
-        self._outputs.reals[step & self._outputs.mask] = step * self._points
+        self._outputs.part("Float64")[step & self._outputs.mask] = step * self._points
 
 
 def _by_instance(lines: Sequence[str]) -> dict[str, list[str]]:

@@ -14,8 +14,8 @@ from fmu_mesh.model.description import VariableType
 from fmu_mesh.record.csv_file import CsvFile
 
 COLUMNS: list[tuple[str, VariableType]] = [
-    ("p.a", "Real"),
-    ("p.n", "Integer"),
+    ("p.a", "Float64"),
+    ("p.n", "Int32"),
     ("p.on", "Boolean"),
     ("p.e", "Enumeration"),
 ]
@@ -25,7 +25,7 @@ def write(path: Path, times: list[float], reals: list[float]) -> None:
     count = len(times)
     integers = np.arange(count, dtype=np.int32)
     with CsvFile(path, COLUMNS) as file:
-        file.write(np.array(times), [np.array(reals), integers, integers % 2, integers + 10])
+        file.write(np.array(times), [np.array(reals), integers, integers % 2 == 1, integers + 10])
         assert file.rows == count
 
 
@@ -53,7 +53,7 @@ def test_numbers_that_json_does_not_have_are_written_as_python_reads_them(tmp_pa
 
 
 def test_a_name_with_a_comma_is_quoted(tmp_path: Path) -> None:
-    with CsvFile(tmp_path / "a.csv", [("p.der(a,2)", "Real"), ('p."x"', "Real")]):
+    with CsvFile(tmp_path / "a.csv", [("p.der(a,2)", "Float64"), ('p."x"', "Float64")]):
         pass
 
     with (tmp_path / "a.csv").open(newline="") as file:

@@ -137,7 +137,7 @@ STRUCTURE = [
     ),
     pytest.param(
         changed("a: 1,", "a: -.inf,"),
-        "mesh.yaml:4: instances.pendulum.start_values.a: -inf; expected a finite number, true or false or text",
+        "mesh.yaml:4: instances.pendulum.start_values.a: -inf; expected a finite number, true or false, text or a list",
         id="an infinite start value",
     ),
     pytest.param(
@@ -380,10 +380,10 @@ def test_an_override_takes_the_place_of_a_start_value() -> None:
                 "Did you mean 'pendulum'?"
             ),
         ),
-        ("delay.d=", "--set delay.d=: the value ''; expected a number, text, true or false"),
-        ("delay.d=[1]", "--set delay.d=[1]: the value '[1]'; expected a number, text, true or false"),
-        ("delay.d=[", "--set delay.d=[: the value '['; expected a number, text, true or false"),
-        ("delay.d=.nan", "--set delay.d=.nan: nan; expected a finite number, true or false or text"),
+        ("delay.d=", "--set delay.d=: the value ''; expected a number, text, true or false, or a list"),
+        ("delay.d={}", "--set delay.d={}: the value '{}'; expected a number, text, true or false, or a list"),
+        ("delay.d=[", "--set delay.d=[: the value '['; expected a number, text, true or false, or a list"),
+        ("delay.d=.nan", "--set delay.d=.nan: nan; expected a finite number, true or false, text or a list"),
     ],
 )
 def test_a_wrong_override_is_told_by_its_option(override: str, expected: str) -> None:

@@ -65,7 +65,7 @@ def test_both_forms_of_a_connection_keep_the_schema() -> None:
         ("stop_time: 1", "stop_time: 1, algorithm: gauss"),
         ("{fmu: b.fmu, step_size: null}", "b.fmu"),
         ("b: {", "b.c: {"),
-        ("x: 1", "x: [1]"),
+        ("x: 1", "x: {a: 1}"),
         ("a.der(x,2) -> b.u", "a.der(x,2) => b.u"),
         ("a.der(x,2) -> b.u", "a -> b.u"),
         ("delay: 1", "delay: 2"),

@@ -10,8 +10,8 @@ from fmu_mesh.model.ring import Layout, Ring
 from fmu_mesh.model.transfer import Transfer
 
 RATES = [(source, target, delay) for source in range(1, 6) for target in range(1, 6) for delay in (0, 1)]
-SOURCE = Layout(("a", "b", "c"), ("n", "m"), ("Integer", "Boolean"))
-INPUTS = Layout(("x", "y", "z"), ("i", "j"), ("Integer", "Boolean"))
+SOURCE = Layout.of([("a", "Float64"), ("b", "Float64"), ("c", "Float64"), ("n", "Int32"), ("m", "Int32")])
+INPUTS = Layout.of([("x", "Float64"), ("y", "Float64"), ("z", "Float64"), ("i", "Int32"), ("j", "Int32")])
 PLAIN = (("c", "x", 1.0, 0.0), ("a", "z", 1.0, 0.0), ("m", "j", 1.0, 0.0))
 
 
@@ -28,8 +28,8 @@ def transfer(
 
 def filled(rows: int) -> Ring:
     ring = Ring(SOURCE, rows)
-    ring.reals[:] = np.arange(rows * 3).reshape(rows, 3) + 0.5
-    ring.integers[:] = np.arange(rows * 2).reshape(rows, 2) - 7
+    ring.part("Float64")[:] = np.arange(rows * 3).reshape(rows, 3) + 0.5
+    ring.part("Int32")[:] = np.arange(rows * 2).reshape(rows, 2) - 7
     return ring
 
 
@@ -63,13 +63,17 @@ def test_frames_of_any_length_feed_every_step_once(
     moved = transfer(inputs, source_points, target_points, delay)
 
     for first in range(0, 42, frame):
-        moved.from_rows(first, source.reals[first : first + frame], source.integers[first : first + frame])
+        moved.from_rows(first, tuple(part[first : first + frame] for part in source.parts))
 
     for step in range(moved.ready(42)):
         row = moved.source_step(step)
-        assert inputs.reals[step].tolist() == [source.reals[row, 2], 0.0, source.reals[row, 0]]
-        assert inputs.integers[step].tolist() == [0, source.integers[row, 1]]
-    assert not inputs.reals[moved.ready(42) :].any()
+        assert inputs.part("Float64")[step].tolist() == [
+            source.part("Float64")[row, 2],
+            0.0,
+            source.part("Float64")[row, 0],
+        ]
+        assert inputs.part("Int32")[step].tolist() == [0, source.part("Int32")[row, 1]]
+    assert not inputs.part("Float64")[moved.ready(42) :].any()
 
 
 @pytest.mark.parametrize(("source_points", "target_points", "delay"), RATES)
@@ -78,52 +82,56 @@ def test_a_ring_feeds_as_frames_do(source_points: int, target_points: int, delay
     by_frame, by_ring, by_step = (Ring(INPUTS, 512) for _ in range(3))
     low, high = 3, 9
 
-    transfer(by_frame, source_points, target_points, delay).from_rows(0, source.reals, source.integers)
+    transfer(by_frame, source_points, target_points, delay).from_rows(0, source.parts)
     transfer(by_ring, source_points, target_points, delay).from_ring(source, low, high)
     for step in range(low, high):
         transfer(by_step, source_points, target_points, delay).step_from_ring(source, step)
 
     for ring in (by_ring, by_step):
-        assert ring.reals[low:high].tolist() == by_frame.reals[low:high].tolist()
-        assert ring.integers[low:high].tolist() == by_frame.integers[low:high].tolist()
-        assert not ring.reals[high:].any()
+        assert ring.part("Float64")[low:high].tolist() == by_frame.part("Float64")[low:high].tolist()
+        assert ring.part("Int32")[low:high].tolist() == by_frame.part("Int32")[low:high].tolist()
+        assert not ring.part("Float64")[high:].any()
 
 
 def test_rows_go_around_the_end_of_a_ring() -> None:
     source, inputs = filled(16), Ring(INPUTS, 8)
 
-    transfer(inputs).from_rows(0, source.reals[:6], source.integers[:6])
-    transfer(inputs).from_rows(6, source.reals[6:12], source.integers[6:12])
+    transfer(inputs).from_rows(0, tuple(part[:6] for part in source.parts))
+    transfer(inputs).from_rows(6, tuple(part[6:12] for part in source.parts))
 
-    assert inputs.reals[:, 2].tolist() == source.reals[[8, 9, 10, 11, 4, 5, 6, 7], 0].tolist()
+    assert inputs.part("Float64")[:, 2].tolist() == source.part("Float64")[[8, 9, 10, 11, 4, 5, 6, 7], 0].tolist()
 
 
 def test_a_factor_and_an_offset_round_as_python_does() -> None:
     source, inputs = filled(4), Ring(INPUTS, 4)
     columns = (("a", "x", 0.1, 0.7), ("n", "y", 1.5, -0.25), ("b", "z", 1.0, 0.0))
 
-    transfer(inputs, columns=columns).from_rows(0, source.reals, source.integers)
+    transfer(inputs, columns=columns).from_rows(0, source.parts)
 
     for row in range(4):
-        a, b, _ = source.reals[row].tolist()
-        assert inputs.reals[row].tolist() == [a * 0.1 + 0.7, int(source.integers[row, 0]) * 1.5 + -0.25, b]
+        a, b, _ = source.part("Float64")[row].tolist()
+        assert inputs.part("Float64")[row].tolist() == [
+            a * 0.1 + 0.7,
+            int(source.part("Int32")[row, 0]) * 1.5 + -0.25,
+            b,
+        ]
 
 
 def test_what_is_not_scaled_keeps_its_sign_of_zero_and_its_nan() -> None:
     source, inputs = Ring(SOURCE, 2), Ring(INPUTS, 2)
-    source.reals[0] = -0.0
-    source.reals[1] = np.nan
+    source.part("Float64")[0] = -0.0
+    source.part("Float64")[1] = np.nan
 
-    transfer(inputs).from_rows(0, source.reals, source.integers)
+    transfer(inputs).from_rows(0, source.parts)
 
-    assert inputs.reals[:, 0].tobytes() == source.reals[:, 2].tobytes()
+    assert inputs.part("Float64")[:, 0].tobytes() == source.part("Float64")[:, 2].tobytes()
 
 
 def test_a_frame_that_feeds_no_step_changes_nothing() -> None:
     source, inputs = filled(4), Ring(INPUTS, 4)
     moved = transfer(inputs, source_points=1, target_points=5, delay=0)
 
-    moved.from_rows(0, source.reals, source.integers)
+    moved.from_rows(0, source.parts)
 
     assert moved.ready(4) == 0
-    assert not inputs.reals.any()
+    assert not inputs.part("Float64").any()

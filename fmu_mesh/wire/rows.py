@@ -1,0 +1,114 @@
+"""Rows as bytes: the values that follow the header of a frame.
+
+Part by part in the order of the layout: what has a fixed size as little-endian numbers, row by row (a Boolean as one
+byte, 0 or 1); String and Binary as the lengths of all values in bytes (u32), then the values themselves (UTF-8, raw
+bytes). Every decoder checks sizes before it touches anything.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator, Sequence
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import FmuMeshError
+from ..model.ring import Part, Rows
+from ..model.types import DTYPES, VariableType, is_text
+from .messages import HEADER, MAX_MESSAGE_SIZE
+
+__all__ = ["decode_rows", "encode_frames", "encode_rows"]
+
+_LENGTH: Final = np.dtype("<u4")
+_HINT: Final = "Do all processes run the same version of fmu_mesh and the same configuration?"
+
+assert sys.byteorder == "little", "numbers go over the wire as they lie in memory"
+
+
+def encode_rows(kind: int, link: int, first: int, rows: Rows) -> bytes:
+    """A FRAME or INITIAL message with consecutive rows of one part or more, from own step ``first`` on."""
+    header = HEADER.pack(kind, link, len(rows[0]), first)
+    if len(rows) == 1 and rows[0].dtype != np.object_:
+        return header + rows[0].tobytes()
+    return b"".join((header, *(_texts(part) if part.dtype == np.object_ else part.tobytes() for part in rows)))
+
+
+def encode_frames(kind: int, link: int, first: int, rows: Rows) -> Iterator[bytes]:
+    """As `encode_rows`, in as many messages as it takes for none to be too large; text can make a row of any size.
+
+    Raises:
+        FmuMeshError: one row alone is too large.
+    """
+    message = encode_rows(kind, link, first, rows)
+    if len(message) <= MAX_MESSAGE_SIZE:
+        yield message
+        return
+    half = len(rows[0]) // 2
+    if not half:
+        text = f"the values of one point take {len(message)} bytes, and {MAX_MESSAGE_SIZE} are the most"
+        raise FmuMeshError(text, hint="Connect and record fewer or smaller variables.")
+    yield from encode_frames(kind, link, first, tuple(part[:half] for part in rows))
+    yield from encode_frames(kind, link, first + half, tuple(part[half:] for part in rows))
+
+
+def decode_rows(data: bytes, count: int, parts: Sequence[Part]) -> Rows:
+    """The ``count`` rows of a FRAME or INITIAL message, read-only where they are numbers.
+
+    Raises:
+        FmuMeshError: it does not hold just these rows.
+    """
+    if len(data) > MAX_MESSAGE_SIZE:
+        raise _refused(data, count, f"{MAX_MESSAGE_SIZE} are the most")
+    place = HEADER.size
+    rows: list[NDArray[Any]] = []
+    for type_, _, width in parts:
+        size = count * width
+        if is_text(type_):
+            values, place = _decode_texts(data, place, count, size, type_)
+        else:
+            dtype = np.dtype(DTYPES[type_])
+            if place + size * dtype.itemsize > len(data):
+                raise _refused(data, count, f"at least {place + size * dtype.itemsize} are expected")
+            values = np.frombuffer(data, dtype, size, place)
+            if type_ == "Boolean" and size and values.view(np.uint8).max() > 1:
+                raise FmuMeshError("a frame has a Boolean that is neither true nor false", hint=_HINT)
+            place += size * dtype.itemsize
+        rows.append(values.reshape(count, width))
+    if place != len(data):
+        raise _refused(data, count, f"{place} are expected")
+    return tuple(rows)
+
+
+def _texts(part: NDArray[Any]) -> bytes:
+    values = [value.encode() if isinstance(value, str) else value for value in part.ravel().tolist()]
+    return b"".join((np.array([len(value) for value in values], _LENGTH).tobytes(), *values))
+
+
+def _decode_texts(
+    data: bytes, place: int, count: int, size: int, type_: VariableType
+) -> tuple[NDArray[np.object_], int]:
+    """The values of a part with text, and where they end."""
+    first = place + size * _LENGTH.itemsize
+    if first > len(data):
+        raise _refused(data, count, f"at least {first} are expected")
+    ends = first + np.cumsum(np.frombuffer(data, _LENGTH, size, place), dtype=np.int64)
+    if size and ends[-1] > len(data):
+        raise _refused(data, count, f"at least {ends[-1]} are expected")
+    values = np.empty(size, dtype=np.object_)
+    begin = first
+    for index, end in enumerate(ends.tolist()):
+        value: bytes | str = data[begin:end]
+        if type_ == "String":
+            try:
+                value = data[begin:end].decode()
+            except UnicodeDecodeError as error:
+                raise FmuMeshError(f"a frame has a String that is no UTF-8 ({error.reason})", hint=_HINT) from error
+        values[index] = value
+        begin = end
+    return values, begin
+
+
+def _refused(data: bytes, count: int, expected: str) -> FmuMeshError:
+    return FmuMeshError(f"a frame of {count} points has {len(data)} bytes where {expected}", hint=_HINT)

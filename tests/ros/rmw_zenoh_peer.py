@@ -1,0 +1,156 @@
+"""A node of an independent implementation of rmw_zenoh in Python, that listens and talks as its arguments say.
+
+Arguments: `sdk` (zenoh-ros2-sdk) or `pyzeros`, and JSON: `port` of the router, `domain`, `subscribe` and `publish`
+(message type by topic) and `count`. It prints one JSON line when it has declared its topics, publishes one sample of
+each kind for each line that it reads, and prints one JSON line with all that it has received when every subscribed
+topic has had `count` samples.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import sys
+import threading
+from pathlib import Path
+from typing import Any
+
+import zenoh
+
+from fmu_mesh.ros.types import MessageTypes
+
+def say(**what: object) -> None:
+    print(json.dumps(what), flush=True)  # noqa: T201 (it is the answer)
+
+
+def plain(message: Any) -> Any:  # noqa: ANN401 any message
+    """A message as what the tests compare."""
+    if hasattr(message, "twist"):
+        stamp = message.header.stamp
+        frame = message.header.frame_id
+        frame = frame.decode() if isinstance(frame, bytes) else frame
+        return [message.twist.linear.x, message.twist.angular.z, int(stamp.sec), int(stamp.nanosec), frame]
+    return message.data.decode() if isinstance(message.data, bytes) else message.data
+
+
+class Collected:
+    """What has arrived, told once it is enough."""
+
+    def __init__(self, orders: dict[str, Any]) -> None:
+        self.received: dict[str, list[Any]] = {topic: [] for topic in orders["subscribe"]}
+        self._count = orders["count"]
+        self._told = False
+
+    def take(self, topic: str, message: Any) -> None:  # noqa: ANN401 any message
+        self.received[topic].append(plain(message))
+        if not self._told and all(len(own) >= self._count for own in self.received.values()):
+            self._told = True
+            say(received=self.received)
+
+
+def sdk(orders: dict[str, Any]) -> None:
+    """Be a node of zenoh-ros2-sdk."""
+    from zenoh_ros2_sdk import ROS2Publisher, ROS2Subscriber  # noqa: PLC0415  only one of the two is used
+
+    collected = Collected(orders)
+    definitions = MessageTypes("kilted")
+    # Of a message in messages it would fetch the definitions from the net to compute the hash: both are given.
+    place = {"domain_id": orders["domain"], "router_ip": "127.0.0.1", "router_port": orders["port"]}
+    subscribers = [
+        ROS2Subscriber(
+            topic,
+            kind,
+            lambda message, topic=topic: collected.take(topic, message),
+            msg_definition=definitions.definition(kind),
+            type_hash=ros_hash(kind),
+            **place,
+        )
+        for topic, kind in orders["subscribe"].items()
+    ]
+    publishers = {
+        kind: ROS2Publisher(topic, kind, msg_definition=definitions.definition(kind), type_hash=ros_hash(kind), **place)
+        for topic, kind in orders["publish"].items()
+    }
+    types = publishers and next(iter(publishers.values())).session_mgr.store.types
+    say(declared=len(subscribers) + len(publishers))
+    for number, _line in enumerate(sys.stdin, start=1):
+        for kind, publisher in publishers.items():
+            if kind.endswith("TwistStamped"):
+                vector, twist = types["geometry_msgs/msg/Vector3"], types["geometry_msgs/msg/Twist"]
+                header, time = types["std_msgs/msg/Header"], types["builtin_interfaces/msg/Time"]
+                publisher.publish(
+                    header=header(stamp=time(sec=0, nanosec=0), frame_id="sdk"),
+                    twist=twist(linear=vector(x=0.5 * number, y=0.0, z=0.0), angular=vector(x=0.0, y=0.0, z=-number)),
+                )
+            else:
+                publisher.publish(data=f"text {number}" if kind.endswith("String") else 0.1 * number)
+
+
+def ros_hash(kind: str) -> str | None:
+    """The hash that ROS itself has computed; None where the peer can do that without the net."""
+    if kind.startswith("std_msgs/"):
+        return None
+    data = json.loads((Path(sys.prefix) / "share" / f"{kind}.json").read_text())
+    found: str = data["type_hashes"][0]["hash_string"]
+    return found
+
+
+def pyzeros(orders: dict[str, Any]) -> None:
+    """Be a node of pyzeros."""
+    import asyncio_for_robotics as afor  # noqa: PLC0415  only one of the two is used
+    import pyzeros as zeros  # noqa: PLC0415  likewise
+    from ros2_pyterfaces.cyclone import all_msgs  # noqa: PLC0415  likewise
+
+    def message_class(kind: str) -> Any:  # noqa: ANN401 a class
+        return getattr(all_msgs, kind.rpartition("/")[2])
+
+    def message(kind: str, number: int) -> Any:  # noqa: ANN401 any message
+        made = message_class(kind)()
+        if kind.endswith("TwistStamped"):
+            made.twist.linear.x, made.twist.angular.z, made.header.frame_id = 0.5 * number, -float(number), "zeros"
+        else:
+            made.data = f"text {number}" if kind.endswith("String") else 0.1 * number
+        return made
+
+    collected = Collected(orders)
+
+    async def listen(topic: str, subscriber: Any) -> None:  # noqa: ANN401 a subscriber of pyzeros
+        async for own in subscriber.listen_reliable(queue_size=10_000):
+            collected.take(topic, own)
+
+    @afor.scoped
+    async def talk() -> None:
+        group = afor.Scope.current().task_group
+        for topic, kind in orders["subscribe"].items():
+            group.create_task(listen(topic, zeros.Sub(message_class(kind), topic)))
+        publishers = {kind: zeros.Pub(message_class(kind), topic) for topic, kind in orders["publish"].items()}
+        lines: asyncio.Queue[str | None] = asyncio.Queue()
+        loop = asyncio.get_running_loop()
+
+        def read() -> None:
+            for line in sys.stdin:
+                loop.call_soon_threadsafe(lines.put_nowait, line)
+            loop.call_soon_threadsafe(lines.put_nowait, None)
+
+        threading.Thread(target=read, daemon=True).start()
+        say(declared=len(orders["subscribe"]) + len(publishers))
+        number = 0
+        while await lines.get() is not None:
+            number += 1
+            for kind, publisher in publishers.items():
+                publisher.publish(message(kind, number))
+        afor.Scope.current().cancel()
+
+    config = zenoh.Config()
+    config.insert_json5("mode", '"client"')
+    config.insert_json5("scouting/multicast/enabled", "false")
+    config.insert_json5("connect/endpoints", f'["tcp/127.0.0.1:{orders["port"]}"]')
+    with (
+        zenoh.open(config) as session,
+        zeros.auto_context(node="zeros", zenoh_session=session, domain_id=orders["domain"]),
+    ):
+        asyncio.run(talk())
+
+
+if __name__ == "__main__":
+    {"sdk": sdk, "pyzeros": pyzeros}[sys.argv[1]](json.loads(sys.argv[2]))
