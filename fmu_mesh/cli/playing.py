@@ -34,9 +34,13 @@ def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.Arg
     command.add_argument(
         "--stamps", choices=("header", "log"), default="header", help="header stamps where there are some, or log times"
     )
-    command.add_argument("--config", type=Path, metavar="CONFIG", help="the configuration, where it is not on this host")
+    command.add_argument(
+        "--config", type=Path, metavar="CONFIG", help="the configuration, where it is not on this host"
+    )
     command.add_argument("--connect", action="append", default=[], metavar="ENDPOINT", help="where the mesh is")
-    command.add_argument("--timeout", type=float, default=_TIMEOUT_S, metavar="S", help="deadline of every wait in s (60)")
+    command.add_argument(
+        "--timeout", type=float, default=_TIMEOUT_S, metavar="S", help="deadline of every wait in s (60)"
+    )
     command.set_defaults(run_command=_play)
 
 

@@ -83,7 +83,9 @@ def _add_config(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_paused(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--paused", action="store_true", help="rest at the first point until `resume`, `step` or `play`")
+    parser.add_argument(
+        "--paused", action="store_true", help="rest at the first point until `resume`, `step` or `play`"
+    )
 
 
 def _options(arguments: argparse.Namespace) -> Options:

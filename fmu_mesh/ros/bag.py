@@ -20,11 +20,12 @@ from ..errors import ConfigurationError
 from ..model.config import RosConfig
 from ..model.findings import Findings
 from ..model.loading import LoadedConfig
+from ..model.types import split_element
 from .cdr import Codec
 from .mapping import message_types
 from .messages import Assembler
 from .stamp import nanoseconds, to_stamp
-from .topics import Descriptions, Resolver, RosPlan, Topic
+from .topics import Descriptions, Port, Resolver, RosPlan, Topic
 from .types import CLOCK, MessageTypes
 
 __all__ = ["BagTopics", "McapFile", "bag_topics", "is_bag"]
@@ -68,7 +69,7 @@ def bag_topics(
     Args:
         loaded: the configuration.
         descriptions: the model descriptions by instance.
-        recorded: (instance, variable).
+        recorded: (instance, variable), or an element of an array as `y[1,2]`.
         findings: where all that is wrong goes.
 
     Returns:
@@ -79,6 +80,7 @@ def bag_topics(
     types = message_types(replace(loaded, config=config), findings)
     if types is None:
         return None
+    recorded = _whole(recorded, descriptions, findings)
     wanted = set(recorded)
     # What is wrong with the section itself is told where it is checked, and once is enough.
     plan = Resolver(config, section, descriptions, types, Findings(str(loaded.file))).plan()
@@ -127,7 +129,8 @@ class McapFile:
         self._types = topics.types
         self._schemas: dict[str, int] = {}
         self._outputs = [
-            _Output(topic, index, self._channel(topic.name, topic.message), topics.types) for topic in topics.plan.topics
+            _Output(topic, index, self._channel(topic.name, topic.message), topics.types)
+            for topic in topics.plan.topics
         ]
         self._clock_points = topics.plan.clock_points
         if self._clock_points is not None:
@@ -184,7 +187,7 @@ class _Output:
     def __init__(self, topic: Topic, index: dict[str, int], channel: int, types: MessageTypes) -> None:
         self.channel = channel
         self._steps = sorted({port.step_points for port in topic.ports})
-        self._columns = [index[f"{port.instance}.{port.variable.name}"] for port in topic.ports]
+        self._columns = [_columns(port, index) for port in topic.ports]
         self._assembler = Assembler(topic, types)
 
     def due(self, point: int) -> bool:
@@ -193,7 +196,34 @@ class _Output:
 
     def message(self, row: Sequence[Any], time: float) -> bytes:
         """The message of a row."""
-        return self._assembler.make([row[column] for column in self._columns], time)
+        values = [row[own] if isinstance(own, int) else [row[column] for column in own] for own in self._columns]
+        return self._assembler.make(values, time)
+
+
+def _columns(port: Port, index: dict[str, int]) -> int | list[int]:
+    """The column of a variable, or those of the elements of an array."""
+    columns = [index[f"{port.instance}.{element}"] for element in port.variable.elements]
+    return columns if port.variable.shape else columns[0]
+
+
+def _whole(
+    recorded: Sequence[tuple[str, str]], descriptions: Descriptions, findings: Findings
+) -> list[tuple[str, str]]:
+    """The recorded variables, each array once; a message has all of an array, so all of it has to be recorded."""
+    columns = set(recorded)
+    whole: dict[tuple[str, str], None] = {}
+    for instance, name in recorded:
+        description = descriptions[instance]
+        split = split_element(name)
+        variable = description.variable(name) or (description.variable(split[0]) if split is not None else None)
+        if variable is None:
+            continue
+        if (instance, variable.name) not in whole and not {(instance, e) for e in variable.elements} <= columns:
+            findings.add(
+                "record.variables", f"some elements of the array '{instance}.{variable.name}'", "all of it in an MCAP"
+            )
+        whole[instance, variable.name] = None
+    return list(whole)
 
 
 def _variables(topic: Topic) -> set[tuple[str, str]]:

@@ -7,7 +7,7 @@ nothing of topics, of ROS parameters and of rclpy. All times are nanoseconds of 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import msgspec
@@ -121,7 +121,8 @@ class FmuDriver:
 
     def get_value(self, name: str) -> Value:
         """The current value of a variable."""
-        return self._adapter.get_value(name)
+        value: Value = self._adapter.get_value(name)
+        return value
 
     def set_input(self, name: str, time: int, value: Value) -> None:
         """An input has ``value`` from ``time`` on.
@@ -153,12 +154,11 @@ class FmuDriver:
         jumped_back = 0.0
         if self._started:
             back = (self._adapter.simulation_time_ns + self._shift - time) / 1e9
-            if back > self.step_size / 2:
-                jumped_back = back
-                if restart:
-                    self._restart()
-                else:
-                    self._shift = time - self._adapter.simulation_time_ns
+            jumped_back = back if back > self.step_size / 2 else 0.0
+            if jumped_back and restart:
+                self._restart()
+            elif jumped_back:
+                self._shift = time - self._adapter.simulation_time_ns
         if not self._started:
             self._begin(time)
         steps, behind = self._advance(time - self._shift)

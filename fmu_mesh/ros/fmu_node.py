@@ -18,7 +18,7 @@ from typing import Any, ParamSpec, TypeVar
 from ..errors import CallRefused, ConfigurationError, DeadlineExceeded, FmuError, FmuMeshError
 from ..model.description import Value, Variable
 from .driving import DriveSettings, FmuDriver, Turn
-from .node_parameters import RosNode, declare_parameters, names_of, parameter_values, undeclare_parameters
+from .node_parameters import RosNode, declare_parameters, names_of, parameter_values, undeclare_parameters, value_of
 from .node_topics import Topic, fill, message_time, own_names, topics_of, values_in
 from .peer import message_class, ros_module
 
@@ -179,6 +179,12 @@ class FmuNode:
         self._set_values(parameter_values(node, self._variables))
         for topic in topics:
             self._open(topic)
+        carried = {variable for topic in topics for _, variable in topic.fields}
+        for variable in description.with_causality("input", "output"):
+            if variable.name not in carried:
+                self._log.warning(
+                    f"'{variable.name}' has no topic: no message of std_msgs carries {variable.type_name}"
+                )
         if self._parameter("publish_clock"):
             self._clock_publisher = node.create_publisher(message_class("rosgraph_msgs/msg/Clock"), "/clock", 10)
         self._checking = self._check_parameters
@@ -307,7 +313,7 @@ class FmuNode:
             if variable is None or parameter.value is None:
                 continue
             try:
-                accepted.append((variable.name, driver.check_value(variable.name, parameter.value)))
+                accepted.append((variable.name, driver.check_value(variable.name, value_of(variable, parameter.value))))
             except CallRefused as error:
                 return result(successful=False, reason=str(error))
         for name, value in accepted:
@@ -383,9 +389,7 @@ class FmuNode:
             self._node.destroy_timer(self._timer)
             self._timer = None
 
-    def _call(
-        self, function: Callable[Arguments, Result], *args: Arguments.args, **kwargs: Arguments.kwargs
-    ) -> Result:
+    def _call(self, function: Callable[Arguments, Result], *args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
         """Call something on the FMU's thread and wait for it."""
         return self._result(self._fmu_thread.submit(function, *args, **kwargs))
 

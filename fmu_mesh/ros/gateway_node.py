@@ -62,9 +62,7 @@ class RclpyProfile:
     def subscribe(self, topic: Topic, take: Take) -> None:
         """Be a subscriber of ``topic``."""
         kind = message_class(topic.message)
-        self._subscriptions.append(
-            self._node.create_subscription(kind, topic.name, take, _quality(topic), raw=True)
-        )
+        self._subscriptions.append(self._node.create_subscription(kind, topic.name, take, _quality(topic), raw=True))
 
     def close(self) -> None:
         """Destroy everything."""
@@ -174,7 +172,9 @@ class GatewayNode:
 
     def _declare_parameters(self, client: MeshClient, plan: RosPlan) -> None:
         """The parameters of the mesh as those of the node, with their current values."""
-        references = {parameter.name: f"{parameter.instance}.{parameter.variable.name}" for parameter in plan.parameters}
+        references = {
+            parameter.name: f"{parameter.instance}.{parameter.variable.name}" for parameter in plan.parameters
+        }
         self._targets = {name: client.target(reference) for name, reference in references.items()}
         values = {reading.key: reading.value for reading in client.get(list(self._targets.values()))}
         descriptor = ros_module("rcl_interfaces.msg").ParameterDescriptor
@@ -213,4 +213,3 @@ def _quality(topic: Topic) -> Any:  # noqa: ANN401 a type of rclpy
     qos = ros_module("rclpy.qos")
     reliability = {"reliable": qos.ReliabilityPolicy.RELIABLE, "best_effort": qos.ReliabilityPolicy.BEST_EFFORT}
     return qos.QoSProfile(depth=DEPTH, reliability=reliability[topic.reliability])
-

@@ -1,6 +1,7 @@
 """`python -m fmu_mesh.ros.node`: an FMU, or a mesh, as a ROS 2 lifecycle node; a drop-in for `fmi_adapter_node`.
 
-With the parameter `fmu_path` it runs an FMU; with `config` it is the gateway of the mesh that this file describes. rclpy comes from the user's own ROS; importing this module does not need it. A program of its own can put the node into
+With the parameter `fmu_path` it runs an FMU; with `config` it is the gateway of the mesh that this file describes.
+rclpy comes from the user's own ROS; importing this module does not need it. A program of its own can put the node into
 its executor: `create_node`.
 """
 
@@ -123,9 +124,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     rclpy.init(args=None if arguments is None else [sys.argv[0], *arguments])
     node = create_node()
     try:
-        if node.get_parameter("autostart").value:
-            if node.trigger_configure() == ros_module("rclpy.lifecycle").TransitionCallbackReturn.SUCCESS:
-                node.trigger_activate()
+        done = ros_module("rclpy.lifecycle").TransitionCallbackReturn.SUCCESS
+        if node.get_parameter("autostart").value and node.trigger_configure() == done:
+            node.trigger_activate()
         rclpy.spin(node)
     except (KeyboardInterrupt, executors.ExternalShutdownException):
         pass

@@ -12,6 +12,7 @@ from typing import Any
 from ..adapter import FMIAdapter
 from ..errors import CallRefused, ConfigurationError
 from ..model.description import ModelDescription, Value, Variable
+from ..model.types import nested
 from .names import NameProblem, name_problems, ros_name
 from .peer import ros_module
 
@@ -21,6 +22,7 @@ __all__ = [
     "names_of",
     "parameter_values",
     "undeclare_parameters",
+    "value_of",
 ]
 
 RosNode = Any
@@ -93,8 +95,17 @@ def undeclare_parameters(node: RosNode, names: Sequence[str]) -> None:
 
 def parameter_values(node: RosNode, variables: Mapping[str, Variable]) -> dict[str, Value]:
     """The values of the parameters that are set, by variable; ``variables`` are by parameter."""
-    values = {variable.name: node.get_parameter(name).value for name, variable in variables.items()}
-    return {name: value for name, value in values.items() if value is not None}
+    values = {variable: node.get_parameter(name).value for name, variable in variables.items()}
+    return {variable.name: value_of(variable, value) for variable, value in values.items() if value is not None}
+
+
+def value_of(variable: Variable, parameter: Any) -> Value:  # noqa: ANN401 any type that a parameter can have
+    """The value of a parameter as that of a variable: an array of ROS has one dimension, that of FMI has its own."""
+    value: Value = parameter
+    if variable.shape and not isinstance(parameter, str) and hasattr(parameter, "__len__"):
+        elements = list(parameter)
+        value = nested(elements, variable.shape) if len(elements) == variable.size else elements
+    return value
 
 
 def initialize_from_parameters(node: RosNode, adapter: FMIAdapter, names: Mapping[str, str] | None = None) -> list[str]:

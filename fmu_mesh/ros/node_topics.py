@@ -14,6 +14,7 @@ import msgspec
 from ..errors import ConfigurationError
 from ..model.description import ModelDescription, Value, Variable
 from ..model.findings import Findings, listed, nearest
+from ..model.types import flattened, nested
 from ..model.yaml_text import Plain, read
 from .names import topic_problem
 from .node_parameters import names_of
@@ -37,12 +38,14 @@ class Topic(msgspec.Struct, frozen=True):
         message: type, such as `std_msgs/msg/Float64`.
         direction: seen from the FMU.
         fields: (path in the message, variable).
+        shape: of the variable, where the message carries one array.
     """
 
     name: str
     message: str
     direction: Literal["in", "out"]
     fields: tuple[tuple[str, str], ...]
+    shape: tuple[int, ...] = ()
 
 
 class _Message(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -72,6 +75,8 @@ def topics_of(
 ) -> list[Topic]:
     """The topics of an FMU: one per input and output, as `fmi_adapter` has them, and those of ``messages``.
 
+    What no message of `std_msgs` carries (Binary, arrays of Boolean or String) has none.
+
     Args:
         description: of the FMU.
         names: ROS names by variable where the usual ones do not do.
@@ -89,7 +94,7 @@ def topics_of(
     mapped = {variable for topic in topics for _, variable in topic.fields}
     for variable in ends.values():
         if variable.name not in mapped:
-            topics += _own_topics(variable, by_variable[variable.name], problems, stamped=stamped)
+            topics += _own_topics(variable, by_variable[variable.name], stamped=stamped)
     seen: dict[str, Topic] = {}
     for topic in topics:
         other = seen.setdefault(topic.name, topic)
@@ -107,8 +112,11 @@ def fill(topic: Topic, message: Any, values: Mapping[str, Value], time: int) -> 
     for path, variable in topic.fields:
         owner, name, index = _place(message, path)
         if index is None:
+            value = values[variable]
+            if topic.shape:
+                value = flattened(value, len(topic.shape))
             # A field takes its own type only; a truth value or a whole number is a number there.
-            setattr(owner, name, type(getattr(owner, name))(values[variable]))
+            setattr(owner, name, value if topic.shape else type(getattr(owner, name))(value))
         else:
             getattr(owner, name)[index] = values[variable]
 
@@ -123,7 +131,8 @@ def values_in(topic: Topic, message: Any) -> dict[str, Value]:  # noqa: ANN401 a
     for path, variable in topic.fields:
         owner, name, index = _place(message, path)
         field = getattr(owner, name)
-        values[variable] = field if index is None else field[index]
+        value = field if index is None else field[index]
+        values[variable] = nested(list(value), topic.shape) if topic.shape else value
     return values
 
 
@@ -135,14 +144,13 @@ def message_time(message: Any, now: int) -> int:  # noqa: ANN401 a ROS message
     return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
 
 
-def _own_topics(variable: Variable, name: str, problems: list[str], *, stamped: bool) -> list[Topic]:
+def _own_topics(variable: Variable, name: str, *, stamped: bool) -> list[Topic]:
     direction: Literal["in", "out"] = "in" if variable.causality == "input" else "out"
-    message = default_type(variable.type)
+    message = default_type(variable.type, array=bool(variable.shape))
     if message is None:
-        problems.append(f"no message of std_msgs carries '{variable.name}', which is of type {variable.type}")
         return []
-    topics = [Topic(name, message, direction, (("data", variable.name),))]
-    if stamped and message != "std_msgs/msg/String":
+    topics = [Topic(name, message, direction, (("data", variable.name),), variable.shape)]
+    if stamped and not variable.shape and message != "std_msgs/msg/String":
         topics.append(Topic(f"{name}_stamped", STAMPED, direction, ((STAMPED_FIELD, variable.name),)))
     return topics
 
@@ -177,7 +185,7 @@ def _mapped(entry: str, ends: Mapping[str, Variable], problems: list[str]) -> To
 def _parsed(entry: str) -> tuple[str, _Message] | None:
     findings = Findings("messages")
     plain: Plain = read(entry, findings, {})
-    if len(list(findings)) or not isinstance(plain, dict) or len(plain) != 1:
+    if findings or not isinstance(plain, dict) or len(plain) != 1:
         return None
     [(name, content)] = plain.items()
     try:

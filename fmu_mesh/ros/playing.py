@@ -13,7 +13,7 @@ import threading
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, Self
 
 import msgspec
 import numpy as np
@@ -110,7 +110,7 @@ class Bag:
         except (AnyReaderError, OSError, ValueError) as error:
             raise ConfigurationError(f"'{path}' cannot be read as a bag: {error}.") from error
 
-    def __enter__(self) -> Bag:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:

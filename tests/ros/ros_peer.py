@@ -11,8 +11,9 @@ import os
 import time
 import warnings
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Self, TypeVar
 
 import pytest
 
@@ -63,7 +64,7 @@ class Ros:
         self._executor = SingleThreadedExecutor(context=self.context)
         self._nodes: list[Any] = []
 
-    def __enter__(self) -> Ros:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -115,7 +116,7 @@ class Ros:
     def matched(self, *ends: Any) -> None:  # noqa: ANN401 types of rclpy
         """Wait until every publisher and subscription has somebody at the other end."""
         for end in ends:
-            self.until(lambda end=end: _matches(end), f"somebody else on '{end.topic_name}'")
+            self.until(partial(_matches, end), f"somebody else on '{end.topic_name}'")
 
     def called(self, client: Any, request: Any) -> Any:  # noqa: ANN401 types of rclpy
         """The answer of a service."""
@@ -133,5 +134,3 @@ class Ros:
 def _matches(end: Any) -> bool:  # noqa: ANN401 types of rclpy
     count = getattr(end, "get_subscription_count", None) or end.get_publisher_count
     return bool(count())
-
-

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +36,9 @@ def messages_of(path: Path) -> dict[str, list[tuple[int, Any]]]:
 
     found: dict[str, list[tuple[int, Any]]] = {}
     with path.open("rb") as file:
-        for _, channel, message, decoded in make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages():
+        for _, channel, message, decoded in make_reader(
+            file, decoder_factories=[DecoderFactory()]
+        ).iter_decoded_messages():
             assert message.publish_time == message.log_time
             found.setdefault(channel.topic, []).append((message.log_time, decoded))
     return found
@@ -47,7 +48,9 @@ def bytes_of(path: Path) -> list[tuple[str, int, bytes]]:
     from mcap.reader import make_reader  # noqa: PLC0415 an optional dependency
 
     with path.open("rb") as file:
-        return [(channel.topic, message.log_time, message.data) for _, channel, message in make_reader(file).iter_messages()]
+        return [
+            (channel.topic, message.log_time, message.data) for _, channel, message in make_reader(file).iter_messages()
+        ]
 
 
 def run(*arguments: str | Path) -> None:
@@ -102,9 +105,11 @@ def test_a_topic_of_the_ros_section_is_recorded_as_it_is_with_stamps_of_simulati
 
 
 def test_an_instance_with_larger_steps_has_messages_at_its_own_points_only(tmp_path: Path) -> None:
-    instances = {"fast": {"fmu": "Gain"}, "slow": {"fmu": "Gain", "step_size": 0.004}}
+    instances: dict[str, dict[str, Any]] = {"fast": {"fmu": "Gain"}, "slow": {"fmu": "Gain", "step_size": 0.004}}
     record = {"file": "pair.mcap"}
-    config = write_config(tmp_path, stop_time=0.02, instances=instances, connections=("fast.y -> slow.u",), record=record)
+    config = write_config(
+        tmp_path, stop_time=0.02, instances=instances, connections=("fast.y -> slow.u",), record=record
+    )
 
     run("launch", config, "--local", "--no-progress")
 
@@ -145,7 +150,11 @@ def test_the_messages_are_read_by_ros_itself(tmp_path: Path) -> None:
     run("launch", config, "--local", "--no-progress")
     run("launch", config, "--local", "--no-progress", "--output", tmp_path / "pair.mcap")
 
-    states = [deserialize_message(data, TwistStamped) for topic, _, data in bytes_of(tmp_path / "pair.mcap") if topic == "/state"]
+    states = [
+        deserialize_message(data, TwistStamped)
+        for topic, _, data in bytes_of(tmp_path / "pair.mcap")
+        if topic == "/state"
+    ]
 
     rows = rows_of(tmp_path / "pair.csv")
     assert [(m.twist.linear.x, m.twist.angular.z) for m in states] == [(row[1], row[4]) for row in rows]
@@ -222,13 +231,13 @@ def test_an_instance_with_larger_steps_is_given_a_value_at_its_own_points() -> N
 
 
 @pytest.fixture
-def delay(place: Place) -> Iterator[tuple[Place, Path, Launched]]:
+def delay(place: Place) -> tuple[Place, Path, Launched]:
     """A mesh of the delay alone that rests at its first point."""
     instances = {"delay": {"fmu": "TransportDelay", "start_values": {"d": 0.1, "x": 1.5}}}
     config = write_config(place.folder, instances=instances, connections=(), name="played", stop_time=0.4)
     launched = place.start("launch", config, "--paused")
     place.note()
-    yield place, config, launched
+    return place, config, launched
 
 
 def test_a_recorded_output_as_input_gives_every_float_of_the_connection(delay: tuple[Place, Path, Launched]) -> None:
@@ -300,4 +309,6 @@ def test_what_cannot_be_played_is_told(
     played = place.run("play", place.folder / arguments[0], *arguments[1:])
 
     assert played.wait() == 2
-    assert complaint.replace("{bag}", str(place.folder / "a.mcap")).replace("'no", f"'{place.folder}/no") in played.errors
+    assert (
+        complaint.replace("{bag}", str(place.folder / "a.mcap")).replace("'no", f"'{place.folder}/no") in played.errors
+    )

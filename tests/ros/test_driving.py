@@ -29,7 +29,9 @@ def gain() -> Iterator[FmuDriver]:
 
 
 def y(driver: FmuDriver, time: int, *, restart: bool = True) -> float:
-    return float(driver.turn(time, ["y"], restart=restart).values["y"])
+    value = driver.turn(time, ["y"], restart=restart).values["y"]
+    assert isinstance(value, float)
+    return value
 
 
 def test_the_first_turn_is_the_time_zero_of_the_fmu_and_takes_no_step(gain: FmuDriver) -> None:
@@ -66,7 +68,7 @@ def test_an_input_holds_from_its_stamp_on_and_the_last_of_two_with_one_stamp_cou
     assert [y(gain, UNIX_NS + k * 100 * MS) for k in (1, 2)] == [0.0, 7.0]
 
 
-def test_catching_up_is_bounded_and_told_and_skips_no_step(gain: FmuDriver) -> None:
+def test_catching_up_is_bounded_and_told_and_skips_no_step() -> None:
     driver = FmuDriver(DriveSettings(fmu_path=FMUS / "Gain.fmu", step_size=0.1, max_steps=4))
     try:
         driver.turn(1, [], restart=True)

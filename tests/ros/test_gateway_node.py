@@ -13,9 +13,9 @@ from tests.ros.ros_peer import Ros, ros_or_skip
 
 ros_or_skip()
 
-LOOP = {
-    "instances": {"plant": {"fmu": "Integrator", "start_values": {"y": 1.0}}, "controller": {"fmu": "Gain"}},
-    "connections": ("plant.y -> controller.u", "controller.y -> plant.u"),
+LOOP: dict[str, dict[str, Any]] = {
+    "plant": {"fmu": "Integrator", "start_values": {"y": 1.0}},
+    "controller": {"fmu": "Gain", "start_values": {"k": -3.0}},
 }
 ROS = {
     "profile": "rclpy",
@@ -47,8 +47,15 @@ def test_a_feedback_loop_at_500_hz_gives_the_floats_of_one_process_while_ros_wat
     from rosgraph_msgs.msg import Clock  # noqa: PLC0415 as above
 
     simulation = {"step_size": 0.002, "real_time_factor": 1.0}
-    loop = {**LOOP, "instances": {**LOOP["instances"], "controller": {"fmu": "Gain", "start_values": {"k": -3.0}}}}
-    config = write_config(place.folder, name="loop", stop_time=2.0, simulation=simulation, ros=ROS, **loop)
+    config = write_config(
+        place.folder,
+        name="loop",
+        instances=LOOP,
+        connections=("plant.y -> controller.u", "controller.y -> plant.u"),
+        stop_time=2.0,
+        simulation=simulation,
+        ros=ROS,
+    )
     reference = place.folder / "reference.csv"
     command(place, "launch", config, "--local", "--output", reference)
     launched = place.start("launch", config, "--paused")
