@@ -55,7 +55,7 @@ def names_of(variables: Sequence[Variable], names: Mapping[str, str] | None = No
 
 
 def declare_parameters(
-    node: RosNode, description: ModelDescription, names: Mapping[str, str] | None = None
+    node: RosNode, description: ModelDescription, names: Mapping[str, str] | None = None, prefix: str = ""
 ) -> dict[str, Variable]:
     """Declare a parameter, not set, for every variable; one that the node has already stays as it is.
 
@@ -66,6 +66,7 @@ def declare_parameters(
         node: the node.
         description: of the FMU.
         names: ROS names by variable, where the usual ones do not do.
+        prefix: what comes before each name, such as `pendulum.` where a node has several FMUs.
 
     Returns:
         The variables by the names of their parameters.
@@ -77,7 +78,7 @@ def declare_parameters(
     names_by_variable = names_of(description.variables, names)
     descriptor = ros_module("rcl_interfaces.msg").ParameterDescriptor
     for variable in description.variables:
-        name = names_by_variable[variable.name]
+        name = prefix + names_by_variable[variable.name]
         if not node.has_parameter(name):
             text = variable.description or f"{variable.causality} of the FMU"
             unit = f" in {variable.unit}" if variable.unit else ""
@@ -108,13 +109,16 @@ def value_of(variable: Variable, parameter: Any) -> Value:  # noqa: ANN401 any t
     return value
 
 
-def initialize_from_parameters(node: RosNode, adapter: FMIAdapter, names: Mapping[str, str] | None = None) -> list[str]:
+def initialize_from_parameters(
+    node: RosNode, adapter: FMIAdapter, names: Mapping[str, str] | None = None, prefix: str = ""
+) -> list[str]:
     """Declare a parameter for every variable of an FMU, and give the FMU the values of those that are set.
 
     Args:
         node: the node.
         adapter: in initialization mode.
         names: ROS names by variable, where the usual ones do not do.
+        prefix: what comes before each name, such as `pendulum.` where a node has several FMUs.
 
     Returns:
         The variables that were given a value.
@@ -123,7 +127,7 @@ def initialize_from_parameters(node: RosNode, adapter: FMIAdapter, names: Mappin
         ConfigurationError: two variables have one name, or one has none in ROS.
         CallRefused: a value has the wrong type or range, or cannot be set; all of them are named.
     """
-    values = parameter_values(node, declare_parameters(node, adapter.description, names))
+    values = parameter_values(node, declare_parameters(node, adapter.description, names, prefix))
     refused = []
     for name, value in values.items():
         try:
