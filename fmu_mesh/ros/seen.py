@@ -6,8 +6,9 @@ from collections.abc import Mapping
 
 import msgspec
 
-from ..model.description import ModelDescription, Variable
-from ..wire.views import InstanceInfo
+from ..model.description import Causality, ModelDescription, Variability, Variable
+from ..model.types import FMI2_TYPES, VariableType
+from ..wire.views import InstanceInfo, VariableView
 
 __all__ = ["descriptions_of"]
 
@@ -18,26 +19,25 @@ def descriptions_of(infos: Mapping[str, InstanceInfo]) -> dict[str, ModelDescrip
 
 
 def _description(info: InstanceInfo) -> ModelDescription:
-    variables = tuple(
-        msgspec.convert(
-            {
-                "name": view.name,
-                "value_reference": 0,
-                "type": view.type,
-                "causality": view.causality,
-                "variability": view.variability,
-                "unit": view.unit,
-                "description": view.description,
-            },
-            Variable,
-        )
-        for view in info.variables
-    )
     return ModelDescription(
         model_name=info.model_name,
         model_identifier=info.model_name,
         fmi_version=info.fmi_version,
         kind="co_simulation",
         guid="",
-        variables=variables,
+        variables=tuple(_variable(view) for view in info.variables),
+    )
+
+
+def _variable(view: VariableView) -> Variable:
+    return Variable(
+        name=view.name,
+        value_reference=0,
+        type=msgspec.convert(FMI2_TYPES.get(view.type, view.type), VariableType),
+        causality=msgspec.convert(view.causality, Causality),
+        variability=msgspec.convert(view.variability, Variability),
+        unit=view.unit,
+        description=view.description,
+        declared_type=view.type,
+        shape=view.shape,
     )

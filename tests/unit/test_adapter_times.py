@@ -77,7 +77,10 @@ def test_inputs_before_the_start_are_on_the_clock_that_the_start_decides(gain: F
 
 @pytest.mark.parametrize(
     ("start", "time", "words"),
-    [(Nanoseconds(5), 1.0, "1.0 is a time in s, and this adapter's clock is in ns"), (0.0, Nanoseconds(5), "in ns, and")],
+    [
+        (Nanoseconds(5), 1.0, "1.0 is a time in s, and this adapter's clock is in ns"),
+        (0.0, Nanoseconds(5), "in ns, and"),
+    ],
 )
 def test_seconds_and_times_of_ros_are_not_mixed(gain: FMIAdapter, start: Any, time: Any, words: str) -> None:
     gain.exit_initialization_mode(start)
