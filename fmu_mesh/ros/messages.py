@@ -5,6 +5,7 @@ Owns which values belong into one message: those of one communication point, nev
 
 from __future__ import annotations
 
+import math
 import re
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -13,9 +14,10 @@ from typing import Any
 import numpy as np
 
 from ..model.description import Value
+from ..model.types import flattened, nested
 from .cdr import CdrError, Codec, Message
 from .stamp import from_stamp, to_stamp
-from .topics import Topic
+from .topics import Port, Topic
 from .types import Basic, MessageTypes, Sequence
 
 __all__ = ["Assembler", "Disassembler"]
@@ -36,7 +38,7 @@ class Assembler:
         self.topic = topic
         self._codec = Codec(types, topic.message)
         self._message = self._codec.empty()
-        self._setters = [_setter(self._message, port.path, types, topic.message) for port in topic.ports]
+        self._setters = [_setter(self._message, port, types, topic.message) for port in topic.ports]
         self._steps = [port.step_points for port in topic.ports]
         self._waiting: list[deque[tuple[int, float, Any]]] = [deque(maxlen=_WAITING) for _ in topic.ports]
         self._last = -1
@@ -100,7 +102,7 @@ class Disassembler:
                     value = value[part]
             except IndexError as error:
                 raise CdrError(f"the message has no '{port.path}'") from error
-            values.append(value.tolist() if isinstance(value, np.ndarray | np.generic) else value)
+            values.append(_in_shape(value, port))
         if not self.topic.stamped:
             return values, None
         stamp = message["header"]["stamp"]
@@ -113,23 +115,45 @@ def _parts(path: str) -> list[str | int]:
     return [int(part[1:-1]) if part.startswith("[") else part for part in _PART.findall(path)]
 
 
-def _setter(message: Message, path: str, types: MessageTypes, name: str) -> Callable[[Any], None]:
-    """A function that puts a value of the mesh at ``path`` of ``message``."""
-    parts = _parts(path)
+def _setter(message: Message, port: Port, types: MessageTypes, name: str) -> Callable[[Any], None]:
+    """A function that puts a value of the mesh into its field of ``message``."""
+    parts = _parts(port.path)
     container: Any = message
     for depth, part in enumerate(parts[:-1]):
         following = container[part]
         if isinstance(parts[depth + 1], int):
-            following = container[part] = _with_length(following, int(parts[depth + 1]) + 1, types, name, path)
+            following = container[part] = _with_length(following, int(parts[depth + 1]) + 1, types, name, port.path)
         container = following
-    kind = types.field(name, path)
-    floats = isinstance(kind, Basic) and kind.kind in ("float64", "float32")
-    last = parts[-1]
+    kind = types.field(name, port.path)
+    element = kind if isinstance(kind, Basic) else getattr(kind, "element", None)
+    floats = isinstance(element, Basic) and element.kind in ("float64", "float32")
+    last, shape = parts[-1], port.variable.shape
+    if shape and "layout" in message:
+        message["layout"]["dim"] = [
+            {"label": f"dim{axis}", "size": size, "stride": math.prod(shape[axis:])} for axis, size in enumerate(shape)
+        ]
+
+    def one(value: Any) -> Any:  # noqa: ANN401 a value of any variable
+        return _FLOATS[value] if floats and isinstance(value, str) else value
 
     def put(value: Any) -> None:  # noqa: ANN401 a value of any variable
-        container[last] = _FLOATS[value] if floats and isinstance(value, str) else value
+        container[last] = [one(own) for own in flattened(value, len(shape))] if shape else one(value)
 
     return put
+
+
+def _in_shape(value: Any, port: Port) -> Value:  # noqa: ANN401 a field of any message
+    """A field as a value of the mesh: an array in the shape of its variable.
+
+    Raises:
+        CdrError: there are too many elements, or too few.
+    """
+    plain: Value = value.tolist() if isinstance(value, np.ndarray | np.generic) else value
+    if not port.variable.shape:
+        return plain
+    if not isinstance(plain, list) or len(plain) != port.variable.size:
+        raise CdrError(f"'{port.path}' needs {port.variable.size} elements for '{port.variable.name}'")
+    return nested(plain, port.variable.shape)
 
 
 def _with_length(elements: Any, length: int, types: MessageTypes, name: str, path: str) -> list[Any]:  # noqa: ANN401

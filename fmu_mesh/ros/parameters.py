@@ -16,9 +16,11 @@ from typing import Any
 import msgspec
 import zenoh
 
+from ..errors import FmuMeshError
 from ..model.description import Value, Variable
 from ..wire.keys import Keys
-from ..wire.values import encode_value, json_encoding
+from ..wire.session import ask
+from ..wire.values import encode_value
 from .cdr import Codec, Message
 from .names import absolute
 from .rmw_zenoh import RmwZenoh, Service
@@ -145,13 +147,11 @@ class ParameterServices:
         """The current value, or what the mesh says to a new one, and the reason where it says no."""
         key = self._keys.variable(parameter.instance, "param", parameter.variable.name)
         payload = encode_value(value) if value is not None else None
-        encoding = json_encoding if payload is not None else None
-        for reply in self._mesh.get(key, payload=payload, encoding=encoding, timeout=_ANSWER_S):
-            if reply.ok is not None:
-                return msgspec.json.decode(reply.ok.payload.to_bytes()), ""
-            if reply.err is not None:
-                return None, reply.err.payload.to_bytes().decode(errors="replace")
-        return None, "the mesh does not answer"
+        try:
+            answer = ask(self._mesh, key, payload, _ANSWER_S, f"'{parameter.name}'")
+        except FmuMeshError as error:
+            return None, error.message
+        return msgspec.json.decode(answer), ""
 
 
 def _kind(variable: Variable) -> int:

@@ -170,7 +170,7 @@ class Resolver:
             variable
             for variable in (description.variables if description is not None else ())
             if variable.causality in ("output", "input") and f"{instance}.{variable.name}" not in self._connected
-            if default_type(variable.type, array=bool(_shape(variable))) is not None
+            if default_type(variable.type, array=bool(variable.shape)) is not None
         ]
         problems = name_problems(variable.name for variable in wanted)
         for problem in problems:
@@ -196,7 +196,7 @@ class Resolver:
             if problems:
                 return
             name = f"{ros_name(port.instance)}/{ros_name(port.variable.name)}"
-        message = entry.item.type or default_type(port.variable.type, array=bool(_shape(port.variable)))
+        message = entry.item.type or default_type(port.variable.type, array=bool(port.variable.shape))
         if message is None:
             text = f"'{reference}' of the type {port.variable.type}, which no message of std_msgs carries"
             self._findings.add(entry.variable_path, text, "a message in `type` and its field in `fields`")
@@ -259,7 +259,7 @@ class Resolver:
         reason = _unfit(kind, port.variable, direction)
         if reason is not None:
             found = f"'{port.path}' of '{message}' for '{port.instance}.{port.variable.name}': {reason}"
-            best = default_type(port.variable.type, array=bool(_shape(port.variable)))
+            best = default_type(port.variable.type, array=bool(port.variable.shape))
             self._findings.add(place, found, f"a field that holds it, as in {best}")
         return reason is None
 
@@ -305,7 +305,7 @@ class Resolver:
 
     def _parameters(self) -> Iterator[Parameter]:
         for instance, description in self._descriptions.items():
-            own = [variable for variable in description.with_causality("parameter") if not _shape(variable)]
+            own = [variable for variable in description.with_causality("parameter") if not variable.shape]
             unusable = {name for problem in name_problems(v.name for v in own) for name in problem.variables}
             for variable in own:
                 if variable.name not in unusable:
@@ -336,7 +336,7 @@ def _unfit(kind: FieldType, variable: Variable, direction: Direction) -> str | N
     """Why a field cannot hold a variable; None if it can."""
     if isinstance(kind, Nested):
         return "it is a message itself"
-    array = bool(_shape(variable))
+    array = bool(variable.shape)
     if array == isinstance(kind, Basic):
         return "an array into one value" if array else "one value into an array; write an index, such as data[0]"
     element = kind if isinstance(kind, Basic) else kind.element
@@ -344,8 +344,3 @@ def _unfit(kind: FieldType, variable: Variable, direction: Direction) -> str | N
         return "its elements are messages themselves"
     source, target = (variable.type, element.kind) if direction == "out" else (element.kind, variable.type)
     return None if carries(target, source) else f"{source} into {target} may lose something"
-
-
-def _shape(_variable: Variable) -> tuple[int, ...]:
-    """The sizes of the dimensions of a variable; empty for a scalar, as every variable of FMI 2.0 is (2.2.7)."""
-    return ()

@@ -241,7 +241,7 @@ _MESSAGES: Mapping[str, str] = {
     "UInt32": "UInt32",
     "UInt64": "UInt64",
     "Boolean": "Bool",
-    "Enumeration": "Int32",
+    "Enumeration": "Int64",
     "String": "String",
 }
 
@@ -275,7 +275,7 @@ _KINDS: Mapping[str, str] = {
     "Real": "float64",
     "Integer": "int32",
     "Boolean": "bool",
-    "Enumeration": "int32",
+    "Enumeration": "int64",
     **{name: name.lower() for name in _MESSAGES if name[0] in "FIU" and name[-1].isdigit()},
     "String": "string",
 }

@@ -17,7 +17,7 @@ def run_router(listen: Sequence[str]) -> Iterator[tuple[str, ...]]:
     Raises:
         ConfigurationError: an endpoint cannot be used.
     """
-    # Peers behind it, such as ROS nodes, learn of each other here and then meet directly: it passes nothing on for them.
+    # Peers behind it, such as ROS nodes, learn of each other here and meet directly: it passes nothing on for them.
     session = open_session(Wiring(mode="router", listen=tuple(listen), gossip=True))
     try:
         yield own_endpoints(session)

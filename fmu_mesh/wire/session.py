@@ -119,7 +119,7 @@ def undeclare_all(*entities: Iterable[_Declared]) -> None:
 
 
 def ask(  # noqa: PLR0913, PLR0917  the parts of one question
-    session: zenoh.Session, key: str, payload: bytes, deadline_s: float, what: str, answer_s: float | None = None
+    session: zenoh.Session, key: str, payload: bytes | None, deadline_s: float, what: str, answer_s: float | None = None
 ) -> bytes:
     """Query ``key`` until somebody is there to answer, and return the answer's payload.
 
@@ -129,7 +129,7 @@ def ask(  # noqa: PLR0913, PLR0917  the parts of one question
     Args:
         session: the session to ask with.
         key: key expression of the queryable.
-        payload: what goes with the query.
+        payload: what goes with the query, if anything.
         deadline_s: how long to wait for an answer, in s.
         what: what is being waited for, for the error.
         answer_s: how long somebody who is there may take to answer, in s, if that is longer.

@@ -137,6 +137,10 @@ class Peer:
         found: dict[str, Any] = json.loads(self.line(number, deadline_s))
         return found
 
+    def count(self) -> int:
+        """How many lines it has written."""
+        return len(self._lines)
+
     def say(self, **what: object) -> None:
         """Send it a JSON line."""
         assert self._popen.stdin is not None

@@ -13,6 +13,8 @@ import sys
 from typing import Any
 
 import rclpy
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
@@ -35,7 +37,7 @@ def say(**what: object) -> None:
     print(json.dumps(what), flush=True)  # noqa: T201 (it is the answer)
 
 
-class Peer(Node):
+class Peer(Node):  # type: ignore[misc]  # rclpy is not always there, so mypy leaves it out
     """The node."""
 
     def __init__(self, orders: dict[str, Any]) -> None:
@@ -65,7 +67,7 @@ class Peer(Node):
 
     def start(self) -> None:
         """Send one message of each kind per period, by the wall clock."""
-        clock = rclpy.clock.Clock(clock_type=rclpy.clock.ClockType.STEADY_TIME)
+        clock = Clock(clock_type=ClockType.STEADY_TIME)
         self.first_ns = self.get_clock().now().nanoseconds + int(self.ahead_s * 1e9)
         self.timer = self.create_timer(self.period_s, self.send, clock=clock)
 

@@ -10,14 +10,18 @@ from __future__ import annotations
 
 import asyncio
 import json
+import struct
 import sys
 import threading
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
+import numpy as np
 import zenoh
 
+from fmu_mesh.ros.parameters import SERVICES
 from fmu_mesh.ros.types import MessageTypes
+
 
 def say(**what: object) -> None:
     print(json.dumps(what), flush=True)  # noqa: T201 (it is the answer)
@@ -95,44 +99,61 @@ def ros_hash(kind: str) -> str | None:
     return found
 
 
+def message_class(kind: str) -> Any:  # noqa: ANN401 a class
+    """A message of ros2_pyterfaces, the types of pyzeros."""
+    from ros2_pyterfaces.cyclone import all_msgs  # noqa: PLC0415  only one of the two is used
+
+    return getattr(all_msgs, kind.rpartition("/")[2])
+
+
+def message(kind: str, number: int) -> Any:  # noqa: ANN401 any message
+    """A message of pyzeros."""
+    made = message_class(kind)()
+    if kind.endswith("TwistStamped"):
+        made.twist.linear.x, made.twist.angular.z, made.header.frame_id = 0.5 * number, -float(number), "zeros"
+    else:
+        made.data = f"text {number}" if kind.endswith("String") else 0.1 * number
+    return made
+
+
+def lines_of(stream: TextIO) -> asyncio.Queue[str | None]:
+    """The lines of a stream for the loop that runs, and None at its end."""
+    lines: asyncio.Queue[str | None] = asyncio.Queue()
+    loop = asyncio.get_running_loop()
+
+    def read() -> None:
+        for line in stream:
+            loop.call_soon_threadsafe(lines.put_nowait, line)
+        loop.call_soon_threadsafe(lines.put_nowait, None)
+
+    threading.Thread(target=read, daemon=True).start()
+    return lines
+
+
 def pyzeros(orders: dict[str, Any]) -> None:
     """Be a node of pyzeros."""
     import asyncio_for_robotics as afor  # noqa: PLC0415  only one of the two is used
     import pyzeros as zeros  # noqa: PLC0415  likewise
-    from ros2_pyterfaces.cyclone import all_msgs  # noqa: PLC0415  likewise
+    from pyzeros.builtin_msgs import Attachment  # noqa: PLC0415  likewise
 
-    def message_class(kind: str) -> Any:  # noqa: ANN401 a class
-        return getattr(all_msgs, kind.rpartition("/")[2])
-
-    def message(kind: str, number: int) -> Any:  # noqa: ANN401 any message
-        made = message_class(kind)()
-        if kind.endswith("TwistStamped"):
-            made.twist.linear.x, made.twist.angular.z, made.header.frame_id = 0.5 * number, -float(number), "zeros"
-        else:
-            made.data = f"text {number}" if kind.endswith("String") else 0.1 * number
-        return made
-
+    # Its own code for the attachment is compiled at the first use, for a minute; the other peer's is left as it is.
+    Attachment.serialize = lambda own: (
+        bytes(4)
+        + struct.pack("<qqB16s", int(own.sequence_number), int(own.source_timestamp), 16, bytes(own.source_gid))
+    )
     collected = Collected(orders)
 
     async def listen(topic: str, subscriber: Any) -> None:  # noqa: ANN401 a subscriber of pyzeros
         async for own in subscriber.listen_reliable(queue_size=10_000):
             collected.take(topic, own)
 
-    @afor.scoped
+    @afor.scoped  # type: ignore[untyped-decorator]  # pyzeros is not always there, so mypy leaves it out
     async def talk() -> None:
         group = afor.Scope.current().task_group
         for topic, kind in orders["subscribe"].items():
             group.create_task(listen(topic, zeros.Sub(message_class(kind), topic)))
         publishers = {kind: zeros.Pub(message_class(kind), topic) for topic, kind in orders["publish"].items()}
-        lines: asyncio.Queue[str | None] = asyncio.Queue()
-        loop = asyncio.get_running_loop()
-
-        def read() -> None:
-            for line in sys.stdin:
-                loop.call_soon_threadsafe(lines.put_nowait, line)
-            loop.call_soon_threadsafe(lines.put_nowait, None)
-
-        threading.Thread(target=read, daemon=True).start()
+        lines = lines_of(sys.stdin)
         say(declared=len(orders["subscribe"]) + len(publishers))
         number = 0
         while await lines.get() is not None:
@@ -152,5 +173,50 @@ def pyzeros(orders: dict[str, Any]) -> None:
         asyncio.run(talk())
 
 
+def parameters(orders: dict[str, Any]) -> None:
+    """Get, set and list parameters of a node as a client of zenoh-ros2-sdk; prints the answers."""
+    from zenoh_ros2_sdk import ROS2ServiceClient  # noqa: PLC0415  only one of the two is used
+    from zenoh_ros2_sdk.session import ZenohSession  # noqa: PLC0415  likewise
+
+    types = MessageTypes("kilted")
+    store = ZenohSession.get_instance("127.0.0.1", orders["port"])
+    for name in ("rcl_interfaces/msg/Parameter", "rcl_interfaces/msg/SetParametersResult"):
+        store.register_message_type(types.definition(name), name)
+    value, parameter = (store.store.types[f"rcl_interfaces/msg/{name}"] for name in ("ParameterValue", "Parameter"))
+
+    def client(service: str) -> Any:  # noqa: ANN401 a client
+        camel = "".join(word.capitalize() for word in service.split("_"))
+        kind = f"rcl_interfaces/srv/{camel}"
+        file = Path(sys.prefix) / "share" / f"{kind}.json"
+        hashes = {own["type_name"]: own["hash_string"] for own in json.loads(file.read_text())["type_hashes"]}
+        return ROS2ServiceClient(
+            f"{orders['node']}/{service}",
+            kind,
+            request_definition=SERVICES[camel][0],
+            response_definition=SERVICES[camel][1],
+            domain_id=orders["domain"],
+            router_ip="127.0.0.1",
+            router_port=orders["port"],
+            type_hash=hashes[kind],
+        )
+
+    def double(number: float) -> Any:  # noqa: ANN401 a message
+        return value(3, False, 0, number, "", *(np.zeros(0, kind) for kind in ("u1", "?", "i8", "f8")), [])  # noqa: FBT003
+
+    def get(*names: str) -> list[tuple[int, float]]:
+        answer = getter.call(names=list(names))
+        return [(int(own.type), float(own.double_value)) for own in answer.values]
+
+    def set_(name: str, number: float) -> tuple[bool, str]:
+        answer = setter.call(parameters=[parameter(name=name, value=double(number))])
+        return bool(answer.results[0].successful), str(answer.results[0].reason)
+
+    getter, setter = client("get_parameters"), client("set_parameters")
+    say(declared=True)
+    for line in sys.stdin:
+        order = json.loads(line)["order"]
+        say(answer=get(*order["get"]) if "get" in order else set_(*order["set"]))
+
+
 if __name__ == "__main__":
-    {"sdk": sdk, "pyzeros": pyzeros}[sys.argv[1]](json.loads(sys.argv[2]))
+    {"sdk": sdk, "pyzeros": pyzeros, "parameters": parameters}[sys.argv[1]](json.loads(sys.argv[2]))
