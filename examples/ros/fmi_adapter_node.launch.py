@@ -42,9 +42,7 @@ def generate_launch_description() -> LaunchDescription:
     return LaunchDescription(
         [
             DeclareLaunchArgument("fmu_path", description="path of the FMU"),
-            RegisterEventHandler(
-                OnStateTransition(target_lifecycle_node=node, goal_state="inactive", entities=[activate])
-            ),
+            RegisterEventHandler(configured),
             node,
             change(node, Transition.TRANSITION_CONFIGURE),
         ]

@@ -86,7 +86,7 @@ class FMIAdapter:
         self._clock: Clock = SecondsClock(0.0)
         self._elapsed = Fraction(0)
         self._point = 0
-        folder = Path(tempfile.mkdtemp(prefix="fmu_mesh-"))
+        self._folder = folder = Path(tempfile.mkdtemp(prefix="fmu_mesh-"))
         try:
             self._instance = open_instance(path, name, description, folder, _forward)
             self._release = weakref.finalize(self, _release, self._instance, folder)
@@ -314,6 +314,10 @@ class FMIAdapter:
         """Free the FMU and remove its files. Never raises; may be called twice."""
         self._mode = "closed"
         self._release()
+
+    def remove_files(self) -> None:
+        """From any thread, when the process is about to be ended while the FMU does not return: remove its files."""
+        shutil.rmtree(self._folder, ignore_errors=True)
 
     def _demand(self, mode: Literal["initialization", "stepping"] | None, call: str) -> None:
         if self._mode in ("initialization", "stepping") and mode in (None, self._mode):

@@ -175,6 +175,10 @@ class FmuDriver:
         """Free the FMU and remove its files. Never raises; may be called twice."""
         self._adapter.close()
 
+    def remove_files(self) -> None:
+        """From any thread, when the process is about to be ended while the FMU does not return: remove its files."""
+        self._adapter.remove_files()
+
     @property
     def _ended(self) -> bool:
         return self._steps >= self._last_step

@@ -136,6 +136,7 @@ class FmuNode:
                 self._fmu_thread.submit(driver.close).result(_CLOSE_S)
             except FutureTimeout:
                 self._log.error(f"the FMU did not return within {_CLOSE_S:g} s; it is left behind")
+                driver.remove_files()
         for _, publisher, _ in self._publishers:
             self._node.destroy_publisher(publisher)
         if self._clock_publisher is not None:

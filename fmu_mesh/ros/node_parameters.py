@@ -96,8 +96,8 @@ def undeclare_parameters(node: RosNode, names: Sequence[str]) -> None:
 
 def parameter_values(node: RosNode, variables: Mapping[str, Variable]) -> dict[str, Value]:
     """The values of the parameters that are set, by variable; ``variables`` are by parameter."""
-    values = {variable: node.get_parameter(name).value for name, variable in variables.items()}
-    return {variable.name: value_of(variable, value) for variable, value in values.items() if value is not None}
+    values = [(variable, node.get_parameter(name).value) for name, variable in variables.items()]
+    return {variable.name: value_of(variable, value) for variable, value in values if value is not None}
 
 
 def value_of(variable: Variable, parameter: Any) -> Value:  # noqa: ANN401 any type that a parameter can have

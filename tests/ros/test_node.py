@@ -21,6 +21,7 @@ import pytest
 
 from fmu_mesh import FMIAdapter
 from fmu_mesh.fmu import Fmi2Instance
+from fmu_mesh.ros.names import ros_name
 from tests.fmus.helpers import find_fmu
 from tests.helpers import FMUS
 from tests.ros.ros_peer import DEADLINE_S, Ros, ros_or_skip
@@ -496,17 +497,23 @@ def test_the_fmu_is_called_from_one_thread_only(ros: Ros, monkeypatch: pytest.Mo
 # ---- a process of its own ----
 
 
-def test_a_process_is_the_source_of_time_for_others_and_leaves_nothing_behind(ros: Ros, tmp_path: Path) -> None:
-    temporary = tmp_path / "temporary"
+def process(ros: Ros, temporary: Path, **parameters: Any) -> subprocess.Popen[str]:
+    """A node that runs an FMU and starts by itself, with its files in a folder of its own."""
     temporary.mkdir()
-    command = [sys.executable, "-m", "fmu_mesh.ros.node", "--ros-args", "-r", "__node:=pendulum", "-r", "__ns:=/lab"]
-    for parameter in (f"fmu_path:={PENDULUM}", "autostart:=true", "publish_clock:=true", "real_time_factor:=10.0"):
-        command += ["-p", parameter]
-    process = subprocess.Popen(command, env={**os.environ, **ros.environment, "TMPDIR": str(temporary)})
+    command = [sys.executable, "-m", "fmu_mesh.ros.node", "--ros-args", "-r", "__node:=own", "-r", "__ns:=/lab"]
+    for name, value in {"autostart": "true", **parameters}.items():
+        command += ["-p", f"{name}:={value}"]
+    environment = {**os.environ, **ros.environment, "TMPDIR": str(temporary)}
+    return subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)
+
+
+def test_a_process_is_the_source_of_time_for_others_and_leaves_nothing_behind(ros: Ros, tmp_path: Path) -> None:
+    import rclpy  # noqa: PLC0415 only where ROS is installed
+
+    temporary = tmp_path / "temporary"
+    node = process(ros, temporary, fmu_path=PENDULUM, publish_clock="true", real_time_factor="10.0")
     try:
         follower = ros.peer("follower")
-        import rclpy  # noqa: PLC0415 only where ROS is installed
-
         follower.set_parameters([rclpy.Parameter("use_sim_time", value=True)])
         subscription, messages = ros.collect(follower, type(float64(0.0)), "/lab/a")
         ros.matched(subscription)
@@ -514,9 +521,64 @@ def test_a_process_is_the_source_of_time_for_others_and_leaves_nothing_behind(ro
         ros.until(lambda: messages, "the angle")
         assert follower.get_clock().now().nanoseconds < 600_000 * MS
         assert list(temporary.iterdir())
-        process.send_signal(signal.SIGTERM)
-        assert process.wait(DEADLINE_S) == 0
+        node.send_signal(signal.SIGTERM)
+        assert node.wait(DEADLINE_S) == 0
     finally:
-        process.kill()
-        process.wait()
+        node.kill()
+        node.communicate()
     assert list(temporary.iterdir()) == []
+
+
+def test_while_an_fmu_hangs_the_node_answers_and_its_end_is_bounded_and_clean(
+    ros: Ros, tmp_path: Path, faulty: Path
+) -> None:
+    from lifecycle_msgs.srv import GetState  # noqa: PLC0415 only where ROS is installed
+
+    temporary = tmp_path / "temporary"
+    node = process(ros, temporary, fmu_path=faulty, step_size="0.01", hang_at="0.05")
+    try:
+        peer = ros.peer()
+        subscription, messages = ros.collect(peer, type(float64(0.0)), "/lab/y")
+        ros.matched(subscription)
+        client = peer.create_client(GetState, "/lab/own/get_state")
+        ros.until(lambda: messages, "a first message")
+        ros.turn(0.3)
+
+        assert ros.called(client, GetState.Request()).current_state.label == "active"
+        node.send_signal(signal.SIGTERM)
+        assert node.wait(DEADLINE_S) == 3
+    finally:
+        node.kill()
+        _, errors = node.communicate()
+    assert "the FMU did not return within 5 s" in errors
+    assert list(temporary.iterdir()) == []
+
+
+def test_without_ros_the_module_says_how_to_get_it() -> None:
+    program = "import sys; sys.modules['rclpy'] = None; from fmu_mesh.ros.node import main; sys.exit(main([]))"
+
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+
+    assert done.returncode == 2
+    assert done.stderr.startswith("fmu_mesh.ros.node: the ROS package 'rclpy' cannot be imported")
+    assert "source /opt/ros/DISTRO/setup.bash" in done.stderr
+
+
+def test_an_array_is_a_multi_array_with_its_elements_row_by_row(ros: Ros, tmp_path: Path) -> None:
+    from std_msgs.msg import Float64MultiArray  # noqa: PLC0415 only where ROS is installed
+
+    with FMIAdapter(find_fmu("AllTypes3", tmp_path), 0.01) as adapter:
+        arrays = [v for v in adapter.description.variables if v.shape and v.type == "Float64"]
+    [array_in] = [v for v in arrays if v.causality == "input"][:1]
+    [array_out] = [v for v in arrays if v.causality == "output"][:1]
+    node = ros.fmu(fmu_path=str(find_fmu("AllTypes3", tmp_path)), step_size=0.01)
+    peer = ros.peer()
+    publisher = peer.create_publisher(Float64MultiArray, ros_name(array_in.name), 10)
+    subscription, messages = ros.collect(peer, Float64MultiArray, ros_name(array_out.name))
+    start(node)
+    ros.matched(publisher, subscription)
+    values = [0.5 + k for k in range(array_in.size)]
+
+    publisher.publish(Float64MultiArray(data=values))
+
+    ros.until(lambda: messages and list(messages[-1].data) == values, f"{values}, but {messages[-1:]}")

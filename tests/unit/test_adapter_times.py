@@ -82,7 +82,9 @@ def test_inputs_before_the_start_are_on_the_clock_that_the_start_decides(gain: F
         (0.0, Nanoseconds(5), "in ns, and"),
     ],
 )
-def test_seconds_and_times_of_ros_are_not_mixed(gain: FMIAdapter, start: Any, time: Any, words: str) -> None:
+def test_seconds_and_times_of_ros_are_not_mixed(
+    gain: FMIAdapter, start: float | Nanoseconds, time: float | Nanoseconds, words: str
+) -> None:
     gain.exit_initialization_mode(start)
 
     for call in (lambda: gain.set_input_value("u", time, 1.0), lambda: gain.do_steps_until(time)):
