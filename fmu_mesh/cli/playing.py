@@ -8,7 +8,8 @@ from typing import Any
 
 from ..errors import ConfigurationError
 from ..model.loading import load
-from ..ros.playing import Bag, chosen_topics, grid_of, play, schedule
+from ..ros.bag_reading import Bag, chosen_topics
+from ..ros.playing import grid_of, play, schedule
 from ..wire.reaching import Meshes
 
 __all__ = ["add_commands"]

@@ -1,42 +1,26 @@
 """One FMU as a ROS lifecycle node: its parameters, topics and timer around an `FmuDriver`.
 
 Owns the thread that calls the FMU, so that it is always the same one, whatever executor the node is in, and the node's
-services answer while the FMU computes. What is not said here is as in `fmi_adapter_node` (docs/ros.md).
+services answer while the FMU computes. What is not said here is as in `fmi_adapter_node` (docs/ros-node.md).
 """
 
 from __future__ import annotations
 
-import math
 import threading
-import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from concurrent.futures import TimeoutError as FutureTimeout
-from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
 from ..errors import CallRefused, ConfigurationError, DeadlineExceeded, FmuError, FmuMeshError
 from ..model.description import Value, Variable
 from .driving import DriveSettings, FmuDriver, Turn
 from .node_parameters import RosNode, declare_parameters, names_of, parameter_values, undeclare_parameters, value_of
-from .node_topics import Topic, fill, message_time, own_names, topics_of, values_in
+from .node_settings import RESERVED, PacedTime, read_settings
+from .node_topics import Topic, fill, message_time, topics_of, values_in
 from .peer import message_class, ros_module
 
-__all__ = ["PARAMETERS", "FmuNode"]
-
-PARAMETERS: dict[str, tuple[Any, str]] = {
-    "fmu_path": ("", "Path of the FMU."),
-    "step_size": (0.0, "Communication step size in s; 0.0: that of the FMU's default experiment."),
-    "update_period": (0.01, "How often the FMU catches up with time and publishes its outputs, in s of wall clock."),
-    "stop_time": (0.0, "Simulated time in s after which the node deactivates itself; 0.0: never."),
-    "max_steps": (1000, "How many steps one update may take to catch up."),
-    "stamped": (False, "Whether every number has a second topic NAME_stamped (geometry_msgs/msg/PointStamped)."),
-    "names": ([""], "Other ROS names of variables, each as 'VARIABLE: NAME'."),
-    "messages": ([""], "Fields of messages, each as 'TOPIC: {type: TYPE, fields: {PATH: VARIABLE}}'."),
-    "publish_clock": (False, "Whether this node is the source of simulated time: it starts at 0 and goes to /clock."),
-    "real_time_factor": (1.0, "With publish_clock: simulated over wall-clock time."),
-}
-"""The parameters of the node itself, which it has before an FMU is there: default and description."""
+__all__ = ["FmuNode"]
 
 _DEPTH = 1000
 _MAX_WAITING = 10_000
@@ -76,7 +60,7 @@ class FmuNode:
         self._held: dict[str, tuple[Topic, Any, int]] = {}
         self._waiting = 0
         self._count = threading.Lock()
-        self._paced = _PacedTime(1.0)
+        self._paced = PacedTime(1.0)
         self._fmu_thread = ThreadPoolExecutor(1, thread_name_prefix="fmu")
 
     def configure(self) -> None:
@@ -106,7 +90,8 @@ class FmuNode:
             self._call(self._take, topic, message, arrived)
         self._held.clear()
         steady = ros_module("rclpy.clock").Clock(clock_type=ros_module("rclpy.clock").ClockType.STEADY_TIME)
-        self._timer = self._node.create_timer(self._positive("update_period"), self._tick, clock=steady)
+        period = read_settings(self._node).update_period
+        self._timer = self._node.create_timer(period, self._tick, clock=steady)
 
     def deactivate(self) -> None:
         """Stop stepping; the FMU stays where it is.
@@ -155,62 +140,46 @@ class FmuNode:
     # --- the transitions in detail
 
     def _configure(self) -> None:
-        node = self._node
-        names = own_names(filter(None, self._parameter("names")))
-        settings = self._settings()
-        if self._parameter("publish_clock") and self._parameter("use_sim_time"):
-            raise ConfigurationError(
-                "this node cannot publish /clock and run by it.", hint="Set either publish_clock or use_sim_time."
-            )
-        self._positive("update_period")
-        self._paced = _PacedTime(self._positive("real_time_factor"))
-        driver = self._driver = self._call(FmuDriver, settings)
+        settings = read_settings(self._node)
+        self._paced = PacedTime(settings.real_time_factor)
+        driver = self._driver = self._call(FmuDriver, settings.drive)
         description = driver.description
-        taken = sorted(set(names_of(description.variables, names).values()) & _reserved())
+        names = names_of(description.variables, settings.names)
+        taken = sorted(RESERVED.intersection(names.values()))
         if taken:
             raise ConfigurationError(
                 f"variables of the FMU have the names of parameters of this node: {', '.join(taken)}.",
                 hint="Give them others, each as 'VARIABLE: NAME', in the parameter 'names'.",
             )
-        messages = [entry for entry in self._parameter("messages") if entry]
-        topics = topics_of(description, names, messages, stamped=self._parameter("stamped"))
-        before = [name for name in names_of(description.variables, names).values() if node.has_parameter(name)]
-        self._variables = declare_parameters(node, description, names)
+        topics = topics_of(description, settings.names, settings.messages, stamped=settings.stamped)
+        before = [name for name in names.values() if self._node.has_parameter(name)]
+        self._variables = declare_parameters(self._node, description, settings.names)
         self._declared = [name for name in self._variables if name not in before]
-        self._set_values(parameter_values(node, self._variables))
+        self._set_values(parameter_values(self._node, self._variables))
         for topic in topics:
             self._open(topic)
+        if settings.publish_clock:
+            kind = message_class("rosgraph_msgs/msg/Clock")
+            self._clock_publisher = self._node.create_publisher(kind, "/clock", 10)
+        self._checking = self._check_parameters
+        self._node.add_on_set_parameters_callback(self._checking)
+        self._tell(driver, settings.drive, topics)
+
+    def _tell(self, driver: FmuDriver, settings: DriveSettings, topics: Sequence[Topic]) -> None:
+        """What a user may want to know of this FMU."""
+        description = driver.description
+        if settings.step_size is None:
+            self._log.info(f"no step_size is given; the FMU's own is used: {driver.step_size!r} s")
+        proposed = description.default_experiment.stop_time
+        if settings.stop_time is None and proposed is not None:
+            self._log.info(f"the FMU proposes to stop at {proposed!r} s; set stop_time to end there")
         carried = {variable for topic in topics for _, variable in topic.fields}
         for variable in description.with_causality("input", "output"):
             if variable.name not in carried:
-                self._log.warning(
-                    f"'{variable.name}' has no topic: no message of std_msgs carries {variable.type_name}"
-                )
-        if self._parameter("publish_clock"):
-            self._clock_publisher = node.create_publisher(message_class("rosgraph_msgs/msg/Clock"), "/clock", 10)
-        self._checking = self._check_parameters
-        node.add_on_set_parameters_callback(self._checking)
-        experiment = description.default_experiment
-        if settings.step_size is None:
-            self._log.info(f"no step_size is given; the FMU's own is used: {driver.step_size!r} s")
-        if settings.stop_time is None and experiment.stop_time is not None:
-            self._log.info(f"the FMU proposes to stop at {experiment.stop_time!r} s; set stop_time to end there")
+                what = f"no message of std_msgs carries {variable.type_name}"
+                self._log.warning(f"'{variable.name}' has no topic: {what}")
         for problem in description.problems:
             self._log.warning(f"{settings.fmu_path}: {problem}")
-
-    def _settings(self) -> DriveSettings:
-        path = self._parameter("fmu_path")
-        if not path:
-            raise ConfigurationError("the parameter 'fmu_path' is not set.", hint="It is the path of the FMU.")
-        step_size, stop_time, max_steps = (self._parameter(name) for name in ("step_size", "stop_time", "max_steps"))
-        for name, value in (("step_size", step_size), ("stop_time", stop_time)):
-            if not (math.isfinite(value) and value >= 0.0):
-                raise ConfigurationError(f"the parameter '{name}' is {value!r}; expected a time of 0.0 s or more.")
-        if max_steps < 1:
-            raise ConfigurationError(f"the parameter 'max_steps' is {max_steps!r}; expected 1 or more.")
-        return DriveSettings(
-            fmu_path=Path(path), step_size=step_size or None, stop_time=stop_time or None, max_steps=max_steps
-        )
 
     def _set_values(self, values: dict[str, Value]) -> None:
         """Give the FMU the values of parameters; all that are wrong are told."""
@@ -281,7 +250,7 @@ class FmuNode:
                 throttle_duration_sec=_COMPLAIN_S,
             )
         if turn.ended:
-            self._log.info(f"the stop time of {self._parameter('stop_time')!r} s is reached")
+            self._log.info("the stop time is reached")
             self._node.trigger_deactivate()
         return not turn.ended
 
@@ -371,15 +340,6 @@ class FmuNode:
     def _simulated_time(self) -> bool:
         return self._clock_publisher is None and bool(self._node.get_clock().ros_time_is_active)
 
-    def _parameter(self, name: str) -> Any:  # noqa: ANN401 the types are those of `PARAMETERS`
-        return self._node.get_parameter(name).value
-
-    def _positive(self, name: str) -> float:
-        value = float(self._parameter(name))
-        if not (math.isfinite(value) and value > 0.0):
-            raise ConfigurationError(f"the parameter '{name}' is {value!r}; expected a number above 0.")
-        return value
-
     def _live(self) -> FmuDriver:
         if self._driver is None:
             raise ConfigurationError("the node has no FMU yet.", hint="Configure it first.")
@@ -403,34 +363,6 @@ class FmuNode:
             raise
         except Exception as error:
             raise FmuError(f"the FMU's thread failed: {error!r}.") from error
-
-
-class _PacedTime:
-    """Simulated time that this node makes itself: 0 at first, then wall-clock time by a factor; it can be paused."""
-
-    def __init__(self, factor: float) -> None:
-        self._factor = factor
-        self._before = 0
-        self._since: int | None = None
-
-    def now(self) -> int:
-        """The time in ns."""
-        running = 0 if self._since is None else time.monotonic_ns() - self._since
-        return self._before + round(running * self._factor)
-
-    def go_on(self) -> None:
-        """Start, or go on."""
-        if self._since is None:
-            self._since = time.monotonic_ns()
-
-    def pause(self) -> None:
-        """Hold it."""
-        self._before, self._since = self.now(), None
-
-
-def _reserved() -> set[str]:
-    """Names of parameters that a node has without its FMU."""
-    return {*PARAMETERS, "autostart", "config", "connect", "use_sim_time", "start_type_description_service"}
 
 
 def _joined(executor: ThreadPoolExecutor) -> list[threading.Thread]:

@@ -13,9 +13,10 @@ from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 from ..errors import ConfigurationError, FmuMeshError
-from .fmu_node import PARAMETERS, FmuNode
+from .fmu_node import FmuNode
 from .gateway_node import GatewayNode
 from .node_parameters import RosNode
+from .node_settings import PARAMETERS
 from .peer import ros_module
 
 __all__ = ["create_node", "main"]

@@ -125,10 +125,15 @@ class Ros:
         self.until(future.done, f"an answer of {client.srv_name}")
         return future.result()
 
-    def collect(self, node: Any, kind: Any, topic: str, depth: int = 5000) -> tuple[Any, list[Any]]:  # noqa: ANN401
+    def collect(
+        self,
+        node: Any,  # noqa: ANN401 types of rclpy
+        kind: Any,  # noqa: ANN401 as above
+        topic: str,
+    ) -> tuple[Any, list[Any]]:
         """A subscription, and a list that fills with what comes."""
         messages: list[Any] = []
-        return node.create_subscription(kind, topic, messages.append, depth), messages
+        return node.create_subscription(kind, topic, messages.append, 5000), messages
 
 
 def _matches(end: Any) -> bool:  # noqa: ANN401 types of rclpy

@@ -354,7 +354,7 @@ def test_every_type_has_its_topic_and_its_parameter(ros: Ros, tmp_path: Path) ->
         "integer": ("Int32", -7),
         "boolean": ("Bool", True),
         "string": ("String", "grün"),
-        "enumeration": ("Int32", 3),
+        "enumeration": ("Int64", 3),
     }
     fmu = str(find_fmu("AllTypes", tmp_path))
     node = ros.fmu(
