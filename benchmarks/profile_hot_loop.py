@@ -20,8 +20,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
-import zenoh
-
 import fmu_mesh.launch.roles as roles_module
 import fmu_mesh.node.node as node_module
 from benchmarks.contestants.fmu_mesh_launch import configuration
@@ -34,7 +32,7 @@ from fmu_mesh.model.plan import Link
 from fmu_mesh.model.ring import Ring
 from fmu_mesh.node.links import OutLink
 from fmu_mesh.node.node import Node
-from fmu_mesh.wire.inbox import Inbox
+from fmu_mesh.wire.inbox import Inbox, Message
 
 __all__: list[str] = []
 
@@ -66,20 +64,20 @@ class _Clock:
 
 
 _FMU, _SEND, _POLL, _WAIT = _Clock(), _Clock(), _Clock(), _Clock()
-_LABELS = {"FMU": _FMU, "zenoh put": _SEND, "zenoh try_recv": _POLL, "waiting": _WAIT}
+_LABELS = {"FMU": _FMU, "send": _SEND, "poll": _POLL, "waiting": _WAIT}
 
 
 class _TimedLink(OutLink):
-    def __init__(self, link: Link, outputs: Ring, publisher: zenoh.Publisher, window: int) -> None:
-        super().__init__(link, outputs, publisher, window)
-        self._put = _SEND.around(self._put)
+    def __init__(self, link: Link, outputs: Ring, put: Callable[[bytes], None], window: int) -> None:
+        super().__init__(link, outputs, _SEND.around(put), window)
 
 
 class _TimedInbox(Inbox):
-    def __init__(self, session: zenoh.Session, key: str, wake_key: str, capacity: int) -> None:
-        super().__init__(session, key, wake_key, capacity)
-        self._try_recv = _POLL.around(self._try_recv)
-        self._recv = _WAIT.around(self._recv)
+    def poll(self) -> Message | None:
+        return _POLL.around(super().poll)()
+
+    def wait(self, timeout_s: float) -> Message | None:
+        return _WAIT.around(super().wait)(timeout_s)
 
 
 class _TimedNode(Node):

@@ -160,9 +160,10 @@ class Place:
             launched.close()
         shutil.rmtree(self.folder, ignore_errors=True)
 
-    def start(self, *arguments: str | Path) -> Launched:
-        """Start ``fmu-mesh`` with these arguments as a process of its own."""
-        launched = Launched([sys.executable, "-m", "fmu_mesh", *map(str, arguments)], self._environment, self.folder)
+    def start(self, *arguments: str | Path, prefix: Sequence[str] = ()) -> Launched:
+        """Start ``fmu-mesh`` with these arguments as a process of its own; ``prefix`` is a command that starts it."""
+        command = [*prefix, sys.executable, "-m", "fmu_mesh", *map(str, arguments)]
+        launched = Launched(command, self._environment, self.folder)
         self._started.append(launched)
         return launched
 

@@ -73,7 +73,7 @@ def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.Arg
     get.add_argument("key", nargs="+", metavar="KEY", help=_REFERENCE)
     set_ = add("set", _set, "set an unconnected input or a tunable parameter")
     set_.add_argument("key", metavar="KEY", help="`instance.variable`, or a key")
-    set_.add_argument("value", metavar="VALUE", help="a number, true, false, or text")
+    set_.add_argument("value", metavar="VALUE", help="a number, true, false, text, or [a, list] for an array")
     watch = add("watch", _watch, "show every value of variables until the mesh ends")
     watch.add_argument("key", nargs="+", metavar="KEY", help=_REFERENCE)
     watch.add_argument("--count", type=_positive, metavar="N", help="end after N values")

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 import msgspec
 
 from ..wire.readings import Reading
-from ..wire.views import InstanceInfo, InstanceStatus, MeshInfo, MeshStatus
+from ..wire.views import InstanceInfo, InstanceStatus, MeshInfo, MeshStatus, VariableView
 from .tables import pairs, table
 
 __all__ = [
@@ -26,7 +26,7 @@ __all__ = [
 def variables(info: InstanceInfo) -> list[str]:
     """One line for each variable of an instance."""
     rows = [
-        [v.key, v.type, v.variability, v.unit or "", "" if v.start is None else _text(v.start), v.description or ""]
+        [v.key, _type(v), v.variability, v.unit or "", "" if v.start is None else _text(v.start), v.description or ""]
         for v in info.variables
     ]
     return table(rows, heading=["variable", "type", "variability", "unit", "start", "description"], indent=2)
@@ -72,6 +72,9 @@ def instance_status(status: InstanceStatus) -> list[str]:
     )
 
 
+_PARTS = {"@record": "the recorder", "@mesh": "the master"}
+
+
 def mesh_info(info: MeshInfo) -> list[str]:
     """What a mesh is."""
     return pairs(
@@ -89,6 +92,7 @@ def mesh_info(info: MeshInfo) -> list[str]:
             ("nodes", ", ".join(info.nodes)),
             ("result file", info.result_file or "none"),
             ("endpoints", ", ".join(info.endpoints)),
+            ("shared memory", ", ".join(_PARTS.get(name, name) for name in info.shared_memory) or "not used"),
             ("master", f"process {info.pid} on {info.host}, fmu_mesh {info.version}"),
         ]
     )
@@ -132,6 +136,11 @@ def progress(status: MeshStatus) -> str:
 def seconds(time: float) -> str:
     """A time in s."""
     return f"{time:.12g} s"
+
+
+def _type(view: VariableView) -> str:
+    """The type, with the sizes of an array's dimensions."""
+    return f"{view.type}[{','.join(map(str, view.shape))}]" if view.shape else view.type
 
 
 def _text(value: object) -> str:

@@ -16,8 +16,9 @@ from fmpy.fmi1 import FMICallException
 from fmpy.fmi2 import FMU2Slave
 
 from ..model.description import Variable
-from ..model.ring import Part
+from ..model.ring import Part, Ring
 from ..model.types import Value, VariableType
+from ..simtime import TimeGrid
 from .buffers import Buffer, NumberBuffer, StringBuffer
 from .callbacks import FMI2_CALLBACKS, register, unregister
 from .instance import STATUS_NAMES, WARNING, FmuInstance, Verb
@@ -40,28 +41,44 @@ _DIRECT: Final = ("Float64", "Int32")
 class Fmi2Instance(FmuInstance):
     """One instance of an FMI 2.0 co-simulation FMU."""
 
+    def bind(self, inputs: Ring, outputs: Sequence[Ring], grid: TimeGrid, points: int, step: int = 0) -> None:
+        """Let `do_step` work on these rings, ``points`` of ``grid`` each; write the current outputs as row ``step``."""
+        super().bind(inputs, outputs, grid, points, step)
+        # One look-up for all that a step needs: it is a part of the time of a small FMU.
+        self._hot = (
+            self._component,
+            self._do_step,
+            self._input_mask,
+            self._output_mask,
+            [call[:4] for call in self._direct_setters],
+            [call[:4] for call in self._direct_getters],
+            bool(self._setters or self._getters),
+        )
+
     def do_step(self, step: int) -> None:
         """Set the inputs of row ``step``, advance to own step ``step + 1``, write the outputs to row ``step + 1``."""
-        component = self._component
-        slot = step & self._input_mask
-        for function, references, count, rows, _ in self._direct_setters:
+        component, do_step, input_mask, output_mask, setters, getters, has_buffers = self._hot
+        slot = step & input_mask
+        for function, references, count, rows in setters:
             status = function(component, references, count, rows[slot])
             if status > WARNING:
                 raise self._failed(f"setting the inputs returned {STATUS_NAMES[status]}")
-        for set_row in self._setters:
-            set_row(slot)
+        if has_buffers:
+            for set_row in self._setters:
+                set_row(slot)
         time = self._start_time + step * self._points * self._base_step_size  # `grid.time`, without a call
-        status = self._do_step(component, time, self._step_size, 1)
+        status = do_step(component, time, self._step_size, 1)
         if status > WARNING:
             raise self._failed(f"fmi2DoStep returned {STATUS_NAMES[status]}")
         self._step = step + 1
-        slot = (step + 1) & self._output_mask
-        for function, references, count, rows, _ in self._direct_getters:
+        slot = (step + 1) & output_mask
+        for function, references, count, rows in getters:
             status = function(component, references, count, rows[slot])
             if status > WARNING:
                 raise self._failed(f"reading the outputs returned {STATUS_NAMES[status]}")
-        for get_row in self._getters:
-            get_row(slot)
+        if has_buffers:
+            for get_row in self._getters:
+                get_row(slot)
 
     def advance(self, time: float, step_size: float) -> None:
         """One step of ``step_size`` from ``time`` (both in s) without rings, for callers with their own time base."""

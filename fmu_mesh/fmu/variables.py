@@ -14,7 +14,7 @@ from fmpy.model_description import ModelDescription as FmpyDescription
 from fmpy.model_description import ModelVariable
 
 from ..model.description import Causality, Initial, Value, Variable, VariableType
-from ..model.types import FMI2_TYPES, INTEGERS, TYPES, nested
+from ..model.types import FMI2_TYPES, INTEGERS, MAX_ELEMENTS, TYPES, nested
 
 __all__ = ["variables_of"]
 
@@ -140,6 +140,8 @@ def _direct_dependencies(source: FmpyDescription, elements: Iterable[ET.Element]
 
 def _array_start(type_: VariableType, texts: list[str], shape: tuple[int, ...]) -> Value | None:
     """The start value of a scalar or an array, for which one value stands for all elements (FMI 3.0, 2.4.7)."""
+    if math.prod(shape) > MAX_ELEMENTS:
+        raise ValueError(f"an array of {math.prod(shape)} elements; {MAX_ELEMENTS} are the most")
     if len(texts) == 1:
         texts *= math.prod(shape)
     values = [_start(type_, text) for text in texts]

@@ -235,7 +235,8 @@ class Launcher:
     def _outcome(self) -> End:
         """How the run ended, as the master says; as this process saw it where the master could not say it any more."""
         rows = self._recorded_rows()
-        if self._end is not None:
+        gateway_lost = any(name == _GATEWAY for name, _, _ in self._lost)  # of which the master knows nothing
+        if self._end is not None and not gateway_lost:
             if self._end.error is None:
                 return self._end
             error = self._with_cause(from_report(self._end.error))

@@ -90,7 +90,7 @@ def _descriptions(loaded: LoadedConfig) -> tuple[dict[str, ModelDescription], Se
         found = cache[path]
         if isinstance(found, LoadFailed):
             text = found.message.rstrip(".") + (f" ({found.hint.rstrip('.')})" if found.hint else "")
-            expected = "an FMI 2.0 co-simulation FMU for this platform"
+            expected = "a co-simulation FMU of FMI 1.0, 2.0 or 3.0 for this platform"
             findings.append(loaded.finding(f"instances.{name}.fmu", text, expected, _similar(path)))
         else:
             descriptions[name] = found

@@ -29,18 +29,19 @@ from .. import __version__
 from ..errors import DeadlineExceeded, ErrorReport, FmuMeshError, Interrupted, MeshLost, from_report
 from ..model.plan import RECORDER, Plan
 from ..wire.inbox import Inbox
-from ..wire.keys import Keys
+from ..wire.keys import Keys, batched
+from ..wire.membership import MASTER, Registration, Welcome
 from ..wire.messages import (
     FINISH,
     GRANT,
     HEADER,
     PROGRESS,
     NodeReport,
-    Registration,
     encode_abort,
 )
-from ..wire.profile import TIME_LINE_ENTRIES, MeshProfile, Welcome
+from ..wire.profile import TIME_LINE_ENTRIES, MeshProfile
 from ..wire.session import matches, undeclare_all
+from ..wire.shared_memory import SharedOutlet
 from ..wire.values import json_encoding
 from ..wire.views import Command, CommandAnswer, LogLine, MeshInfo, MeshState, MeshStatus
 from .pacing import Clock, Pacer
@@ -52,7 +53,6 @@ log = logging.getLogger(__name__)
 
 _HEARTBEAT_S = 0.5
 _STATUS_S = 0.1
-_NODE = "@mesh"
 
 
 class Events(Protocol):
@@ -97,7 +97,9 @@ class Master:
         self._windows = [plan.nodes[node].window for node in self._nodes]
         self._progress = [-1] * len(self._nodes)
         self._slowest = -1
-        self._registered: dict[str, zenoh.Query] = {}
+        self._registered: dict[str, tuple[Registration, zenoh.Query]] = {}
+        self._outlets: dict[str, SharedOutlet] = {}
+        self._shared: tuple[str, ...] = ()
         self._present: set[str] = set()
         self._reports: dict[str, NodeReport] = {}
         self._failure: FmuMeshError | None = None
@@ -113,12 +115,17 @@ class Master:
         self._status_published = 0.0
         self._moved = time.monotonic()
         self._inbox = Inbox(
-            session, self._keys.inbox(_NODE), self._keys.wake(_NODE), (plan.window + 64) * len(self._nodes) + 1024
+            session,
+            self._keys.inbox(MASTER),
+            self._keys.wake(MASTER),
+            (plan.window + 64) * len(self._nodes) + 1024,
+            dict.fromkeys(self._nodes, 0) if config.zenoh.shared_memory else None,
         )
         self._grants = [
             session.declare_publisher(key, congestion_control=zenoh.CongestionControl.BLOCK, express=True)
             for key in self._keys.grants(self._nodes)
         ]
+        self._senders: list[Callable[[bytes], None]] = [publisher.put for publisher in self._grants]
         self._entities: list[zenoh.Queryable[None] | zenoh.Subscriber[None]] = []
         self._status_publisher = session.declare_publisher(
             self._keys.mesh_key("status"), encoding=json_encoding, congestion_control=zenoh.CongestionControl.DROP
@@ -185,10 +192,25 @@ class Master:
                     hint=f"Started, but not ready: {', '.join(there)}." if there else "None of them was started.",
                 )
             self._turn(0.25)
+        self._welcome()
+
+    def _welcome(self) -> None:
+        """Answer all nodes, and tell them who is reached through shared memory: the master is if all nodes are."""
+        shared = [node for node in self._nodes if node in self._outlets and self._registered[node][0].shared]
+        self._senders = [self._outlets[node].put for node in shared]
+        rest = [node for node in self._nodes if node not in shared]
+        if rest:
+            publishers = zip(self._grants, batched(self._nodes), strict=True)
+            self._senders += [publisher.put for publisher, nodes in publishers if not set(nodes).isdisjoint(rest)]
+        offer = self._inbox.offer if len(self._outlets) == len(self._nodes) else None
+        if offer is not None:
+            self._inbox.share()
+            shared.append(MASTER)
+        self._shared = tuple(shared)
         entries = TIME_LINE_ENTRIES // len(self._nodes) if self.watch is not None else 0
         for number, node in enumerate(self._nodes):
-            query = self._registered.pop(node)
-            query.reply(query.key_expr, msgspec.json.encode(Welcome(number, entries)))
+            _, query = self._registered.pop(node)
+            query.reply(query.key_expr, msgspec.json.encode(Welcome(number, entries, self._shared, offer)))
             query.drop()
 
     def _grant_to_the_end(self) -> None:
@@ -274,14 +296,14 @@ class Master:
 
     def _send(self, kind: int, point: int) -> None:
         message = HEADER.pack(kind, 0, 0, point)
-        for publisher in self._grants:
-            publisher.put(message)
+        for send in self._senders:
+            send(message)
 
     def _abort(self, error: FmuMeshError) -> None:
         """Tell the nodes why the run ends, and give them the time to end by themselves."""
-        for publisher in self._grants:
-            publisher.put(encode_abort(error.report()))
-        for query in self._registered.values():  # nodes that still wait to be let in
+        for send in self._senders:
+            send(encode_abort(error.report()))
+        for _, query in self._registered.values():  # nodes that still wait to be let in
             query.reply_err(str(error))
             query.drop()
         self._registered.clear()
@@ -326,7 +348,12 @@ class Master:
         elif registration.node in self._registered or self._state != "starting":
             query.reply_err(f"node '{registration.node}' is there already; two processes run it")
         else:
-            self._registered[registration.node] = query
+            outlet = SharedOutlet.open(
+                registration.offer, MASTER, _spoken(registration.node), self._inbox.stash, self._timeouts.step
+            )
+            if outlet is not None and self._inbox.offer is not None:
+                self._outlets[registration.node] = outlet
+            self._registered[registration.node] = (registration, query)
             return
         query.drop()
 
@@ -422,6 +449,7 @@ class Master:
             endpoints=self._endpoints,
             pid=os.getpid(),
             host=socket.gethostname(),
+            shared_memory=self._shared,
         )
 
     def last_status(self) -> MeshStatus:

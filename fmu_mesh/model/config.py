@@ -109,12 +109,19 @@ class InstanceConfig(Base, frozen=True, kw_only=True):
 class ConnectionConfig(Base, frozen=True, kw_only=True):
     """One connection from an output to an input; the short form is `a.y -> b.u`."""
 
-    source: Annotated[str, Meta(description="`instance.variable` of an output.", examples=["pendulum.a"])] = (
-        msgspec.field(name="from")
-    )
-    target: Annotated[str, Meta(description="`instance.variable` of an input.", examples=["delay.x"])] = msgspec.field(
-        name="to"
-    )
+    source: Annotated[
+        str,
+        Meta(
+            description="`instance.variable` of an output, or an element of an array as `a.y[1,2]`.",
+            examples=["pendulum.a"],
+        ),
+    ] = msgspec.field(name="from")
+    target: Annotated[
+        str,
+        Meta(
+            description="`instance.variable` of an input, or an element of an array as `b.u[3]`.", examples=["delay.x"]
+        ),
+    ] = msgspec.field(name="to")
     factor: Annotated[float, Meta(description="The input is factor * output + offset; Real inputs only.")] = 1.0
     offset: Annotated[float, Meta(description="The input is factor * output + offset; Real inputs only.")] = 0.0
     delay: Annotated[
@@ -159,6 +166,13 @@ class ZenohConfig(Base, frozen=True, kw_only=True):
         Meta(description="Endpoints where the master can be reached; default: a free loopback port."),
     ] = []
     connect: Annotated[list[Endpoint], Meta(description="Endpoints of a router or of another host's mesh.")] = []
+    shared_memory: Annotated[
+        bool,
+        Meta(
+            description="Whether processes of one host exchange frames and grants through shared memory; false: "
+            "through Zenoh, as those of different hosts do."
+        ),
+    ] = True
     config: Annotated[
         str | None,
         Meta(description="A Zenoh configuration file (JSON5), relative to this file, to start from."),

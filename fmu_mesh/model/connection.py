@@ -68,9 +68,9 @@ def resolve_connections(
         if not config.source and not config.target:
             findings.add(path, "no ends", "instance.output -> instance.input")
             continue
-        _check_single_source(config, path, sources, findings)
         source = resolve_variable(config.source, f"{path}.from", variables, "output", findings)
         target = resolve_variable(config.target, f"{path}.to", variables, "input", findings)
+        _check_single_source(config, path, _taken(config.target, target), sources, findings)
         if source is None or target is None:
             continue
         connection = Connection(
@@ -142,21 +142,42 @@ def unit_warnings(connections: Sequence[Connection], findings: Findings) -> None
             findings.add(connection.path, found, "the same unit, or a factor that converts it")
 
 
+def _taken(reference: str, target: tuple[Variable, tuple[int, ...]] | None) -> tuple[str, str]:
+    """The name of the target and that of the variable it belongs to, each with the instance; as written if unknown."""
+    if target is None:
+        return reference, reference
+    variable, index = target
+    whole = f"{reference.partition('.')[0]}.{variable.name}"
+    return element_name(whole, index) if index else whole, whole
+
+
 def _check_single_source(
-    config: ConnectionConfig, path: str, sources: dict[str, tuple[str, ConnectionConfig]], findings: Findings
+    config: ConnectionConfig,
+    path: str,
+    taken: tuple[str, str],
+    sources: dict[str, tuple[str, ConnectionConfig]],
+    findings: Findings,
 ) -> None:
-    if config.target not in sources:
-        sources[config.target] = (path, config)
+    """An input has one source, and so has each element of an array.
+
+    ``sources`` holds the first source by target, and by `*` after the name of an array that of its first element.
+    """
+    name, whole = taken
+    first_source = sources.get(name) or sources.get(whole if name != whole else f"{whole}*")
+    if first_source is None:
+        sources[name] = path, config
+        if name != whole:
+            sources.setdefault(f"{whole}*", (path, config))
         return
-    first_path, first = sources[config.target]
+    first_path, first = first_source
     line = findings.line(first_path)
     place = f"{first_path} in line {line}" if line is not None else first_path
     if first.source == config.source:
         found = f"{config.source} -> {config.target} a second time (first: {place})"
     else:
         found = (
-            f"a second source for the input '{config.target}': {config.source} -> {config.target}, "
-            f"after {first.source} -> {config.target} ({place})"
+            f"a second source for the input '{name}': {config.source} -> {config.target}, "
+            f"after {first.source} -> {first.target} ({place})"
         )
     findings.add(path, found, "one source for an input")
 

@@ -13,7 +13,7 @@ from typing import Literal
 import msgspec
 from msgspec.structs import replace
 
-from .types import PlainValue, Value, VariableType, element_names, split_element
+from .types import MAX_ELEMENTS, PlainValue, Value, VariableType, element_names, flattened, nested, split_element
 
 __all__ = [
     "Causality",
@@ -148,9 +148,14 @@ class ModelDescription(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             value = dimension if isinstance(dimension, int) else sizes.get(dimension)
             return value if isinstance(value, int) and value > 0 else 1
 
-        return replace(
-            self,
-            variables=tuple(
-                replace(v, shape=tuple(map(size_of, v.dimensions))) if v.dimensions else v for v in self.variables
-            ),
-        )
+        return replace(self, variables=tuple(_reshaped(v, tuple(map(size_of, v.dimensions))) for v in self.variables))
+
+
+def _reshaped(variable: Variable, shape: tuple[int, ...]) -> Variable:
+    """A variable with another shape; its start value goes along if it is one value for all elements."""
+    if shape == variable.shape:
+        return variable
+    elements = [] if variable.start is None else flattened(variable.start, len(variable.shape))
+    is_one = bool(elements) and elements == elements[:1] * len(elements) and math.prod(shape) <= MAX_ELEMENTS
+    start = nested(elements[:1] * math.prod(shape), shape) if is_one else None
+    return replace(variable, shape=shape, start=start)

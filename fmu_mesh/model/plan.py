@@ -102,6 +102,7 @@ class NodePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         links_in: links that end here.
         links_out: links that start here.
         result_file: absolute path of the result CSV (for the recorder).
+        shared_memory: whether processes of one host exchange messages through shared memory.
     """
 
     mesh: str
@@ -119,6 +120,7 @@ class NodePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     links_out: tuple[Link, ...]
     result_file: str | None = None
     recorded: tuple[tuple[str, str], ...] = ()
+    shared_memory: bool = True
 
     def instance(self, name: str) -> InstancePlan:
         """The plan of one of its instances."""
@@ -327,6 +329,7 @@ def _node(
         links_out=tuple(link for link in links if link.source_node == node),
         result_file=plan.system.result_file if node == RECORDER else None,
         recorded=plan.system.recorded if node == RECORDER else (),
+        shared_memory=config.zenoh.shared_memory,
     )
 
 

@@ -11,20 +11,34 @@ from collections.abc import Mapping
 from fmu_mesh.model.config import InstanceConfig
 from fmu_mesh.model.description import ModelDescription, Value, Variable
 from fmu_mesh.model.findings import Findings, listed, nearest, shown
+from fmu_mesh.model.types import MAX_ELEMENTS
 from fmu_mesh.model.values import ValueRefused, to_value
 
 __all__ = ["resolve_start_values", "sized"]
 
 
-def sized(description: ModelDescription, config: InstanceConfig) -> ModelDescription:
-    """A model description with the shapes that its arrays get by the structural parameters of the configuration."""
+def sized(name: str, description: ModelDescription, config: InstanceConfig, findings: Findings) -> ModelDescription:
+    """A model description with the shapes that its arrays get by the structural parameters of the configuration.
+
+    Args:
+        name: instance name.
+        description: the model description.
+        config: the instance's section of the configuration.
+        findings: where arrays go that would be too large; they keep their shapes.
+    """
     sizes: dict[str, Value] = {}
     for variable in description.with_causality("structuralParameter"):
         try:
             sizes[variable.name] = to_value(config.start_values[variable.name], variable)
         except (KeyError, ValueRefused):
             continue  # it keeps its own, or `resolve_start_values` finds it
-    return description.sized(sizes)
+    made = description.sized(sizes)
+    for variable in made.variables:
+        if variable.size > MAX_ELEMENTS:
+            path, found = f"instances.{name}.start_values", f"'{variable.name}' would have {variable.size} elements"
+            findings.add(path, found, f"{MAX_ELEMENTS} elements of an array at most")
+            return description
+    return made
 
 
 def resolve_start_values(

@@ -93,7 +93,7 @@ def build(
     collected = loaded.findings()
     collected.merge(findings)
     descriptions = {
-        name: sized(description, config.instances[name])
+        name: sized(name, description, config.instances[name], collected)
         for name, description in descriptions.items()
         if name in config.instances
     }

@@ -6,7 +6,7 @@ arrive and on rings of the same process alike.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -66,13 +66,31 @@ class Transfer:
         slots = ((steps * self._target_points + self._lead) // self._source_points) & source.mask
         self._write(low, high, tuple(part[slots] for part in source.parts))
 
-    def step_from_ring(self, source: Ring, step: int) -> None:
-        """Feed one own step of the target from ``source``; the cheap way for one row."""
-        slot = ((step * self._target_points + self._lead) // self._source_points) & source.mask
-        target = step & self._inputs.mask
-        for copy in self._copies:
-            values = source.parts[copy.source_part][slot]
-            copy.part[target, copy.columns] = copy.convert(values[copy.source_columns])
+    def stepper(self, source: Ring) -> Callable[[int], None]:
+        """What feeds one own step of the target from ``source``: the cheap way for one row.
+
+        Single numbers of one type go through memory views, which hand over the same bits several times faster.
+        """
+        if self._same_rate and all(copy.is_one_number(source) for copy in self._copies):
+            lead = self._lead // self._source_points
+            steppers = [copy.stepper(source, lead, self._inputs.mask) for copy in self._copies]
+            if len(steppers) == 1:
+                return steppers[0]
+
+            def step_each(step: int) -> None:
+                for feed in steppers:
+                    feed(step)
+
+            return step_each
+
+        def step_rows(step: int) -> None:
+            slot = self.source_step(step) & source.mask
+            target = step & self._inputs.mask
+            for copy in self._copies:
+                values = source.parts[copy.source_part][slot]
+                copy.part[target, copy.columns] = copy.convert(values[copy.source_columns])
+
+        return step_rows
 
     def _write(self, low: int, high: int, rows: Rows) -> None:
         """Write rows of own steps ``low .. high - 1``, in two pieces where the ring wraps."""
@@ -97,6 +115,37 @@ class _Copy:
         self.part = part
         self.columns = columns
         self.scale = scale
+
+    def is_one_number(self, source: Ring) -> bool:
+        """Whether this is one number that Python hands over as it is; a Float32 would go through a Float64."""
+        if not (isinstance(self.source_columns, slice) and isinstance(self.columns, slice)):
+            return False
+        single = self.columns.stop - self.columns.start == 1
+        dtype = source.parts[self.source_part].dtype
+        return single and dtype == self.part.dtype and dtype not in (np.float32, np.object_)
+
+    def stepper(self, source: Ring, lead: int, mask: int) -> Callable[[int], None]:
+        """As `Transfer.stepper`, for `is_one_number`; ``lead`` is how many rows the source is ahead."""
+        have, want = source.parts[self.source_part], self.part
+        values, inputs = have.reshape(-1).data, want.reshape(-1).data
+        assert isinstance(self.source_columns, slice)
+        assert isinstance(self.columns, slice)
+        first, width, source_mask = self.source_columns.start, have.shape[1], source.mask
+        own_first, own_width = self.columns.start, want.shape[1]
+        if self.scale is None:
+
+            def step_one(step: int) -> None:
+                inputs[(step & mask) * own_width + own_first] = values[((step + lead) & source_mask) * width + first]
+
+            return step_one
+        factor, offset = float(self.scale[0][0]), float(self.scale[1][0])
+
+        def step_scaled(step: int) -> None:
+            inputs[(step & mask) * own_width + own_first] = (
+                values[((step + lead) & source_mask) * width + first] * factor + offset
+            )
+
+        return step_scaled
 
     def convert(self, values: NDArray[Any]) -> NDArray[Any]:
         """Apply factor and offset in Float64, one rounding each, as any program would; a Float32 is rounded once more.

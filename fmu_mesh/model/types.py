@@ -17,6 +17,7 @@ __all__ = [
     "DTYPES",
     "FMI2_TYPES",
     "INTEGERS",
+    "MAX_ELEMENTS",
     "TYPES",
     "PlainValue",
     "Value",
@@ -96,6 +97,9 @@ INTEGERS: Final[dict[VariableType, range]] = {
     "UInt8": range(2**8),
 }
 """What each type of whole numbers can hold."""
+
+MAX_ELEMENTS: Final = 2**20
+"""How many elements an array may have."""
 
 _ELEMENT: Final = re.compile(r"(?s)(.+)\[(\s*\d+\s*(?:,\s*\d+\s*)*)\]")
 _MANTISSA_BITS: Final[dict[VariableType, int]] = {"Float64": 53, "Float32": 24}

@@ -44,7 +44,8 @@ _WORDS: dict[str, bool | None] = {
     **dict.fromkeys(("true", "True", "TRUE"), True),
     **dict.fromkeys(("false", "False", "FALSE"), False),
 }
-_LONGEST_INTEGER = 18  # characters that fit 64 bits; what is longer is a float, and text in another base
+_LONGEST_INTEGER = 40  # characters; leading zeros are rare
+_INTEGERS = range(-(2**63), 2**64)  # of 64 bits; what is beyond is a float, and text in another base
 
 
 def read(text: str, findings: Findings, lines: dict[str, int]) -> Plain:
@@ -78,7 +79,9 @@ def resolve(text: str) -> Plain:
         return _WORDS[text]
     if _INTEGER.fullmatch(text):
         if len(text) <= _LONGEST_INTEGER:
-            return int(text, 0) if text[:2] in ("0x", "0o") else int(text)
+            number = int(text, 0) if text[:2] in ("0x", "0o") else int(text)
+            if number in _INTEGERS:
+                return number
         return text if text[:2] in ("0x", "0o") else float(text)
     if _FLOAT.fullmatch(text):
         return float(text.replace(".inf", "inf").replace(".nan", "nan")) if text[-1].isalpha() else float(text)

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
-import zenoh
-
+from ..errors import FmuMeshError
 from ..model.plan import LAZY_ROWS, RECORDER, Link
 from ..model.ring import Layout, Ring
 from ..model.types import Value
@@ -27,7 +26,7 @@ class OutLink:
         lazy: whether nobody steps on these rows, so that they may wait a little when others are sent.
     """
 
-    def __init__(self, link: Link, outputs: Ring, publisher: zenoh.Publisher, window: int) -> None:
+    def __init__(self, link: Link, outputs: Ring, put: Callable[[bytes], None], window: int) -> None:
         self.link = link
         self.sent = 0
         self.lazy = link.target_node == RECORDER
@@ -35,8 +34,7 @@ class OutLink:
         by_window = LAZY_ROWS // 2 if self.lazy else max(1, window // (4 * link.step_points))
         self.capacity = max(1, min(_FRAME_POINTS, _FRAME_BYTES // max(link.layout.row_size, 1), by_window))
         self._outputs = outputs
-        self.publisher = publisher
-        self._put = publisher.put
+        self.put = put
         self._picks = _picks(outputs.layout, link.layout)
 
     def flush(self, end: int) -> None:
@@ -45,6 +43,10 @@ class OutLink:
         if first >= end:
             return
         ring = self._outputs
+        if end - first > ring.rows:
+            lost = end - ring.rows - first
+            text = f"{lost} rows for {self.link.target_node} were overwritten before they were sent"
+            raise FmuMeshError(text, instance=self.link.source, point=first * self.link.step_points)
         while first < end:
             start = first & ring.mask
             cut = min(end - first, ring.rows - start)
@@ -54,7 +56,7 @@ class OutLink:
                 for part, picked in self._picks
             )
             for message in encode_frames(FRAME, self.link.index, first, rows):
-                self._put(message)
+                self.put(message)
             first += cut
         self.sent = end
 
@@ -64,11 +66,7 @@ class OutLink:
         for name in row.layout.names:
             if name in values:
                 row.put(0, name, values[name])
-        self._put(encode_rows(INITIAL, self.link.index, level, row.parts))
-
-    def close(self) -> None:
-        """Undeclare the publisher."""
-        self.publisher.undeclare()
+        self.put(encode_rows(INITIAL, self.link.index, level, row.parts))
 
 
 def _picks(have: Layout, want: Layout) -> list[tuple[int, list[int] | None]]:

@@ -17,8 +17,6 @@ served by `fmu_mesh.node.serving` from snapshots.
 from __future__ import annotations
 
 import logging
-import os
-import socket
 import time
 from collections.abc import Callable
 
@@ -32,6 +30,7 @@ from ..model.transfer import Transfer
 from ..wire.frames import FrameReceiver
 from ..wire.inbox import Inbox, Message
 from ..wire.keys import Keys
+from ..wire.membership import MASTER, Membership, credit
 from ..wire.messages import (
     ABORT,
     FINISH,
@@ -41,11 +40,8 @@ from ..wire.messages import (
     INITIAL,
     PROGRESS,
     NodeReport,
-    Registration,
     decode_abort,
-    decode_json,
 )
-from ..wire.profile import Welcome
 from ..wire.session import ask
 from .initialization import Initialization
 from .links import OutLink
@@ -100,14 +96,14 @@ class Node:
         self._remote: dict[int, tuple[FrameReceiver, list[RemoteFeed]]] = {}
         self._initialization = Initialization(plan, self._wait_for_initial_value)
         capacity = sum(plan.window + 8 for _ in plan.links_in) + 4096
-        self._inbox = Inbox(session, self._keys.inbox(plan.node), self._keys.wake(plan.node), capacity)
+        self._inbox = Inbox(session, self._keys.inbox(plan.node), self._keys.wake(plan.node), capacity, credit(plan))
+        self._membership = Membership(plan, session, self._keys, self._inbox)
         self._progress_number = 0
-        self._progress = session.declare_publisher(self._keys.progress(), congestion_control=_BLOCK, express=True)
         self._profiler: Profiler | None = None
         # The calls that a profile measures; without one they are what they seem.
         self._poll = self._inbox.poll
         self._take = self._sort_in
-        self._put_progress: Callable[[bytes], None] = self._progress.put
+        self._put_progress: Callable[[bytes], None]
         self.server = Server(plan, session, self._keys, self._inbox)
 
     def run(self) -> None:
@@ -118,13 +114,14 @@ class Node:
         """
         watcher: zenoh.Subscriber[None] | None = None
         try:
-            with self._session.declare_queryable(self._keys.hello(self._plan.node), _answer):
+            with self._session.declare_queryable(self._keys.hello(self._plan.node), self._membership.answer_hello):
                 tokens = [self._session.liveliness().declare_token(key) for key in self._token_keys()]
                 watcher = self._session.liveliness().declare_subscriber(
                     self._keys.master, self._master_token_changed, history=True
                 )
                 self._load()
                 self._meet()
+                self._connect()
                 self._initialize()
                 self._step_to_the_end()
                 self.server.close()  # the last samples, while the master is there to bring them to clients
@@ -138,9 +135,7 @@ class Node:
             if watcher is not None:
                 watcher.undeclare()
             self.server.close()
-            for runner in self._runners.values():
-                for link in runner.out_links:
-                    link.close()
+            self._membership.close()
             self._inbox.close()
 
     def interrupt(self, reason: str) -> None:
@@ -184,36 +179,32 @@ class Node:
                     )
                     feeds.append(RemoteFeed(receiver, transfer))
                     runner.remote_feeds.append(feeds[-1])
-        for link in plan.links_out:
-            runner = self._runners[link.source]
-            publisher = self._session.declare_publisher(
-                self._keys.frames(link.source, link.target_node), congestion_control=_BLOCK, express=True
-            )
-            runner.out_links.append(OutLink(link, runner.outputs, publisher, plan.window))
         self._units = [Unit([self._runners[name] for name in names]) for names in plan.units]
         self.server.serve(self._runners)
 
     def _meet(self) -> None:
-        """Wait until the links with all other nodes work in both directions, then register with the master.
-
-        A source that answers has our subscription: it was declared before the question was asked, on the same link.
-        """
+        """Join the mesh: from now on all others are there."""
         self.server.state = "waiting for the mesh"
-        deadline_s = self._plan.timeouts.start
-        for node in dict.fromkeys(link.source_node for link in self._plan.links_in):
-            ask(self._session, self._keys.hello(node), b"", deadline_s, f"node '{node}'")
-        registration = Registration(self._plan.node, self._plan.digest, os.getpid(), socket.gethostname())
-        payload = msgspec.json.encode(registration)
-        answer = ask(self._session, self._keys.register, payload, deadline_s, "the master", 2 * deadline_s)
-        welcome = decode_json(answer, Welcome)
+        welcome = self._membership.join()
         self._progress_number = welcome.number
         self._heard = time.monotonic()
         if welcome.profile:
-            self._measure(welcome.profile)
+            self._profiler = Profiler(self._plan.node, welcome.profile, self._plan.window)
 
-    def _measure(self, entries: int) -> None:
+    def _connect(self) -> None:
+        """Make what sends to the other nodes and to the master."""
+        plan, membership = self._plan, self._membership
+        for link in plan.links_out:
+            runner = self._runners[link.source]
+            put = membership.sender(link.target_node, self._keys.frames(link.source, link.target_node))
+            runner.out_links.append(OutLink(link, runner.outputs, put, plan.window))
+        self._poll = self._inbox.poll
+        self._put_progress = membership.sender(MASTER, self._keys.progress())
+        if self._profiler is not None:
+            self._measure(self._profiler)
+
+    def _measure(self, profiler: Profiler) -> None:
         """From now on measured units, links and calls take the place of the plain ones."""
-        self._profiler = profiler = Profiler(self._plan.node, entries, self._plan.window)
         self._units = profiler.measure(self._units, self._runners.values())
         self._poll = profiler.receiving(self._poll)
         self._take = profiler.receiving(self._take)
@@ -368,6 +359,7 @@ class Node:
         self.server.state = "failed"
         if self._master_is_gone:
             return True
+        self.server.say_everything()
         timeout_s = self._plan.timeouts.stop
         try:
             self._report(error, timeout_s if self._master_was_there else min(timeout_s, _NO_MASTER_S))
@@ -391,13 +383,5 @@ class _Aborted(FmuMeshError):
         self.cause = cause
 
 
-_BLOCK = zenoh.CongestionControl.BLOCK
-
-
 def _raise(error: FmuMeshError) -> None:
     raise error
-
-
-def _answer(query: zenoh.Query) -> None:
-    query.reply(query.key_expr, b"")
-    query.drop()

@@ -168,7 +168,7 @@ class _MeasuredLink(OutLink):
     """A link that takes the place of another one before its first frame, and tells the time that sending takes."""
 
     def __init__(self, profiler: Profiler, link: OutLink, outputs: Ring, window: int) -> None:
-        super().__init__(link.link, outputs, link.publisher, window)
+        super().__init__(link.link, outputs, link.put, window)
         self._profiler = profiler
 
     def flush(self, end: int) -> None:

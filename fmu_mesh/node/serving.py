@@ -38,6 +38,7 @@ log = logging.getLogger(__name__)
 _TICK_S = 0.25
 _ANSWER_S = 2.0
 _LAST_ROWS_S = 1.0
+_LAST_WORDS_S = 0.5
 _STREAM_SHARE = 4.0
 
 Job = Callable[[], None]
@@ -192,9 +193,13 @@ class Server:
         """What can be asked from the start, even before the FMU is loaded."""
         root = self._keys.instance(name)
         self._entities.append(self._session.declare_queryable(f"{root}/**", partial(self._query_arrived, name)))
-        for what, publishers in (("status", self._status_publishers), ("log", self._log_publishers)):
+        # A log message is not lost; the status is told again.
+        for what, publishers, congestion_control in (
+            ("status", self._status_publishers, zenoh.CongestionControl.DROP),
+            ("log", self._log_publishers, zenoh.CongestionControl.BLOCK),
+        ):
             publishers[name] = self._session.declare_publisher(
-                f"{root}/{what}", encoding=json_encoding, congestion_control=zenoh.CongestionControl.DROP
+                f"{root}/{what}", encoding=json_encoding, congestion_control=congestion_control
             )
 
     def _query_arrived(self, name: str, query: zenoh.Query) -> None:
@@ -351,6 +356,12 @@ class Server:
         return self._stalled_since[name][1]
 
     # --- publishing
+
+    def say_everything(self) -> None:
+        """Let what was logged so far go out before what follows from it; not for longer than `_LAST_WORDS_S`."""
+        said = threading.Event()
+        self._jobs.put(said.set)
+        said.wait(_LAST_WORDS_S)
 
     def _streams_changed(self, streams: InstanceStreams) -> None:
         def update() -> None:

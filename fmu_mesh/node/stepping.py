@@ -39,6 +39,7 @@ class LocalFeed:
     def __init__(self, source: Runner, transfer: Transfer) -> None:
         self.source = source
         self.transfer = transfer
+        self.step = transfer.stepper(source.outputs)
 
 
 class Runner:
@@ -65,9 +66,8 @@ class Runner:
 
     def bind(self) -> None:
         """Let the instance work on the rings, and read the current outputs. Call after Initialization Mode."""
-        if self.step == 0 and self.watched is None:
-            connected = [target for feed in self.plan.feeds for _, target, _, _ in feed.columns]
-            fill_unconnected(self.inputs, connected, self.instance.get_values)
+        connected = [target for feed in self.plan.feeds for _, target, _, _ in feed.columns]
+        fill_unconnected(self.inputs, connected, self.instance.get_values)
         outputs = (self.outputs,) if self.watched is None else (self.outputs, self.watched)
         self.instance.bind(self.inputs, outputs, self._grid, self.plan.step_points, self.step)
 
@@ -134,8 +134,10 @@ class Unit:
         self.runners = runners
         self._single = runners[0] if len(runners) == 1 else None
         self._inner = frozenset(runner.name for runner in runners)
+        self._one_rate = all(runner.plan.step_points == 1 for runner in runners)
         self._point = 0
         self._burst = 1
+        self._starved = False
 
     def advance(self, grant: int) -> bool:
         """Step as far as inputs and ``grant`` allow, for one burst at most; whether anything was stepped."""
@@ -152,13 +154,16 @@ class Unit:
             runner.step_seconds += elapsed
             if elapsed >= _BURST_S:
                 runner.flush()
-            else:
-                runner.flush_full()
+                continue
+            if self._starved:
+                runner.flush(lazy=False)
+            runner.flush_full()
         return True
 
     def _advance_single(self, runner: Runner, grant: int) -> int:
         first = runner.step
-        end = min(runner.limit(grant), first + self._burst)
+        limit = runner.limit(grant)
+        end = min(limit, first + self._burst)
         if end <= first:
             return 0
         for link in runner.out_links:
@@ -169,11 +174,30 @@ class Unit:
         for step in range(first, end):
             do_step(step)
             runner.step = step + 1
+        self._starved = end == limit
         return end - first
 
     def _advance_cycle(self, grant: int) -> int:
         first = self._point
-        end = min(self._cycle_limit(grant), first + self._burst)
+        limit = self._cycle_limit(grant)
+        end = min(limit, first + self._burst)
+        if self._one_rate:
+            self._step_together(first, end)
+        else:
+            self._step_at_own_rates(first, end)
+        self._point = max(first, end)
+        self._starved = end == limit
+        return max(0, end - first)
+
+    def _step_together(self, first: int, end: int) -> None:
+        for point in range(first, end):
+            for runner in self.runners:
+                for feed in runner.local_feeds:
+                    feed.step(point)
+                runner.instance.do_step(point)
+                runner.step = point + 1
+
+    def _step_at_own_rates(self, first: int, end: int) -> None:
         for point in range(first, end):
             for runner in self.runners:
                 # A slower instance steps when the end of its step is reached: only then all its inputs can be there.
@@ -181,11 +205,9 @@ class Unit:
                 if rest:
                     continue
                 for feed in runner.local_feeds:
-                    feed.transfer.step_from_ring(feed.source.outputs, step)
+                    feed.step(step)
                 runner.instance.do_step(step)
                 runner.step = step + 1
-        self._point = max(first, end)
-        return max(0, end - first)
 
     def _cycle_limit(self, grant: int) -> int:
         """The point up to which the whole cycle may step: bounded by the grant and by what comes from outside."""

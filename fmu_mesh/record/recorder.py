@@ -7,10 +7,9 @@ written yet holds the grant back, so that nothing has to be dropped and memory s
 from __future__ import annotations
 
 import logging
-import os
-import socket
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -26,8 +25,8 @@ from ..model.plan import RECORDER, NodePlan
 from ..wire.frames import FrameReceiver
 from ..wire.inbox import Inbox, Message
 from ..wire.keys import Keys
-from ..wire.messages import ABORT, FINISH, FRAME, HEADER, PROGRESS, NodeReport, Registration, decode_abort, decode_json
-from ..wire.profile import Welcome
+from ..wire.membership import MASTER, Membership, credit
+from ..wire.messages import ABORT, FINISH, FRAME, HEADER, PROGRESS, NodeReport, decode_abort
 from ..wire.session import ask
 from .csv_file import CsvFile
 from .result_file import OpenResult
@@ -73,10 +72,9 @@ class Recorder:
         self._finished = False
         self._flushed = time.monotonic()
         capacity = (plan.window + 8) * len(plan.links_in) + 1024
-        self._inbox = Inbox(session, self._keys.inbox(RECORDER), self._keys.wake(RECORDER), capacity)
-        self._progress = session.declare_publisher(
-            self._keys.progress(), congestion_control=zenoh.CongestionControl.BLOCK, express=True
-        )
+        self._inbox = Inbox(session, self._keys.inbox(RECORDER), self._keys.wake(RECORDER), capacity, credit(plan))
+        self._membership = Membership(plan, session, self._keys, self._inbox)
+        self._put_progress: Callable[[bytes], None]
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
 
     @property
@@ -101,6 +99,7 @@ class Recorder:
             if error is None:
                 raise unwritable(self._file.path, failure) from failure
         finally:
+            self._membership.close()
             self._inbox.close()
 
     def _finish_file(self) -> None:
@@ -137,13 +136,8 @@ class Recorder:
             raise _Ended(error) from error
 
     def _meet(self) -> None:
-        deadline_s = self._plan.timeouts.start
-        for node in dict.fromkeys(link.source_node for link in self._plan.links_in):
-            ask(self._session, self._keys.hello(node), b"", deadline_s, f"node '{node}'")
-        registration = Registration(RECORDER, self._plan.digest, os.getpid(), socket.gethostname())
-        payload = msgspec.json.encode(registration)
-        answer = ask(self._session, self._keys.register, payload, deadline_s, "the master", 2 * deadline_s)
-        self._number = decode_json(answer, Welcome).number
+        self._number = self._membership.join().number
+        self._put_progress = self._membership.sender(MASTER, self._keys.progress())
 
     def _record(self) -> None:
         """Take what comes, write rows when they are many or nothing more is there, and tell the progress."""
@@ -205,7 +199,7 @@ class Recorder:
         if complete > self._progress_sent and (due or complete == self._plan.grid.last_point):
             self._progress_sent = complete
             self._progress_told_at = now
-            self._progress.put(HEADER.pack(PROGRESS, self._number, 0, complete))
+            self._put_progress(HEADER.pack(PROGRESS, self._number, 0, complete))
 
     def _report(self, error: FmuMeshError | None) -> None:
         report = NodeReport(RECORDER, max(self._written - 1, 0), error.report() if error is not None else None)

@@ -158,7 +158,7 @@ def _in_shape(value: Any, port: Port) -> Value:  # noqa: ANN401 a field of any m
 
 def _with_length(elements: Any, length: int, types: MessageTypes, name: str, path: str) -> list[Any]:  # noqa: ANN401
     """The elements as a list, with zeros up to ``length`` where a sequence is shorter."""
-    listed = list(elements)
+    listed = elements if isinstance(elements, list) else list(elements)  # the list that another port has already
     kind = types.field(name, path[: path.rfind("[")])
     if isinstance(kind, Sequence) and isinstance(kind.element, Basic):
         zero: Any = "" if kind.element.kind == "string" else 0

@@ -134,14 +134,14 @@ class MeshClient:
 
         Args:
             target: the variable.
-            text: the value as JSON; what is no JSON is taken as text, so an item or a String needs no quotes.
+            text: the value as JSON; what is no JSON is taken as text, so an item, a String or base64 needs no quotes.
         """
         payload = text.encode()
         try:
             value = msgspec.json.decode(payload)
         except msgspec.DecodeError:
             value = None
-        if value is None or (target.variable.type == "String" and not isinstance(value, str | list)):
+        if value is None or (target.variable.type in ("String", "Binary") and not isinstance(value, str | list)):
             payload = msgspec.json.encode(text)
         return self._view(target.key, SetAnswer, f"'{target.instance}.{target.variable.name}'", payload)
 

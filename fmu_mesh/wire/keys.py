@@ -8,7 +8,7 @@ from typing import Literal
 
 import msgspec
 
-__all__ = ["Keys", "VariableKind", "escape", "unescape"]
+__all__ = ["Keys", "VariableKind", "batched", "escape", "unescape"]
 
 VariableKind = Literal["out", "in", "param", "local"]
 
@@ -96,8 +96,10 @@ class Keys(msgspec.Struct, frozen=True):
 
     def grants(self, nodes: Iterable[str]) -> list[str]:
         """Keys on which one put each reaches up to 16 nodes."""
-        names = list(nodes)
-        return [
-            f"{self.root}/@sync/grant/" + "/".join(f"to={node}" for node in names[first : first + _GRANT_CHUNKS])
-            for first in range(0, len(names), _GRANT_CHUNKS)
-        ]
+        return [f"{self.root}/@sync/grant/" + "/".join(f"to={node}" for node in part) for part in batched(nodes)]
+
+
+def batched(nodes: Iterable[str]) -> list[list[str]]:
+    """The nodes that one put of a grant reaches, for each of the keys of `Keys.grants`."""
+    names = list(nodes)
+    return [names[first : first + _GRANT_CHUNKS] for first in range(0, len(names), _GRANT_CHUNKS)]

@@ -26,7 +26,6 @@ __all__ = [
     "PROGRESS",
     "WAKE",
     "NodeReport",
-    "Registration",
     "decode_abort",
     "decode_json",
     "encode_abort",
@@ -44,15 +43,6 @@ WAKE: Final = 7
 MAX_MESSAGE_SIZE: Final = 64 * 2**20
 
 T = TypeVar("T")
-
-
-class Registration(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a node says about itself when it is ready for Initialization Mode."""
-
-    node: str
-    digest: str
-    pid: int
-    host: str
 
 
 class NodeReport(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -8,25 +8,13 @@ from __future__ import annotations
 
 import msgspec
 
-__all__ = ["GRANT", "TIME_LINE_ENTRIES", "Burst", "MeshProfile", "NodeProfile", "UnitProfile", "Wait", "Welcome"]
+__all__ = ["GRANT", "TIME_LINE_ENTRIES", "Burst", "MeshProfile", "NodeProfile", "UnitProfile", "Wait"]
 
 TIME_LINE_ENTRIES = 100_000
 """How many bursts and waits the time lines of all nodes of a mesh hold together; sums are never cut."""
 
 GRANT = ""
 """What stands for the master's grant where the name of an instance could stand."""
-
-
-class Welcome(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The master's answer to a registration, when all nodes are there.
-
-    Attributes:
-        number: what the node writes into its progress.
-        profile: how many bursts and waits it shall note for a profile; 0: nothing is measured.
-    """
-
-    number: int
-    profile: int = 0
 
 
 class Burst(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):

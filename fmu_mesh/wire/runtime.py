@@ -19,6 +19,7 @@ from ..errors import ConfigurationError
 
 __all__ = [
     "MeshNote",
+    "is_alive",
     "leave_run_folder",
     "meshes",
     "remove_run_folder",
@@ -83,7 +84,7 @@ def remove_run_folder(folder: Path) -> None:
 def leave_run_folder(folder: Path) -> None:
     """Remove the folder of a run if nobody uses it any more; called by every process on its way out."""
     note = _read_note(folder / "mesh.json")
-    if note is not None and not _is_alive(note.pid):
+    if note is not None and not is_alive(note.pid):
         remove_run_folder(folder)  # the launcher was killed
         return
     for empty in (folder / "fmus", folder):
@@ -121,7 +122,7 @@ def meshes() -> Iterator[MeshNote]:
     """The meshes that run on this host for this user; folders whose process is gone are removed on the way."""
     for file in sorted(runtime_folder().glob("*/mesh.json")):
         note = _read_note(file)
-        if note is not None and _is_alive(note.pid):
+        if note is not None and is_alive(note.pid):
             yield note
         elif note is not None:
             remove_run_folder(file.parent)
@@ -140,11 +141,16 @@ def _read_note(file: Path) -> MeshNote | None:
         return None
 
 
-def _is_alive(pid: int) -> bool:
+def is_alive(pid: int) -> bool:
+    """Whether this process still runs; one that has ended, but whose parent has not asked how, does not."""
     try:
         os.kill(pid, 0)
     except ProcessLookupError:
         return False
     except PermissionError:
         return True
-    return True
+    try:
+        state = Path(f"/proc/{pid}/stat").read_bytes().rpartition(b")")[2].split()[0]
+    except (OSError, IndexError):  # gone meanwhile, or a system without /proc
+        return not Path("/proc/self/stat").exists()
+    return state not in (b"Z", b"X")

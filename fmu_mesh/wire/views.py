@@ -112,7 +112,12 @@ class SetAnswer(msgspec.Struct, frozen=True):
 
 
 class MeshInfo(msgspec.Struct, frozen=True):
-    """Answer of `…/mesh/info`."""
+    """Answer of `…/mesh/info`.
+
+    Attributes:
+        shared_memory: nodes that get their messages through shared memory, and `@mesh` if the master does; all others
+            get them through Zenoh. Known when all are there.
+    """
 
     mesh: str
     version: str
@@ -129,6 +134,7 @@ class MeshInfo(msgspec.Struct, frozen=True):
     endpoints: tuple[str, ...]
     pid: int
     host: str
+    shared_memory: tuple[str, ...] = ()
 
 
 class MeshStatus(msgspec.Struct, frozen=True):

@@ -170,7 +170,7 @@ def test_a_chain_gives_the_same_floats_in_any_groups(groups: Mapping[str, str], 
 
 @pytest.mark.parametrize("algorithm", [GAUSS_SEIDEL, JACOBI])
 def test_a_cycle_in_one_group_gives_the_same_floats(algorithm: str, place: Place) -> None:
-    config = rewritten(CYCLE, place.folder, grouped(2000, algorithm, {"position": "loop", "velocity": "loop"}))
+    config = rewritten(CYCLE, place.folder, grouped(6000, algorithm, {"position": "loop", "velocity": "loop"}))
 
     assert_equivalent(place, config, cycle_of_two(config, algorithm))
 

@@ -135,7 +135,7 @@ def test_parameters_are_got_and_set_by_the_services_of_ros(met: Met) -> None:
             ],
             start=1,
         ):
-            peer.say(**order)
+            peer.say(order=order)
             answers.append(peer.answer(number)["answer"])
 
     assert answers[0] == [[3, 1.0], [0, 0.0]]

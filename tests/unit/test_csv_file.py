@@ -98,3 +98,20 @@ def test_a_file_that_cannot_be_written_is_an_error_that_says_so(tmp_path: Path) 
     (tmp_path / "file").touch()
     with pytest.raises(ConfigurationError, match=r"cannot be written: (Not a directory|File exists)"):
         CsvFile(tmp_path / "file" / "a.csv", [])
+
+
+def test_text_is_quoted_and_binary_is_base64(tmp_path: Path) -> None:
+    columns: list[tuple[str, VariableType]] = [("s", "String"), ("b", "Binary"), ("n", "UInt64"), ("on", "Boolean")]
+    texts = np.array(['a "b", c', "two\nlines", "[1]"], dtype=np.object_)
+    data = np.array([b"", b"\xff\0", b"abc"], dtype=np.object_)
+    numbers = np.array([2**64 - 1, 0, 1], dtype=np.uint64)
+
+    with CsvFile(tmp_path / "a.csv", columns) as file:
+        file.write(np.array([0.0, 1e22, math.inf]), [texts, data, numbers, numbers == 0])
+
+    with (tmp_path / "a.csv").open(newline="") as written:
+        assert list(csv.reader(written))[1:] == [
+            ["0.0", 'a "b", c', "", "18446744073709551615", "false"],
+            ["1e22", "two\nlines", "/wA=", "0", "true"],
+            ["inf", "[1]", "YWJj", "1", "false"],
+        ]

@@ -58,6 +58,15 @@ def test_a_last_row_that_is_cut_off_is_left_out(results: Path, rest: str) -> Non
     assert read_results(results).times.tolist() == [0.0, 0.5, 1.0]
 
 
+def test_columns_of_text_are_left_out(tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    path.write_text('time,a,"s,t",b\n0.0,1.5,"x, ""y""\nz",2\n0.5,2.5,"",3\n1.0,3.5,"cut')
+
+    results = read_results(path)
+
+    assert {name: column.tolist() for name, column in results.columns.items()} == {"a": [1.5, 2.5], "b": [2.0, 3.0]}
+
+
 def test_variables_are_chosen_in_the_order_asked_for(results: Path) -> None:
     assert list(read_results(results, ["b.count", "a.y"]).columns) == ["b.count", "a.y"]
 

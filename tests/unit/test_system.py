@@ -311,6 +311,122 @@ def test_lossless_types_and_loops_may_be_connected(connection: str) -> None:
     assert len(built(text(connections=connection)).connections) == 1
 
 
+MATRIX = description(
+    variable("y", "Float64", "output", declared_type=None, shape=(2, 3)),
+    variable("x", "Float32", "output", declared_type=None, shape=(3,)),
+    variable("z[2]", "Float64", "output", declared_type=None),
+    variable("z", "Float64", "output", declared_type=None, shape=(2,)),
+    variable("big", "UInt64", "output", declared_type=None),
+    variable("mode", "Enumeration", "output", declared_type=None, items=(("a", 0), ("b", 200))),
+    variable("data", "Binary", "output", declared_type=None),
+    variable("u", "Float64", "input", declared_type=None, shape=(2, 3)),
+    variable("v", "Float64", "input", declared_type=None),
+    variable("n", "Int8", "input", declared_type=None),
+    variable("byte", "UInt8", "input", declared_type=None),
+    variable("w", "Float32", "input", declared_type=None),
+)
+ARRAYS = {"pendulum": SOURCE, "delay": MATRIX}
+
+
+def array_findings(connections: str) -> list[str]:
+    with pytest.raises(ConfigurationError) as caught:
+        build(parse(text(connections=connections), FILE), ARRAYS)
+    return [f"{finding.path}: {finding.found}; expected {finding.expected}" for finding in caught.value.findings]
+
+
+@pytest.mark.parametrize(
+    ("connection", "ends"),
+    [
+        ("delay.y -> delay.u", ("y", "u")),
+        ("delay.y[2,3] -> delay.v", ("y[2,3]", "v")),
+        ("pendulum.a -> delay.u[ 1 , 3 ]", ("a", "u[1,3]")),
+        ("delay.x[3] -> delay.u[1,1]", ("x[3]", "u[1,1]")),
+        ("delay.z[2] -> delay.v", ("z[2]", "v")),
+        ("delay.mode -> delay.byte", ("mode", "byte")),
+        ("{from: delay.x[1], to: delay.w, factor: 2}", ("x[1]", "w")),
+    ],
+)
+def test_arrays_are_connected_as_a_whole_or_by_element(connection: str, ends: tuple[str, str]) -> None:
+    quoted = connection if connection[0] == "{" else f"'{connection}'"
+    quoted = quoted.replace("delay.x[1]", "'delay.x[1]'")
+    (made,) = build(parse(text(connections=quoted), FILE), ARRAYS).connections
+    assert (made.source_name, made.target_name) == ends
+
+
+def test_a_variable_that_is_called_like_an_element_wins() -> None:
+    loaded = parse(text(connections="'delay.z[2] -> delay.v', 'delay.z[1] -> delay.u[1,1]'"), FILE)
+    first, second = build(loaded, ARRAYS).connections
+    assert (first.source.name, first.source_index) == ("z[2]", ())
+    assert (second.source.name, second.source_index) == ("z", (0,))
+
+
+@pytest.mark.parametrize(
+    ("connection", "expected"),
+    [
+        ("delay.y -> delay.v", ("connections[0]: delay.y -> delay.v connects a Float64[2,3] to a Float64; "
+         "expected ends of the same shape: two arrays of the same dimensions, or one element as in y[1]")),
+        ("delay.y[3,1] -> delay.v", ("connections[0].from: 'delay.y[3,1]' of the Float64[2,3] 'y'; "
+         "expected an index from [1,1] to [2,3]")),
+        ("delay.y[0,1] -> delay.v", ("connections[0].from: 'delay.y[0,1]' of the Float64[2,3] 'y'; "
+         "expected an index from [1,1] to [2,3]")),
+        ("delay.y[1] -> delay.v", ("connections[0].from: 'delay.y[1]' of the Float64[2,3] 'y'; "
+         "expected an index from [1,1] to [2,3]")),
+        ("pendulum.a[1] -> delay.v", ("connections[0].from: 'pendulum.a[1]' of the Real 'a'; "
+         "expected an element of an array only: this variable is a scalar")),
+        ("delay.big -> delay.v", ("connections[0]: delay.big -> delay.v connects an UInt64 to a Float64; expected a "
+         "source of type Float64 or Float32 or Int32 or UInt32 or Int16 or UInt16 or Int8 or UInt8")),
+        ("delay.mode -> delay.n", ("connections[0]: delay.mode -> delay.n connects an Enumeration to an Int8; "
+         "expected a source of type Int8 or Boolean")),
+        ("delay.data -> delay.v", ("connections[0]: delay.data -> delay.v connects a Binary to a Float64; expected a "
+         "source of type Float64 or Float32 or Int32 or UInt32 or Int16 or UInt16 or Int8 or UInt8")),
+        ("delay.z -> delay.z", "connections[0].to: 'delay.z' is an output; expected an input"),
+    ],
+)  # fmt: skip
+def test_arrays_and_types_that_do_not_fit_are_refused(connection: str, expected: str) -> None:
+    assert array_findings(f"'{connection}'") == [expected]
+
+
+def test_an_input_array_has_one_source_for_each_element() -> None:
+    found = array_findings("'delay.y -> delay.u', 'delay.y[1,1] -> delay.u[1,1]', 'delay.y[1,2] -> delay.u[ 1,1]'")
+    assert [line.partition(";")[0] for line in found] == [
+        f"connections[{index}]: a second source for the input 'delay.u[1,1]': {connection}, "
+        "after delay.y -> delay.u (connections[0] in line 6)"
+        for index, connection in enumerate(["delay.y[1,1] -> delay.u[1,1]", "delay.y[1,2] -> delay.u[ 1,1]"], 1)
+    ]
+
+
+def test_every_element_of_a_recorded_array_is_a_column() -> None:
+    loaded = parse(text(rest="record: {variables: ['delay.y[2,1]', delay.x, 'delay.z[2]', delay.data]}"), FILE)
+    assert [name for _, name in build(loaded, ARRAYS).recorded] == ["y[2,1]", "x[1]", "x[2]", "x[3]", "z[2]", "data"]
+    assert ("delay", "data") not in build(parse(text(), FILE), ARRAYS).recorded
+    assert ("delay", "y[1,1]") in build(parse(text(), FILE), ARRAYS).recorded
+
+
+def test_structural_parameters_give_arrays_their_shapes() -> None:
+    sized = description(
+        variable("n", "UInt64", "structuralParameter", declared_type=None, start=2, initial="exact", minimum=1.0),
+        variable("u", "Float64", "input", declared_type=None, shape=(2,), dimensions=("n",), start=[0.5, 0.5]),
+    )
+    loaded = parse(text(pendulum="fmu: p.fmu, start_values: {n: 3, u: [1, 2, 3]}"), FILE)
+    instance = build(loaded, {"pendulum": sized, "delay": TARGET}).instances["pendulum"]
+    assert instance.start_values == {"n": 3, "u": [1.0, 2.0, 3.0]}
+    described = instance.description.variable("u")
+    assert described is not None
+    assert (described.shape, described.start) == ((3,), [0.5, 0.5, 0.5])
+
+
+def test_an_array_that_is_too_large_is_refused_before_it_takes_memory() -> None:
+    sized = description(
+        variable("n", "UInt64", "structuralParameter", declared_type=None, start=2, initial="exact"),
+        variable("u", "Float64", "input", declared_type=None, shape=(2,), dimensions=("n",)),
+    )
+    loaded = parse(text(pendulum="fmu: p.fmu, start_values: {n: 18446744073709551615}"), FILE)
+    with pytest.raises(
+        ConfigurationError, match=r"start_values: 'u' would have 18446744073709551615 elements; expected "
+    ):
+        build(loaded, {"pendulum": sized, "delay": TARGET})
+
+
 def test_different_units_without_a_factor_are_a_warning() -> None:
     (warning,) = built(text(connections="pendulum.a -> delay.x")).warnings
     assert warning == Finding(

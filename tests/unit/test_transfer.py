@@ -85,7 +85,7 @@ def test_a_ring_feeds_as_frames_do(source_points: int, target_points: int, delay
     transfer(by_frame, source_points, target_points, delay).from_rows(0, source.parts)
     transfer(by_ring, source_points, target_points, delay).from_ring(source, low, high)
     for step in range(low, high):
-        transfer(by_step, source_points, target_points, delay).step_from_ring(source, step)
+        transfer(by_step, source_points, target_points, delay).stepper(source)(step)
 
     for ring in (by_ring, by_step):
         assert ring.part("Float64")[low:high].tolist() == by_frame.part("Float64")[low:high].tolist()
@@ -135,3 +135,33 @@ def test_a_frame_that_feeds_no_step_changes_nothing() -> None:
 
     assert moved.ready(4) == 0
     assert not inputs.part("Float64").any()
+
+
+@pytest.mark.parametrize("delay", [0, 1])
+@pytest.mark.parametrize(
+    "columns",
+    [
+        (("c", "x", 1.0, 0.0),),
+        (("b", "z", 0.1, -3.3),),
+        (("m", "j", 1.0, 0.0),),
+        (("b", "y", 1.0, 0.0), ("n", "i", 1.0, 0.0), ("a", "x", -1.7, 1e-9)),
+    ],
+)
+def test_single_numbers_are_handed_over_bit_by_bit(
+    columns: tuple[tuple[str, str, float, float], ...], delay: int
+) -> None:
+    """Random bits: every kind of NaN, infinities and denormals among them; both rings go around several times."""
+    source = Ring(SOURCE, 8)
+    by_ring, by_step = Ring(INPUTS, 4), Ring(INPUTS, 4)
+    whole, single = (transfer(ring, delay=delay, columns=columns) for ring in (by_ring, by_step))
+    step_once = single.stepper(source)
+    random = np.random.default_rng(delay)
+
+    for step in range(40):
+        for part in source.parts:
+            part[(step + 1) & source.mask] = np.frombuffer(random.bytes(part[0].nbytes), part.dtype)
+        with np.errstate(all="ignore"):
+            whole.from_ring(source, step, step + 1)
+        step_once(step)
+
+        assert [part.tobytes() for part in by_step.parts] == [part.tobytes() for part in by_ring.parts]

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
+import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
-from fmu_mesh.errors import InitializationFailed, StepFailed
+from fmu_mesh import FMIAdapter
+from fmu_mesh.errors import CallRefused, InitializationFailed, LoadFailed, StepFailed
 from fmu_mesh.fmu import FmuInstance, open_instance, read_description
 from fmu_mesh.model.ring import Layout, Ring
 from fmu_mesh.model.types import INTEGERS, VariableType
@@ -213,3 +216,50 @@ def test_a_step_that_returns_early_is_finished_with_its_events(opened: FmuInstan
     opened.set_values({"u": -1.0, "interval": 1.0})
     opened.advance(0.75, 0.5)
     assert opened.get_values(["x", "y", "v"]) == [1.25, 12.0, -1.0]
+
+
+@of("Events3")
+def test_a_step_ends_at_an_event_that_was_announced(opened: FmuInstance) -> None:
+    opened.enter_initialization(0.0, 2.0, {"interval": 0.1, "announced": 1.0})
+    opened.exit_initialization()
+
+    opened.advance(0.0, 0.25)
+    opened.advance(0.25, 0.25)
+
+    assert opened.get_values(["x", "y"]) == [0.5, 5.0]
+
+
+@of("Events3")
+def test_an_fmu_that_wants_to_end_the_simulation_is_a_named_failure(opened: FmuInstance) -> None:
+    opened.enter_initialization(0.0, 2.0, {"last": 0.5})
+    opened.exit_initialization()
+    opened.advance(0.0, 0.25)
+
+    with pytest.raises(StepFailed, match="fmi3DoStep asks to end the simulation"):
+        opened.advance(0.25, 0.25)
+
+
+def test_a_beta_version_of_fmi_3_is_refused(folder: Path, tmp_path: Path) -> None:
+    path = tmp_path / "beta.fmu"
+    with zipfile.ZipFile(build_test_fmu("Events3", folder)) as source, zipfile.ZipFile(path, "w") as target:
+        for name in source.namelist():
+            target.writestr(name, source.read(name).replace(b'fmiVersion="3.0"', b'fmiVersion="3.0-beta.4"'))
+
+    with pytest.raises(LoadFailed, match=r"is an FMI 3\.0-beta\.4 FMU; co-simulation of FMI 1\.0, 2\.0 and 3\.0 is"):
+        read_description(path)
+
+
+def test_the_library_steps_fmus_of_fmi_3_with_arrays(folder: Path) -> None:
+    with FMIAdapter(build_test_fmu("AllTypes3", folder), step_size=0.5) as adapter:
+        adapter.set_initial_value("columns", 2)
+        matrix: Any = np.array([[1, 2], [3, 4]])
+        adapter.set_initial_value("int16_array_in", matrix)
+        adapter.exit_initialization_mode(0.0)
+        adapter.set_input_value("float64_array_in", 1.0, [[1.0, 2.0], [3.0, 4.0]])
+        adapter.do_step()
+        adapter.do_step()
+
+        assert adapter.get_output_value("int16_array_out") == [[1, 2], [3, 4]]
+        assert adapter.get_output_value("float64_array_out") == [[0.5, 1.0], [1.5, 2.0]]
+        with pytest.raises(CallRefused, match="a list of 2 x 2 values"):
+            adapter.set_input_value("float64_array_in", 2.0, [1.0, 2.0])

@@ -3,6 +3,7 @@
  * FMI 3.0 co-simulation with Event Mode and early return: `y` counts the time events, which come at every whole multiple
  * of `interval`; a step that would pass one returns early there. `x` is the time at the end of the last step.
  * `u` is discrete, so it may be set in Event Mode only; `v` takes its value there. Calls in the wrong state are errors.
+ * If `announced` is 1, the next event is announced, and a step past it is an error. From `last` on the FMU wants to end.
  */
 #include <math.h>
 #include <stdlib.h>
@@ -14,7 +15,7 @@
 #include "fmi3Functions.h"
 #include "fmu_guid.h"
 
-enum { X, Y, U, V, INTERVAL, COUNT };
+enum { X, Y, U, V, INTERVAL, ANNOUNCED, LAST, COUNT };
 enum { INSTANTIATED = 1, INITIALIZATION = 2, EVENT = 4, STEP = 8, TERMINATED = 16 };
 
 typedef struct {
@@ -70,6 +71,7 @@ fmi3Instance fmi3InstantiateCoSimulation(fmi3String name, fmi3String token, fmi3
     Model *m = calloc(1, sizeof *m);
     m->state = INSTANTIATED;
     m->values[INTERVAL] = 1.0;
+    m->values[LAST] = INFINITY;
     m->environment = environment;
     m->log = log;
     return m;
@@ -125,8 +127,9 @@ fmi3Status fmi3UpdateDiscreteStates(fmi3Instance i, fmi3Boolean *update, fmi3Boo
         m->values[Y] += 1.0;
     m->due = 0;
     m->values[V] = m->values[U];
-    *terminate = *nominals = *values = *defined = fmi3False;
-    *time = 0.0;
+    *terminate = *nominals = *values = fmi3False;
+    *defined = m->values[ANNOUNCED] != 0.0;
+    *time = (m->values[Y] + 1.0) * m->values[INTERVAL];
     return fmi3OK;
 }
 
@@ -138,11 +141,13 @@ fmi3Status fmi3DoStep(fmi3Instance i, fmi3Float64 time, fmi3Float64 size, fmi3Bo
     if (m->state != STEP || time != m->values[X] || size <= 0.0)
         return refuse(m, "fmi3DoStep is not allowed now, or not from this time");
     double next = (m->values[Y] + 1.0) * m->values[INTERVAL];
+    if (m->values[ANNOUNCED] != 0.0 && next < time + size)
+        return refuse(m, "this step passes the event that was announced");
     m->due = next <= time + size;
     *event = m->due;
     *early = next < time + size;
-    *terminate = fmi3False;
     *last = m->values[X] = *early ? next : time + size;
+    *terminate = *last >= m->values[LAST];
     return fmi3OK;
 }
 

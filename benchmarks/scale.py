@@ -1,0 +1,130 @@
+"""`python -m benchmarks.scale`: what a point costs with more and more instances, start-up included.
+
+A chain `Integrator -> Gain -> Gain -> …`, each instance in a process of its own, or in groups; recorded is the last
+output. Sizes are interleaved, figures are medians. Every result is compared with that of `launch --local`, row by row.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import json
+import re
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from benchmarks.contestants.entry import FMUS
+from benchmarks.environment import loads, machine
+
+_SUMMARY = re.compile(r"^(\d+) points in ([0-9.]+) s: (\d+) points/s", re.MULTILINE)
+_HEADER = "| instances | nodes | points | points/s | us per point and instance | start and end, s |"
+
+
+@dataclass
+class Size:
+    """A size of the chain, and what was measured with it.
+
+    Attributes:
+        nodes: processes of nodes; as many as instances, or the groups they are dealt into.
+    """
+
+    instances: int
+    nodes: int
+    points: int
+    rates: list[float] = field(default_factory=list)
+    around_s: list[float] = field(default_factory=list)
+
+    def row(self) -> str:
+        """The medians."""
+        rate = statistics.median(self.rates)
+        cost = 1e6 / rate / self.instances
+        around = statistics.median(self.around_s)
+        figures = (self.instances, self.nodes, self.points, f"{rate:,.0f}", f"{cost:.2f}", f"{around:.1f}")
+        return "| " + " | ".join(map(str, figures)) + " |"
+
+
+SIZES = (
+    Size(2, 2, 20_000),
+    Size(8, 8, 20_000),
+    Size(16, 16, 10_000),
+    Size(32, 32, 10_000),
+    Size(64, 64, 5_000),
+    Size(64, 8, 10_000),
+    Size(256, 8, 5_000),
+    Size(256, 2, 5_000),
+)
+
+
+def configuration(size: Size, result: Path) -> dict[str, Any]:
+    """The chain of this size."""
+    instances: dict[str, dict[str, Any]] = {
+        "source": {"fmu": str(FMUS / "Integrator.fmu"), "start_values": {"u": 1.0, "k": 0.7}}
+    }
+    for number in range(1, size.instances):
+        instances[f"gain_{number}"] = {"fmu": str(FMUS / "Gain.fmu"), "start_values": {"k": 1.01}}
+    names = list(instances)
+    if size.nodes < size.instances:
+        for number, name in enumerate(names):
+            instances[name]["group"] = f"group_{number * size.nodes // size.instances}"
+    return {
+        "mesh": "scale",
+        "simulation": {"stop_time": size.points * 0.001, "step_size": 0.001},
+        "instances": instances,
+        "connections": [f"{source}.y -> {target}.u" for source, target in itertools.pairwise(names)],
+        "record": {"file": str(result), "variables": [f"{names[-1]}.y"]},
+    }
+
+
+def measure(size: Size, folder: Path) -> None:
+    """Run it once.
+
+    Raises:
+        RuntimeError: the run failed, or its result is not that of one process.
+    """
+    config, result, local = folder / "scale.yaml", folder / "distributed.csv", folder / "local.csv"
+    config.write_text(json.dumps(configuration(size, result)))  # JSON is YAML
+    command = [sys.executable, "-m", "fmu_mesh", "launch", str(config), "--no-progress"]
+    started = time.perf_counter()
+    done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=170)
+    wall = time.perf_counter() - started
+    found = _SUMMARY.search(done.stdout)
+    if done.returncode or found is None:
+        msg = f"{size.instances} instances: exit code {done.returncode}: {done.stderr.strip()[-400:]}"
+        raise RuntimeError(msg)
+    subprocess.run([*command, "--local", "--output", str(local)], check=True, capture_output=True, timeout=170)
+    if result.read_bytes() != local.read_bytes():
+        msg = f"{size.instances} instances in {size.nodes} nodes: the result is not that of one process"
+        raise RuntimeError(msg)
+    size.rates.append(int(found[3]))
+    size.around_s.append(wall - float(found[2]))
+
+
+def main() -> int:
+    """Measure all sizes."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.scale", description=__doc__)
+    parser.add_argument("--repeat", type=int, default=3, metavar="N", help="interleaved rounds (3)")
+    options = parser.parse_args()
+    before = loads()
+    with tempfile.TemporaryDirectory(prefix="scale-") as folder:
+        for number in range(options.repeat):
+            for size in SIZES:
+                print(f"round {number + 1}: {size.instances} instances, {size.nodes} nodes", file=sys.stderr)
+                measure(size, Path(folder))
+    print(
+        f"median of {options.repeat} interleaved rounds; {machine()}; load average before {before}, after {loads()}\n"
+    )
+    print(_HEADER)
+    print("|" + "---:|" * (_HEADER.count("|") - 1))
+    for size in SIZES:
+        print(size.row())
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

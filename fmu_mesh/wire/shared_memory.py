@@ -1,0 +1,385 @@
+"""Messages between processes of one host through shared memory: bounded buffers, and a doorbell to sleep on.
+
+A receiver owns one piece of anonymous memory with one buffer for each of its senders. Whoever may open it finds it by
+process id and descriptor, which an `Offer` tells; a random token proves that it is the same host. There is no file, so
+nothing is left behind, whoever is killed.
+
+Each buffer is the bounded buffer of Dijkstra: the semaphore ``items`` counts messages that are written, ``spaces``
+those that are read. All order between processes comes from these semaphores, so it holds on every processor. One more
+semaphore of the receiver, the doorbell, is what it waits on; it is rung after every message.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import fcntl
+import mmap
+import os
+import secrets
+import struct
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import msgspec
+
+from ..errors import DeadlineExceeded, FmuMeshError
+from .messages import ABORT, MAX_MESSAGE_SIZE
+from .runtime import is_alive
+
+__all__ = ["Offer", "SharedInbox", "SharedOutlet", "available"]
+
+_NAME: Final = "fmu_mesh"
+_TOKEN_SIZE: Final = 16
+_DOORBELL: Final = 64
+_CHANNELS: Final = 128
+_ITEMS: Final = 0
+_SPACES: Final = 64
+_DATA: Final = 128
+_MIN_SIZE: Final = 64 * 1024
+_MAX_SIZE: Final = 16 * 2**20
+_LENGTH: Final = struct.Struct("<I")
+_MORE: Final = 1 << 31
+"""Set in a length where the message goes on in the next record: it was too long for one."""
+
+_LOOK_S: Final = 0.05
+_SPIN_S: Final = 50e-6
+"""How long a receiver looks for the next message before it sleeps: about what it takes to wake up on another core."""
+
+_PATIENCE: Final = 3
+_REST: Final = 30
+_ONE_CORE: Final = not hasattr(os, "sched_getaffinity") or len(os.sched_getaffinity(0)) == 1
+
+
+class _Timespec(ctypes.Structure):
+    _fields_ = (("seconds", ctypes.c_long), ("nanoseconds", ctypes.c_long))
+
+
+def _functions() -> tuple[Any, Any, Any, Any] | None:
+    """sem_init, sem_post, sem_trywait and sem_clockwait, or None where the C library has not all of them.
+
+    Those that cannot block keep the interpreter's lock: letting it go costs more than they do.
+    """
+    quick, slow = ctypes.PyDLL(None), ctypes.CDLL(None)
+    if not hasattr(slow, "sem_clockwait"):
+        return None
+    return quick.sem_init, quick.sem_post, quick.sem_trywait, slow.sem_clockwait
+
+
+_SEMAPHORES: Final = _functions()
+
+
+def available() -> bool:
+    """Whether this system has what sharing needs: Linux with a C library that has `sem_clockwait` (glibc 2.30)."""
+    return _SEMAPHORES is not None and hasattr(os, "memfd_create") and Path("/proc/self/fd").is_dir()
+
+
+class Offer(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Where the memory of a receiver is.
+
+    Attributes:
+        pid: process that has it open.
+        descriptor: as which file descriptor.
+        token: hexadecimal; stands at its beginning.
+        size: of all of it, in bytes.
+        channels: (offset, bytes of data) of the buffer of each sender.
+    """
+
+    pid: int
+    descriptor: int
+    token: str
+    size: int
+    channels: dict[str, tuple[int, int]]
+
+
+class _Memory:
+    """A mapping and its address; it stays as long as something refers to it."""
+
+    def __init__(self, descriptor: int, size: int) -> None:
+        self.map = mmap.mmap(descriptor, size)
+        self.view = memoryview(self.map)
+        self.address = ctypes.addressof(ctypes.c_char.from_buffer(self.map))
+
+    def semaphore(self, offset: int) -> ctypes.c_void_p:
+        return ctypes.c_void_p(self.address + offset)
+
+
+class SharedInbox:
+    """The receiving end: everything that is sent to one process, in the order of each sender.
+
+    Args:
+        senders: bytes that may be on their way, by sender; more than that blocks it.
+
+    Raises:
+        OSError: the system gives no memory.
+
+    One thread receives; `wake` may be called by any thread.
+    """
+
+    def __init__(self, senders: Mapping[str, int]) -> None:
+        assert _SEMAPHORES is not None
+        init, post, self._trywait, self._clockwait = _SEMAPHORES
+        channels: dict[str, tuple[int, int]] = {}
+        end = _CHANNELS
+        for sender, wanted in senders.items():
+            size = -(-min(max(wanted, _MIN_SIZE), _MAX_SIZE) // 64) * 64
+            channels[sender] = (end, size)
+            end += _DATA + size
+        token = secrets.token_bytes(_TOKEN_SIZE)
+        self._descriptor = os.memfd_create(_NAME, os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
+        os.ftruncate(self._descriptor, end)
+        # A sender cannot make the mapping of the others shorter.
+        fcntl.fcntl(self._descriptor, fcntl.F_ADD_SEALS, fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL)
+        self._memory = memory = _Memory(self._descriptor, end)
+        memory.view[:_TOKEN_SIZE] = token
+        self._doorbell = memory.semaphore(_DOORBELL)
+        for offset in (_DOORBELL, *(start + part for start, _ in channels.values() for part in (_ITEMS, _SPACES))):
+            init(memory.semaphore(offset), 1, 0)
+        self._channels = [_Incoming(memory, *place) for place in channels.values()]
+        self._arrived: deque[bytes] = deque()
+        self._post = post
+        self.offer = Offer(os.getpid(), self._descriptor, token.hex(), end, channels)
+        self._woken = False
+        self._patience = 0
+
+    def take(self) -> bytes | None:
+        """The next message if one is there."""
+        if not self._arrived and self._trywait(self._doorbell) == 0:
+            self._collect()
+        return self._arrived.popleft() if self._arrived else None
+
+    def take_within(self, timeout_s: float) -> bytes | None:
+        """The next message; None after ``timeout_s`` seconds or a `wake`."""
+        arrived = self._arrived
+        if arrived:
+            return arrived.popleft()
+        until = None
+        while not arrived and not self._woken:
+            if self._trywait(self._doorbell) != 0:
+                # The bell may ring once more for what was taken already; then it is waited on again.
+                until = until or _after(timeout_s)
+                if (
+                    not self._rings_soon()
+                    and self._clockwait(self._doorbell, time.CLOCK_MONOTONIC, ctypes.byref(until)) != 0
+                ):
+                    return None
+            self._collect()
+        self._woken = False
+        return arrived.popleft() if arrived else None
+
+    def stash(self) -> bool:
+        """Make room for those who send to this process, while it waits for room itself; whether the run is over."""
+        if self._trywait(self._doorbell) == 0:
+            self._collect()
+            # What was taken here must not be slept over later.
+            self._post(self._doorbell)
+        return any(message[0] == ABORT for message in self._arrived)
+
+    def wake(self) -> None:
+        """From any thread: let `take_within` come back."""
+        self._woken = True
+        self._post(self._doorbell)
+
+    def close(self) -> None:
+        """No further sender can open the memory; it is free when the last one lets go of it."""
+        if self._descriptor >= 0:
+            os.close(self._descriptor)
+            self._descriptor = -1
+
+    def _rings_soon(self) -> bool:
+        """Look again and again for a moment, as long as that has been worth it of late.
+
+        Where it was in vain, somebody else may need the processor: then it is left alone for a number of waits.
+        """
+        if _ONE_CORE:
+            return False
+        if self._patience < 0:
+            self._patience += 1
+            return False
+        trywait, doorbell = self._trywait, self._doorbell
+        end = time.perf_counter() + _SPIN_S
+        while time.perf_counter() < end:
+            if trywait(doorbell) == 0:
+                self._patience = min(self._patience + 1, _PATIENCE)
+                return True
+        self._patience = self._patience - 1 if self._patience else -_REST
+        return False
+
+    def _collect(self) -> None:
+        """Take over all messages; the doorbell was rung for at least one of them."""
+        while self._trywait(self._doorbell) == 0:
+            continue
+        arrived = self._arrived
+        for channel in self._channels:
+            channel.collect(arrived)
+
+
+class _Incoming:
+    """The reader of one buffer."""
+
+    def __init__(self, memory: _Memory, offset: int, size: int) -> None:
+        assert _SEMAPHORES is not None
+        _, self._post, self._trywait, _ = _SEMAPHORES
+        self._memory = memory
+        self._items = memory.semaphore(offset + _ITEMS)
+        self._spaces = memory.semaphore(offset + _SPACES)
+        self._data = memory.view[offset + _DATA : offset + _DATA + size]
+        self._size = size
+        self._read = 0
+        self._parts: list[bytes] = []
+
+    def collect(self, arrived: deque[bytes]) -> None:
+        """Append all messages that are written."""
+        trywait, items, size, data = self._trywait, self._items, self._size, self._data
+        while trywait(items) == 0:
+            (length,) = _LENGTH.unpack_from(data, self._read)
+            more, length = length & _MORE, length & ~_MORE
+            start = self._read + 4
+            end = start + length
+            message = bytes(data[start:end])
+            if end > size:
+                message += bytes(data[: end - size])
+            self._read = (self._read + _space(length)) % size
+            self._post(self._spaces)
+            if more or self._parts:
+                self._parts.append(message)
+                if more:
+                    continue
+                message = b"".join(self._parts)
+                self._parts.clear()
+            arrived.append(message)
+
+
+class SharedOutlet:
+    """The sending end of one buffer; only one process and one thread at a time may use it.
+
+    Args:
+        offer: where the memory of the receiver is.
+        sender: which of its buffers is ours.
+        target: who the receiver is, for errors.
+        own: the sender's own inbox if it has one; it is emptied while there is no room in this buffer, so that two who
+            send to each other do not wait for each other.
+        deadline_s: how long to wait for room, in s.
+    """
+
+    def __init__(
+        self, offer: Offer, sender: str, target: str, own: Callable[[], bool] | None, deadline_s: float
+    ) -> None:
+        assert _SEMAPHORES is not None
+        _, self._post, self._trywait, self._clockwait = _SEMAPHORES
+        self._memory = memory = _open(offer)
+        offset, size = offer.channels[sender]
+        self._doorbell = memory.semaphore(_DOORBELL)
+        self._items = memory.semaphore(offset + _ITEMS)
+        self._spaces = memory.semaphore(offset + _SPACES)
+        self._data = memory.view[offset + _DATA : offset + _DATA + size]
+        self._size = self._free = size
+        self._written = 0
+        self._sent: deque[int] = deque()
+        self._pid = offer.pid
+        self._target = target
+        self._own = own
+        self._deadline_s = deadline_s
+
+    @classmethod
+    def open(
+        cls, offer: Offer | None, sender: str, target: str, own: Callable[[], bool] | None, deadline_s: float
+    ) -> SharedOutlet | None:
+        """The sending end, or None if the offer's memory cannot be reached from here: another host, or another user."""
+        if offer is None or not available() or sender not in offer.channels:
+            return None
+        try:
+            return cls(offer, sender, target, own, deadline_s)
+        except (OSError, ValueError):
+            return None
+
+    def put(self, message: bytes) -> None:
+        """Send a message.
+
+        Raises:
+            DeadlineExceeded: the receiver takes nothing.
+            FmuMeshError: the message is larger than any may be.
+        """
+        size = len(message)
+        if size <= self._size // 4:
+            self._write(message, size)
+            return
+        if size > MAX_MESSAGE_SIZE:
+            raise FmuMeshError(f"a message of {size} bytes for {self._target} is larger than {MAX_MESSAGE_SIZE} bytes")
+        view, part = memoryview(message), self._size // 4
+        for first in range(0, size, part):
+            piece = view[first : first + part]
+            self._write(piece, len(piece) | (_MORE if first + part < size else 0))
+
+    def _write(self, piece: bytes | memoryview, length: int) -> None:
+        needed = _space(len(piece))
+        if self._free < needed and not self._make_room(needed):
+            return
+        data, size = self._data, self._size
+        _LENGTH.pack_into(data, self._written, length)
+        start = self._written + 4
+        end = start + len(piece)
+        if end <= size:
+            data[start:end] = piece
+        else:
+            data[start:size] = piece[: size - start]
+            data[: end - size] = piece[size - start :]
+        self._written = (self._written + needed) % size
+        self._free -= needed
+        self._sent.append(needed)
+        self._post(self._items)
+        self._post(self._doorbell)
+
+    def _make_room(self, needed: int) -> bool:
+        """Wait until the receiver has read enough; False if nobody reads any more.
+
+        Raises:
+            DeadlineExceeded: it takes nothing for as long as a step may take.
+        """
+        started = time.monotonic()
+        while True:
+            while self._sent and self._trywait(self._spaces) == 0:
+                self._free += self._sent.popleft()
+                started = time.monotonic()
+            if self._free >= needed:
+                return True
+            if self._clockwait(self._spaces, time.CLOCK_MONOTONIC, ctypes.byref(_after(_LOOK_S))) == 0:
+                self._free += self._sent.popleft()
+            elif (self._own is not None and self._own()) or not is_alive(self._pid):
+                return False
+            elif time.monotonic() - started > self._deadline_s:
+                raise DeadlineExceeded(f"{self._target} has taken no message for {self._deadline_s:g} s")
+
+
+def _after(seconds: float) -> _Timespec:
+    """The instant in so many seconds, for `sem_clockwait`."""
+    end = time.monotonic() + seconds
+    return _Timespec(int(end), int(end % 1.0 * 1e9))
+
+
+def _space(length: int) -> int:
+    """Bytes that a record takes: its length word and its message, in multiples of 8 so that no length word is cut."""
+    return (length + 11) & ~7
+
+
+def _open(offer: Offer) -> _Memory:
+    """Map the memory of an offer.
+
+    Raises:
+        OSError: it cannot be opened from here.
+        ValueError: it is not the memory that was offered.
+    """
+    path = Path(f"/proc/{offer.pid}/fd/{offer.descriptor}")
+    if not str(path.readlink()).startswith(f"/memfd:{_NAME}"):  # opening a device could do something
+        msg = f"descriptor {offer.descriptor} of process {offer.pid} is no such memory"
+        raise ValueError(msg)
+    descriptor = os.open(path, os.O_RDWR | os.O_CLOEXEC)
+    try:
+        if os.fstat(descriptor).st_size != offer.size or os.pread(descriptor, _TOKEN_SIZE, 0).hex() != offer.token:
+            msg = f"descriptor {offer.descriptor} of process {offer.pid} is something else"
+            raise ValueError(msg)
+        return _Memory(descriptor, offer.size)
+    finally:
+        os.close(descriptor)

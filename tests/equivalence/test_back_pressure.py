@@ -1,0 +1,48 @@
+"""A fast chain in front of a slow end, with little room on the way and a window that lets everybody run far ahead."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from fmu_mesh.launch.local import LocalMesh
+from fmu_mesh.launch.preparing import Options, prepare
+from tests.helpers import Place, write_config
+
+POINTS = 12_000
+SLOW_S = 0.0001
+
+TINY_QUEUES = """
+{transport: {link: {tx: {queue: {size: {
+    control: 1, real_time: 1, interactive_high: 1, interactive_low: 1, data_high: 1, data: 1, data_low: 1, background: 1
+}}}}}}
+"""
+
+
+@pytest.mark.timeout(120)
+@pytest.mark.parametrize("way", ["shared memory", "zenoh"])
+def test_a_chain_of_eight_with_a_slow_end_runs_through_with_nothing_lost(way: str, place: Place, faulty: Path) -> None:
+    """The queues of Zenoh hold one message each; that shared memory blocks when it is full has tests of its own."""
+    (place.folder / "zenoh.json5").write_text(TINY_QUEUES, encoding="utf-8")
+    names = [f"i{number}" for number in range(7)]
+    members = {name: {"fmu": "Gain", "start_values": {"k": 1.001}} for name in names}
+    members["i0"] = {"fmu": "Integrator", "start_values": {"u": 1.0}}
+    members["slow"] = {"fmu": str(faulty), "start_values": {"slow": SLOW_S}}
+    connections = [f"{source}.y -> {target}.u" for source, target in zip(names, [*names[1:], "slow"], strict=True)]
+    config = write_config(
+        place.folder,
+        instances=members,
+        connections=connections,
+        stop_time=POINTS * 0.001,
+        simulation={"window": 8192},
+        zenoh={"shared_memory": way == "shared memory", "config": "zenoh.json5"},
+    )
+
+    assert place.run("launch", config, "--no-progress", deadline_s=100.0).wait() == 0
+
+    local = place.folder / "local.csv"
+    members["slow"]["start_values"] = {"slow": 0.0}  # the same values, sooner
+    write_config(place.folder, instances=members, connections=connections, stop_time=POINTS * 0.001, name="quick")
+    LocalMesh(prepare(place.folder / "quick.yaml", Options(output=local))).run()
+    assert config.with_suffix(".csv").read_bytes() == local.read_bytes()

@@ -1,0 +1,73 @@
+"""Shared memory or Zenoh: whichever way messages take, the result is the same in every float."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+import yaml
+
+from fmu_mesh.launch.local import LocalMesh
+from fmu_mesh.launch.preparing import Options, prepare
+from fmu_mesh.wire.shared_memory import available
+from tests.equivalence.test_equivalence import CHAIN, CYCLE, GAUSS_SEIDEL, JACOBI, PENDULUM, rewritten, shortened
+from tests.helpers import Place, wait_until, write_config
+
+shares = pytest.mark.skipif(not available(), reason="needs Linux with memfd_create and glibc 2.30")
+
+
+def local_result(place: Place, config: Path) -> bytes:
+    output = place.folder / "local.csv"
+    LocalMesh(prepare(config, Options(output=output))).run()
+    return output.read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("name", "points", "window", "algorithm"),
+    [
+        (PENDULUM, 1500, "auto", GAUSS_SEIDEL),
+        (PENDULUM, 200, 1, JACOBI),
+        (CHAIN, 600, "auto", GAUSS_SEIDEL),
+        (CYCLE, 300, "auto", GAUSS_SEIDEL),
+    ],
+)
+def test_over_zenoh_the_floats_are_those_of_one_process(
+    name: str, points: int, window: int | str, algorithm: str, place: Place
+) -> None:
+    config = rewritten(name, place.folder, shortened(points, algorithm, window))
+    content = yaml.safe_load(config.read_text(encoding="utf-8"))
+    content["zenoh"] = {"shared_memory": False}
+    config.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
+    output = place.folder / "result.csv"
+
+    launched = place.run("launch", config, "--no-progress", "--output", output)
+
+    assert launched.wait() == 0, launched.errors
+    assert output.read_bytes() == local_result(place, config)
+
+
+@shares
+@pytest.mark.skipif(os.geteuid() != 0 or shutil.which("unshare") is None, reason="needs root and unshare")
+@pytest.mark.timeout(60)
+def test_a_node_in_a_container_of_its_own_joins_through_zenoh(place: Place) -> None:
+    config = write_config(place.folder, stop_time=3.0, simulation={"real_time_factor": 1.0})
+    inside = ("unshare", "--pid", "--fork", "--mount-proc", "--kill-child")
+
+    by_hand = [
+        place.start("master", config),
+        place.start("node", config, "pendulum"),
+        place.start("node", config, "delay", prefix=inside),
+    ]
+    place.note()
+
+    def shared() -> list[str]:
+        asked = place.run("info", "mesh", "--json")
+        found: list[str] = json.loads(asked.output)["shared_memory"] if asked.wait() == 0 else []
+        return found
+
+    assert wait_until(shared, "a mesh that runs") == ["pendulum"]  # the others get something from the container
+    assert [launched.wait() for launched in by_hand] == [0, 0, 0]
+    assert config.with_suffix(".csv").read_bytes() == local_result(place, config)

@@ -1,0 +1,130 @@
+"""The gateway as a process: what it carries from the first point to the last, and what its end means."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zenoh
+
+from tests.helpers import Place, rows_of, wait_until, write_config
+from tests.ros.peers import free_port
+
+FLOAT = struct.Struct("<4xd")
+TIME = struct.Struct("<4xiI")
+
+
+class Ros:
+    """The side of ROS: a router that gets what is published; keys are those of the bridge."""
+
+    def __init__(self, session: zenoh.Session, port: int) -> None:
+        self.session = session
+        self.port = port
+        self.samples: dict[str, list[bytes]] = {}
+        self._subscriber = session.declare_subscriber("*", self._keep)
+
+    def _keep(self, sample: zenoh.Sample) -> None:
+        self.samples.setdefault(str(sample.key_expr), []).append(sample.payload.to_bytes())
+
+    def floats(self, topic: str) -> list[float]:
+        return [FLOAT.unpack(data)[0] for data in self.samples.get(topic, [])]
+
+    def ticks(self) -> list[float]:
+        return [sec + nanosec / 1e9 for sec, nanosec in map(TIME.unpack, self.samples.get("clock", []))]
+
+
+@pytest.fixture
+def ros() -> Iterator[Ros]:
+    port = free_port()
+    config = zenoh.Config()
+    config.insert_json5("mode", '"router"')
+    config.insert_json5("scouting/multicast/enabled", "false")
+    config.insert_json5("listen/endpoints", f'["tcp/127.0.0.1:{port}"]')
+    with zenoh.open(config) as session:
+        yield Ros(session, port)
+
+
+def configured(place: Place, ros: Ros, *, factor: float, stop_time: float = 3.0, **more: Any) -> Path:  # noqa: ANN401
+    return write_config(
+        place.folder,
+        name="lab",
+        instances={"pendulum": {"fmu": "DampedPendulum", "start_values": {"a": 1.3}}, "gain": {"fmu": "Gain"}},
+        connections=[],
+        stop_time=stop_time,
+        simulation={"step_size": 0.01, "real_time_factor": factor},
+        ros={
+            "connect": [f"tcp/127.0.0.1:{ros.port}"],
+            "topics": [{"topic": "/angle", "variable": "pendulum.a"}, {"topic": "/command", "variable": "gain.u"}],
+            **more,
+        },
+    )
+
+
+def test_every_sample_from_the_first_point_to_the_last_arrives_and_the_clock_tells_every_point(
+    place: Place, ros: Ros
+) -> None:
+    config = configured(place, ros, factor=3)
+
+    mesh = place.run("launch", config, "--no-progress")
+
+    rows = rows_of(place.folder / "lab.csv")
+    assert (mesh.wait(), mesh.errors.count("\n")) == (0, 1), mesh.errors
+    assert len(rows) == 301
+    assert ros.floats("angle") == [row[1] for row in rows]
+    assert [round(tick, 9) for tick in ros.ticks()] == [round(row[0], 9) for row in rows]
+    place.assert_nothing_left()
+
+
+def test_the_clock_stands_while_the_mesh_is_paused_and_goes_on_by_the_points_of_a_step(place: Place, ros: Ros) -> None:
+    mesh = place.start("launch", configured(place, ros, factor=1, stop_time=60.0, clock_rate=50), "--no-progress")
+    wait_until(lambda: len(ros.ticks()) > 3, "the clock")
+
+    assert place.run("pause", "lab").wait() == 0
+    wait_until(lambda: len(ticks := ros.ticks()) > 2 and ticks[-1] == ticks[-2], "the same time a second time")
+    stands = ros.ticks()[-1]
+    with contextlib.suppress(StopIteration):
+        ros.session.put("command", b"no message at all")
+    assert place.run("step", "lab", "10").wait() == 0
+    wait_until(lambda: ros.ticks()[-1] > stands + 0.09, "the clock after the step")
+    wait_until(lambda: len(ticks := ros.ticks()) > 2 and ticks[-1] == ticks[-2], "the same time a second time")
+    moved = ros.ticks()[-1]
+
+    assert {round(late - early, 9) for early, late in zip(ros.ticks(), ros.ticks()[1:], strict=False)} <= {0.0, 0.02}
+    assert stands + 0.08 <= moved <= stands + 0.1 + 0.02
+    assert mesh.wait_for_error_line("a message of 17 bytes is no 'std_msgs/msg/Float64'")
+    mesh.signal(signal.SIGINT)
+    mesh.wait()
+
+
+def test_a_gateway_that_dies_ends_the_run_with_its_name_and_what_was_recorded(place: Place, ros: Ros) -> None:
+    mesh = place.start("launch", configured(place, ros, factor=1, stop_time=60.0), "--no-progress")
+    wait_until(lambda: len(ros.floats("angle")) > 20, "samples")
+    [gateway] = [process for process in place.processes() if "gateway" in process.cmdline()]
+
+    gateway.kill()
+
+    assert mesh.wait() == 4
+    assert "the gateway to ROS was lost: its process was ended by SIGKILL" in mesh.message
+    assert len(rows_of(place.folder / "lab.csv")) > 20
+    place.assert_nothing_left(2.0)
+
+
+def test_a_mesh_runs_on_where_nobody_of_ros_is_there(place: Place, ros: Ros) -> None:
+    config = configured(place, ros, factor=0, stop_time=1.0, connect=[f"tcp/127.0.0.1:{free_port()}"])
+
+    assert place.run("launch", config, "--no-progress").wait() == 0
+
+    assert len(rows_of(place.folder / "lab.csv")) == 101
+    assert ros.samples == {}
+
+
+def test_the_gateway_by_hand_says_what_is_missing(place: Place) -> None:
+    gateway = place.run("gateway", write_config(place.folder))
+
+    assert gateway.wait() == 2
+    assert "there is no section `ros`" in gateway.message

@@ -1,0 +1,156 @@
+"""Messages of values and values of messages: what belongs to one point, and nothing else, is in one message."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Literal
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fmu_mesh.model.description import Variable, VariableType
+from fmu_mesh.ros.cdr import CdrError, Codec
+from fmu_mesh.ros.messages import Assembler, Disassembler
+from fmu_mesh.ros.topics import Port, Topic
+from fmu_mesh.ros.types import MessageTypes
+
+TYPES = MessageTypes("kilted")
+TWIST = "geometry_msgs/msg/TwistStamped"
+
+
+def port(path: str, *, kind: VariableType = "Float64", steps: int = 1, shape: tuple[int, ...] = ()) -> Port:
+    variable = Variable(
+        name=path, value_reference=0, type=kind, causality="output", variability="continuous", shape=shape
+    )
+    return Port(path, "one", variable, "out", steps)
+
+
+def topic(message: str, *ports: Port, direction: Literal["out", "in"] = "out") -> Topic:
+    stamped = TYPES.has_header(message)
+    return Topic("/t", message, direction, ports, "ros2dds", stamped=stamped, frame_id="base", reliability="reliable")
+
+
+def decoded(message: str, data: bytes) -> dict[str, Any]:
+    return Codec(TYPES, message).decode(data)
+
+
+def test_a_message_of_two_variables_holds_values_of_one_point_whatever_comes_first() -> None:
+    assembler = Assembler(topic(TWIST, port("twist.linear.x"), port("twist.angular.z")), TYPES)
+
+    made = [
+        message
+        for index, point, value in [(0, 0, 1.0), (0, 1, 2.0), (1, 0, -1.0), (0, 2, 3.0), (1, 1, -2.0), (1, 2, -3.0)]
+        for message in assembler.add(index, point, point * 0.25, value)
+    ]
+
+    messages = [decoded(TWIST, data) for data, _ in made]
+    assert [time for _, time in made] == [0.0, 0.25, 0.5]
+    assert [(own["twist"]["linear"]["x"], own["twist"]["angular"]["z"]) for own in messages] == [
+        (1.0, -1.0),
+        (2.0, -2.0),
+        (3.0, -3.0),
+    ]
+    assert messages[1]["header"] == {"stamp": {"sec": 0, "nanosec": 250_000_000}, "frame_id": "base"}
+
+
+def test_the_value_of_a_slower_instance_holds_until_its_next() -> None:
+    assembler = Assembler(topic(TWIST, port("twist.linear.x"), port("twist.angular.z", steps=3)), TYPES)
+
+    made = [
+        decoded(TWIST, data)["twist"]
+        for index, point in [(0, 0), (0, 1), (1, 0), (0, 2), (0, 3), (1, 3), (0, 4)]
+        for data, _ in assembler.add(index, point, float(point), float(point))
+    ]
+
+    assert [(own["linear"]["x"], own["angular"]["z"]) for own in made] == [(0, 0), (1, 0), (2, 0), (3, 3), (4, 3)]
+
+
+def test_a_sample_that_is_lost_costs_its_own_message_only() -> None:
+    assembler = Assembler(topic(TWIST, port("twist.linear.x"), port("twist.angular.z")), TYPES)
+
+    made = [
+        time
+        for index, point in [(0, 0), (1, 0), (0, 1), (0, 2), (1, 2), (0, 3), (1, 3)]
+        for _, time in assembler.add(index, point, float(point), 0.0)
+    ]
+
+    assert made == [0.0, 2.0, 3.0]
+
+
+@given(st.integers(1, 4), st.integers(1, 4), st.randoms(use_true_random=False))
+def test_any_order_of_arrival_gives_the_same_messages(fast: int, slow: int, random: Any) -> None:  # noqa: ANN401
+    last = 12
+    arrivals = [list(range(0, last + 1, steps)) for steps in (fast, slow)]
+    assembler = Assembler(topic(TWIST, port("twist.linear.x", steps=fast), port("twist.angular.z", steps=slow)), TYPES)
+    made = []
+    while any(arrivals):
+        index = random.choice([number for number, waiting in enumerate(arrivals) if waiting])
+        point = arrivals[index].pop(0)
+        made += [
+            (time, own["twist"]["linear"]["x"], own["twist"]["angular"]["z"])
+            for data, time in assembler.add(index, point, float(point), float(point))
+            for own in [decoded(TWIST, data)]
+        ]
+
+    points = sorted({*range(0, last + 1, fast), *range(0, last + 1, slow)})
+    assert made == [(point, point // fast * fast, point // slow * slow) for point in points]
+
+
+def test_what_json_does_not_have_arrives_as_what_it_is() -> None:
+    assembler = Assembler(topic("std_msgs/msg/Float64", port("data")), TYPES)
+
+    [(nothing, _)] = assembler.add(0, 0, 0.0, "NaN")
+    [(below, _)] = assembler.add(0, 1, 1.0, "-INF")
+
+    assert math.isnan(decoded("std_msgs/msg/Float64", nothing)["data"])
+    assert decoded("std_msgs/msg/Float64", below)["data"] == -math.inf
+
+
+def test_an_array_goes_and_comes_with_its_shape() -> None:
+    name = "std_msgs/msg/Float64MultiArray"
+    matrix = [[1.0, 2.0, 3.0], [4.0, 5.0, "INF"]]
+    own = port("data", shape=(2, 3))
+
+    [(data, _)] = Assembler(topic(name, own), TYPES).add(0, 0, 0.0, matrix)
+    values, _ = Disassembler(topic(name, own, direction="in"), TYPES).values(data)
+
+    assert decoded(name, data)["layout"]["dim"] == [
+        {"label": "dim0", "size": 2, "stride": 6},
+        {"label": "dim1", "size": 3, "stride": 3},
+    ]
+    assert values == [[[1.0, 2.0, 3.0], [4.0, 5.0, math.inf]]]
+
+
+def test_single_variables_fill_the_elements_of_an_array() -> None:
+    name = "std_msgs/msg/Int16MultiArray"
+    ports = (port("data[0]", kind="Int16"), port("data[2]", kind="Int16"))
+    assembler = Assembler(topic(name, *ports), TYPES)
+
+    made = [data for index in (0, 1) for data, _ in assembler.add(index, 0, 0.0, index + 7)]
+
+    assert decoded(name, made[0])["data"].tolist() == [7, 0, 8]
+    assert Disassembler(topic(name, *ports, direction="in"), TYPES).values(made[0]) == ([7, 8], None)
+
+
+def test_a_message_without_the_element_that_a_variable_needs_is_refused() -> None:
+    name = "std_msgs/msg/Float64MultiArray"
+    empty = Codec(TYPES, name).encode(Codec(TYPES, name).empty())
+
+    with pytest.raises(CdrError, match=r"has no 'data\[3\]'"):
+        Disassembler(topic(name, port("data[3]"), direction="in"), TYPES).values(empty)
+    with pytest.raises(CdrError, match="needs 2 elements"):
+        Disassembler(topic(name, port("data", shape=(2,)), direction="in"), TYPES).values(empty)
+
+
+def test_the_stamp_of_a_message_comes_with_its_values_and_zero_is_none() -> None:
+    own = topic(TWIST, port("twist.linear.x"), direction="in")
+    codec = Codec(TYPES, TWIST)
+    message = codec.empty()
+    message["twist"]["linear"]["x"] = 0.1
+
+    without = Disassembler(own, TYPES).values(codec.encode(message))
+    message["header"]["stamp"] = {"sec": 3, "nanosec": 500_000_000}
+
+    assert without == ([0.1], None)
+    assert Disassembler(own, TYPES).values(codec.encode(message)) == ([0.1], 3.5)

@@ -1,0 +1,167 @@
+"""The `ros` section: which topics follow from it, and all that can be wrong with it, each with the way out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from fmu_mesh.errors import ConfigurationError
+from fmu_mesh.launch.preparing import prepare
+from fmu_mesh.model.description import ModelDescription, Variable
+from fmu_mesh.model.loading import load
+from fmu_mesh.ros.mapping import resolve
+from fmu_mesh.ros.topics import RosPlan
+from tests.helpers import write_config
+
+TWIST = "geometry_msgs/msg/TwistStamped"
+
+
+def planned(folder: Path, **ros: Any) -> RosPlan:  # noqa: ANN401 what a file may hold
+    """The plan of a mesh of a pendulum, a delay that it feeds, and a gain that nothing feeds."""
+    path = configured(folder, **ros)
+    plan = prepare(path)
+    loaded = load(path)
+    found = resolve(loaded, {name: own.description for name, own in plan.system.instances.items()}, loaded.findings())
+    assert found is not None
+    return found
+
+
+def configured(folder: Path, **ros: Any) -> Path:  # noqa: ANN401 what a file may hold
+    return write_config(
+        folder,
+        instances={
+            "pendulum": {"fmu": "DampedPendulum"},
+            "delay": {"fmu": "TransportDelay"},
+            "gain": {"fmu": "Gain", "step_size": 0.004},
+        },
+        ros=ros,
+    )
+
+
+def test_without_topics_all_outputs_and_unconnected_inputs_have_one(tmp_path: Path) -> None:
+    plan = planned(tmp_path, namespace="/robot")
+
+    assert [(topic.name, topic.direction, topic.message) for topic in plan.topics] == [
+        ("/robot/pendulum/a", "out", "std_msgs/msg/Float64"),
+        ("/robot/pendulum/der_a_", "out", "std_msgs/msg/Float64"),
+        ("/robot/pendulum/der_a_2_", "out", "std_msgs/msg/Float64"),
+        ("/robot/delay/y", "out", "std_msgs/msg/Float64"),
+        ("/robot/gain/u", "in", "std_msgs/msg/Float64"),
+        ("/robot/gain/y", "out", "std_msgs/msg/Float64"),
+    ]
+    assert {"pendulum.l", "pendulum.d", "delay.d", "gain.k"} <= {parameter.name for parameter in plan.parameters}
+    assert (plan.node, plan.clock_points) == ("pair", 10)
+
+
+def test_topics_are_set_by_hand_for_a_variable_an_instance_or_several_variables(tmp_path: Path) -> None:
+    fields = {"twist.linear.x": "pendulum.a", "twist.angular.z": "gain.y"}
+
+    plan = planned(
+        tmp_path,
+        profile="rmw_zenoh",
+        clock_rate=None,
+        topics=[
+            "delay.y",
+            {"variable": "gain", "topic": "/g", "reliability": "best_effort"},
+            {"topic": "state", "type": TWIST, "fields": fields, "frame_id": "base", "profile": "ros2dds"},
+            {"topic": "/narrow", "variable": "pendulum.a", "type": "std_msgs/msg/Float32"},
+        ],
+    )
+
+    assert [(topic.name, topic.profile, topic.stamped) for topic in plan.topics] == [
+        ("/delay/y", "rmw_zenoh", False),
+        ("/g/u", "rmw_zenoh", False),
+        ("/g/y", "rmw_zenoh", False),
+        ("/state", "ros2dds", True),
+        ("/narrow", "rmw_zenoh", False),
+    ]
+    assert [(port.path, port.instance, port.step_points) for port in plan.topics[3].ports] == [
+        ("twist.linear.x", "pendulum", 1),
+        ("twist.angular.z", "gain", 4),
+    ]
+    assert plan.clock_points is None
+
+
+@pytest.mark.parametrize(
+    ("ros", "message"),
+    [
+        ({"node": "a/b"}, "ros.node: 'a/b': a slash; expected letters"),
+        ({"namespace": "robot"}, "ros.namespace: 'robot'; expected a name that starts with a slash"),
+        ({"clock_rate": 0}, "ros.clock_rate: 0; expected a rate > 0 in Hz"),
+        ({"connect": []}, "ros.connect: no endpoint; expected where the bridge"),
+        ({"messages": {"Wheel": "w.msg"}}, "ros.messages.Wheel: 'Wheel'; expected the full name of a message type"),
+        ({"messages": {"lab_msgs/msg/Wheel": "w.msg"}}, "'w.msg', which cannot be read (No such file or directory)"),
+        ({"topics": ["pendlum.a"]}, "the unknown instance 'pendlum'; expected one of the instances"),
+        ({"topics": ["pendlum.a"]}, "Did you mean 'pendulum'?"),
+        ({"topics": ["pendulum.der(b)"]}, "the unknown variable 'der(b)' of instance 'pendulum'"),
+        ({"topics": ["delay.x"]}, "the connected input 'delay.x'; expected an input without a connection"),
+        ({"topics": ["gain.k"]}, "'gain.k', a parameter; expected an output"),
+        ({"topics": [{"topic": "/x"}]}, "neither `variable` nor `fields`; expected one of them"),
+        ({"topics": [{"variable": "delay.y", "topic": "/1a"}]}, "'/1a': the part '1a' starts with a digit"),
+        ({"topics": ["delay.y", "delay"]}, "the topic '/delay/y' for 'delay.y' and for 'delay.y'"),
+        (
+            {"topics": [{"variable": "delay.y", "topic": "/x"}, {"variable": "gain.u", "topic": "/x", "type": TWIST}]},
+            "'geometry_msgs/msg/TwistStamped' has no field 'data'",
+        ),
+        (
+            {"topics": [{"variable": "delay.y", "type": "std_msgs/msg/Flot64"}]},
+            "the unknown message type 'std_msgs/msg/Flot64'; expected one of ROS. Did you mean 'std_msgs/msg/Float64'?",
+        ),
+        (
+            {"topics": [{"variable": "delay.y", "type": "std_msgs/msg/Int32"}]},
+            "'data' of 'std_msgs/msg/Int32' for 'delay.y': Float64 into int32 may lose something",
+        ),
+        (
+            {"topics": [{"variable": "delay.y", "type": "std_msgs/msg/Float64MultiArray"}]},
+            "one value into an array; write an index, such as data[0]",
+        ),
+        ({"topics": [{"fields": {"data": "delay.y"}}]}, "no `topic`; expected a topic"),
+        ({"topics": [{"variable": "gain", "type": TWIST}]}, "one type for all topics of the instance 'gain'"),
+        (
+            {"topics": [{"topic": "/v", "type": TWIST, "fields": {"twist.linear.q": "delay.y"}}]},
+            "has no field 'twist.linear.q'; expected one of",
+        ),
+        (
+            {"topics": [{"topic": "/v", "type": TWIST, "fields": {"twist.linear": "delay.y"}}]},
+            "'twist.linear' of 'geometry_msgs/msg/TwistStamped' for 'delay.y': it is a message itself",
+        ),
+        (
+            {
+                "topics": [
+                    {"topic": "/v", "type": TWIST, "fields": {"twist.linear.x": "delay.y", "twist.linear.y": "gain.u"}}
+                ]
+            },
+            "the output 'delay.y' and the input 'gain.u' in one message; expected a topic for each direction",
+        ),
+    ],
+)
+def test_what_is_wrong_is_told_with_the_way_out(tmp_path: Path, ros: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigurationError) as caught:
+        prepare(configured(tmp_path, **ros))
+
+    assert message in str(caught.value)
+
+
+def test_names_that_collide_or_start_with_a_digit_are_told_with_all_else_that_is_wrong(tmp_path: Path) -> None:
+    loaded = load(configured(tmp_path, topics=["pendulum", "delay.nothing"]))
+    variables = tuple(
+        Variable(name=name, value_reference=number, type="Float64", causality="output", variability="continuous")
+        for number, name in enumerate(["b.x", "b_x", "1st", "fine"])
+    )
+    model = ModelDescription(
+        model_name="m", model_identifier="m", fmi_version="2.0", kind="co_simulation", guid="g", variables=variables
+    )
+    findings = loaded.findings()
+
+    plan = resolve(loaded, {"pendulum": model, "delay": model}, findings)
+
+    texts = [str(finding) for finding in findings]
+    assert len(texts) == 3
+    assert "in 'pendulum' the variables 'b.x', 'b_x' all become 'b_x'; expected a name by hand" in texts[0]
+    assert "{topic: /a_name, variable: 'pendulum.b.x'}" in texts[0]
+    assert "the variable '1st' becomes '1st', which starts with a digit" in texts[1]
+    assert "the unknown variable 'nothing'" in texts[2]
+    assert plan is not None
+    assert [topic.name for topic in plan.topics] == ["/pendulum/fine"]
