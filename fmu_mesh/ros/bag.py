@@ -20,12 +20,12 @@ from ..errors import ConfigurationError
 from ..model.config import RosConfig
 from ..model.findings import Findings
 from ..model.loading import LoadedConfig
-from ..model.types import split_element
+from ..model.types import nested, split_element
 from .cdr import Codec
 from .mapping import message_types
 from .messages import Assembler
 from .stamp import nanoseconds, to_stamp
-from .topics import Descriptions, Port, Resolver, RosPlan, Topic
+from .topics import Descriptions, Resolver, RosPlan, Topic
 from .types import CLOCK, MessageTypes
 
 __all__ = ["BagTopics", "McapFile", "bag_topics", "is_bag"]
@@ -187,7 +187,8 @@ class _Output:
     def __init__(self, topic: Topic, index: dict[str, int], channel: int, types: MessageTypes) -> None:
         self.channel = channel
         self._steps = sorted({port.step_points for port in topic.ports})
-        self._columns = [_columns(port, index) for port in topic.ports]
+        self._columns = [[index[f"{port.instance}.{name}"] for name in port.variable.elements] for port in topic.ports]
+        self._shapes = [port.variable.shape for port in topic.ports]
         self._assembler = Assembler(topic, types)
 
     def due(self, point: int) -> bool:
@@ -196,14 +197,11 @@ class _Output:
 
     def message(self, row: Sequence[Any], time: float) -> bytes:
         """The message of a row."""
-        values = [row[own] if isinstance(own, int) else [row[column] for column in own] for own in self._columns]
+        values = [
+            nested([row[column] for column in columns], shape)
+            for columns, shape in zip(self._columns, self._shapes, strict=True)
+        ]
         return self._assembler.make(values, time)
-
-
-def _columns(port: Port, index: dict[str, int]) -> int | list[int]:
-    """The column of a variable, or those of the elements of an array."""
-    columns = [index[f"{port.instance}.{element}"] for element in port.variable.elements]
-    return columns if port.variable.shape else columns[0]
 
 
 def _whole(

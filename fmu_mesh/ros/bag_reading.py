@@ -19,10 +19,11 @@ from ..model.config import RosConfig, RosTopicConfig
 from ..model.description import Value
 from ..model.findings import listed, nearest
 from ..model.loading import LoadedConfig
+from ..model.types import nested
 from ..wire.views import InstanceInfo
 from .mapping import message_types
 from .seen import descriptions_of
-from .topics import Resolver, Topic
+from .topics import Port, Resolver, Topic
 from .types import MessageTypes
 
 if TYPE_CHECKING:
@@ -107,7 +108,7 @@ class Bag:
             message: Any = self._reader.deserialize(data, connection.msgtype)
             stamp = _header_stamp(message) if stamps == "header" else None
             for parts, port in wanted[connection.topic]:
-                value = _value_at(message, parts, f"{connection.topic}:{port.path}")
+                value = _value_at(message, parts, port, connection.topic)
                 yield Sample(logged if stamp is None else stamp, port.instance, port.variable.name, value)
 
 
@@ -186,12 +187,20 @@ def _parts(path: str) -> list[str | int]:
     return [int(part[1:-1]) if part.startswith("[") else part for part in _PART.findall(path)]
 
 
-def _value_at(message: Any, parts: Sequence[str | int], what: str) -> Value:  # noqa: ANN401 a message of rosbags
+def _value_at(message: Any, parts: Sequence[str | int], port: Port, topic: str) -> Value:  # noqa: ANN401 of rosbags
+    """A field as a value of a variable, an array in its shape."""
     value = message
     try:
         for part in parts:
             value = value[part] if isinstance(part, int) else getattr(value, part)
     except IndexError as error:
-        raise ConfigurationError(f"a message has no '{what}'.") from error
+        raise ConfigurationError(f"a message of '{topic}' has no '{port.path}'.") from error
     plain: Value = value.tolist() if isinstance(value, np.generic | np.ndarray) else value
-    return plain
+    if not port.variable.shape:
+        return plain
+    if not isinstance(plain, list) or len(plain) != port.variable.size:
+        raise ConfigurationError(
+            f"a message of '{topic}' does not have the {port.variable.size} elements of "
+            f"'{port.instance}.{port.variable.name}'."
+        )
+    return nested(plain, port.variable.shape)

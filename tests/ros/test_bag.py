@@ -11,11 +11,13 @@ from fmu_mesh.cli.main import main
 from fmu_mesh.ros.bag_reading import Sample
 from fmu_mesh.ros.playing import schedule
 from fmu_mesh.simtime import TimeGrid
+from tests.fmus.helpers import find_fmu
 from tests.helpers import Launched, Place, rows_of, wait_until, write_config
 
 pytest.importorskip("mcap", reason="the package mcap is not installed; pip install 'fmu-mesh[test]'")
 
 MS = 1_000_000
+ARRAY = [[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]
 TWIST = {
     "topics": [
         {
@@ -117,6 +119,19 @@ def test_an_instance_with_larger_steps_has_messages_at_its_own_points_only(tmp_p
     found = messages_of(tmp_path / "pair.mcap")
     assert [stamp // MS for stamp, _ in found["/slow/y"]] == [0, 4, 8, 12, 16, 20]
     assert [stamp // MS for stamp, _ in found["/fast/y"]] == list(range(21))
+
+
+def test_an_array_is_one_message_with_its_dimensions(tmp_path: Path) -> None:
+    instances = {"all": {"fmu": str(find_fmu("AllTypes3", tmp_path)), "start_values": {"float64_array_in": ARRAY}}}
+    record = {"file": "pair.mcap", "variables": ["all.float64_array_out"]}
+    config = write_config(tmp_path, stop_time=0.003, instances=instances, connections=(), record=record)
+
+    run("launch", config, "--local", "--no-progress")
+
+    found = messages_of(tmp_path / "pair.mcap")
+    arrays = [message for _, message in found["/all/float64_array_out"]]
+    assert [list(message.data) for message in arrays][1:] == [[1.0, 2.0, 3.0, 4.0, 5.0, 6.0]] * 3
+    assert [(own.size, own.stride) for own in arrays[0].layout.dim] == [(2, 6), (3, 3)]
 
 
 def test_the_schemas_and_channels_are_those_of_ros2_bag(tmp_path: Path) -> None:
