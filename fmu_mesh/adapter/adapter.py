@@ -1,6 +1,7 @@
 """`FMIAdapter`: one FMU for a program that steps it by itself.
 
-Owns the modes, the time reached and the FMU's private folder. Knows nothing of meshes, Zenoh or ROS.
+Owns the modes, the time reached and the FMU's private folder. Knows nothing of meshes and Zenoh, and of ROS only that
+its times are nanoseconds.
 """
 
 from __future__ import annotations
@@ -22,9 +23,10 @@ from typing import Any, Literal, Self
 from ..errors import FmuError
 from ..fmu import FmuInstance, LogMessage, open_instance, read_description
 from ..model.description import ModelDescription, Value
+from ..model.trajectory import Trajectory
 from ..model.types import is_float
 from .arguments import Arguments
-from .trajectory import Clock, Trajectory
+from .times import Clock, Instant, RosTime, SecondsClock, Time, clock_from
 
 __all__ = ["FMIAdapter"]
 
@@ -41,8 +43,9 @@ class FMIAdapter:
     `do_steps_until` with `set_input_value` and `get_output_value` in between; `close`, or the end of a `with` block, at
     the end. All calls come from one thread.
 
-    Times are seconds of the caller's clock, whatever its zero is; the FMU's own time starts at 0.0. What a step from
-    t to t + h does:
+    Times are those of the caller's clock, whatever its zero is: seconds, or a time of ROS (`rclpy.time.Time`, the stamp
+    of a header, `Nanoseconds`), which is exact to the nanosecond. `exit_initialization_mode` decides which, and all
+    other times are of the same kind. The FMU's own time starts at 0.0. What a step from t to t + h does:
 
         for every input with a trajectory: set its value at t
         fmi2DoStep from t to t + h
@@ -53,7 +56,7 @@ class FMIAdapter:
 
     Args:
         fmu_path: the .fmu file.
-        step_size: communication step size in s; None takes the default experiment's.
+        step_size: communication step size in s, or a `rclpy.duration.Duration`; None takes the default experiment's.
         interpolate_input: whether Real inputs are linear between their times.
 
     Raises:
@@ -64,7 +67,7 @@ class FMIAdapter:
     def __init__(
         self,
         fmu_path: str | os.PathLike[str],
-        step_size: float | None = None,
+        step_size: float | RosTime | None = None,
         interpolate_input: bool = True,  # noqa: FBT001, FBT002 as the constructor of fmi_adapter has it
     ) -> None:
         path = Path(fmu_path)
@@ -77,13 +80,13 @@ class FMIAdapter:
         self._mode: Literal["initialization", "stepping", "failed", "closed"] = "initialization"
         self._entered = False
         self._start_values: dict[str, Value] = {}
-        self._early_inputs: dict[str, dict[float, Value]] = {}
+        self._early_inputs: dict[str, dict[Instant, Value]] = {}
         self._initial_inputs: dict[str, Value] = {}
         self._trajectories: dict[str, Trajectory] = {}
-        self._clock = Clock(0.0)
+        self._clock: Clock = SecondsClock(0.0)
         self._elapsed = Fraction(0)
         self._point = 0
-        folder = Path(tempfile.mkdtemp(prefix="fmu_mesh-"))
+        self._folder = folder = Path(tempfile.mkdtemp(prefix="fmu_mesh-"))
         try:
             self._instance = open_instance(path, name, description, folder, _forward)
             self._release = weakref.finalize(self, _release, self._instance, folder)
@@ -154,6 +157,16 @@ class FMIAdapter:
         self._demand("stepping", "simulation_time")
         return self._clock.from_fmu(float(self._elapsed))
 
+    @property
+    def simulation_time_ns(self) -> int:
+        """The same in ns; exact to the nanosecond if the clock is one of ROS.
+
+        Raises:
+            CallRefused: there is none before `exit_initialization_mode`.
+        """
+        self._demand("stepping", "simulation_time_ns")
+        return self._clock.nanoseconds_from_fmu(float(self._elapsed))
+
     def set_initial_value(self, name: str, value: Value) -> None:
         """Set a parameter, an input or the initial value of another variable.
 
@@ -175,34 +188,35 @@ class FMIAdapter:
         with self._fmu_called():
             self._instance.set_values({name: converted})
 
-    def exit_initialization_mode(self, time: float) -> None:
-        """Start the simulation: ``time`` (s) on the caller's clock is 0.0 on the FMU's.
+    def exit_initialization_mode(self, time: Time) -> None:
+        """Start the simulation: ``time`` (s, or a time of ROS) on the caller's clock is 0.0 on the FMU's.
 
         An input whose trajectory begins at or before ``time`` starts with its value there, any other with its initial
         value.
 
         Raises:
-            CallRefused: it was called before, or ``time`` is no finite number.
+            CallRefused: it was called before, or ``time`` is no finite number, or of another kind than those of inputs
+                that were set before.
             InitializationFailed: the FMU refuses a start value, or does not start.
         """
         self._demand("initialization", "exit_initialization_mode")
-        self._clock = Clock(self._arguments.seconds(time, "time"))
+        self._clock = clock_from(self._arguments.time(time))
+        early = {name: {self._on_fmu_clock(t): v for t, v in own.items()} for name, own in self._early_inputs.items()}
         self._enter()
         with self._fmu_called():
             names = self.input_variable_names
             self._initial_inputs = dict(zip(names, self._instance.get_values(names), strict=True))
-            for name, values in self._early_inputs.items():
-                times = [self._clock.to_fmu(time) for time in values]
-                trajectory = self._begin_trajectory(name, initial=min(times) > self._clock.resolution(0.0))
-                for when, value in zip(times, values.values(), strict=True):
+            for name, values in early.items():
+                trajectory = self._begin_trajectory(name, initial=min(values) > self._clock.resolution(0.0))
+                for when, value in values.items():
                     trajectory.add(when, value)
             self._early_inputs.clear()
             self._set_inputs(0.0)
             self._instance.exit_initialization()
         self._mode = "stepping"
 
-    def set_input_value(self, name: str, time: float, value: Value) -> None:
-        """Add a value to the trajectory of an input: it is valid from ``time`` (s, caller's clock) on.
+    def set_input_value(self, name: str, time: Time, value: Value) -> None:
+        """Add a value to the trajectory of an input: it is valid from ``time`` (caller's clock) on.
 
         Times may come in any order and lie any time ahead. Of several values for one time the last one counts. A time
         that is past is accepted: its value holds from the next step on, unless that of a later time is already in use.
@@ -212,13 +226,14 @@ class FMIAdapter:
         """
         self._demand(None, "set_input_value")
         converted = self._arguments.value(self._arguments.input(name), value)
-        seconds = self._arguments.seconds(time, "time")
+        instant = self._arguments.time(time)
         if self._mode == "initialization":
-            self._early_inputs.setdefault(name, {})[seconds] = converted
+            self._early_inputs.setdefault(name, {})[instant] = converted
             return
+        when = self._on_fmu_clock(instant)
         if name not in self._trajectories:
             self._begin_trajectory(name, initial=True)
-        self._trajectories[name].add(self._clock.to_fmu(seconds), converted)
+        self._trajectories[name].add(when, converted)
 
     def set_parameter_value(self, name: str, value: Value) -> None:
         """Change a tunable parameter between two steps.
@@ -232,7 +247,7 @@ class FMIAdapter:
         with self._fmu_called():
             self._instance.set_values({name: converted})
 
-    def do_step(self, step_size: float | None = None) -> float:
+    def do_step(self, step_size: float | RosTime | None = None) -> float:
         """Advance by one step of ``step_size`` (s; None: the default one) and return the time reached, in s.
 
         Raises:
@@ -244,8 +259,8 @@ class FMIAdapter:
         self._step(default if step_size is None else self._arguments.other_step_size(step_size, default))
         return self.simulation_time
 
-    def do_steps_until(self, time: float, max_steps: int | None = None) -> float:
-        """Take as many default steps as bring the FMU nearest to ``time`` (s), and return the time reached.
+    def do_steps_until(self, time: Time, max_steps: int | None = None) -> float:
+        """Take as many default steps as bring the FMU nearest to ``time``, and return the time reached, in s.
 
         Of two times equally near the earlier one is taken. So the time reached may be up to half a step past ``time``,
         and a ``time`` that is past by no more than that is no error.
@@ -261,11 +276,12 @@ class FMIAdapter:
         self._demand("stepping", "do_steps_until")
         if max_steps is not None and max_steps < 1:
             raise self._arguments.refusal(f"max_steps is {max_steps!r}; expected 1 or more.")
-        target = Fraction(self._clock.to_fmu(self._arguments.seconds(time, "time")))
+        target = Fraction(self._on_fmu_clock(self._arguments.time(time)))
         missing = (target - self._elapsed) / Fraction(self._step_size)
         if missing < -_HALF:
             now = self.simulation_time
-            raise self._arguments.refusal(f"cannot step until {time!r} s, because {now!r} s is already reached.")
+            wanted = self._clock.from_fmu(float(target))
+            raise self._arguments.refusal(f"cannot step until {wanted!r} s, because {now!r} s is already reached.")
         steps = max(0, math.ceil(missing - _HALF))
         for _ in range(steps if max_steps is None else min(steps, max_steps)):
             self._step(self._step_size)
@@ -299,6 +315,10 @@ class FMIAdapter:
         self._mode = "closed"
         self._release()
 
+    def remove_files(self) -> None:
+        """From any thread, when the process is about to be ended while the FMU does not return: remove its files."""
+        shutil.rmtree(self._folder, ignore_errors=True)
+
     def _demand(self, mode: Literal["initialization", "stepping"] | None, call: str) -> None:
         if self._mode in ("initialization", "stepping") and mode in (None, self._mode):
             return
@@ -312,6 +332,17 @@ class FMIAdapter:
             ),
         }[self._mode]
         raise self._arguments.refusal(f"{call} is not possible, because {reason}.", hint)
+
+    def _on_fmu_clock(self, time: Instant) -> float:
+        """A time of the caller on the FMU's clock, in s."""
+        when = self._clock.to_fmu(time)
+        if when is None:
+            other, own = ("s", "ns") if isinstance(time, float) else ("ns", "s")
+            raise self._arguments.refusal(
+                f"{time!r} is a time in {other}, and this adapter's clock is in {own}.",
+                "Give all times as the one of exit_initialization_mode: as times of ROS, or as seconds.",
+            )
+        return when
 
     def _enter(self) -> None:
         """Let the FMU enter Initialization Mode: as late as possible, because some start values come before it."""

@@ -14,6 +14,7 @@ from ..errors import CallRefused
 from ..model.description import Causality, ModelDescription, Value, Variable
 from ..model.findings import listed, nearest
 from ..model.values import ValueRefused, to_value
+from .times import Instant, RosStamp, RosTime, Time, instant_of
 
 __all__ = ["Arguments"]
 
@@ -69,14 +70,18 @@ class Arguments:
                 text = f"{value!r} cannot be its value; expected {kind}: {refused.expected}."
             raise self.refusal(text, variable=variable.name) from refused
 
-    def seconds(self, value: float, what: str) -> float:
+    def time(self, value: Time) -> Instant:
+        """``value`` as a time in its exact form."""
+        return instant_of(value) if isinstance(value, RosTime | RosStamp) else self.seconds(value, "time")
+
+    def seconds(self, value: float | RosTime, what: str) -> float:
         """``value``, which is called ``what``, as a finite number."""
-        number = _plain(value)
+        number = value.nanoseconds / 1e9 if isinstance(value, RosTime) else _plain(value)
         if isinstance(number, bool) or not isinstance(number, int | float) or not math.isfinite(number):
             raise self.refusal(f"the {what} is {value!r}; expected a finite number of seconds.")
         return float(number)
 
-    def step_size(self, value: float | None) -> float:
+    def step_size(self, value: float | RosTime | None) -> float:
         """``value``, or else the default experiment's step size, as a number of seconds above 0."""
         if value is None:
             value = self._description.default_experiment.step_size
@@ -87,7 +92,7 @@ class Arguments:
             raise self.refusal(f"the step size is {value!r} s; expected one above 0.")
         return number
 
-    def other_step_size(self, value: float, default: float) -> float:
+    def other_step_size(self, value: float | RosTime, default: float) -> float:
         """``value`` as the size of one step where the others are ``default`` seconds long."""
         number = self.step_size(value)
         if number != default and not self._description.can_handle_variable_step_size:

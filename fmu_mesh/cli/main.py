@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 
 from .. import __version__
 from ..errors import ConfigurationError, FmuMeshError, Interrupted
-from . import checking, free_running, inspecting, looking, plotting, running, top
+from . import checking, free_running, inspecting, looking, playing, plotting, running, top
 
 __all__ = ["main"]
 
@@ -57,6 +57,6 @@ def _parser() -> argparse.ArgumentParser:
     common.add_argument("--debug", action="store_true", help="show the traceback of an error")
     parser.set_defaults(debug=False)
     commands = parser.add_subparsers(dest="command", metavar="COMMAND")
-    for module in (running, free_running, checking, inspecting, looking, top, plotting):
+    for module in (running, free_running, checking, inspecting, looking, top, plotting, playing):
         module.add_commands(commands, common)
     return parser

@@ -108,6 +108,8 @@ def read_results(path: Path, wanted: Sequence[str] | None = None) -> Results:
     Raises:
         ConfigurationError: there is no such file or variable, or it is no result file; says in which line.
     """
+    if path.suffix == ".mcap":
+        raise ConfigurationError(f"'{path}' is an MCAP, and plots are drawn from CSV.", hint="Record into a .csv file.")
     try:
         with path.open(encoding="utf-8", newline="") as file:
             names, first, values = _read(path, file)

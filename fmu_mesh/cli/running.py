@@ -21,6 +21,7 @@ from ..launch.local import LocalMesh
 from ..launch.opening import Showing
 from ..launch.preparing import Options, prepare
 from ..launch.process import ended_by_signals
+from ..launch.results import result_opener
 from ..launch.roles import BY_HAND, run_master, run_node
 from ..model.plan import Plan
 from ..wire.profile import MeshProfile
@@ -39,6 +40,7 @@ def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.Arg
     launch = commands.add_parser("launch", parents=[common], help="run a mesh: one process per node, and the master")
     _add_config(launch)
     launch.add_argument("--local", action="store_true", help="run everything in this one process")
+    _add_paused(launch)
     launch.add_argument("--plot", type=Path, metavar="FILE.png", help="plot the result when done")
     launch.add_argument("--no-progress", action="store_true", help="no progress line")
     _add_showing(launch)
@@ -55,6 +57,7 @@ def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.Arg
 
     master = commands.add_parser("master", parents=[common], help="run the master and the recorder by hand")
     _add_config(master)
+    _add_paused(master)
     master.add_argument("--plot", type=Path, metavar="FILE.png", help="plot the result when done")
     master.add_argument("--no-progress", action="store_true", help="no progress line")
     add_profile(master)
@@ -105,6 +108,12 @@ def _showing(arguments: argparse.Namespace) -> Showing:
     return showing
 
 
+def _add_paused(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--paused", action="store_true", help="rest at the first point until `resume`, `step` or `play`"
+    )
+
+
 def _options(arguments: argparse.Namespace) -> Options:
     return Options(
         start_values=tuple(arguments.set),
@@ -113,6 +122,7 @@ def _options(arguments: argparse.Namespace) -> Options:
         connect=tuple(arguments.connect),
         profile=getattr(arguments, "profile", None) is not None,
         showing=_showing(arguments),
+        paused=getattr(arguments, "paused", False),
     )
 
 
@@ -120,13 +130,15 @@ def _launch(arguments: argparse.Namespace) -> int:
     if arguments.plot is not None:
         require_matplotlib()
     options = _options(arguments)
+    if arguments.local and options.paused:
+        raise ConfigurationError("--paused is for a mesh that others can reach, and --local has none of it.")
     if arguments.local and options.profile:
         raise ConfigurationError("--profile measures nodes, and --local has none", hint="Leave one of them out.")
     plan = prepare(arguments.config, options, say)
     profile: MeshProfile | None = None
     with Display(plan, show_progress=not arguments.no_progress) as display:
         if arguments.local:
-            point, seconds, rows = _run_local(plan, display, options.showing)
+            point, seconds, rows = _run_local(plan, arguments.config, display, options.showing)
         else:
             launcher = Launcher(plan, arguments.config, options, display.event, display.output)
             end = run_launcher(launcher)
@@ -153,7 +165,7 @@ def run_launcher(launcher: Launcher) -> End:
             signal.signal(number, handler)
 
 
-def _run_local(plan: Plan, display: Display, showing: Showing) -> tuple[int, float, int]:
+def _run_local(plan: Plan, config: Path, display: Display, showing: Showing) -> tuple[int, float, int]:
     def log(message: LogMessage) -> None:
         line = LogLine(message.instance, message.status, message.category, message.message, mesh.point)
         display.log(line)
@@ -173,7 +185,15 @@ def _run_local(plan: Plan, display: Display, showing: Showing) -> tuple[int, flo
     enter_run_folder(folder, f"local {os.getpid()}")
     fmus = fmu_folder(folder)
     fmus.mkdir(parents=True, exist_ok=True)
-    mesh = LocalMesh(plan, log, display.progress, on_hang=end, parent=fmus, showing=showing)
+    mesh = LocalMesh(
+        plan,
+        log,
+        display.progress,
+        on_hang=end,
+        parent=fmus,
+        showing=showing,
+        open_result=result_opener(config, plan.system),
+    )
     try:
         with stdout_as_stderr(), ended_by_signals(mesh.interrupt, clean_up, watch_stdin=False):
             mesh.run()

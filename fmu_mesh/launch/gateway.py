@@ -48,6 +48,11 @@ def run_gateway(config_file: Path, options: Options, emit: Callable[[Event], Non
     section = loaded.config.ros
     if section is None:
         raise ConfigurationError(f"{config_file}: there is no section `ros`", hint="It says which topics there are.")
+    if section.profile == "rclpy":
+        raise ConfigurationError(
+            f"{config_file}: with the profile rclpy a ROS node is the gateway",
+            hint=f"Start it: python -m fmu_mesh.ros.node --ros-args -p config:={config_file}",
+        )
     types, ros_plan = _ros_plan(loaded, plan)
     folder = run_folder(loaded.config.mesh, run)
     interrupted: list[str] = []

@@ -24,6 +24,7 @@ import msgspec
 from ..errors import FmuError, FmuMeshError, Interrupted, MeshLost, from_report
 from ..model.config import MujocoConfig
 from ..model.plan import RECORDER, Plan
+from ..ros.bag import is_bag
 from ..wire.runtime import MeshNote, remove_run_folder, remove_stale_folders, run_folder, runtime_folder, write_note
 from .events import End, Event, Ready, Status, decode_event
 from .preparing import Options
@@ -111,11 +112,13 @@ class Launcher:
             changes.append(f"--window={self._options.window}")
         if self._options.output is not None:
             changes.append(f"--output={self._options.output}")
-        if self._options.profile:
-            changes.append("--profile")
-        self._spawn(_MASTER, ["master", config_file, *common, *changes, "--events"], folder)
+        granting = ["--profile"] if self._options.profile else []
+        if self._options.paused:
+            granting.append("--paused")
+        self._spawn(_MASTER, ["master", config_file, *common, *changes, *granting, "--events"], folder)
         self._spawn_nodes = partial(self._spawn_each_node, folder, common)
-        if self._plan.system.config.ros is not None:
+        section = self._plan.system.config.ros
+        if section is not None and section.profile != "rclpy":
             # The nodes follow when it is ready: then it misses nothing.
             self._spawn(_GATEWAY, ["gateway", config_file, *common, *changes, "--events"], folder)
         else:
@@ -282,6 +285,8 @@ class Launcher:
         name = self._plan.system.result_file
         if self._point is None or name is None or not Path(name).is_file():
             return 0
+        if is_bag(name):  # it has no lines to count
+            return self._end.rows if self._end is not None else 0
         rows, end, offset = -1, 0, 0
         with Path(name).open("r+b") as file:
             while chunk := file.read(1 << 20):

@@ -36,6 +36,7 @@ from ..model.ring import Layout, Ring
 from ..model.types import DTYPES, Value, VariableType
 from ..record.csv_file import CsvFile
 from ..record.recorder import unwritable
+from ..record.result_file import OpenResult, ResultFile
 from ..simtime import TimeGrid
 from .opening import Showing, open_instance, stepped
 
@@ -58,6 +59,7 @@ class LocalMesh:
             result file; the thread in the FMU cannot be got back, so only the end of the process is left to do.
         parent: an existing folder to extract FMUs into; by default that for temporary files.
         showing: whether and how a physics engine shows its world.
+        open_result: opens the result file.
 
     Attributes:
         point: the last point reached.
@@ -75,6 +77,7 @@ class LocalMesh:
         on_hang: Callable[[FmuError], None] = lambda error: log.error("%s", error),
         parent: Path | None = None,
         showing: Showing = Showing(),  # noqa: B008  a frozen Struct
+        open_result: OpenResult = CsvFile,
     ) -> None:
         self.point = 0
         self.rows = 0
@@ -89,6 +92,7 @@ class LocalMesh:
         self._stepping = ""
         self._save: Callable[[], None] = lambda: None
         self._showing = showing
+        self._open_result = open_result
         self._stop: str | None = None
         self._folder: Path | None = None
 
@@ -141,7 +145,7 @@ class LocalMesh:
         watch = CallWatch(self._take_hang)
         with tempfile.TemporaryDirectory(prefix="fmu_mesh-", dir=self._parent) as folder, closing(watch):
             self._folder = Path(folder)
-            file = CsvFile(Path(plan.system.result_file), columns) if plan.system.result_file is not None else None
+            file = self._open_result(Path(plan.system.result_file), columns) if plan.system.result_file else None
             try:
                 for name in plan.order:
                     members[name] = _Member(plan, name, self._guarded(name, Path(folder), watch))
@@ -218,14 +222,14 @@ class LocalMesh:
         c = next(c for c in self._plan.connections if (c.target_instance, c.target_name) == (tear.target, tear.input))
         return scaled(_at(known[c.source_instance, c.source.name], c.source_index), c.factor, c.offset)
 
-    def _loop(self, members: dict[str, _Member], file: CsvFile | None) -> None:
+    def _loop(self, members: dict[str, _Member], file: ResultFile | None) -> None:
         plan, grid = self._plan, self._plan.grid
         recorded = [(members[instance], variable) for instance, variable in plan.system.recorded]
         types = [member.type_of(variable) for member, variable in recorded]
         buffer: list[list[Value]] = []
         first = 0
         self._save = lambda: self._save_rows(
-            file, lambda csv: _write(csv, grid, first, buffer, types) if buffer else None
+            file, lambda result: _write(result, grid, first, buffer, types) if buffer else None
         )
         try:
             for point in range(grid.last_point + 1):
@@ -254,7 +258,7 @@ class LocalMesh:
                 _write(file, grid, first, buffer, types)
         self._progress(self.point)
 
-    def _save_rows(self, file: CsvFile | None, write: Callable[[CsvFile], None]) -> None:
+    def _save_rows(self, file: ResultFile | None, write: Callable[[ResultFile], None]) -> None:
         """From the watching thread: bring to the file what the main thread cannot any more."""
         if file is not None:
             write(file)
@@ -345,7 +349,9 @@ def _at(value: Value, index: tuple[int, ...]) -> Value:
     return value
 
 
-def _write(file: CsvFile, grid: TimeGrid, first: int, rows: list[list[Value]], types: Sequence[VariableType]) -> None:
+def _write(
+    file: ResultFile, grid: TimeGrid, first: int, rows: list[list[Value]], types: Sequence[VariableType]
+) -> None:
     if not rows:
         return
     times = grid.times(first, first + len(rows))
@@ -356,7 +362,7 @@ def _write(file: CsvFile, grid: TimeGrid, first: int, rows: list[list[Value]], t
         raise unwritable(file.path, error) from error
 
 
-def _close(file: CsvFile) -> None:
+def _close(file: ResultFile) -> None:
     try:
         file.close()
     except OSError as error:

@@ -18,6 +18,7 @@ from ..model.plan import Plan, make_plan
 from ..model.system import build
 from ..ros.mapping import resolve as resolve_ros
 from .opening import Showing, check_showing, describe, expected_model
+from .results import check_results
 
 __all__ = ["Options", "planned", "prepare", "zenoh_section"]
 
@@ -32,6 +33,7 @@ class Options(msgspec.Struct, frozen=True):
         connect: Zenoh endpoints instead of the configured ones.
         profile: whether the nodes measure where their time goes.
         showing: whether and how a physics engine shows its world.
+        paused: whether the run starts at rest at its first point.
     """
 
     start_values: tuple[str, ...] = ()
@@ -40,6 +42,7 @@ class Options(msgspec.Struct, frozen=True):
     connect: tuple[str, ...] = ()
     profile: bool = False
     showing: Showing = Showing()
+    paused: bool = False
 
 
 def prepare(
@@ -74,6 +77,7 @@ def planned(
     findings.merge(unreadable)
     resolve_ros(loaded, descriptions, findings)
     system = build(loaded, descriptions, tuple(findings))
+    check_results(loaded, system)
     check_showing(system, options.showing)
     return make_plan(system, window=options.window, file=str(loaded.file))
 

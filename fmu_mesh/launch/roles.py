@@ -42,6 +42,7 @@ from .events import End, Event, Log, Ready, Status
 from .opening import open_instance, stepped
 from .preparing import Options, prepare, zenoh_section
 from .process import die_with_parent, ended_by_signals
+from .results import result_opener
 from .wiring import MASTER, wiring
 
 __all__ = ["BY_HAND", "run_master", "run_node"]
@@ -209,11 +210,12 @@ def run_master(
         error: FmuMeshError | None = None
         master = Master(plan, session, _Emitter(emit), endpoints=public, config_file=str(config_file))
         master.watch = GrantWatch() if options.profile else None
+        master.starts_paused = options.paused
         for reason in early:
             master.interrupt(reason)
         try:
             if RECORDER in plan.nodes:
-                with Recorder(plan.nodes[RECORDER], session) as recorder:
+                with Recorder(plan.nodes[RECORDER], session, result_opener(config_file, plan.system)) as recorder:
                     master.run()
             else:
                 master.run()

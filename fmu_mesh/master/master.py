@@ -118,6 +118,7 @@ class Master:
         self._hold: int | None = None
         self._stop_asked = False
         self.watch: GrantWatch | None = None
+        self.starts_paused = False
         self._pacer = Pacer(plan, config.simulation.real_time_factor)
         self._clock = Clock()
         self._published = 0.0
@@ -226,8 +227,11 @@ class Master:
             query.drop()
 
     def _grant_to_the_end(self) -> None:
-        self._state = "running"
-        self._clock.start()
+        if self.starts_paused:
+            self._state, self._hold = "paused", 0
+        else:
+            self._state = "running"
+            self._clock.start()
         self._pacer.start(0)
         self._moved = time.monotonic()
         while self._slowest < self._last_point and not self._stop_asked:
@@ -433,7 +437,7 @@ class Master:
             case "stop":
                 self._stop_asked = True
         self._moved = time.monotonic()
-        answer = CommandAnswer(command.command, self._state, self._slowest)
+        answer = CommandAnswer(command.command, self._state, self._slowest, self._hold)
         query.reply(self._keys.mesh_key("command"), msgspec.json.encode(answer), encoding=json_encoding)
         query.drop()
 

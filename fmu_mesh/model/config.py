@@ -53,7 +53,8 @@ Sha256 = Annotated[
     ),
 ]
 Endpoint = Annotated[str, Meta(pattern=ENDPOINT_PATTERN, title="a Zenoh endpoint such as tcp/192.168.1.2:7447")]
-RosProfile = Literal["ros2dds", "rmw_zenoh"]
+RosTopicProfile = Literal["ros2dds", "rmw_zenoh"]
+RosProfile = Literal["ros2dds", "rmw_zenoh", "rclpy"]
 DeadlineSeconds = Annotated[float, Meta(gt=0)]
 
 # What editors should know but `system.build` checks: these errors are shown together with those of the names.
@@ -504,7 +505,7 @@ class RosTopicConfig(Base, frozen=True, kw_only=True):
             examples=[{"twist.linear.x": "path_filter.v"}],
         ),
     ] = {}
-    profile: Annotated[RosProfile | None, Meta(description="Another profile than that of the mesh.")] = None
+    profile: Annotated[RosTopicProfile | None, Meta(description="Another profile than that of the mesh.")] = None
     frame_id: Annotated[str, Meta(description="frame_id of the header, where the message has one.")] = ""
     reliability: Annotated[
         Literal["reliable", "best_effort"],
@@ -519,7 +520,7 @@ class RosConfig(Base, frozen=True, kw_only=True):
         RosProfile,
         Meta(
             description="ros2dds: as zenoh-bridge-ros2dds expects it, for ROS on DDS; rmw_zenoh: as ROS nodes on "
-            "rmw_zenoh expect it."
+            "rmw_zenoh expect it; rclpy: as topics of a ROS node, `python -m fmu_mesh.ros.node` with this file."
         ),
     ] = "ros2dds"
     topics: Annotated[

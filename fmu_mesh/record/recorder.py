@@ -29,6 +29,7 @@ from ..wire.membership import MASTER, Membership, credit
 from ..wire.messages import ABORT, FINISH, FRAME, HEADER, PROGRESS, NodeReport, decode_abort
 from ..wire.session import ask
 from .csv_file import CsvFile
+from .result_file import OpenResult
 
 __all__ = ["Recorder", "unwritable"]
 
@@ -46,11 +47,12 @@ class Recorder:
     Args:
         plan: the recorder's part of the plan.
         session: the session of this process; stays the caller's.
+        open_file: opens the result file.
 
     Use it as a context manager: the thread runs inside, and the file is complete up to the last complete row outside.
     """
 
-    def __init__(self, plan: NodePlan, session: zenoh.Session) -> None:
+    def __init__(self, plan: NodePlan, session: zenoh.Session, open_file: OpenResult = CsvFile) -> None:
         self._plan = plan
         self._session = session
         self._keys = Keys(plan.key_prefix, plan.mesh)
@@ -59,7 +61,7 @@ class Recorder:
         }
         by_name = {source.receiver.link.source: source for source in self._sources.values()}
         self._columns = [(by_name[instance], variable) for instance, variable in plan.recorded]
-        self._file = CsvFile(
+        self._file = open_file(
             Path(plan.result_file or ""),
             [(f"{i}.{v}", by_name[i].type_of(v)) for i, v in plan.recorded],
         )

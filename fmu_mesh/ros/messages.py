@@ -64,9 +64,14 @@ class Assembler:
             if not over:
                 self._last = now
                 stamp = next(head[1] for head in heads if head[0] == now)
-                yield self._make([head[2] for head in heads], stamp), stamp
+                yield self.make([head[2] for head in heads], stamp), stamp
 
-    def _make(self, values: list[Any], time: float) -> bytes:
+    def make(self, values: list[Any], time: float) -> bytes:
+        """The message that has these values, one per port, at ``time`` s.
+
+        Raises:
+            CdrError: a value does not fit into its field.
+        """
         for put, value in zip(self._setters, values, strict=True):
             put(value)
         if self.topic.stamped:

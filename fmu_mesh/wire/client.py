@@ -62,6 +62,11 @@ class MeshClient:
         self._session = session
         self._timeout_s = timeout_s
 
+    @property
+    def session(self) -> zenoh.Session:
+        """The session that reaches the mesh."""
+        return self._session
+
     def info(self) -> MeshInfo:
         """What the mesh is."""
         return self._view(self.keys.mesh_key("info"), MeshInfo, f"mesh '{self.keys.mesh}'")

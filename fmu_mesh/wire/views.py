@@ -170,8 +170,14 @@ class Command(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class CommandAnswer(msgspec.Struct, frozen=True):
-    """What `…/mesh/command` answers."""
+    """What `…/mesh/command` answers.
+
+    Attributes:
+        point: the last point that every instance has reached.
+        hold: the point where all of them are going to rest; None while the mesh runs on.
+    """
 
     command: str
     state: MeshState
     point: int
+    hold: int | None = None

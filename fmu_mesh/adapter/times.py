@@ -1,0 +1,137 @@
+"""What the caller's clock says: seconds, or the nanoseconds of a ROS clock.
+
+Owns the two kinds of clock against the FMU's, which is in seconds and starts at 0.0. Knows ROS times by their shape
+only and imports nothing of ROS.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Protocol, runtime_checkable
+
+import msgspec
+
+__all__ = ["Clock", "Instant", "Nanoseconds", "RosStamp", "RosTime", "SecondsClock", "Time", "clock_from", "instant_of"]
+
+_NANO = 1_000_000_000
+
+
+class Nanoseconds(msgspec.Struct, frozen=True):
+    """A time, or a duration, in whole nanoseconds, where there is no `rclpy.time.Time` at hand."""
+
+    nanoseconds: int
+
+
+@runtime_checkable
+class RosTime(Protocol):
+    """What `rclpy.time.Time`, `rclpy.duration.Duration` and `Nanoseconds` have in common."""
+
+    @property
+    def nanoseconds(self) -> int:
+        """The time in ns."""
+        ...
+
+
+@runtime_checkable
+class RosStamp(Protocol):
+    """What the stamp of a message's header is (`builtin_interfaces/Time`)."""
+
+    sec: int
+    nanosec: int
+
+
+Time = float | RosTime | RosStamp
+"""Seconds, or a time of ROS."""
+
+Instant = float | Nanoseconds
+"""A `Time` in one of two exact forms."""
+
+
+def instant_of(time: RosTime | RosStamp) -> Nanoseconds:
+    """A time of ROS in its exact form."""
+    if isinstance(time, RosStamp):
+        return Nanoseconds(int(time.sec) * _NANO + int(time.nanosec))
+    return Nanoseconds(int(time.nanoseconds))
+
+
+class Clock(Protocol):
+    """The caller's clock against the FMU's, which starts at 0.0."""
+
+    def to_fmu(self, time: Instant) -> float | None:
+        """A time of the caller on the FMU's clock, in s; None if it is not a time of this kind of clock."""
+        ...
+
+    def from_fmu(self, time: float) -> float:
+        """A time of the FMU on the caller's clock, in s."""
+        ...
+
+    def nanoseconds_from_fmu(self, time: float) -> int:
+        """A time of the FMU on the caller's clock, in ns."""
+        ...
+
+    def resolution(self, time: float) -> float:
+        """How far apart two of the caller's times near the FMU's ``time`` can be (s) and still mean the same."""
+        ...
+
+
+def clock_from(start: Instant) -> Clock:
+    """The clock that says ``start`` when the FMU's says 0.0."""
+    return NanosecondsClock(start.nanoseconds) if isinstance(start, Nanoseconds) else SecondsClock(start)
+
+
+class SecondsClock:
+    """A caller's clock of seconds.
+
+    Args:
+        start: the caller's time of the FMU's 0.0, in s.
+    """
+
+    def __init__(self, start: float) -> None:
+        self._start = start
+
+    def to_fmu(self, time: Instant) -> float | None:
+        """One subtraction, exact while ``time`` is near the start."""
+        return None if isinstance(time, Nanoseconds) else time - self._start
+
+    def from_fmu(self, time: float) -> float:
+        """One addition."""
+        return self._start + time
+
+    def nanoseconds_from_fmu(self, time: float) -> int:
+        """Rounded to the nearest nanosecond."""
+        return round(self.from_fmu(time) * _NANO)
+
+    def resolution(self, time: float) -> float:
+        """8 units in the last place.
+
+        A float of today's Unix time is good to 0.24 us, and `start + 3 * 0.1` is not `start + 0.3`: a few units in the
+        last place are left to the rounding of one multiplication and one addition, as in `simtime.steps_between`.
+        """
+        return 8 * math.ulp(max(abs(self._start), abs(self._start + time)))
+
+
+class NanosecondsClock:
+    """A caller's clock of whole nanoseconds, as ROS has it: exact, whatever its zero is.
+
+    Args:
+        start: the caller's time of the FMU's 0.0, in ns.
+    """
+
+    def __init__(self, start: int) -> None:
+        self._start = start
+
+    def to_fmu(self, time: Instant) -> float | None:
+        """An exact subtraction and one division."""
+        return (time.nanoseconds - self._start) / _NANO if isinstance(time, Nanoseconds) else None
+
+    def from_fmu(self, time: float) -> float:
+        """The nearest float to the time in ns."""
+        return self.nanoseconds_from_fmu(time) / _NANO
+
+    def nanoseconds_from_fmu(self, time: float) -> int:
+        """Rounded to the nearest nanosecond."""
+        return self._start + round(time * _NANO)
+
+    def resolution(self, time: float) -> float:
+        """1 ns: a stamp is the time of a step cut or rounded to whole nanoseconds."""
+        return 1.0 / _NANO + 8 * math.ulp(time)

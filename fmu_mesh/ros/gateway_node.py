@@ -1,0 +1,215 @@
+"""The gateway of a mesh as a ROS lifecycle node: its topics are those of the node, on whatever middleware ROS has.
+
+What flows is the matter of `fmu_mesh.ros.gateway`; here is the profile that lets rclpy carry it, and the mesh's
+parameters as those of the node.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import msgspec
+from msgspec.structs import replace
+
+from ..errors import ConfigurationError, FmuMeshError
+from ..model.config import RosConfig
+from ..model.loading import load
+from ..wire.client import MeshClient
+from ..wire.reaching import Meshes
+from ..wire.readings import Target
+from .gateway import Gateway
+from .mapping import message_types, resolve
+from .node_parameters import RosNode
+from .peer import message_class, ros_module
+from .playing import grid_of
+from .profile import DEPTH, Put, Take
+from .seen import descriptions_of
+from .topics import RosPlan, Topic
+from .types import MessageTypes
+
+__all__ = ["GatewayNode", "RclpyProfile"]
+
+_TIMEOUT_S = 10.0
+_LOOK_S = 0.25
+
+
+class RclpyProfile:
+    """A profile whose topics are those of a node of rclpy. Messages pass as the CDR bytes that they are.
+
+    Args:
+        node: the node; stays the caller's.
+    """
+
+    def __init__(self, node: RosNode) -> None:
+        self._node = node
+        self._publishers: list[Any] = []
+        self._subscriptions: list[Any] = []
+
+    def publish(self, topic: Topic) -> Put:
+        """Be a publisher of ``topic``."""
+        publisher = self._node.create_publisher(message_class(topic.message), topic.name, _quality(topic))
+        self._publishers.append(publisher)
+
+        def put(data: bytes, _time: float) -> None:
+            publisher.publish(data)
+
+        return put
+
+    def subscribe(self, topic: Topic, take: Take) -> None:
+        """Be a subscriber of ``topic``."""
+        kind = message_class(topic.message)
+        self._subscriptions.append(self._node.create_subscription(kind, topic.name, take, _quality(topic), raw=True))
+
+    def close(self) -> None:
+        """Destroy everything."""
+        for subscription in self._subscriptions:
+            self._node.destroy_subscription(subscription)
+        for publisher in self._publishers:
+            self._node.destroy_publisher(publisher)
+        self._subscriptions, self._publishers = [], []
+
+
+class GatewayNode:
+    """What a lifecycle node does that is the gateway of a running mesh.
+
+    Args:
+        node: the lifecycle node, with the parameters `config` and `connect` declared.
+
+    Attributes:
+        failure: None; a mesh that ends is no failure of its gateway.
+    """
+
+    failure: FmuMeshError | None = None
+
+    def __init__(self, node: RosNode) -> None:
+        self._node = node
+        self._log = node.get_logger()
+        self._stack = ExitStack()
+        self._client: MeshClient | None = None
+        self._plan: RosPlan | None = None
+        self._types: MessageTypes | None = None
+        self._targets: dict[str, Target] = {}
+        self._gateway: Gateway | None = None
+        self._thread: threading.Thread | None = None
+        self._timer: Any = None
+
+    def configure(self) -> None:
+        """Find the mesh, resolve its topics, and declare its parameters.
+
+        Raises:
+            FmuMeshError: something is wrong; nothing is left of this attempt.
+        """
+        try:
+            self._configure()
+        except BaseException:
+            self.cleanup()
+            raise
+
+    def activate(self) -> None:
+        """Let topics flow.
+
+        Raises:
+            FmuMeshError: a topic cannot be opened.
+        """
+        client, plan, types = self._client, self._plan, self._types
+        if client is None or plan is None or types is None:
+            raise ConfigurationError("the gateway has no mesh yet.", hint="Configure it first.")
+        profile = RclpyProfile(self._node)
+        names = {topic.profile for topic in plan.topics} or {"ros2dds"}
+        gateway = Gateway(
+            plan, types, client.session, client.keys, grid_of(client.info()), dict.fromkeys(sorted(names), profile)
+        )
+        self._gateway = gateway
+        gateway.open()
+        self._thread = threading.Thread(target=gateway.run, name="gateway", daemon=True)
+        self._thread.start()
+        clock = ros_module("rclpy.clock")
+        steady = clock.Clock(clock_type=clock.ClockType.STEADY_TIME)
+        self._timer = self._node.create_timer(_LOOK_S, self._look, clock=steady)
+
+    def deactivate(self) -> None:
+        """Let nothing flow any more; what has come from the mesh is published before."""
+        if self._timer is not None:
+            self._node.destroy_timer(self._timer)
+            self._timer = None
+        gateway, self._gateway = self._gateway, None
+        if gateway is not None:
+            gateway.end()
+            if self._thread is not None:
+                self._thread.join(_TIMEOUT_S)
+            gateway.close()
+
+    def cleanup(self) -> None:
+        """Leave the mesh, and take its parameters back. Never raises."""
+        self.deactivate()
+        self._stack.close()
+        self._client = None
+
+    def close(self) -> bool:
+        """`cleanup`; returns that nothing is left running."""
+        self.cleanup()
+        return True
+
+    def _configure(self) -> None:
+        loaded = load(Path(self._node.get_parameter("config").value))
+        if loaded.config.ros is None:
+            loaded = replace(loaded, config=replace(loaded.config, ros=RosConfig()))
+        endpoints = [endpoint for endpoint in self._node.get_parameter("connect").value if endpoint]
+        meshes = self._stack.enter_context(Meshes(endpoints, _TIMEOUT_S))
+        client = self._client = meshes.named(loaded.config.mesh)
+        infos = {name: client.instance_info(name) for name in client.info().instances}
+        findings = loaded.findings()
+        self._types = message_types(loaded, findings)
+        plan = self._plan = resolve(loaded, descriptions_of(infos), findings)
+        findings.raise_any()
+        if plan is not None:
+            self._declare_parameters(client, plan)
+        self._log.info(f"gateway of mesh '{loaded.config.mesh}' with {len(plan.topics) if plan else 0} topics")
+
+    def _declare_parameters(self, client: MeshClient, plan: RosPlan) -> None:
+        """The parameters of the mesh as those of the node, with their current values."""
+        references = {
+            parameter.name: f"{parameter.instance}.{parameter.variable.name}" for parameter in plan.parameters
+        }
+        self._targets = {name: client.target(reference) for name, reference in references.items()}
+        values = {reading.key: reading.value for reading in client.get(list(self._targets.values()))}
+        descriptor = ros_module("rcl_interfaces.msg").ParameterDescriptor
+        for name, target in self._targets.items():
+            view = target.variable
+            about = f"{target.instance}.{view.name}: {view.description or view.causality}"
+            about += f" ({view.type}{f' in {view.unit}' if view.unit else ''})"
+            read_only = view.variability != "tunable"
+            self._node.declare_parameter(
+                name, values.get(target.key), descriptor(description=about, read_only=read_only, dynamic_typing=True)
+            )
+            self._stack.callback(self._node.undeclare_parameter, name)
+        self._node.add_on_set_parameters_callback(self._set_parameters)
+        self._stack.callback(self._node.remove_on_set_parameters_callback, self._set_parameters)
+
+    def _set_parameters(self, parameters: Sequence[Any]) -> Any:  # noqa: ANN401 types of rclpy
+        """Set tunable parameters of the mesh; what the mesh refuses is refused with its reason."""
+        result = ros_module("rcl_interfaces.msg").SetParametersResult
+        for parameter in parameters:
+            target = self._targets.get(parameter.name)
+            if target is None or self._client is None:
+                continue
+            try:
+                self._client.set(target, msgspec.json.encode(parameter.value).decode())
+            except FmuMeshError as error:
+                return result(successful=False, reason=str(error))
+        return result(successful=True)
+
+    def _look(self) -> None:
+        if self._thread is not None and not self._thread.is_alive():
+            self._log.info("the mesh has ended")
+            self._node.trigger_deactivate()
+
+
+def _quality(topic: Topic) -> Any:  # noqa: ANN401 a type of rclpy
+    qos = ros_module("rclpy.qos")
+    reliability = {"reliable": qos.ReliabilityPolicy.RELIABLE, "best_effort": qos.ReliabilityPolicy.BEST_EFFORT}
+    return qos.QoSProfile(depth=DEPTH, reliability=reliability[topic.reliability])

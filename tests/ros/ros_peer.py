@@ -1,0 +1,141 @@
+"""Real ROS 2 for tests: rclpy and Fast DDS on the loopback, in a domain of its own; without them a test is skipped.
+
+Nodes of one test share an executor that the test itself turns, until what it waits for is there or a deadline is met.
+"""
+
+from __future__ import annotations
+
+import gc
+import importlib.util
+import os
+import time
+import warnings
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any, Self, TypeVar
+
+import pytest
+
+__all__ = ["DEADLINE_S", "Ros", "environment", "ros_or_skip"]
+
+DEADLINE_S = 30.0
+_SPIN_S = 0.02
+
+Found = TypeVar("Found")
+
+
+def environment(log_folder: Path) -> dict[str, str]:
+    """What keeps ROS on this machine, and apart from other tests: a domain by process."""
+    return {
+        "ROS_DOMAIN_ID": str(1 + os.getpid() % 100),
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+        "ROS_LOG_DIR": str(log_folder),
+        "RMW_IMPLEMENTATION": "rmw_fastrtps_cpp",
+    }
+
+
+def ros_or_skip() -> None:
+    """Skip a test, or a whole module, where ROS is not installed."""
+    needed = ("rclpy", "std_msgs", "geometry_msgs", "rosgraph_msgs", "rmw_fastrtps_cpp")
+    # The last one has a library and no Python module.
+    missing = [name for name in needed[:4] if importlib.util.find_spec(name) is None]
+    if missing:
+        pytest.skip(
+            f"ROS 2 is not installed ({', '.join(missing)}); pip install 'fmu-mesh[test-ros]'", allow_module_level=True
+        )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # a parser that ROS imports is older than this Python
+        importlib.import_module("rosidl_generator_py")
+
+
+class Ros:
+    """One ROS context with an executor; use it as a context manager."""
+
+    def __init__(self, log_folder: Path) -> None:
+        import rclpy  # noqa: PLC0415 only where it is installed
+        from rclpy.executors import SingleThreadedExecutor  # noqa: PLC0415 as above
+
+        self._rclpy = rclpy
+        self.environment = environment(log_folder)
+        os.environ.update(self.environment)
+        self.context = rclpy.Context()
+        rclpy.init(context=self.context)
+        self._executor = SingleThreadedExecutor(context=self.context)
+        self._nodes: list[Any] = []
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        node = None
+        for node in self._nodes:
+            if hasattr(node, "managed"):
+                node.managed.close()
+            self._executor.remove_node(node)
+            node.destroy_node()
+        # A lifecycle node keeps its ROS node, which others would still see, until the last reference is gone.
+        del node
+        self._nodes.clear()
+        gc.collect()
+        self._executor.shutdown()
+        self._rclpy.shutdown(context=self.context)
+
+    def add(self, node: Any) -> Any:  # noqa: ANN401 types of rclpy
+        """Let this executor turn ``node``, and destroy it at the end."""
+        self._nodes.append(node)
+        self._executor.add_node(node)
+        return node
+
+    def peer(self, name: str = "peer", **options: Any) -> Any:  # noqa: ANN401 types of rclpy
+        """A plain node."""
+        return self.add(self._rclpy.create_node(name, context=self.context, **options))
+
+    def fmu(self, **parameters: Any) -> Any:  # noqa: ANN401 types of rclpy
+        """A node that runs an FMU, with these parameters."""
+        from fmu_mesh.ros.node import create_node  # noqa: PLC0415 needs ROS when it is called only
+
+        overrides = [self._rclpy.Parameter(name, value=value) for name, value in parameters.items()]
+        return self.add(create_node(context=self.context, parameter_overrides=overrides))
+
+    def turn(self, seconds: float = 0.0) -> None:
+        """Let callbacks run, at least one round of them, for so long."""
+        end = time.monotonic() + seconds
+        self._executor.spin_once(timeout_sec=0.0)
+        while time.monotonic() < end:
+            self._executor.spin_once(timeout_sec=min(_SPIN_S, max(0.0, end - time.monotonic())))
+
+    def until(self, condition: Callable[[], Found | None], what: str, deadline_s: float = DEADLINE_S) -> Found:
+        """Let callbacks run until ``condition`` is true; fail after ``deadline_s``, saying ``what`` did not come."""
+        end = time.monotonic() + deadline_s
+        while not (found := condition()):
+            assert time.monotonic() < end, f"not within {deadline_s:g} s: {what}"
+            self._executor.spin_once(timeout_sec=_SPIN_S)
+        return found
+
+    def matched(self, *ends: Any) -> None:  # noqa: ANN401 types of rclpy
+        """Wait until every publisher and subscription has somebody at the other end."""
+        for end in ends:
+            self.until(partial(_matches, end), f"somebody else on '{end.topic_name}'")
+
+    def called(self, client: Any, request: Any) -> Any:  # noqa: ANN401 types of rclpy
+        """The answer of a service."""
+        self.until(client.service_is_ready, f"the service {client.srv_name}")
+        future = client.call_async(request)
+        self.until(future.done, f"an answer of {client.srv_name}")
+        return future.result()
+
+    def collect(
+        self,
+        node: Any,  # noqa: ANN401 types of rclpy
+        kind: Any,  # noqa: ANN401 as above
+        topic: str,
+    ) -> tuple[Any, list[Any]]:
+        """A subscription, and a list that fills with what comes."""
+        messages: list[Any] = []
+        return node.create_subscription(kind, topic, messages.append, 5000), messages
+
+
+def _matches(end: Any) -> bool:  # noqa: ANN401 types of rclpy
+    count = getattr(end, "get_subscription_count", None) or end.get_publisher_count
+    return bool(count())

@@ -1,0 +1,330 @@
+"""Recording into MCAP and playing a bag: what is in the file, read by others, and what comes of it as input."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from fmu_mesh.cli.main import main
+from fmu_mesh.ros.bag_reading import Sample
+from fmu_mesh.ros.playing import schedule
+from fmu_mesh.simtime import TimeGrid
+from tests.fmus.helpers import find_fmu
+from tests.helpers import Launched, Place, rows_of, wait_until, write_config
+
+pytest.importorskip("mcap", reason="the package mcap is not installed; pip install 'fmu-mesh[test]'")
+
+MS = 1_000_000
+ARRAY = [[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]
+TWIST = {
+    "topics": [
+        {
+            "topic": "/state",
+            "type": "geometry_msgs/msg/TwistStamped",
+            "fields": {"twist.linear.x": "pendulum.a", "twist.angular.z": "delay.y"},
+            "frame_id": "base",
+        },
+        "pendulum.der(a)",
+    ],
+    "clock_rate": 50.0,
+}
+
+
+def messages_of(path: Path) -> dict[str, list[tuple[int, Any]]]:
+    """What an independent reader finds in an MCAP: (log time in ns, message) by topic."""
+    from mcap.reader import make_reader  # noqa: PLC0415 an optional dependency
+    from mcap_ros2.decoder import DecoderFactory  # noqa: PLC0415 as above
+
+    found: dict[str, list[tuple[int, Any]]] = {}
+    with path.open("rb") as file:
+        for _, channel, message, decoded in make_reader(
+            file, decoder_factories=[DecoderFactory()]
+        ).iter_decoded_messages():
+            assert message.publish_time == message.log_time
+            found.setdefault(channel.topic, []).append((message.log_time, decoded))
+    return found
+
+
+def bytes_of(path: Path) -> list[tuple[str, int, bytes]]:
+    from mcap.reader import make_reader  # noqa: PLC0415 an optional dependency
+
+    with path.open("rb") as file:
+        return [
+            (channel.topic, message.log_time, message.data) for _, channel, message in make_reader(file).iter_messages()
+        ]
+
+
+def run(*arguments: str | Path) -> None:
+    assert main([str(argument) for argument in arguments]) == 0
+
+
+# ---- recording ----
+
+
+def test_an_mcap_has_the_floats_of_the_csv_at_the_times_of_their_points(tmp_path: Path) -> None:
+    config = write_config(tmp_path, stop_time=0.5, simulation={"step_size": 0.002})
+    run("launch", config, "--local", "--no-progress")
+    run("launch", config, "--local", "--no-progress", "--output", tmp_path / "pair.mcap")
+
+    found = messages_of(tmp_path / "pair.mcap")
+
+    rows = rows_of(tmp_path / "pair.csv")
+    topics = ["/pendulum/a", "/pendulum/der_a_", "/pendulum/der_a_2_", "/delay/y"]
+    assert sorted(found) == sorted([*topics, "/clock"])
+    for column, topic in enumerate(topics, start=1):
+        assert [message.data for _, message in found[topic]] == [row[column] for row in rows], topic
+        assert [stamp for stamp, _ in found[topic]] == [k * 2 * MS for k in range(251)]
+    assert [stamp for stamp, _ in found["/clock"]] == [k * 10 * MS for k in range(51)]
+    assert all(m.clock.sec * 1_000_000_000 + m.clock.nanosec == stamp for stamp, m in found["/clock"])
+
+
+def test_real_processes_record_the_messages_of_one_process(place: Place) -> None:
+    config = write_config(place.folder, stop_time=0.5, record={"file": "pair.mcap"}, ros=TWIST)
+    local = place.run("launch", config, "--local", "--output", place.folder / "local.mcap")
+    distributed = place.run("launch", config)
+
+    assert (local.wait(), distributed.wait()) == (0, 0), (local.errors, distributed.errors)
+    assert "pair.mcap (501 rows)" in distributed.output
+    assert bytes_of(place.folder / "pair.mcap") == bytes_of(place.folder / "local.mcap")
+
+
+def test_a_topic_of_the_ros_section_is_recorded_as_it_is_with_stamps_of_simulation_time(tmp_path: Path) -> None:
+    config = write_config(tmp_path, stop_time=0.1, ros=TWIST)
+    run("launch", config, "--local", "--no-progress")
+    run("launch", config, "--local", "--no-progress", "--output", tmp_path / "pair.mcap")
+
+    found = messages_of(tmp_path / "pair.mcap")
+
+    rows = rows_of(tmp_path / "pair.csv")
+    # `der(a,2)` has no topic in the section, and so the one that it has by default.
+    assert sorted(found) == ["/clock", "/pendulum/der_a_", "/pendulum/der_a_2_", "/state"]
+    states = found["/state"]
+    assert [(m.twist.linear.x, m.twist.angular.z) for _, m in states] == [(row[1], row[4]) for row in rows]
+    assert [m.header.stamp.sec * 1_000_000_000 + m.header.stamp.nanosec for _, m in states] == [s for s, _ in states]
+    assert {m.header.frame_id for _, m in states} == {"base"}
+    assert len(found["/clock"]) == 6
+
+
+def test_an_instance_with_larger_steps_has_messages_at_its_own_points_only(tmp_path: Path) -> None:
+    instances: dict[str, dict[str, Any]] = {"fast": {"fmu": "Gain"}, "slow": {"fmu": "Gain", "step_size": 0.004}}
+    record = {"file": "pair.mcap"}
+    config = write_config(
+        tmp_path, stop_time=0.02, instances=instances, connections=("fast.y -> slow.u",), record=record
+    )
+
+    run("launch", config, "--local", "--no-progress")
+
+    found = messages_of(tmp_path / "pair.mcap")
+    assert [stamp // MS for stamp, _ in found["/slow/y"]] == [0, 4, 8, 12, 16, 20]
+    assert [stamp // MS for stamp, _ in found["/fast/y"]] == list(range(21))
+
+
+def test_an_array_is_one_message_with_its_dimensions(tmp_path: Path) -> None:
+    instances = {"all": {"fmu": str(find_fmu("AllTypes3", tmp_path)), "start_values": {"float64_array_in": ARRAY}}}
+    record = {"file": "pair.mcap", "variables": ["all.float64_array_out"]}
+    config = write_config(tmp_path, stop_time=0.003, instances=instances, connections=(), record=record)
+
+    run("launch", config, "--local", "--no-progress")
+
+    found = messages_of(tmp_path / "pair.mcap")
+    arrays = [message for _, message in found["/all/float64_array_out"]]
+    assert [list(message.data) for message in arrays][1:] == [[1.0, 2.0, 3.0, 4.0, 5.0, 6.0]] * 3
+    assert [(own.size, own.stride) for own in arrays[0].layout.dim] == [(2, 6), (3, 3)]
+
+
+def test_the_schemas_and_channels_are_those_of_ros2_bag(tmp_path: Path) -> None:
+    from mcap.reader import make_reader  # noqa: PLC0415 an optional dependency
+    from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415 an optional dependency
+
+    config = write_config(tmp_path, stop_time=0.01, record={"file": "pair.mcap"}, ros=TWIST)
+    run("launch", config, "--local", "--no-progress")
+
+    with (tmp_path / "pair.mcap").open("rb") as file:
+        reader = make_reader(file)
+        header, summary = reader.get_header(), reader.get_summary()
+
+    assert summary is not None
+    assert header.profile == "ros2"
+    store = get_typestore(Stores.ROS2_JAZZY)
+    for channel in summary.channels.values():
+        schema = summary.schemas[channel.schema_id]
+        assert (channel.message_encoding, schema.encoding) == ("cdr", "ros2msg")
+        assert channel.metadata["topic_type_hash"] == store.hash_rihs01(schema.name)
+        assert "reliability: reliable" in channel.metadata["offered_qos_profiles"]
+
+
+def test_the_messages_are_read_by_ros_itself(tmp_path: Path) -> None:
+    from tests.ros.ros_peer import ros_or_skip  # noqa: PLC0415 only this test needs it
+
+    ros_or_skip()
+    from geometry_msgs.msg import TwistStamped  # noqa: PLC0415 only where ROS is installed
+    from rclpy.serialization import deserialize_message  # noqa: PLC0415 as above
+
+    config = write_config(tmp_path, stop_time=0.01, ros=TWIST)
+    run("launch", config, "--local", "--no-progress")
+    run("launch", config, "--local", "--no-progress", "--output", tmp_path / "pair.mcap")
+
+    states = [
+        deserialize_message(data, TwistStamped)
+        for topic, _, data in bytes_of(tmp_path / "pair.mcap")
+        if topic == "/state"
+    ]
+
+    rows = rows_of(tmp_path / "pair.csv")
+    assert [(m.twist.linear.x, m.twist.angular.z) for m in states] == [(row[1], row[4]) for row in rows]
+
+
+@pytest.mark.parametrize(
+    ("sections", "complaint"),
+    [
+        ({"simulation": {"start_time": -1.0}}, "an MCAP of times before 0"),
+        ({"instances": {"1a": {"fmu": "Gain"}}, "connections": ()}, "1a"),
+    ],
+)
+def test_what_an_mcap_cannot_hold_is_told_by_check(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], sections: dict[str, Any], complaint: str
+) -> None:
+    config = write_config(tmp_path, stop_time=1.0, record={"file": "pair.mcap"}, **sections)
+
+    assert main(["check", str(config)]) == 2
+
+    assert complaint in capsys.readouterr().err
+
+
+def test_a_plot_of_an_mcap_is_refused_with_the_way_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "x.mcap").touch()
+
+    assert main(["plot", str(tmp_path / "x.mcap")]) == 2
+
+    assert "Record into a .csv file" in capsys.readouterr().err
+
+
+# ---- playing ----
+
+
+GRID = TimeGrid(0.0, 0.01, 100)
+
+
+def at(ms: float, value: float, instance: str = "gain") -> Sample:
+    return Sample(round(ms * MS), instance, "u", value)
+
+
+@pytest.mark.parametrize(
+    ("samples", "points"),
+    [
+        ([at(0, 1.0), at(10, 2.0), at(20, 3.0)], {0: 1.0, 1: 2.0, 2: 3.0}),
+        ([at(20, 3.0), at(0, 1.0)], {0: 1.0, 2: 3.0}),
+        ([at(10.000001, 1.0), at(19.999999, 2.0)], {1: 1.0, 2: 2.0}),
+        ([at(10.1, 1.0)], {2: 1.0}),
+        ([at(5, 1.0), at(7, 2.0), at(10, 3.0)], {1: 3.0}),
+        ([at(990, 1.0), at(1000, 2.0), at(5000, 2.0)], {99: 1.0}),
+    ],
+    ids=["on points", "in any order", "a nanosecond off", "between points", "the last of one point", "after the end"],
+)
+def test_a_sample_holds_from_the_first_point_that_is_not_before_its_stamp(
+    samples: list[Sample], points: dict[int, float]
+) -> None:
+    moments, merged, beyond = schedule(samples, GRID, {"gain": 1}, start=None)
+
+    assert {moment.point: moment.values["gain", "u"] for moment in moments} == points
+    assert len(moments) + merged + beyond == len(samples)
+
+
+def test_stamps_of_another_clock_are_moved_so_that_the_first_one_is_at_the_start() -> None:
+    samples = [Sample(1_700_000_000_000_000_000 + k * 10 * MS, "gain", "u", float(k)) for k in range(5)]
+
+    moments, _, _ = schedule(samples, GRID, {"gain": 1}, start=0.02)
+
+    assert [(moment.point, moment.values["gain", "u"]) for moment in moments] == [(2 + k, float(k)) for k in range(5)]
+
+
+def test_an_instance_with_larger_steps_is_given_a_value_at_its_own_points() -> None:
+    moments, merged, _ = schedule([at(10, 1.0), at(20, 2.0), at(50, 3.0)], GRID, {"gain": 4}, start=None)
+
+    assert ([(m.point, m.values["gain", "u"]) for m in moments], merged) == ([(4, 2.0), (8, 3.0)], 1)
+
+
+@pytest.fixture
+def delay(place: Place) -> tuple[Place, Path, Launched]:
+    """A mesh of the delay alone that rests at its first point."""
+    instances = {"delay": {"fmu": "TransportDelay", "start_values": {"d": 0.1, "x": 1.5}}}
+    config = write_config(place.folder, instances=instances, connections=(), name="played", stop_time=0.4)
+    launched = place.start("launch", config, "--paused")
+    place.note()
+    return place, config, launched
+
+
+def test_a_recorded_output_as_input_gives_every_float_of_the_connection(delay: tuple[Place, Path, Launched]) -> None:
+    place, _, launched = delay
+    jacobi = {"algorithm": "jacobi"}
+    coupled = write_config(place.folder, name="coupled", simulation=jacobi, stop_time=0.4)
+    assert place.run("launch", coupled, "--local").wait() == 0
+    assert place.run("launch", coupled, "--local", "--output", place.folder / "a.mcap").wait() == 0
+
+    played = place.run("play", place.folder / "a.mcap", "--topic", "/pendulum/a=delay.x")
+    launched.wait()
+
+    assert (played.wait(), launched.wait()) == (0, 0), (played.errors, launched.errors)
+    assert "played 400 values of /pendulum/a from point 0 to point 399" in played.output
+    assert "1 values are at or after the end" in played.output
+    names = [row[4] for row in rows_of(place.folder / "coupled.csv")]
+    assert [row[1] for row in rows_of(place.folder / "played.csv")] == names
+
+
+def test_a_bag_of_ros2_with_headers_is_played_by_their_stamps(delay: tuple[Place, Path, Launched]) -> None:
+    from rosbags.rosbag2 import StoragePlugin, Writer  # noqa: PLC0415 an optional dependency
+    from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415 an optional dependency
+
+    place, _, launched = delay
+    store = get_typestore(Stores.ROS2_JAZZY)
+    types = store.types
+    name = "geometry_msgs/msg/TwistStamped"
+    zero = types["geometry_msgs/msg/Vector3"](0.0, 0.0, 0.0)
+    bag = place.folder / "drive"
+    with Writer(bag, version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
+        connection = writer.add_connection("/vel_des", name, typestore=store)
+        for k in range(5):
+            stamp = types["builtin_interfaces/msg/Time"](sec=1_700_000_000, nanosec=k * 50 * MS)
+            twist = types["geometry_msgs/msg/Twist"](types["geometry_msgs/msg/Vector3"](float(k), 0.0, 0.0), zero)
+            message = types[name](types["std_msgs/msg/Header"](stamp, "base"), twist)
+            # It was recorded late, each message by another time.
+            logged = 1_700_000_100_000_000_000 + k * k * 1000 * MS
+            writer.write(connection, logged, store.serialize_cdr(message, name))
+
+    early = place.run("play", bag, "--topic", "vel_des:twist.linear.x=delay.x")
+    played = place.run("play", bag, "--topic", "vel_des:twist.linear.x=delay.x", "--start", "0.0")
+    launched.wait()
+
+    assert (early.wait(), played.wait(), launched.wait()) == (2, 0, 0), (early.errors, played.errors, launched.errors)
+    assert "Say when the first one is: --start 0." in early.errors
+    rows = rows_of(place.folder / "played.csv")
+    # The delay of 100 ms shows each of the values 100 ms after its stamp.
+    assert [rows[k][1] for k in (140, 190, 240, 290, 340)] == [0.0, 1.0, 2.0, 3.0, 4.0]
+
+
+def test_what_cannot_be_played_is_told(
+    delay: tuple[Place, Path, Launched], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    place, _, _ = delay
+    bag = place.folder / "a.mcap"
+    config = write_config(place.folder, name="coupled", stop_time=0.01)
+    run("launch", config, "--local", "--no-progress", "--output", bag)
+    monkeypatch.setenv("FMU_MESH_RUNTIME_DIR", str(place.folder / "run"))
+    wait_until(lambda: main(["status", "played"]) == 0, "the mesh")
+    cases = [
+        (["no.mcap"], "'no.mcap' cannot be read as a bag"),
+        ([str(bag)], f"no topic of '{bag}' is one that the mesh subscribes to"),
+        ([str(bag), "--topic", "/pendulum/b=delay.x"], "Did you mean '/pendulum/a'?"),
+        ([str(bag), "--topic", "/pendulum/a=delay.z"], "the unknown variable 'z' of instance 'delay'"),
+        ([str(bag), "--topic", "/pendulum/a:date=delay.x"], "has no field 'date'"),
+        ([str(bag), "--topic", "nothing"], "expected TOPIC=INSTANCE.VARIABLE"),
+    ]
+    capsys.readouterr()
+
+    said = {complaint: (main(["play", *arguments]), capsys.readouterr().err) for arguments, complaint in cases}
+
+    for complaint, (code, error) in said.items():
+        assert code == 2, error
+        assert complaint in error
