@@ -182,7 +182,7 @@ STRUCTURE = [
     pytest.param(
         changed("{fmu: delay.fmu}", "delay.fmu"),
         "mesh.yaml:5: instances.delay: 'delay.fmu'; expected a mapping with fmu, kind, solver, retry_discarded_steps, "
-        "start_values, step_size, interpolation, group and 3 more",
+        "start_values, step_size, group, host and 3 more",
         id="text for a mapping",
     ),
     pytest.param(
