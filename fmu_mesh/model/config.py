@@ -11,9 +11,40 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from fmu_mesh.model.types import PlainValue
+from fmu_mesh.model.config_base import (
+    ENDPOINT_PATTERN,
+    KEY_PREFIX_PATTERN,
+    NAME_PATTERN,
+    NOT_NEGATIVE,
+    POSITIVE,
+    SHA256_PATTERN,
+    Base,
+    DeadlineSeconds,
+    Endpoint,
+    Name,
+)
+from fmu_mesh.model.instance_config import (
+    KIND,
+    ActuatorConfig,
+    AnyInstanceConfig,
+    ControllerConfig,
+    EngineConfig,
+    FluidDynamicsConfig,
+    GazeboClassicConfig,
+    HostConfig,
+    InstanceConfig,
+    MujocoConfig,
+    PidConfig,
+    SolverConfig,
+)
+from fmu_mesh.model.ros_config import RosConfig, RosProfile, RosTopicConfig
 
 __all__ = [
+    "ENDPOINT_PATTERN",
+    "KEY_PREFIX_PATTERN",
+    "KIND",
+    "NAME_PATTERN",
+    "SHA256_PATTERN",
     "ActuatorConfig",
     "AnyInstanceConfig",
     "Config",
@@ -30,40 +61,13 @@ __all__ = [
     "PidConfig",
     "RecordConfig",
     "RosConfig",
+    "RosProfile",
     "RosTopicConfig",
     "SimulationConfig",
     "SolverConfig",
     "TimeoutsConfig",
     "ZenohConfig",
 ]
-
-NAME_PATTERN = r"^[A-Za-z_][A-Za-z0-9_-]*$"
-SHA256_PATTERN = r"^[0-9A-Fa-f]{64}$"
-KEY_PREFIX_PATTERN = r"^[^/*$?#@\s]+(/[^/*$?#@\s]+)*$"
-ENDPOINT_PATTERN = r"^[a-z0-9_-]+/\S+$"
-
-Name = Annotated[
-    str, Meta(pattern=NAME_PATTERN, title="a name of letters, digits, _ and - that starts with a letter or _")
-]
-Sha256 = Annotated[
-    str,
-    Meta(
-        pattern=SHA256_PATTERN,
-        title="a SHA-256 as 64 hexadecimal digits, as `sha256sum` or `fmu-mesh inspect` prints it",
-    ),
-]
-Endpoint = Annotated[str, Meta(pattern=ENDPOINT_PATTERN, title="a Zenoh endpoint such as tcp/192.168.1.2:7447")]
-RosTopicProfile = Literal["ros2dds", "rmw_zenoh"]
-RosProfile = Literal["ros2dds", "rmw_zenoh", "rclpy"]
-DeadlineSeconds = Annotated[float, Meta(gt=0)]
-
-# What editors should know but `system.build` checks: these errors are shown together with those of the names.
-_POSITIVE = {"exclusiveMinimum": 0}
-_NOT_NEGATIVE = {"minimum": 0}
-
-
-class Base(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Every section is frozen and refuses unknown fields; `kw_only` is repeated: it is not inherited."""
 
 
 class SimulationConfig(Base, frozen=True, kw_only=True):
@@ -81,7 +85,7 @@ class SimulationConfig(Base, frozen=True, kw_only=True):
         float,
         Meta(
             description="Base communication step size in s; greater than 0.",
-            extra_json_schema=_POSITIVE,
+            extra_json_schema=POSITIVE,
             examples=[0.002],
         ),
     ]
@@ -100,7 +104,7 @@ class SimulationConfig(Base, frozen=True, kw_only=True):
         float,
         Meta(
             description="0: as fast as possible; 1: wall clock; 2: twice as fast as the wall clock.",
-            extra_json_schema=_NOT_NEGATIVE,
+            extra_json_schema=NOT_NEGATIVE,
         ),
     ] = 0.0
     update_period: Annotated[
@@ -118,207 +122,6 @@ class SimulationConfig(Base, frozen=True, kw_only=True):
             "what it lost, which `status` counts as overruns; null: it catches up however long that takes."
         ),
     ] = None
-
-
-class SolverConfig(Base, frozen=True, kw_only=True):
-    """How the continuous states of a model-exchange FMU are solved."""
-
-    name: Annotated[
-        Literal["cvode", "euler"],
-        Meta(description="cvode: variable step and order, finds events exactly; euler: fixed steps, for checks."),
-    ] = "cvode"
-    relative_tolerance: Annotated[
-        float | None,
-        Meta(
-            description="Relative tolerance of cvode; default: that of the FMU's default experiment, or 1e-6.",
-            extra_json_schema=_POSITIVE,
-            examples=[1e-6],
-        ),
-    ] = None
-    maximum_step_size: Annotated[
-        float | None,
-        Meta(
-            description="Longest step of the solver in s; default: the instance's own step size.",
-            extra_json_schema=_POSITIVE,
-        ),
-    ] = None
-
-
-KIND = "@kind"
-"""What tells the kinds of instances apart once a file is read; nobody writes it, the keys of a section say it."""
-
-StartValues = Annotated[
-    dict[str, PlainValue],
-    Meta(
-        description="Start values of parameters, inputs and initial values, by variable name. "
-        "An Enumeration takes the item's name or its number, an array nested lists row by row, Binary base64."
-    ),
-]
-StepSize = Annotated[
-    float | None,
-    Meta(
-        description="Step size of this instance in s: a whole multiple of the base step size (default).",
-        extra_json_schema=_POSITIVE,
-    ),
-]
-Group = Annotated[Name | None, Meta(description="Instances of one group share one node (one process).")]
-Host = Annotated[str | None, Meta(description="Host the node is meant to run on; `launch` starts those without.")]
-
-
-class InstanceConfig(Base, frozen=True, kw_only=True, tag_field=KIND, tag="fmu"):
-    """One instance of an FMU."""
-
-    fmu: Annotated[str, Meta(description="Path of the .fmu file, or of an unpacked one, relative to this file.")]
-    kind: Annotated[
-        Literal["auto", "co_simulation", "model_exchange"],
-        Meta(description="Which kind of the FMU to use; auto: co-simulation if it has both."),
-    ] = "auto"
-    solver: Annotated[SolverConfig, Meta(description="The solver of a model-exchange FMU.")] = SolverConfig()
-    retry_discarded_steps: Annotated[
-        bool,
-        Meta(
-            description="Whether a step that an FMI 2.0 FMU discards is tried again in smaller ones; then its state is "
-            "kept before every step. FMI 3.0 needs no such wish."
-        ),
-    ] = False
-    start_values: StartValues = {}
-    step_size: StepSize = None
-    group: Group = None
-    host: Host = None
-    interpolation: Annotated[
-        Literal["hold", "linear"] | None,
-        Meta(
-            description="How a value that is sent to an unconnected input with a time in its attachment is used: it "
-            "holds from that time on, or Reals go to it linearly; null: the time is ignored, and it holds from the "
-            "next point on."
-        ),
-    ] = None
-    sha256: Annotated[
-        Sha256 | None, Meta(description="SHA-256 that the .fmu file must have; any other is refused.")
-    ] = None
-    strict: Annotated[
-        bool | None,
-        Meta(description="Whether problems that a strict validation finds in the FMU are errors (default: top level)."),
-    ] = None
-
-    @property
-    def path(self) -> str:
-        """The file of the model, relative to the configuration."""
-        return self.fmu
-
-
-class CouplingConfig(Base, frozen=True, kw_only=True):
-    """Another instance that reads and drives a part of a physics engine."""
-
-    name: Annotated[str, Meta(description="Name of this coupling, for messages.")]
-    instance: Annotated[Name, Meta(description="The instance that is coupled.")]
-    enabled: Annotated[bool, Meta(description="false: as if it were not there.")] = True
-    variable_names: Annotated[
-        dict[str, str],
-        Meta(description="The instance's own names of variables, by their default names."),
-    ] = {}
-
-
-class ControllerConfig(CouplingConfig, frozen=True, kw_only=True):
-    """A controller of a joint: `position` and `velocity` to `effort`."""
-
-    joint: Annotated[str, Meta(description="Name of the joint, revolute or prismatic.")]
-
-
-class ActuatorConfig(CouplingConfig, frozen=True, kw_only=True):
-    """An actuator of a joint: `actuatorInput`, `jointPosition`, `jointVelocity`, `jointAcceleration` to `jointTorque`.
-
-    What a controller asks for goes to the actuator, and the joint gets the actuator's effort instead.
-    """
-
-    joint: Annotated[str, Meta(description="Name of the joint, revolute or prismatic.")]
-    disable_velocity_effort_limits: Annotated[
-        bool, Meta(description="true: the effort of the joint is not limited, whatever the model says.")
-    ] = False
-
-
-class FluidDynamicsConfig(CouplingConfig, frozen=True, kw_only=True):
-    """Fluid dynamics of one body: `relativeVelocity_x/y/z` to `fluidDynamicForce_…` and `fluidDynamicMoment_…`."""
-
-    link: Annotated[str, Meta(description="Name of the body.")]
-
-
-class MujocoConfig(Base, frozen=True, kw_only=True, tag_field=KIND, tag="mujoco"):
-    """A world that the physics engine MuJoCo computes: its joints and bodies are variables."""
-
-    mujoco: Annotated[str, Meta(description="Path of the model (MJCF or URDF), relative to this file.")]
-    physics_steps: Annotated[
-        Annotated[int, Meta(ge=1)] | None,
-        Meta(
-            description="Steps of the engine per own step; default: as few as make none longer than the model's "
-            "timestep.",
-        ),
-    ] = None
-    keyframe: Annotated[str | None, Meta(description="The model's keyframe to start from.")] = None
-    controllers: Annotated[list[ControllerConfig], Meta(description="Controllers of joints.")] = []
-    actuators: Annotated[list[ActuatorConfig], Meta(description="Actuators of joints, as in gazebo-fmi.")] = []
-    fluid_dynamics: Annotated[
-        list[FluidDynamicsConfig], Meta(description="Fluid dynamics of single bodies, as in gazebo-fmi.")
-    ] = []
-    start_values: StartValues = {}
-    step_size: StepSize = None
-    group: Group = None
-    host: Host = None
-
-    @property
-    def path(self) -> str:
-        """The file of the model, relative to the configuration."""
-        return self.mujoco
-
-
-class GazeboClassicConfig(Base, frozen=True, kw_only=True, tag_field=KIND, tag="gazebo_classic"):
-    """A world that the simulator Gazebo classic 11 computes: its joints and links are variables."""
-
-    gazebo_classic: Annotated[str, Meta(description="Path of the SDF world, relative to this file.")]
-    physics_steps: Annotated[
-        Annotated[int, Meta(ge=1)] | None,
-        Meta(
-            description="Steps of the engine per own step; default: as few as make none longer than the world's "
-            "max_step_size.",
-        ),
-    ] = None
-    controllers: Annotated[list[ControllerConfig], Meta(description="Controllers of joints.")] = []
-    actuators: Annotated[list[ActuatorConfig], Meta(description="Actuators of joints, as in gazebo-fmi.")] = []
-    fluid_dynamics: Annotated[
-        list[FluidDynamicsConfig], Meta(description="Fluid dynamics of single links, as in gazebo-fmi.")
-    ] = []
-    start_values: StartValues = {}
-    step_size: StepSize = None
-    group: Group = None
-    host: Host = None
-
-    @property
-    def path(self) -> str:
-        """The file of the world, relative to the configuration."""
-        return self.gazebo_classic
-
-
-class PidConfig(Base, frozen=True, kw_only=True, tag_field=KIND, tag="controller"):
-    """A controller that needs no FMU."""
-
-    controller: Annotated[
-        Literal["position_pid"],
-        Meta(description="position_pid: gains p, i, d; inputs target, position, velocity; output effort."),
-    ]
-    start_values: StartValues = {}
-    step_size: StepSize = None
-    group: Group = None
-    host: Host = None
-
-    @property
-    def path(self) -> str:
-        """There is no file."""
-        return ""
-
-
-EngineConfig = MujocoConfig | GazeboClassicConfig
-HostConfig = EngineConfig | PidConfig
-AnyInstanceConfig = InstanceConfig | MujocoConfig | GazeboClassicConfig | PidConfig
 
 
 class LimitsConfig(Base, frozen=True, kw_only=True):
@@ -478,82 +281,6 @@ class TimeoutsConfig(Base, frozen=True, kw_only=True):
         DeadlineSeconds,
         Meta(description="For terminating and freeing an FMU, in s."),
     ] = 30.0
-
-
-class RosTopicConfig(Base, frozen=True, kw_only=True):
-    """One ROS topic; outputs are published, unconnected inputs subscribed. The short form is `instance.variable`."""
-
-    topic: Annotated[
-        str | None,
-        Meta(description="Name of the topic; default: <instance>/<variable>, with _ for what ROS does not allow."),
-    ] = None
-    variable: Annotated[
-        str | None,
-        Meta(description="`instance.variable`, or `instance` for all of its outputs and unconnected inputs."),
-    ] = None
-    type: Annotated[
-        str | None,
-        Meta(
-            description="Message type; default: the one of std_msgs for the type of the variable.",
-            examples=["std_msgs/msg/Float64"],
-        ),
-    ] = None
-    fields: Annotated[
-        dict[str, str],
-        Meta(
-            description="Several variables in one message: `instance.variable` by the field that it goes into.",
-            examples=[{"twist.linear.x": "path_filter.v"}],
-        ),
-    ] = {}
-    profile: Annotated[RosTopicProfile | None, Meta(description="Another profile than that of the mesh.")] = None
-    frame_id: Annotated[str, Meta(description="frame_id of the header, where the message has one.")] = ""
-    reliability: Annotated[
-        Literal["reliable", "best_effort"],
-        Meta(description="Reliability in ROS; a best-effort publisher needs a best-effort subscription here."),
-    ] = "reliable"
-
-
-class RosConfig(Base, frozen=True, kw_only=True):
-    """What ROS 2 sees of the mesh, without ROS on this side."""
-
-    profile: Annotated[
-        RosProfile,
-        Meta(
-            description="ros2dds: as zenoh-bridge-ros2dds expects it, for ROS on DDS; rmw_zenoh: as ROS nodes on "
-            "rmw_zenoh expect it; rclpy: as topics of a ROS node, `python -m fmu_mesh.ros.node` with this file."
-        ),
-    ] = "ros2dds"
-    topics: Annotated[
-        list[str | RosTopicConfig] | None,
-        Meta(description="The topics; default: all outputs and all unconnected inputs of all instances."),
-    ] = None
-    connect: Annotated[list[Endpoint], Meta(description="Where the bridge or the router of rmw_zenoh is.")] = (
-        msgspec.field(default_factory=lambda: ["tcp/127.0.0.1:7447"])
-    )
-    listen: Annotated[
-        list[Endpoint], Meta(description="Endpoints where a bridge can connect to, instead of or beside `connect`.")
-    ] = []
-    node: Annotated[str | None, Meta(description="Name of the node in ROS; default: the name of the mesh.")] = None
-    namespace: Annotated[str, Meta(description="Namespace of the node and of its topics.")] = "/"
-    domain: Annotated[int, Meta(ge=0, le=232, description="ROS_DOMAIN_ID; used by rmw_zenoh.")] = 0
-    distribution: Annotated[
-        Literal["humble", "jazzy", "kilted", "lyrical"],
-        Meta(description="The ROS 2 distribution whose message definitions and hashes hold."),
-    ] = "jazzy"
-    clock_rate: Annotated[
-        float | None,
-        Meta(
-            description="/clock messages per second of simulation time, at most one per point; null: no /clock.",
-            extra_json_schema=_POSITIVE,
-        ),
-    ] = 100.0
-    messages: Annotated[
-        dict[str, str],
-        Meta(
-            description="Custom message types: the path of the .msg file, relative to this file, by the full name.",
-            examples=[{"lab_msgs/msg/Wheel": "msg/Wheel.msg"}],
-        ),
-    ] = {}
 
 
 class Config(Base, frozen=True, kw_only=True):
