@@ -49,7 +49,7 @@ from ..wire.messages import (
 )
 from ..wire.profile import TIME_LINE_ENTRIES, MeshProfile
 from ..wire.session import matches, undeclare_all
-from ..wire.shared_memory import SharedOutlet
+from ..wire.shared_memory import SharedInbox, SharedOutlet, available
 from ..wire.values import json_encoding
 from ..wire.views import Command, CommandAnswer, LogLine, MeshInfo, MeshState, MeshStatus
 from .pacing import Clock, Pacer
@@ -124,12 +124,14 @@ class Master:
         self._published = 0.0
         self._status_published = 0.0
         self._moved = time.monotonic()
+        shares = config.zenoh.shared_memory and available()
         self._inbox = Inbox(
             session,
             self._keys.inbox(MASTER),
             self._keys.wake(MASTER),
             (plan.window + 64) * len(self._nodes) + 1024,
-            dict.fromkeys(self._nodes, 0) if config.zenoh.shared_memory else None,
+            # It is looked at closely only where nodes wait for every single grant.
+            SharedInbox(dict.fromkeys(self._nodes, 0), spins=plan.window == 1) if shares else None,
         )
         self._grants = [
             session.declare_publisher(key, congestion_control=zenoh.CongestionControl.BLOCK, express=True)

@@ -38,7 +38,7 @@ from ..model.transfer import Transfer
 from ..wire.frames import FrameReceiver
 from ..wire.inbox import Inbox, Message
 from ..wire.keys import Keys
-from ..wire.membership import MASTER, Membership, credit
+from ..wire.membership import MASTER, Membership, shared_inbox
 from ..wire.messages import (
     ABORT,
     FINISH,
@@ -105,7 +105,8 @@ class Node:
         self._remote: dict[int, tuple[FrameReceiver, list[RemoteFeed]]] = {}
         self._initialization = Initialization(plan, self._wait_for_initial_value)
         capacity = sum(plan.window + 8 for _ in plan.links_in) + 4096
-        self._inbox = Inbox(session, self._keys.inbox(plan.node), self._keys.wake(plan.node), capacity, credit(plan))
+        shared = shared_inbox(plan, spins=True)
+        self._inbox = Inbox(session, self._keys.inbox(plan.node), self._keys.wake(plan.node), capacity, shared)
         self._membership = Membership(plan, session, self._keys, self._inbox)
         self._progress_number = 0
         self._profiler: Profiler | None = None

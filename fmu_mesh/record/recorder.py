@@ -25,7 +25,7 @@ from ..model.plan import RECORDER, NodePlan
 from ..wire.frames import FrameReceiver
 from ..wire.inbox import Inbox, Message
 from ..wire.keys import Keys
-from ..wire.membership import MASTER, Membership, credit
+from ..wire.membership import MASTER, Membership, shared_inbox
 from ..wire.messages import ABORT, FINISH, FRAME, HEADER, PROGRESS, NodeReport, decode_abort
 from ..wire.session import ask
 from .csv_file import CsvFile
@@ -72,7 +72,8 @@ class Recorder:
         self._finished = False
         self._flushed = time.monotonic()
         capacity = (plan.window + 8) * len(plan.links_in) + 1024
-        self._inbox = Inbox(session, self._keys.inbox(RECORDER), self._keys.wake(RECORDER), capacity, credit(plan))
+        shared = shared_inbox(plan, spins=False)  # nobody waits for it, but others need the processor
+        self._inbox = Inbox(session, self._keys.inbox(RECORDER), self._keys.wake(RECORDER), capacity, shared)
         self._membership = Membership(plan, session, self._keys, self._inbox)
         self._put_progress: Callable[[bytes], None]
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)

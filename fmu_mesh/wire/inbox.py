@@ -10,7 +10,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from types import TracebackType
 from typing import Final, Protocol, Self
 
@@ -18,7 +18,7 @@ import zenoh
 from zenoh.handlers import FifoChannel
 
 from .messages import HEADER, WAKE
-from .shared_memory import Offer, SharedInbox, available
+from .shared_memory import Offer, SharedInbox
 
 __all__ = ["Inbox", "Message"]
 
@@ -57,20 +57,20 @@ class Inbox:
         key: key expression to subscribe to; see `Keys.inbox`.
         wake_key: a key of this node that only this process publishes on.
         capacity: messages that fit; at least as many as the senders have credit for.
-        senders: for shared memory: bytes that each sender has credit for; None where nothing is shared.
+        shared: shared memory that `share` changes over to; None where nothing is shared.
 
     Attributes:
         offer: where senders on this host find the shared memory; None where nothing is shared.
     """
 
     def __init__(
-        self, session: zenoh.Session, key: str, wake_key: str, capacity: int, senders: Mapping[str, int] | None = None
+        self, session: zenoh.Session, key: str, wake_key: str, capacity: int, shared: SharedInbox | None = None
     ) -> None:
         self._posted: deque[Callable[[], None]] = deque()
         self._source: _Source = _ZenohSource(session, key, wake_key, capacity)
         self._take = self._source.take
-        self._shared = SharedInbox(senders) if senders is not None and available() else None
-        self.offer: Offer | None = self._shared.offer if self._shared is not None else None
+        self._shared = shared
+        self.offer: Offer | None = shared.offer if shared is not None else None
 
     def __enter__(self) -> Self:
         return self

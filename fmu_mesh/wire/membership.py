@@ -20,9 +20,9 @@ from .inbox import Inbox
 from .keys import Keys
 from .messages import decode_json
 from .session import ask
-from .shared_memory import Offer, SharedOutlet
+from .shared_memory import Offer, SharedInbox, SharedOutlet, available
 
-__all__ = ["MASTER", "Membership", "Registration", "Welcome", "credit"]
+__all__ = ["MASTER", "Membership", "Registration", "Welcome", "shared_inbox"]
 
 MASTER = "@mesh"
 """Name of the master where node names stand."""
@@ -38,15 +38,15 @@ class Hello(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     offer: Offer | None = None
 
 
-def credit(plan: NodePlan) -> dict[str, int] | None:
-    """Bytes that may be on their way from each sender to this node; None where nothing shall be shared."""
-    if not plan.shared_memory:
+def shared_inbox(plan: NodePlan, *, spins: bool) -> SharedInbox | None:
+    """Shared memory with room for what each sender of this node has credit for; None where nothing can be shared."""
+    if not plan.shared_memory or not available():
         return None
     senders = {MASTER: 0}
     for link in plan.links_in:
         own = plan.ring_rows * (link.layout.row_size + _FRAME_OVERHEAD)
         senders[link.source_node] = senders.get(link.source_node, 0) + own
-    return senders
+    return SharedInbox(senders, spins=spins)
 
 
 class Registration(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -87,7 +87,7 @@ class Membership:
     Args:
         plan: what the participant has to do.
         session: the session of this process; stays the caller's.
-        inbox: its inbox, made with `credit`.
+        inbox: its inbox, made with `shared_inbox`.
 
     Call sequence: `join` once, then `sender` for everything that is sent to, and `close` at the end.
     """

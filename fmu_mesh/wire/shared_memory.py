@@ -111,6 +111,7 @@ class SharedInbox:
 
     Args:
         senders: bytes that may be on their way, by sender; more than that blocks it.
+        spins: whether it looks again for a moment before it sleeps, for those whose messages are waited for.
 
     Raises:
         OSError: the system gives no memory.
@@ -118,7 +119,7 @@ class SharedInbox:
     One thread receives; `wake` may be called by any thread.
     """
 
-    def __init__(self, senders: Mapping[str, int]) -> None:
+    def __init__(self, senders: Mapping[str, int], *, spins: bool = True) -> None:
         assert _SEMAPHORES is not None
         init, post, self._trywait, self._clockwait = _SEMAPHORES
         channels: dict[str, tuple[int, int]] = {}
@@ -142,6 +143,7 @@ class SharedInbox:
         self._post = post
         self.offer = Offer(os.getpid(), self._descriptor, token.hex(), end, channels)
         self._woken = False
+        self._spins = spins and not _ONE_CORE
         self._patience = 0
 
     def take(self) -> bytes | None:
@@ -193,7 +195,7 @@ class SharedInbox:
 
         Where it was in vain, somebody else may need the processor: then it is left alone for a number of waits.
         """
-        if _ONE_CORE:
+        if not self._spins:
             return False
         if self._patience < 0:
             self._patience += 1
