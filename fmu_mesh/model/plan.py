@@ -34,7 +34,7 @@ RECORDER = "@record"
 RECORDER_WINDOW = 4096
 """How many points the recorder may be behind, at least."""
 
-LAZY_ROWS = 256
+LAZY_ROWS = 2048
 """Rows for the recorder that may wait in a node until a frame is worth sending."""
 
 AUTO_WINDOW_POINTS = 1024

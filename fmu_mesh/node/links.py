@@ -31,8 +31,8 @@ class OutLink:
         self.sent = 0
         self.lazy = link.target_node == RECORDER
         # A quarter of the window, so that the consumer has work while the credit for more is on its way.
-        by_window = LAZY_ROWS // 2 if self.lazy else max(1, window // (4 * link.step_points))
-        self.capacity = max(1, min(_FRAME_POINTS, _FRAME_BYTES // max(link.layout.row_size, 1), by_window))
+        rows = LAZY_ROWS // 2 if self.lazy else min(_FRAME_POINTS, max(1, window // (4 * link.step_points)))
+        self.capacity = max(1, min(rows, _FRAME_BYTES // max(link.layout.row_size, 1)))
         self._outputs = outputs
         self.put = put
         self._picks = _picks(outputs.layout, link.layout)

@@ -36,7 +36,7 @@ __all__ = ["Recorder", "unwritable"]
 log = logging.getLogger(__name__)
 
 _LOOK_S = 0.2
-_WRITE_ROWS = 512
+_WRITE_ROWS = 1024
 _TELL_S = 0.1
 _FLUSH_S = 0.2
 
