@@ -186,6 +186,7 @@ def _facts(inspection: Inspection, width: int) -> list[str]:
         ("Needs", ", ".join(needs)),
         ("Experiment", ", ".join(times)),
         ("Variables", ", ".join(counts) or "none"),
+        ("Clocks", ", ".join(map(str, description.clocks))),
     ]
     lines = pairs((name, " ".join(value.split())) for name, value in facts)
     indent = " " * (2 + max(len(name) for name, value in facts if value))

@@ -128,6 +128,11 @@ class Clock(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     interval: float | None = None
     shift: float = 0.0
 
+    def __str__(self) -> str:
+        """Such as `tick (input, constant, every 0.4 s from 0.2 s on)`."""
+        every = f", every {self.interval:g} s from {self.shift:g} s on" if self.interval is not None else ""
+        return f"{self.name} ({self.causality}, {self.interval_variability}{every})"
+
 
 class ModelDescription(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A model description (FMI 2.0, 2.2) as far as the mesh needs it."""

@@ -61,4 +61,5 @@ def instance_info(plan: NodePlan, runner: Runner) -> InstanceInfo:
         pid=os.getpid(),
         host=socket.gethostname(),
         problems=description.problems,
+        clocks=description.clocks,
     )

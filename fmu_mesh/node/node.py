@@ -285,7 +285,7 @@ class Node:
         self._report(asked, self._plan.timeouts.stop)
 
     def _flush_before_waiting(self) -> None:
-        """Send what a consumer could be waiting for; rows that are only recorded at least every 50 ms, and at the end."""
+        """Send what a consumer could be waiting for; what is only recorded at least every 50 ms, and at the end."""
         now = time.monotonic()
         done = self._covered() == self._plan.grid.last_point
         lazy = done or self._waited_long or now - self._lazy_flushed > _LAZY_S

@@ -7,7 +7,7 @@ from typing import Literal
 import msgspec
 
 from ..errors import ErrorReport
-from ..model.description import DefaultExperiment, PlainValue
+from ..model.description import Clock, DefaultExperiment, PlainValue
 
 __all__ = [
     "Command",
@@ -69,6 +69,7 @@ class InstanceInfo(msgspec.Struct, frozen=True):
     pid: int
     host: str
     problems: tuple[str, ...]
+    clocks: tuple[Clock, ...] = ()
 
 
 class InstanceStatus(msgspec.Struct, frozen=True):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -127,3 +128,11 @@ def test_what_is_no_fmu_is_refused(name: str, says: str, capsys: pytest.CaptureF
     assert main(["inspect", str(FMUS / name)]) == 2
 
     assert says in capsys.readouterr().err
+
+
+def test_clocks_are_shown_with_their_times(event_fmu: Callable[..., Path], capsys: pytest.CaptureFixture[str]) -> None:
+    clock = 'intervalVariability="constant" intervalDecimal="0.4" shiftDecimal="0.2"'
+
+    page = inspected(capsys, event_fmu("Stairs", 3, clocks=clock))
+
+    assert "tick (input, constant, every 0.4 s from 0.2 s on), stair (output, triggered)" in " ".join(page.split())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,6 +19,7 @@ from fmu_mesh.model.ring import Layout, Ring
 from fmu_mesh.model.types import INTEGERS, VariableType
 from fmu_mesh.simtime import TimeGrid
 from tests.fmus.helpers import NO_COMPILER, build_test_fmu
+from tests.fmus.packing import repacked
 
 pytestmark = pytest.mark.skipif(NO_COMPILER is not None, reason=str(NO_COMPILER))
 
@@ -264,3 +266,24 @@ def test_the_library_steps_fmus_of_fmi_3_with_arrays(folder: Path) -> None:
         assert adapter.get_output_value("float64_array_out") == [[0.5, 1.0], [1.5, 2.0]]
         with pytest.raises(CallRefused, match="a list of 2 x 2 values"):
             adapter.set_input_value("float64_array_in", 2.0, [1.0, 2.0])
+
+
+def test_an_alias_of_fmi_3_is_a_variable_with_the_same_value(folder: Path, tmp_path: Path) -> None:
+    path = repacked(
+        tmp_path / "alias.fmu",
+        source=build_test_fmu("AllTypes3", folder),
+        description=lambda text: re.sub(
+            r'(<Float64 name="float64_out"[^>]*)/>', r'\1><Alias name="again" description="the same"/></Float64>', text
+        ),
+    )
+    description = read_description(path)
+    instance = open_instance(path, "it", description, tmp_path)
+
+    alias = description.variable("again")
+    instance.enter_initialization(0.0, None, {"float64_in": 0.1})
+    values = instance.get_values(["float64_out", "again"])
+    instance.close()
+
+    assert alias is not None
+    assert (alias.causality, alias.description) == ("output", "the same")
+    assert values == [0.1, 0.1]
