@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import sys
+import threading
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
@@ -20,6 +21,8 @@ from .node_settings import PARAMETERS
 from .peer import ros_module
 
 __all__ = ["create_node", "main"]
+
+_END_S = 20.0
 
 NODE_NAME = "fmi_adapter_node"
 
@@ -133,6 +136,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         pass
     finally:
         managed: Managed = node.managed
+        # Neither an FMU that hangs nor the middleware's own shutdown may keep this process for ever.
+        end = threading.Timer(_END_S, os._exit, (3,))
+        end.daemon = True
+        end.start()
         returned = managed.close()
         node.destroy_node()
         rclpy.try_shutdown()
@@ -140,6 +147,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if not returned:
         # A thread that is inside the FMU for ever would keep this process alive for ever.
         os._exit(exit_code or 3)
+    end.cancel()
     return exit_code
 
 

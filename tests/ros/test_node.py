@@ -535,14 +535,14 @@ def test_while_an_fmu_hangs_the_node_answers_and_its_end_is_bounded_and_clean(
     from lifecycle_msgs.srv import GetState  # noqa: PLC0415 only where ROS is installed
 
     temporary = tmp_path / "temporary"
-    node = process(ros, temporary, fmu_path=faulty, step_size="0.01", hang_at="0.05")
+    node = process(ros, temporary, fmu_path=faulty, step_size="0.01", hang_at="3.0")
     try:
         peer = ros.peer()
         subscription, messages = ros.collect(peer, type(float64(0.0)), "/lab/y")
         ros.matched(subscription)
         client = peer.create_client(GetState, "/lab/own/get_state")
         ros.until(lambda: messages, "a first message")
-        ros.turn(0.3)
+        ros.turn(3.5)  # by then it hangs
 
         assert ros.called(client, GetState.Request()).current_state.label == "active"
         node.send_signal(signal.SIGTERM)
