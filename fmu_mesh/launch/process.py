@@ -46,7 +46,7 @@ def ended_by_signals(
         interrupt(reason)
         if not left.wait(GRACE_S):
             clean_up()
-            os._exit(130)
+            _exit(reason, told=watch_stdin)
 
     def wait_for_signal() -> None:
         number = os.read(reading, 1)
@@ -76,6 +76,13 @@ def ended_by_signals(
         os.close(writing)
         watcher.join(GRACE_S)
         os.close(reading)
+
+
+def _exit(reason: str, *, told: bool) -> None:
+    """End the process although its main thread does not come back; say why, unless the launcher does."""
+    if not told:
+        os.write(2, f"fmu-mesh: {reason}\n".encode())
+    os._exit(130)
 
 
 def _ignore(_number: int, _frame: FrameType | None) -> None:

@@ -56,6 +56,6 @@ def test_the_integrated_node_publishes_the_floats_of_the_mesh_with_both_fmus(ros
         process.terminate()
         assert process.wait(DEADLINE_S) == 0
 
-    assert len(angles) == len(delayed_angles)
+    assert min(len(angles), len(delayed_angles)) >= 500  # the last ones may still be on their way
     assert [message.data for message in angles][:500] == [row[1] for row in expected[1:501]]
     assert [message.data for message in delayed_angles][:500] == [row[2] for row in expected[1:501]]
