@@ -15,9 +15,9 @@ import msgspec
 import numpy as np
 
 from ..errors import FmuMeshError
-from ..model.description import ModelDescription, Value
 from ..model.instance import Instance, KeepsState, LinearInput
 from ..model.ring import Layout, Ring
+from ..model.wrapping import AroundInstance
 from ..simtime import TimeGrid
 
 __all__ = ["LinearInputs", "TakesDerivatives"]
@@ -31,7 +31,7 @@ class TakesDerivatives(Instance, KeepsState, Protocol):
         ...
 
 
-class LinearInputs:
+class LinearInputs(AroundInstance[TakesDerivatives]):
     """An instance of whose inputs some change linearly; for the rest it is the instance itself.
 
     Args:
@@ -40,7 +40,7 @@ class LinearInputs:
     """
 
     def __init__(self, instance: TakesDerivatives, inputs: Sequence[LinearInput]) -> None:
-        self._instance = instance
+        super().__init__(instance)
         self._names = [item.name for item in inputs]
         self._at_end = np.array([item.delay == 0 for item in inputs])
         self._previous: np.ndarray[Any, np.dtype[np.float64]] = np.zeros(0)
@@ -49,29 +49,6 @@ class LinearInputs:
         self._inner = self._outer
         self._columns = np.zeros(0, dtype=np.intp)
         self._step_size = 0.0
-
-    @property
-    def description(self) -> ModelDescription:
-        """See `Instance`."""
-        return self._instance.description
-
-    def enter_initialization(
-        self, start_time: float, stop_time: float | None, start_values: Mapping[str, Value]
-    ) -> None:
-        """See `Instance`."""
-        self._instance.enter_initialization(start_time, stop_time, start_values)
-
-    def exit_initialization(self) -> None:
-        """See `Instance`."""
-        self._instance.exit_initialization()
-
-    def set_values(self, values: Mapping[str, Value]) -> None:
-        """See `Instance`."""
-        self._instance.set_values(values)
-
-    def get_values(self, names: Sequence[str]) -> list[Value]:
-        """See `Instance`."""
-        return self._instance.get_values(names)
 
     def bind(self, inputs: Ring, outputs: Sequence[Ring], grid: TimeGrid, points: int, step: int = 0) -> None:
         """See `Instance`."""
@@ -132,10 +109,6 @@ class LinearInputs:
         except msgspec.DecodeError as error:
             raise FmuMeshError(f"this is no state of an instance with linear inputs: {error}") from error
         return _State(self._instance.deserialize_state(rest), slopes)
-
-    def close(self) -> None:
-        """See `Instance`."""
-        self._instance.close()
 
 
 class _Slopes(msgspec.Struct, frozen=True):

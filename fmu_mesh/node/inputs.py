@@ -7,14 +7,15 @@ at all is `fmu_mesh.node.settings`.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Literal
 
-from ..model.description import ModelDescription, Value
+from ..model.description import Value
 from ..model.instance import Instance
 from ..model.ring import Ring
 from ..model.trajectory import Trajectory
 from ..model.types import is_float
+from ..model.wrapping import AroundInstance
 from ..simtime import TimeGrid
 from ..wire.values import ValueRefused
 
@@ -23,7 +24,7 @@ __all__ = ["TimedInputs", "set_input"]
 _WAITING = 1 << 16
 
 
-class TimedInputs:
+class TimedInputs(AroundInstance[Instance]):
     """An `Instance` whose unconnected inputs follow trajectories; everything else goes to the one within.
 
     The step from t sets each of these inputs to its value at t. A value that comes without a time holds from the next
@@ -35,7 +36,7 @@ class TimedInputs:
     """
 
     def __init__(self, instance: Instance, interpolation: Literal["hold", "linear"]) -> None:
-        self._instance = instance
+        super().__init__(instance)
         self._linear = interpolation == "linear"
         self._trajectories: dict[str, Trajectory] = {}
         self._used: dict[str, Value] = {}
@@ -43,29 +44,6 @@ class TimedInputs:
         self._grid: TimeGrid | None = None
         self._points = 1
         self._step = 0
-
-    @property
-    def description(self) -> ModelDescription:
-        """The model description."""
-        return self._instance.description
-
-    def enter_initialization(
-        self, start_time: float, stop_time: float | None, start_values: Mapping[str, Value]
-    ) -> None:
-        """As the one within."""
-        self._instance.enter_initialization(start_time, stop_time, start_values)
-
-    def exit_initialization(self) -> None:
-        """As the one within."""
-        self._instance.exit_initialization()
-
-    def set_values(self, values: Mapping[str, Value]) -> None:
-        """As the one within."""
-        self._instance.set_values(values)
-
-    def get_values(self, names: Sequence[str]) -> list[Value]:
-        """As the one within."""
-        return self._instance.get_values(names)
 
     def bind(self, inputs: Ring, outputs: Sequence[Ring], grid: TimeGrid, points: int, step: int = 0) -> None:
         """As the one within; from now on there is a time, and values that came before it get theirs."""
@@ -86,10 +64,6 @@ class TimedInputs:
                 self._used.update(changed)
         self._instance.do_step(step)
         self._step = step + 1
-
-    def close(self) -> None:
-        """As the one within."""
-        self._instance.close()
 
     def add(self, name: str, value: Value, time: float | None) -> int:
         """A value of an input from ``time`` (s; None: now) on; returns the own step that is the first to use it.
