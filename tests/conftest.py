@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import settings
@@ -15,6 +16,16 @@ from tests.helpers import Place
 # How long an example takes says more about the machine than about the code; a failure must be the same everywhere.
 settings.register_profile("fmu_mesh", deadline=None, derandomize=True, print_blob=True)
 settings.load_profile("fmu_mesh")
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, Any, Any]:
+    """A failed test shows what the processes that it started have written."""
+    report = yield
+    place = getattr(item, "funcargs", {}).get("place")
+    if report.when == "call" and report.failed and isinstance(place, Place):
+        report.sections.append(("Processes of this test", place.story()))
+    return report
 
 
 @pytest.fixture

@@ -31,6 +31,7 @@ __all__ = [
     "Launched",
     "Place",
     "assert_readable",
+    "on_a_busy_machine",
     "row_count",
     "rows_of",
     "wait_until",
@@ -39,7 +40,7 @@ __all__ = [
 
 FMUS = Path(__file__).resolve().parents[1] / "fmus"
 
-DEADLINE_S = 30.0
+DEADLINE_S = 100.0
 """Longer than anything takes on a busy machine, shorter than the timeout of a test."""
 
 _LOOK_S = 0.01
@@ -56,6 +57,11 @@ def wait_until(condition: Callable[[], Value | None], what: str, deadline_s: flo
             return value
         assert time.monotonic() < end, f"not within {deadline_s:g} s: {what}"
         never.wait(_LOOK_S)
+
+
+def on_a_busy_machine(seconds: float) -> float:
+    """What takes ``seconds`` where a core is free may take this long now: as many times as processes share a core."""
+    return seconds * max(1.0, os.getloadavg()[0] / (os.cpu_count() or 1))
 
 
 def write_config(
@@ -205,6 +211,11 @@ class Place:
         left = self.left()
         assert not left, "\n".join(left)
 
+    def story(self) -> str:
+        """What has been started here, how it ended, what it wrote, and where it is if it still runs."""
+        stories = [launched.story() for launched in self._started]
+        return "\n".join([*stories, *(_stacks(process.pid) for process in self.processes())])
+
     def extracted(self) -> list[Path]:
         """The folders of extracted FMUs."""
         return [path.parent for path in self.folder.rglob("modelDescription.xml")]
@@ -218,6 +229,7 @@ class Launched:
     """
 
     def __init__(self, command: Sequence[str], environment: Mapping[str, str], folder: Path) -> None:
+        self._command = command
         self._popen = subprocess.Popen(
             command,
             cwd=folder,
@@ -268,6 +280,11 @@ class Launched:
         assert_readable(message)
         return message
 
+    def story(self) -> str:
+        """Its command, how it ended, and what it wrote."""
+        end = "runs" if self.running else f"ended with {self._popen.returncode}"
+        return f"$ fmu-mesh {' '.join(self._command[3:])}  ({end})\n{self.output}{self.errors}"
+
     def signal(self, number: signal.Signals) -> None:
         """Send it a signal."""
         self._popen.send_signal(number)
@@ -313,6 +330,15 @@ class Launched:
         for pipe in (self._popen.stdout, self._popen.stderr):
             if pipe is not None:
                 pipe.close()
+
+
+def _stacks(pid: int) -> str:
+    """Where all threads of a Python process are, for a test that hangs."""
+    command = [str(Path(sys.executable).with_name("py-spy")), "dump", "--pid", str(pid)]
+    try:
+        return subprocess.run(command, capture_output=True, text=True, timeout=30, check=False).stdout
+    except (OSError, subprocess.TimeoutExpired) as error:
+        return f"process {pid}: {error}"
 
 
 def _command(process: psutil.Process) -> list[str]:

@@ -7,6 +7,7 @@ Uses the open keys of a mesh (docs/key-space.md) and nothing else of the project
 from __future__ import annotations
 
 import json
+import threading
 import time
 from collections.abc import Mapping, Sequence
 from types import TracebackType
@@ -39,6 +40,7 @@ class HeldMesh:
 
     def __init__(self, endpoint: str, mesh: str, key_prefix: str = "fmu_mesh", deadline_s: float = 10.0) -> None:
         self._prefix, self._deadline_s = f"{key_prefix}/{mesh}", deadline_s
+        self._patience = threading.Event()  # never set
         config = zenoh.Config()
         config.insert_json5("mode", '"client"')
         config.insert_json5("scouting/multicast/enabled", "false")
@@ -103,13 +105,17 @@ class HeldMesh:
 
     def _ask(self, key: str, payload: str | None = None) -> tuple[Any, Any]:
         """The answer to a query and its attachment."""
-        for reply in self._session.get(f"{self._prefix}/{key}", payload=payload, timeout=self._deadline_s):
-            if reply.ok is None:
-                text = reply.err.payload.to_string() if reply.err is not None else "no answer"
-                raise MeshError(f"{key}: {text}")
-            attachment = reply.ok.attachment
-            return (
-                json.loads(reply.ok.payload.to_string()),
-                json.loads(attachment.to_string()) if attachment is not None else None,
-            )
-        raise MeshError(f"{self._prefix}/{key} does not answer; does the mesh run?")
+        end = time.monotonic() + self._deadline_s
+        # A session learns only after it has opened who can be asked; until then a query ends without any reply.
+        while (left := end - time.monotonic()) > 0:
+            for reply in self._session.get(f"{self._prefix}/{key}", payload=payload, timeout=left):
+                if reply.ok is None:
+                    text = reply.err.payload.to_string() if reply.err is not None else "no answer"
+                    raise MeshError(f"{key}: {text}")
+                attachment = reply.ok.attachment
+                return (
+                    json.loads(reply.ok.payload.to_string()),
+                    json.loads(attachment.to_string()) if attachment is not None else None,
+                )
+            self._patience.wait(0.01)
+        raise MeshError(f"{self._prefix}/{key} does not answer within {self._deadline_s:g} s; does the mesh run?")

@@ -155,7 +155,7 @@ class _NodeProcess:
 
     def _take_hang(self, error: FmuError) -> None:
         """From a watching thread: an FMU has not returned in time, and only the end of the process gets it back."""
-        known = self._node is not None and self._node.server.report_hang(error)
+        known = self._node is not None and self._node.report_hang(error)
         if not (self._child and known):
             log.error("%s", error)
         self._clean_up()

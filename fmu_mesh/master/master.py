@@ -252,7 +252,7 @@ class Master:
             raise Interrupted("stopped by a command", point=point, time=self._plan.grid.time(point))
 
     def _publish_grant(self) -> float:
-        """Publish the grant if it may grow, or as a sign of life; returns how long to wait for the next look, in s."""
+        """Publish the grant if it may grow; returns how long to wait for the next look, in s."""
         credit = min(map(operator.add, self._progress, self._windows))
         grant = min(credit, self._last_point)
         if self._hold is not None:
@@ -261,12 +261,20 @@ class Master:
         grant = min(grant, paced)
         if self.watch is not None:
             self.watch.look(self._holder(credit, grant))
+        if grant > self._grant:
+            self._grant = grant
+            self._published = time.monotonic()
+            self._send(GRANT, grant)
+        else:
+            self._send_grant_as_sign_of_life()
+        return min(pause, _STATUS_S)
+
+    def _send_grant_as_sign_of_life(self) -> None:
+        """The same grant again, so that nodes that wait for a slow FMU of another one know that the master lives."""
         now = time.monotonic()
-        if grant > self._grant or now - self._published >= _HEARTBEAT_S:
-            self._grant = max(grant, self._grant)
+        if now - self._published >= _HEARTBEAT_S:
             self._published = now
             self._send(GRANT, self._grant)
-        return min(pause, _STATUS_S)
 
     def _holder(self, credit: int, grant: int) -> str | None:
         """What keeps the grant from growing, for a profile."""
@@ -292,6 +300,8 @@ class Master:
                     if (self._progress[number] < 0 if self._state == "initializing" else node not in self._reports)
                 ]
                 raise DeadlineExceeded(f"{what} {', '.join(map(_spoken, missing))} within {timeout_s:g} s")
+            if self._state == "initializing":
+                self._send_grant_as_sign_of_life()
             self._turn(0.1)
 
     def _turn(self, timeout_s: float) -> None:

@@ -25,6 +25,7 @@ import zenoh
 
 from ..errors import (
     DeadlineExceeded,
+    FmuError,
     FmuMeshError,
     Interrupted,
     MeshLost,
@@ -153,6 +154,10 @@ class Node:
     def interrupt(self, reason: str) -> None:
         """From any thread: end the run with `Interrupted` at the next point or during the current wait."""
         self._inbox.post(lambda: _raise(Interrupted(reason)))
+
+    def report_hang(self, error: FmuError) -> bool:
+        """From a watching thread, while an FMU does not return: tell the master; whether it knows now."""
+        return self.server.report_hang(error, self._patience_s())
 
     # --- before the first point
 
@@ -393,13 +398,17 @@ class Node:
         if self._master_is_gone:
             return True
         self.server.say_everything()
-        timeout_s = self._plan.timeouts.stop
         try:
-            self._report(error, timeout_s if self._master_was_there else min(timeout_s, _NO_MASTER_S))
+            self._report(error, self._patience_s())
         except FmuMeshError as unreachable:
             log.info("failure_not_reported", extra={"error": str(unreachable)})
             return False
         return True
+
+    def _patience_s(self) -> float:
+        """How long a failure waits for the master to take it."""
+        stop_s = self._plan.timeouts.stop
+        return stop_s if self._master_was_there else min(stop_s, _NO_MASTER_S)
 
     def _report(self, error: FmuMeshError | None, timeout_s: float) -> None:
         point = min((runner.point for runner in self._runners.values()), default=0)

@@ -175,14 +175,14 @@ class Server:
                 )
                 return
 
-    def report_hang(self, error: FmuError) -> bool:
+    def report_hang(self, error: FmuError, deadline_s: float) -> bool:
         """From a watching thread: tell the master that an FMU does not return; whether it knows now."""
         runner = self._runners.get(error.instance or "")
         if runner is not None and self.state != "initializing":
             error.point, error.time = runner.point, self._plan.grid.time(runner.point)
         report = NodeReport(self._plan.node, error.point or 0, error.report())
         try:
-            ask(self._session, self._keys.report, msgspec.json.encode(report), 2.0, "the master")
+            ask(self._session, self._keys.report, msgspec.json.encode(report), deadline_s, "the master")
         except FmuMeshError as unreachable:
             log.warning("hang_not_reported", extra={"error": str(unreachable)})
             return False

@@ -57,7 +57,6 @@ def fmu_mesh(*arguments: str) -> list[str]:
     return [sys.executable, "-m", "fmu_mesh", *arguments]
 
 
-@pytest.mark.timeout(4 * RUN_DEADLINE_S)
 def test_the_services_of_compose_give_the_result_of_one_process(
     compose: dict[str, Any], router: str, tmp_path: Path
 ) -> None:

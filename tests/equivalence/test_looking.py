@@ -26,9 +26,9 @@ import pytest
 import zenoh
 
 from fmu_mesh.cli.main import main
+from tests.helpers import DEADLINE_S
 
 FMUS = Path(__file__).parents[2] / "fmus"
-DEADLINE_S = 30.0
 ROOT = "fmu_mesh/looked_at"
 
 CONFIG = """\

@@ -174,7 +174,7 @@ def test_every_type_is_the_same_over_the_wire_and_in_one_process_and_right() -> 
         config = written(place.folder)
         local = place.folder / "local.csv"
         LocalMesh(prepare(config, Options(output=local))).run()
-        process = place.run("launch", config, "--no-progress", deadline_s=50.0)
+        process = place.run("launch", config, "--no-progress")
         assert process.wait() == 0, process.errors
         content = (place.folder / "result.csv").read_bytes()
 

@@ -51,7 +51,6 @@ def test_over_zenoh_the_floats_are_those_of_one_process(
 
 @shares
 @pytest.mark.skipif(os.geteuid() != 0 or shutil.which("unshare") is None, reason="needs root and unshare")
-@pytest.mark.timeout(60)
 def test_a_node_in_a_container_of_its_own_joins_through_zenoh(place: Place) -> None:
     config = write_config(place.folder, stop_time=3.0, simulation={"real_time_factor": 1.0})
     inside = ("unshare", "--pid", "--fork", "--mount-proc", "--kill-child")

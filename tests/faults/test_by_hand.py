@@ -20,7 +20,6 @@ def wait_until_there(place: Place, count: int) -> None:
     wait_until(lambda: len(list(place.folder.rglob("*.sock"))) == count, f"{count} processes that listen")
 
 
-@pytest.mark.timeout(60)
 @pytest.mark.parametrize(
     "order",
     [("pendulum", "delay", "master"), ("master", "delay", "pendulum"), ("delay", "master", "pendulum")],
@@ -45,7 +44,6 @@ def test_processes_started_by_hand_in_any_order_do_the_same_job_as_launch(place:
     place.assert_nothing_left()
 
 
-@pytest.mark.timeout(60)
 @pytest.mark.parametrize("order", [("pendulum", "master"), ("master", "pendulum")], ids=", ".join)
 def test_a_node_that_nobody_starts_is_named_after_the_deadline(place: Place, order: tuple[str, ...]) -> None:
     config = write_config(place.folder, timeouts={"start": 2.0})
@@ -63,7 +61,6 @@ def test_a_node_that_nobody_starts_is_named_after_the_deadline(place: Place, ord
     place.assert_nothing_left()
 
 
-@pytest.mark.timeout(60)
 def test_a_node_without_a_master_gives_up_after_the_deadline(place: Place) -> None:
     launched = place.run("node", write_config(place.folder, timeouts={"start": 1.0}), "pendulum")
 
@@ -73,7 +70,6 @@ def test_a_node_without_a_master_gives_up_after_the_deadline(place: Place) -> No
     place.assert_nothing_left()
 
 
-@pytest.mark.timeout(60)
 def test_a_second_master_of_a_mesh_is_refused_and_the_first_goes_on(place: Place) -> None:
     config = write_config(place.folder)
     first = start(place, config, "master")
@@ -89,7 +85,6 @@ def test_a_second_master_of_a_mesh_is_refused_and_the_first_goes_on(place: Place
     place.assert_nothing_left()
 
 
-@pytest.mark.timeout(60)
 def test_a_second_process_for_a_node_is_refused_and_the_first_goes_on(place: Place) -> None:
     config = write_config(place.folder)
     first = start(place, config, "pendulum")
@@ -104,7 +99,6 @@ def test_a_second_process_for_a_node_is_refused_and_the_first_goes_on(place: Pla
     place.assert_nothing_left()
 
 
-@pytest.mark.timeout(60)
 def test_a_node_with_another_configuration_is_refused_with_the_reason(place: Place) -> None:
     config = write_config(place.folder, timeouts={"start": 5.0})
     master = start(place, config, "master")
@@ -120,7 +114,6 @@ def test_a_node_with_another_configuration_is_refused_with_the_reason(place: Pla
     place.assert_nothing_left()
 
 
-@pytest.mark.timeout(60)
 @pytest.mark.parametrize("name", ["pendulun", "mesh"])
 def test_an_unknown_node_is_told_with_the_names_that_there_are(place: Place, name: str) -> None:
     launched = place.run("node", write_config(place.folder), name)
@@ -131,7 +124,6 @@ def test_an_unknown_node_is_told_with_the_names_that_there_are(place: Place, nam
     place.assert_nothing_left()
 
 
-@pytest.mark.timeout(60)
 @pytest.mark.parametrize("victim", ["master", "pendulum"])
 def test_when_a_process_started_by_hand_is_killed_the_others_end_and_say_so(place: Place, victim: str) -> None:
     config = write_config(place.folder, stop_time=10_000.0, simulation={"real_time_factor": 1})
@@ -147,7 +139,6 @@ def test_when_a_process_started_by_hand_is_killed_the_others_end_and_say_so(plac
     place.assert_nothing_left()  # the others have tidied up for the one that was killed
 
 
-@pytest.mark.timeout(60)
 def test_ctrl_c_at_the_master_started_by_hand_ends_the_nodes_too(place: Place) -> None:
     config = write_config(place.folder, stop_time=10_000.0)
     by_hand = {role: start(place, config, role) for role in ("pendulum", "delay", "master")}
@@ -162,7 +153,6 @@ def test_ctrl_c_at_the_master_started_by_hand_ends_the_nodes_too(place: Place) -
     place.assert_nothing_left()
 
 
-@pytest.mark.timeout(60)
 @pytest.mark.parametrize("next_start", ["launch", "node"])
 def test_what_a_killed_process_has_left_is_removed_by_the_next_start(place: Place, next_start: str) -> None:
     config = write_config(place.folder, timeouts={"start": 20.0})
@@ -181,7 +171,6 @@ def test_what_a_killed_process_has_left_is_removed_by_the_next_start(place: Plac
     place.assert_nothing_left()
 
 
-@pytest.mark.timeout(60)
 def test_what_a_killed_run_in_one_process_has_left_is_removed_by_the_next_start(place: Place) -> None:
     config = write_config(place.folder, stop_time=10_000.0)
     killed = place.start("launch", config, "--local")

@@ -28,7 +28,6 @@ def with_faulty(place: Place, faulty: Path, start_values: Mapping[str, float | b
     )
 
 
-@pytest.mark.timeout(60)
 @pytest.mark.parametrize("options", [(), ("--local",)], ids=["distributed", "local"])
 @pytest.mark.parametrize(
     ("fault", "status", "says"),
@@ -55,7 +54,6 @@ def test_a_failed_step_is_told_with_instance_point_time_and_the_message_of_the_f
     place.assert_nothing_left()
 
 
-@pytest.mark.timeout(60)
 @pytest.mark.parametrize("options", [(), ("--local",)], ids=["distributed", "local"])
 def test_an_fmu_that_fails_in_initialization_mode_is_told_with_its_instance(
     place: Place, faulty: Path, options: tuple[str, ...]
@@ -71,7 +69,6 @@ def test_an_fmu_that_fails_in_initialization_mode_is_told_with_its_instance(
     place.assert_nothing_left()
 
 
-@pytest.mark.timeout(60)
 def test_an_fmu_that_aborts_takes_only_its_own_process_with_it(place: Place, faulty: Path) -> None:
     config = with_faulty(place, faulty, {"crash_at": 1.0})
 
@@ -85,7 +82,6 @@ def test_an_fmu_that_aborts_takes_only_its_own_process_with_it(place: Place, fau
     place.assert_nothing_left()
 
 
-@pytest.mark.timeout(60)
 def test_an_fmu_that_does_not_return_meets_the_deadline_of_a_step(place: Place, faulty: Path) -> None:
     config = with_faulty(place, faulty, {"hang_at": 1.0}, step=1.0)
 
@@ -99,7 +95,6 @@ def test_an_fmu_that_does_not_return_meets_the_deadline_of_a_step(place: Place, 
     place.assert_nothing_left()
 
 
-@pytest.mark.timeout(60)
 def test_status_is_answered_while_an_fmu_does_not_return(place: Place, faulty: Path) -> None:
     launched = place.start("launch", with_faulty(place, faulty, {"hang_at": 1.0}))
     settings = zenoh.Config()
@@ -126,7 +121,6 @@ def test_status_is_answered_while_an_fmu_does_not_return(place: Place, faulty: P
     place.assert_nothing_left()
 
 
-@pytest.mark.timeout(60)
 @pytest.mark.parametrize("options", [(), ("--local",)], ids=["distributed", "local"])
 def test_an_fmu_that_asks_to_end_the_simulation_is_named_and_nothing_has_failed(
     place: Place, event_fmu: Callable[..., Path], options: tuple[str, ...]

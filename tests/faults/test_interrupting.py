@@ -8,7 +8,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from tests.helpers import Place, row_count, rows_of, wait_until, write_config
+from tests.helpers import Place, on_a_busy_machine, row_count, rows_of, wait_until, write_config
 
 FAR_S = 10_000.0
 SIGNALS = [signal.SIGINT, signal.SIGTERM]
@@ -21,7 +21,6 @@ def is_pending(pid: int, number: signal.Signals) -> bool:
     return bool(int(waiting, 16) >> (number - 1) & 1)
 
 
-@pytest.mark.timeout(60)
 def test_ctrl_c_ends_the_run_within_two_seconds_even_if_the_master_does_not_answer(place: Place) -> None:
     config = write_config(place.folder, stop_time=FAR_S)
     launched = place.start("launch", config)
@@ -31,12 +30,11 @@ def test_ctrl_c_ends_the_run_within_two_seconds_even_if_the_master_does_not_answ
     launched.signal(signal.SIGINT)
 
     assert launched.wait() == 130
-    assert launched.ended_after_s < 2.0
+    assert launched.ended_after_s < on_a_busy_machine(2.0)
     assert "interrupted" in launched.message
     place.assert_nothing_left()
 
 
-@pytest.mark.timeout(60)
 @pytest.mark.parametrize("options", [(), ("--local",)], ids=["distributed", "local"])
 @pytest.mark.parametrize("number", SIGNALS, ids=lambda number: number.name)
 def test_a_signal_ends_the_run_within_two_seconds_with_a_readable_partial_result(
@@ -50,14 +48,13 @@ def test_a_signal_ends_the_run_within_two_seconds_with_a_readable_partial_result
     launched.signal(number)
 
     assert launched.wait() == 130
-    assert launched.ended_after_s < 2.0
+    assert launched.ended_after_s < on_a_busy_machine(2.0)
     place.assert_nothing_left()
     rows = rows_of(result)
     assert f"({len(rows)} rows) is in '{result}'" in launched.message
     assert f"point {len(rows) - 1}, t = " in launched.message
 
 
-@pytest.mark.timeout(60)
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="looks into /proc")
 def test_a_second_ctrl_c_waits_for_nobody(place: Place) -> None:
     config = write_config(place.folder, stop_time=FAR_S)
@@ -72,13 +69,12 @@ def test_a_second_ctrl_c_waits_for_nobody(place: Place) -> None:
     launched.signal(signal.SIGINT)
 
     assert launched.wait() == 130
-    assert launched.ended_after_s < 2.0
+    assert launched.ended_after_s < on_a_busy_machine(2.0)
     assert "interrupted" in launched.message
     place.assert_nothing_left()
     assert rows_of(result)
 
 
-@pytest.mark.timeout(60)
 def test_ctrl_c_before_the_first_point_ends_the_run_too(place: Place) -> None:
     launched = place.start("launch", write_config(place.folder, stop_time=FAR_S))
     launched.child("delay")
@@ -86,12 +82,11 @@ def test_ctrl_c_before_the_first_point_ends_the_run_too(place: Place) -> None:
     launched.signal(signal.SIGINT)
 
     assert launched.wait() == 130
-    assert launched.ended_after_s < 2.0
+    assert launched.ended_after_s < on_a_busy_machine(2.0)
     assert "interrupted" in launched.message
     place.assert_nothing_left()
 
 
-@pytest.mark.timeout(60)
 def test_ctrl_c_ends_a_run_in_one_process_while_its_fmu_hangs(place: Place, faulty: Path) -> None:
     config = write_config(
         place.folder,
@@ -107,5 +102,5 @@ def test_ctrl_c_ends_a_run_in_one_process_while_its_fmu_hangs(place: Place, faul
     launched.signal(signal.SIGINT)
 
     assert launched.wait() == 130
-    assert launched.ended_after_s < 2.0
+    assert launched.ended_after_s < on_a_busy_machine(2.0)
     place.assert_nothing_left()

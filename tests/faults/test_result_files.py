@@ -12,7 +12,6 @@ from tests.helpers import Place, write_config
 MODES = pytest.mark.parametrize("options", [(), ("--local",)], ids=["distributed", "local"])
 
 
-@pytest.mark.timeout(60)
 @MODES
 def test_a_folder_is_no_result_file(place: Place, options: tuple[str, ...]) -> None:
     config = write_config(place.folder)
@@ -25,7 +24,6 @@ def test_a_folder_is_no_result_file(place: Place, options: tuple[str, ...]) -> N
     place.assert_nothing_left()
 
 
-@pytest.mark.timeout(60)
 @MODES
 def test_a_result_file_that_cannot_be_made_ends_the_run_before_its_first_point(
     place: Place, options: tuple[str, ...]
@@ -41,7 +39,6 @@ def test_a_result_file_that_cannot_be_made_ends_the_run_before_its_first_point(
     place.assert_nothing_left()
 
 
-@pytest.mark.timeout(60)
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason=f"{sys.platform} has no /dev/full")
 @pytest.mark.parametrize("stop_time", [0.01, 100.0], ids=["at the end", "in mid-run"])
 @MODES

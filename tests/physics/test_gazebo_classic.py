@@ -31,7 +31,7 @@ def _why_not() -> str | None:
 
 WHY_NOT = _why_not()
 
-pytestmark = [pytest.mark.skipif(WHY_NOT is not None, reason=str(WHY_NOT)), pytest.mark.timeout(300)]
+pytestmark = pytest.mark.skipif(WHY_NOT is not None, reason=str(WHY_NOT))
 
 
 def columns(config: Path, output: Path, *start_values: str) -> dict[str, Array]:

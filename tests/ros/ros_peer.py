@@ -17,9 +17,10 @@ from typing import Any, Self, TypeVar
 
 import pytest
 
-__all__ = ["DEADLINE_S", "Ros", "environment", "ros_or_skip"]
+from tests.helpers import DEADLINE_S
 
-DEADLINE_S = 30.0
+__all__ = ["Ros", "environment", "ros_or_skip"]
+
 _SPIN_S = 0.02
 
 Found = TypeVar("Found")

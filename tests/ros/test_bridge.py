@@ -31,7 +31,6 @@ def port(place: Place) -> Iterator[int]:
         yield port
 
 
-@pytest.mark.timeout(150)
 def test_a_thousand_samples_each_way_arrive_with_their_values_and_stamps(place: Place, port: int) -> None:
     config = write_config(
         place.folder,
@@ -93,7 +92,6 @@ def test_a_thousand_samples_each_way_arrive_with_their_values_and_stamps(place: 
     assert "WARNING" not in mesh.errors
 
 
-@pytest.mark.timeout(120)
 def test_a_loop_at_500_hz_gives_the_numbers_of_one_process_while_ros_watches(place: Place, port: int) -> None:
     def configured(name: str, **sections: Any) -> Path:  # noqa: ANN401 sections of a configuration
         return write_config(

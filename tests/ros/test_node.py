@@ -23,8 +23,8 @@ from fmu_mesh import FMIAdapter
 from fmu_mesh.fmu import Fmi2Instance
 from fmu_mesh.ros.names import ros_name
 from tests.fmus.helpers import find_fmu
-from tests.helpers import FMUS
-from tests.ros.ros_peer import DEADLINE_S, Ros, ros_or_skip
+from tests.helpers import DEADLINE_S, FMUS
+from tests.ros.ros_peer import Ros, ros_or_skip
 
 ros_or_skip()
 

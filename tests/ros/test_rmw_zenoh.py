@@ -80,7 +80,6 @@ def met(place: Place, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Met]
     router.wait()
 
 
-@pytest.mark.timeout(120)
 @pytest.mark.parametrize("implementation", ["sdk", "pyzeros"])
 def test_numbers_text_and_stamped_messages_flow_both_ways(met: Met, implementation: str) -> None:
     orders = met.orders(
@@ -117,7 +116,6 @@ def test_numbers_text_and_stamped_messages_flow_both_ways(met: Met, implementati
     assert rows[-1][3] > 0.0, "the stamped message did not reach the input"
 
 
-@pytest.mark.timeout(90)
 def test_parameters_are_got_and_set_by_the_services_of_ros(met: Met) -> None:
     wait_until(lambda: row_count(met.place.folder / "lab.csv"), "the first points")
     orders = met.orders(node="/lab")
