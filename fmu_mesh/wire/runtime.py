@@ -38,8 +38,8 @@ __all__ = [
 
 _SOCKET_PATH_LIMIT = 100
 
-_held: list[TextIO] = []
-"""The open notes of this process, which hold their locks."""
+_held: dict[Path, TextIO] = {}
+"""The open notes of this process by the folder of their run; they hold their locks."""
 
 
 class MeshNote(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -100,7 +100,7 @@ def enter_run_folder(folder: Path, node: str) -> None:
     folder.mkdir(mode=0o700, exist_ok=True)  # whoever left it last may just have removed it
     draft = folder / f"{os.getpid()}.new"
     file = draft.open("w", encoding="utf-8")
-    _held.append(file)
+    _held[folder] = file
     file.write(_socket_name(node))
     file.flush()
     fcntl.flock(file, fcntl.LOCK_EX)  # gone with the process, however it ends
@@ -135,6 +135,8 @@ def _remove_traces(folder: Path, pid: str) -> None:
 def leave_run_folder(folder: Path) -> None:
     """Remove the folder of a run if nobody uses it any more; called by every process on its way out."""
     _remove_traces(folder, str(os.getpid()))
+    if (held := _held.pop(folder, None)) is not None:
+        held.close()
     tidy_run_folder(folder)
     note = _read_note(folder / "mesh.json")
     if note is not None and not is_alive(note.pid):
