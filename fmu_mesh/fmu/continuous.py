@@ -19,6 +19,7 @@ from ..errors import TerminationRequested
 from ..model.ring import Ring
 from ..model.types import Value
 from ..simtime import TimeGrid
+from .calls import hot, memory
 from .clocks import Clocks
 from .instance import STATUS_NAMES, WARNING, FmuInstance
 from .model_calls import ModelCalls
@@ -167,13 +168,14 @@ class ContinuousInstance(FmuInstance):
         variables = [self._variables[name] for name in slopes]
         references = (ctypes.c_uint * count)(*(variable.value_reference for variable in variables))
         values = (ctypes.c_double * count)()
-        function = self._function("Set", "Float64")
+        where, what = memory(references), memory(values)
+        function = hot(self._function("Set", "Float64"), self._direct_declaration)
         at_start = [float(self._inputs.value(slot, name)) for name in slopes]  # type: ignore[arg-type]  # Float64 only
         pairs = list(zip(at_start, slopes.values(), strict=True))
 
         def set_inputs(time: float) -> None:
             values[:] = [value + (time - start) * slope for value, slope in pairs]
-            status = self._call_direct(function, ctypes.addressof(references), count, ctypes.addressof(values), count)
+            status = self._call_direct(function, where, count, what, count)
             if status > WARNING:
                 raise FMICallException(function=self._function_name("Set", "Float64"), status=status)
 

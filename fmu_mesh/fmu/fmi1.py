@@ -21,12 +21,13 @@ from ..model.ring import Part
 from ..model.types import Value, VariableType
 from .buffers import Buffer, NumberBuffer, StringBuffer
 from .callbacks import FMI1_CALLBACKS, register, unregister
+from .calls import Function, Pointer, hot
 from .instance import STATUS_NAMES, WARNING, FmuInstance, Verb
 
 __all__ = ["Fmi1Instance"]
 
 _GET_OR_SET = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_size_t, ctypes.c_void_p)
-_DO_STEP = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_double, ctypes.c_double, ctypes.c_char)
+_DO_STEP = "int (*)(void *, double, double, char)"
 _INITIALIZE = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_double, ctypes.c_char, ctypes.c_double)
 _TERMINATE = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p)
 _SUFFIX: Final[dict[VariableType, str]] = {
@@ -51,9 +52,11 @@ class Fmi1Instance(FmuInstance):
     FMPy takes the status of most functions of FMI 1.0 for text, so they are called by prototypes of our own.
     """
 
+    _direct_declaration = "int (*)(void *, void *, size_t, void *)"
+
     def do_step(self, step: int) -> None:
         """Set the inputs of row ``step``, advance to own step ``step + 1``, write the outputs to row ``step + 1``."""
-        component = self._component
+        component = self._self
         slot = step & self._input_mask
         for function, references, count, rows, _ in self._direct_setters:
             status = function(component, references, count, rows[slot])
@@ -68,7 +71,7 @@ class Fmi1Instance(FmuInstance):
 
     def advance(self, time: float, step_size: float) -> None:
         """One step of ``step_size`` from ``time`` (both in s) without rings, for callers with their own time base."""
-        status = self._do_step(self._component, time, step_size, b"\x01")
+        status = self._do_step(self._self, time, step_size, b"\x01")
         if status > WARNING:
             raise self._failed(f"fmiDoStep returned {STATUS_NAMES[status]}")
 
@@ -97,7 +100,7 @@ class Fmi1Instance(FmuInstance):
             raise RuntimeError("fmiInstantiateSlave returned no instance")
         self._fmu = fmu
         self._component = fmu.component
-        self._do_step = _DO_STEP((self._prefixed("DoStep"), fmu.dll))
+        self._do_step = hot(getattr(fmu.dll, self._prefixed("DoStep")), _DO_STEP)
 
     def _enter_initialization(self, start_time: float, stop_time: float | None, start_values: dict[str, Value]) -> None:
         self._times = start_time, stop_time
@@ -151,5 +154,5 @@ class Fmi1Instance(FmuInstance):
         array = (ctypes.c_uint * len(references))(*references)
         return function(self._component, ctypes.addressof(array), len(references), buffer.address)
 
-    def _call_direct(self, function: Callable[..., int], references: int, count: int, row: int, _size: int) -> int:
-        return function(self._component, references, count, row)
+    def _call_direct(self, function: Function, references: Pointer, count: int, row: Pointer, _size: int) -> int:
+        return function(self._self, references, count, row)

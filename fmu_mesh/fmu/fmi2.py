@@ -22,13 +22,14 @@ from ..model.types import Value, VariableType
 from ..simtime import TimeGrid
 from .buffers import Buffer, NumberBuffer, StringBuffer
 from .callbacks import FMI2_CALLBACKS, register, unregister
+from .calls import Function, Pointer, hot
 from .instance import STATUS_NAMES, WARNING, FmuInstance, Verb
 from .substeps import DISCARD, SMALLEST, take_sub_steps
 
 __all__ = ["Fmi2Instance", "Fmi2Values"]
 
 _GET_OR_SET = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_size_t, ctypes.c_void_p)
-_DO_STEP = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_double, ctypes.c_double, ctypes.c_int)
+_DO_STEP = "int (*)(void *, double, double, int)"
 _SUFFIX: Final[dict[VariableType, str]] = {
     "Float64": "Real",
     "Int32": "Integer",
@@ -45,6 +46,7 @@ class Fmi2Values(FmuInstance):
     """What both kinds of FMI 2.0 instances share: values, initialization and the end."""
 
     _library: type[Any]
+    _direct_declaration = "int (*)(void *, void *, size_t, void *)"
 
     def close(self) -> None:
         """Terminate if allowed, free the instance and remove its files. Never raises; may be called twice."""
@@ -104,8 +106,8 @@ class Fmi2Values(FmuInstance):
         array = (ctypes.c_uint * len(references))(*references)
         return function(self._component, ctypes.addressof(array), len(references), buffer.address)
 
-    def _call_direct(self, function: Callable[..., int], references: int, count: int, row: int, _size: int) -> int:
-        return function(self._component, references, count, row)
+    def _call_direct(self, function: Function, references: Pointer, count: int, row: Pointer, _size: int) -> int:
+        return function(self._self, references, count, row)
 
 
 class Fmi2Instance(Fmi2Values):
@@ -119,7 +121,7 @@ class Fmi2Instance(Fmi2Values):
         super().bind(inputs, outputs, grid, points, step)
         # One look-up for all that a step needs: it is a part of the time of a small FMU.
         self._hot = (
-            self._component,
+            self._self,
             self._do_step,
             self._input_mask,
             self._output_mask,
@@ -167,7 +169,7 @@ class Fmi2Instance(Fmi2Values):
             self._variables[name].value_reference: slope for name, slope in derivatives.items()
         }
 
-    def _step_with_derivatives(self, component: int, time: float, step_size: float, no_set_state: int) -> int:
+    def _step_with_derivatives(self, component: Pointer, time: float, step_size: float, no_set_state: int) -> int:
         """fmi2DoStep, after the derivatives of the inputs, which are set after their values."""
         references, slopes = list(self._derivatives), list(self._derivatives.values())
         try:
@@ -178,7 +180,7 @@ class Fmi2Instance(Fmi2Values):
 
     def _instantiate(self, folder: Path) -> None:
         super()._instantiate(folder)
-        self._do_step: Callable[..., int] = _DO_STEP(("fmi2DoStep", self._fmu.dll))
+        self._do_step: Function = hot(self._fmu.dll.fmi2DoStep, _DO_STEP)
         if self._options.retry_discarded_steps:
             self._retrying = _Retrying(self._fmu, self._do_step, self._asks_to_end, self._failed)
             self._do_step = self._retrying
@@ -222,7 +224,7 @@ class _Retrying:
     def __init__(
         self,
         fmu: Any,  # noqa: ANN401 FMPy is untyped
-        do_step: Callable[..., int],
+        do_step: Function,
         asks_to_end: Callable[[], bool],
         failed: Callable[[str], Exception],
     ) -> None:
@@ -233,15 +235,15 @@ class _Retrying:
         self._failed = failed
         self._state = ctypes.c_void_p()
 
-    def __call__(self, component: int, time: float, step_size: float, _no_set_state: int) -> int:
+    def __call__(self, component: Pointer, time: float, step_size: float, _no_set_state: int) -> int:
         def attempt(start: float, size: float) -> int:
-            self._fmu.fmi2GetFMUstate(component, ctypes.byref(self._state))
+            self._fmu.fmi2GetFMUstate(self._fmu.component, ctypes.byref(self._state))
             status = self._do_step(component, start, size, 0)
             if status == DISCARD:
                 self.ends = self._asks_to_end()
                 if self.ends:
                     return PENDING
-                self._fmu.fmi2SetFMUstate(component, self._state)
+                self._fmu.fmi2SetFMUstate(self._fmu.component, self._state)
             return status
 
         try:

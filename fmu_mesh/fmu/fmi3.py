@@ -19,6 +19,7 @@ from ..model.description import Variable
 from ..model.ring import Part
 from ..model.types import DTYPES, Value, VariableType, is_text
 from .buffers import BinaryBuffer, Buffer, NumberBuffer, StringBuffer
+from .calls import Function, Pointer
 from .fmi3_events import SteppedInEvents
 from .fmi3_steps import Fmi3Steps
 from .instance import FmuInstance, Verb
@@ -43,6 +44,7 @@ class Fmi3Values(FmuInstance):
     """What all kinds of FMI 3.0 instances share: values, initialization and the end."""
 
     _library: type[Any]
+    _direct_declaration = "int (*)(void *, void *, size_t, void *, size_t)"
 
     def _instantiate(self, folder: Path) -> None:
         fmu = self._library(
@@ -120,8 +122,8 @@ class Fmi3Values(FmuInstance):
             return function(self._component, address, len(references), buffer.sizes_address, buffer.address, size)
         return function(self._component, address, len(references), buffer.address, size)
 
-    def _call_direct(self, function: Callable[..., int], references: int, count: int, row: int, size: int) -> int:
-        return function(self._component, references, count, row, size)
+    def _call_direct(self, function: Function, references: Pointer, count: int, row: Pointer, size: int) -> int:
+        return function(self._self, references, count, row, size)
 
 
 class Fmi3Instance(SteppedInEvents, Fmi3Values):

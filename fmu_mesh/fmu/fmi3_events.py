@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 
 from fmpy.fmi1 import FMICallException
 
-from ..errors import TerminationRequested
+from ..errors import FmuError, TerminationRequested
 from ..model.ring import Part, Ring
 from ..model.types import Value
 from ..simtime import TimeGrid
@@ -40,14 +40,25 @@ class SteppedInEvents(FmuInstance):
 
     def do_step(self, step: int) -> None:
         """Set the inputs of row ``step``, advance to own step ``step + 1``, write the outputs to row ``step + 1``."""
-        slot = step & self._input_mask
+        component, slot = self._self, step & self._input_mask
         if self._discrete:
             self._set_discrete(slot)
-        self._set_row(slot, self._direct_setters, self._setters)
+        for function, references, count, rows, size in self._direct_setters:
+            status = function(component, references, count, rows[slot], size)
+            if status > WARNING:
+                raise self._failed(f"setting the inputs returned {STATUS_NAMES[status]}")
+        for set_row in self._setters:
+            set_row(slot)
         end = self._start_time + (step + 1) * self._points * self._base_step_size
         self._go_on(self._start_time + step * self._points * self._base_step_size, self._step_size, end)
         self._step = step + 1
-        self._read_outputs((step + 1) & self._output_mask)
+        slot = (step + 1) & self._output_mask
+        for function, references, count, rows, size in self._direct_getters:
+            status = function(component, references, count, rows[slot], size)
+            if status > WARNING:
+                raise self._failed(f"reading the outputs returned {STATUS_NAMES[status]}")
+        for get_row in self._getters:
+            get_row(slot)
 
     def advance(self, time: float, step_size: float) -> None:
         """One step of ``step_size`` from ``time`` (both in s) without rings, for callers with their own time base."""
@@ -55,7 +66,11 @@ class SteppedInEvents(FmuInstance):
         self._go_on(time, step_size, time + step_size)
 
     def _go_on(self, time: float, step_size: float, end: float) -> None:
-        if not self._stepped(lambda: self._steps.step(time, step_size, end)):
+        try:
+            done = self._steps.step(time, step_size, end)
+        except (FMICallException, SolverFailed) as error:
+            raise self._failure(error) from error
+        if not done:
             raise TerminationRequested("the FMU asked to end the simulation", instance=self.name)
 
     def set_values(self, values: Mapping[str, Value]) -> None:
@@ -108,7 +123,10 @@ class SteppedInEvents(FmuInstance):
     def _stepped(self, call: Callable[[], T]) -> T:
         try:
             return call()
-        except FMICallException as error:
-            raise self._failed(f"{error.function} returned {STATUS_NAMES[error.status]}") from error
-        except SolverFailed as error:
-            raise self._failed(str(error)) from error
+        except (FMICallException, SolverFailed) as error:
+            raise self._failure(error) from error
+
+    def _failure(self, error: FMICallException | SolverFailed) -> FmuError:
+        if isinstance(error, SolverFailed):
+            return self._failed(str(error))
+        return self._failed(f"{error.function} returned {STATUS_NAMES[error.status]}")

@@ -21,6 +21,7 @@ from typing import Any, Final
 from fmpy.fmi1 import FMICallException
 
 from ..model.description import ModelDescription
+from .calls import hot, pointer
 from .clocks import Clocks
 from .solver import SolverFailed, resolvable
 from .substeps import DISCARD, SMALLEST
@@ -31,17 +32,7 @@ WARNING: Final = 1
 MOST_RETURNS: Final = 1000
 """Returns of fmi3DoStep or events, without any advance of time, after which an FMU is taken to be stuck."""
 
-_DO_STEP = ctypes.CFUNCTYPE(
-    ctypes.c_int,
-    ctypes.c_void_p,
-    ctypes.c_double,
-    ctypes.c_double,
-    ctypes.c_bool,
-    ctypes.c_void_p,
-    ctypes.c_void_p,
-    ctypes.c_void_p,
-    ctypes.c_void_p,
-)
+_DO_STEP = "int (*)(void *, double, double, _Bool, void *, void *, void *, void *)"
 
 
 class Fmi3Steps:
@@ -67,14 +58,13 @@ class Fmi3Steps:
         self.terminated = False
         self.clocks = Clocks(fmu, description.clocks)
         self._fmu = fmu
-        self._component = fmu.component
+        self._self = pointer(fmu.component)
         self._has_event_mode = description.has_event_mode
         self._varies = description.can_handle_variable_step_size
-        self._do_step = _DO_STEP(("fmi3DoStep", fmu.dll))
-        self._event_needed, self._terminate, self._early = (ctypes.c_bool() for _ in range(3))
-        self._last_time = ctypes.c_double()
-        results = (self._event_needed, self._terminate, self._early, self._last_time)
-        self._results = [ctypes.addressof(result) for result in results]
+        self._do_step = hot(fmu.dll.fmi3DoStep, _DO_STEP)
+        self._is_eventful = self._has_event_mode or bool(self.clocks)
+        self._results = _Results()
+        self._pointers = [pointer(address) for address in self._results.addresses]
         self._time = 0.0
         self._next_event = math.inf
         self._event_time = -math.inf
@@ -113,32 +103,39 @@ class Fmi3Steps:
 
     def step(self, start: float, step_size: float, end: float) -> bool:
         """Go on from ``start`` by ``step_size`` to ``end`` (s); False if the FMU asked to end the simulation before."""
-        time, largest, stuck = start, step_size, 0
+        results = self._results
+        time, largest, stuck, status = start, step_size, 0, None
         self._time = start
+        if not self._is_eventful:
+            status = self._attempt(start, step_size)
+            if status <= WARNING and not results.any[0]:  # the step was nothing but a step
+                self._time = end
+                return True
         while not self.terminated and resolvable(time, end):
             if self._is_due(time):
                 self._handle_event()
                 continue
             target = self._target(time, min(end, time + largest))
-            status = self._attempt(time, step_size if (time, target) == (start, end) else target - time)
+            if status is None:
+                status = self._attempt(time, step_size if (time, target) == (start, end) else target - time)
             if status == DISCARD and self._varies and largest > step_size / SMALLEST:
-                largest /= 2.0
+                largest, status = largest / 2.0, None
                 continue
             self._check(status, retried=largest < step_size)
-            before, time = time, self._last_time.value if self._early.value else target
+            status = None
+            before, time = time, results.last_time.value if results.early else target
             stuck = 0 if time > before else stuck + 1
             if stuck > MOST_RETURNS:
                 raise SolverFailed(f"fmi3DoStep returned early {MOST_RETURNS} times at t = {time:.12g} s")
             self._time = time
-            self.terminated = self._terminate.value
-            if not self.terminated and (self._event_needed.value or self._is_due(time)):
+            self.terminated = results.terminate
+            if not self.terminated and (results.event_needed or self._is_due(time)):
                 self._handle_event()
         return not resolvable(time, end)
 
     def _attempt(self, time: float, size: float) -> int:
-        self._event_needed.value = self._terminate.value = self._early.value = False
-        status: int = self._do_step(self._component, time, size, True, *self._results)  # noqa: FBT003 a C function
-        return status
+        self._results.any[0] = 0
+        return self._do_step(self._self, time, size, True, *self._pointers)  # noqa: FBT003 a C function
 
     def _check(self, status: int, *, retried: bool) -> None:
         if status == DISCARD and retried:
@@ -181,3 +178,35 @@ class Fmi3Steps:
         self._next_event = next_event if defined else math.inf
         self.clocks.update_intervals(self._time)
         self._fmu.enterStepMode()
+
+
+class _Results:
+    """What fmi3DoStep says besides its status (FMI 3.0, 4.2.1).
+
+    Attributes:
+        any: the flags as one number, which is 0 if none is set; one look instead of three.
+        last_time: how far an early return has come, in s.
+        addresses: of eventHandlingNeeded, terminateSimulation, earlyReturn and lastSuccessfulTime.
+    """
+
+    def __init__(self) -> None:
+        self._flags = (ctypes.c_bool * 4)()
+        self.any = memoryview(self._flags).cast("B").cast("I")
+        self.last_time = ctypes.c_double()
+        first = ctypes.addressof(self._flags)
+        self.addresses = (first, first + 1, first + 2, ctypes.addressof(self.last_time))
+
+    @property
+    def event_needed(self) -> bool:
+        """The FMU has an event to be handled."""
+        return self._flags[0]
+
+    @property
+    def terminate(self) -> bool:
+        """The FMU asks to end the simulation."""
+        return self._flags[1]
+
+    @property
+    def early(self) -> bool:
+        """The FMU has returned before the end of the step."""
+        return self._flags[2]

@@ -25,6 +25,7 @@ from ..model.values import to_value
 from ..simtime import TimeGrid
 from .archive import Terms
 from .buffers import Buffer
+from .calls import Function, Pointer, hot, memory, pointer
 from .sources import extract
 from .state import KeepsFmuState, Standing
 
@@ -35,8 +36,8 @@ WARNING: Final = 1
 STATUS_NAMES: Final = ("ok", "warning", "discard", "error", "fatal", "pending")
 
 Verb = Literal["Get", "Set"]
-DirectCall = tuple[Callable[..., int], int, int, list[int], int]
-"""A function on ring memory: it, address and number of the value references, address of each row, number of values."""
+DirectCall = tuple[Function, Pointer, int, list[Pointer], int]
+"""A function on ring memory: it, the value references and their number, each row, number of values."""
 
 
 class LogMessage(msgspec.Struct, frozen=True):
@@ -72,6 +73,12 @@ class FmuInstance(KeepsFmuState, ABC):
         LoadFailed: the FMU cannot be extracted, loaded or instantiated.
     """
 
+    _direct_declaration: str
+    """The type in C of the functions that get and set numbers."""
+
+    _component: int
+    """The address of the instance, for what is called through ctypes; for `hot` functions it is ``_self``."""
+
     def __init__(  # noqa: PLR0913, PLR0917 what an instance is made of; all of it is named where it is called
         self,
         path: Path,
@@ -94,6 +101,7 @@ class FmuInstance(KeepsFmuState, ABC):
         self._extracted = extract(path, folder, terms)
         try:
             self._instantiate(self._extracted)
+            self._self = pointer(self._component)
             self._live = True
         except Exception as error:
             self._state = "failed"
@@ -263,11 +271,10 @@ class FmuInstance(KeepsFmuState, ABC):
         variables = [self._variables[column.name] for column in part.columns]
         function = self._function(verb, part.type)
         if self._is_direct(part):
-            references = _references(variables)
-            self._keep.append(references)
-            rows = [array.ctypes.data + slot * array.strides[0] for slot in range(len(array))]
+            rows = [pointer(array.ctypes.data + slot * array.strides[0]) for slot in range(len(array))]
             calls = self._direct_setters if verb == "Set" else self._direct_getters
-            calls.append((function, ctypes.addressof(references), len(variables), rows, part.width))
+            called = hot(function, self._direct_declaration)
+            calls.append((called, memory(_references(variables)), len(variables), rows, part.width))
             return
         buffer = self._buffer(part.type, variables)
         names = [variable.name for variable in variables]
@@ -297,7 +304,7 @@ class FmuInstance(KeepsFmuState, ABC):
             get_row(slot)
 
     @abstractmethod
-    def _call_direct(self, function: Callable[..., int], references: int, count: int, row: int, size: int) -> int:
+    def _call_direct(self, function: Function, references: Pointer, count: int, row: Pointer, size: int) -> int:
         """Call a getter or setter on the memory of a ring; returns the status."""
 
     def _transfer(self, verb: Verb, type_: VariableType, variables: Sequence[Variable], buffer: Buffer) -> None:

@@ -45,6 +45,7 @@ class Profiler:
         self._bursts: list[Burst] = []
         self._waits: list[Wait] = []
         self._cut = 0
+        self._transport_s = 0.0
         self.sent_s = 0.0
 
     def measure(self, units: Iterable[Unit], runners: Iterable[Runner]) -> list[Unit]:
@@ -57,7 +58,7 @@ class Profiler:
     def start(self) -> None:
         """The node is at point 0."""
         self._started = self._ended = perf_counter()
-        self.sent_s = self._received_s = 0.0
+        self.sent_s = self._received_s = self._transport_s = 0.0
 
     def sending(self, call: Callable[P, T]) -> Callable[P, T]:
         """The same call, whose time is spent on sending."""
@@ -84,8 +85,9 @@ class Profiler:
         return measured
 
     def stepped(self, burst: Burst) -> None:
-        """Note a burst."""
+        """Note a burst; what is sent and received after the last one is no part of the run."""
         self._ended = burst.end
+        self._transport_s = self.sent_s + self._received_s
         if len(self._bursts) + len(self._waits) < self._entries:
             self._bursts.append(burst)
         else:
@@ -93,10 +95,10 @@ class Profiler:
 
     def waited(self, seconds: float, *, running: bool) -> None:
         """Note a wait that has just ended, before its message is taken; ``running``: whether there was a grant yet."""
-        ended = perf_counter()
         if not running:  # the others are not at point 0: the run begins with the first grant
-            self._started = self._ended = ended
+            self.start()
             return
+        ended = perf_counter()
         reason = self._behind()
         if reason is None:
             return
@@ -115,7 +117,7 @@ class Profiler:
             started=self._started,
             ended=self._ended,
             units=tuple(unit.profile() for unit in self._units),
-            transport_s=self.sent_s + self._received_s,
+            transport_s=self._transport_s,
             wait_s=self._wait_s,
             bursts=tuple(self._bursts),
             waits=tuple(self._waits),

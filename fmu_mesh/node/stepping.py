@@ -194,11 +194,17 @@ class Unit:
         return max(0, end - first)
 
     def _step_together(self, first: int, end: int) -> None:
+        one, half_ulp, quarter_ulp, tiny = DEFAULT_MODE
+        members = [
+            (runner, [feed.step for feed in runner.local_feeds], runner.instance.do_step) for runner in self.runners
+        ]
         for point in range(first, end):
-            for runner in self.runners:
-                for feed in runner.local_feeds:
-                    feed.step(point)
-                runner.instance.do_step(point)
+            for runner, feeds, do_step in members:
+                for feed in feeds:
+                    feed(point)
+                do_step(point)
+                if one + half_ulp - quarter_ulp != one or not tiny + tiny:  # as in `_advance_single`
+                    restore_floating_point()
                 runner.step = point + 1
 
     def _step_at_own_rates(self, first: int, end: int) -> None:

@@ -127,6 +127,25 @@ def test_what_an_fmu_does_to_folder_locale_memory_and_floating_point_mode_change
 
 
 @pytest.mark.parametrize("options", [(), ("--local",)], ids=["distributed", "local"])
+def test_what_an_fmu_does_to_the_floating_point_mode_changes_no_result_of_a_cycle(
+    place: Place, hostile: Path, options: tuple[str, ...]
+) -> None:
+    results = []
+    for name in ("peaceful", "flushing_fmi2DoStep"):
+        config = write_config(
+            place.folder,
+            instances={own: {"fmu": str(hostile), "group": "together"} for own in (name, "polite")},
+            connections=[f"{name}.third -> polite.u", f"polite.subnormal -> {name}.u"],
+            stop_time=0.01,
+        )
+        assert place.run("launch", config, *options).wait() == 0
+        results.append(rows_of(config.with_suffix(".csv")))
+
+    assert results[0] == results[1]
+    assert 0.0 < results[0][-1][1] < 2e-310
+
+
+@pytest.mark.parametrize("options", [(), ("--local",)], ids=["distributed", "local"])
 def test_an_fmu_that_fills_standard_output_neither_blocks_nor_garbles_the_launcher(
     place: Place, hostile: Path, options: tuple[str, ...]
 ) -> None:
