@@ -14,18 +14,13 @@ The master never sees a value. Its work per grant depends on the number of nodes
 
 from __future__ import annotations
 
-import logging
 import operator
-import os
-import socket
 import time
 from collections.abc import Callable, Sequence
-from typing import Literal, Protocol
 
 import msgspec
 import zenoh
 
-from .. import __version__
 from ..errors import (
     DeadlineExceeded,
     ErrorReport,
@@ -41,32 +36,17 @@ from ..wire.keys import Keys
 from ..wire.membership import MASTER
 from ..wire.messages import FINISH, GRANT, PROGRESS, NodeReport
 from ..wire.profile import TIME_LINE_ENTRIES, MeshProfile
-from ..wire.session import matches, undeclare_all
 from ..wire.shared_memory import SharedInbox, available
 from ..wire.values import json_encoding
-from ..wire.views import Command, CommandAnswer, LogLine, MeshInfo, MeshState, MeshStatus
+from ..wire.views import Command, CommandAnswer, MeshInfo, MeshState, MeshStatus
 from .members import Members, spoken
 from .pacing import Clock, Pacer
 from .profiling import CLOCK, PAUSE, GrantWatch
+from .serving import STATUS_S, Events, Server, mesh_info
 
-__all__ = ["Events", "Master"]
-
-log = logging.getLogger(__name__)
+__all__ = ["Master"]
 
 _HEARTBEAT_S = 0.5
-_STATUS_S = 0.1
-
-
-class Events(Protocol):
-    """What the master tells whoever started it. Called on the master's main thread."""
-
-    def status(self, status: MeshStatus) -> None:
-        """The state of the run, about ten times a second."""
-        ...
-
-    def log(self, line: LogLine) -> None:
-        """A log message of an FMU, or about a setting that was refused."""
-        ...
 
 
 class Master:
@@ -91,7 +71,6 @@ class Master:
         config = plan.system.config
         self._plan = plan
         self._session = session
-        self._events = events
         self._endpoints = tuple(endpoints)
         self._config_file = config_file
         self._timeouts = config.timeouts
@@ -112,7 +91,6 @@ class Master:
         self._pacer = Pacer(plan, config.simulation.real_time_factor)
         self._clock = Clock()
         self._published = 0.0
-        self._status_published = 0.0
         self._moved = time.monotonic()
         shares = config.zenoh.shared_memory and available()
         self._inbox = Inbox(
@@ -125,10 +103,8 @@ class Master:
         )
         self._members = Members(plan, session, self._keys, self._inbox, self._lose)
         self._send = self._members.send
-        self._entities: list[zenoh.Queryable[None] | zenoh.Subscriber[None]] = []
-        self._status_publisher = session.declare_publisher(
-            self._keys.mesh_key("status"), encoding=json_encoding, congestion_control=zenoh.CongestionControl.DROP
-        )
+        self._server = Server(session, self._keys, self._inbox, events, self.last_status)
+        self._publish_status = self._server.publish_status
 
     def run(self) -> None:
         """Run the mesh to its last point.
@@ -228,7 +204,7 @@ class Master:
             self._send(GRANT, grant)
         else:
             self._send_grant_as_sign_of_life()
-        return min(pause, _STATUS_S)
+        return min(pause, STATUS_S)
 
     def _send_grant_as_sign_of_life(self) -> None:
         """The same grant again, so that nodes that wait for a slow FMU of another one know that the master lives."""
@@ -289,31 +265,17 @@ class Master:
         if self._failure is None:
             self._failure = error
 
-    # --- what arrives on foreign threads; all of it is posted to the main thread
+    # --- what arrives; all of it on the main thread
 
     def _declare(self) -> None:
-        post = self._inbox.post
-        session = self._session
-
-        def served(key: str, answer: Callable[[zenoh.Query], None]) -> None:
-            self._entities.append(session.declare_queryable(key, lambda query: post(lambda: answer(query))))
-
-        served(self._keys.register, self._members.register)
-        served(self._keys.report, self._take_report)
-        served(self._keys.mesh_key("info"), self._reply_with("info", self._info))
-        served(self._keys.mesh_key("status"), self._reply_with("status", self.last_status))
-        served(self._keys.mesh_key("plan"), self._reply_with("plan", lambda: self._plan.nodes))
-        served(self._keys.mesh_key("command"), self._command)
-        self._entities.append(
-            session.liveliness().declare_subscriber(
-                self._keys.node_token("*"),
-                lambda sample: post(lambda: self._members.token_changed(sample)),
-                history=True,
-            )
-        )
-        self._entities.append(
-            session.declare_subscriber(f"{self._keys.root}/*/log", lambda sample: post(lambda: self._log(sample)))
-        )
+        server = self._server
+        server.serve(self._keys.register, self._members.register)
+        server.serve(self._keys.report, self._take_report)
+        server.show("info", self._info)
+        server.show("status", self.last_status)
+        server.show("plan", lambda: self._plan.nodes)
+        server.serve(self._keys.mesh_key("command"), self._command)
+        server.watch(self._members.token_changed)
 
     def _take_report(self, query: zenoh.Query) -> None:
         report = msgspec.json.decode(query.payload.to_bytes() if query.payload else b"", type=NodeReport)
@@ -342,12 +304,6 @@ class Master:
                 time=self._plan.grid.time(point),
             )
         )
-
-    def _log(self, sample: zenoh.Sample) -> None:
-        try:
-            self._events.log(msgspec.json.decode(sample.payload.to_bytes(), type=LogLine))
-        except msgspec.DecodeError as error:
-            log.warning("log_line_not_understood", extra={"key": str(sample.key_expr), "error": str(error)})
 
     def _command(self, query: zenoh.Query) -> None:
         """pause, resume, step N and stop; the grant is all that they move."""
@@ -379,40 +335,10 @@ class Master:
         query.reply(self._keys.mesh_key("command"), msgspec.json.encode(answer), encoding=json_encoding)
         query.drop()
 
-    def _reply_with(
-        self, what: Literal["info", "status", "plan"], view: Callable[[], object]
-    ) -> Callable[[zenoh.Query], None]:
-        key = self._keys.mesh_key(what)
-
-        def reply(query: zenoh.Query) -> None:
-            query.reply(key, msgspec.json.encode(view()), encoding=json_encoding)
-            query.drop()
-
-        return reply
-
     # --- views
 
     def _info(self) -> MeshInfo:
-        config = self._plan.system.config
-        grid = self._plan.grid
-        return MeshInfo(
-            mesh=config.mesh,
-            version=__version__,
-            config=self._config_file,
-            start_time=grid.start_time,
-            stop_time=grid.stop_time,
-            step_size=grid.step_size,
-            algorithm=config.simulation.algorithm,
-            window=self._plan.window,
-            real_time_factor=config.simulation.real_time_factor,
-            instances=tuple(self._plan.system.instances),
-            nodes=tuple(self._nodes),
-            result_file=self._plan.system.result_file,
-            endpoints=self._endpoints,
-            pid=os.getpid(),
-            host=socket.gethostname(),
-            shared_memory=self._members.shared,
-        )
+        return mesh_info(self._plan, self._config_file, self._endpoints, self._members.shared)
 
     def last_status(self) -> MeshStatus:
         """The state of the run right now."""
@@ -433,17 +359,7 @@ class Master:
             overruns=self._pacer.overruns,
         )
 
-    def _publish_status(self, *, final: bool = False) -> None:
-        now = time.monotonic()
-        if not final and now - self._status_published < _STATUS_S:
-            return
-        self._status_published = now
-        status = self.last_status()
-        self._events.status(status)
-        if matches(self._status_publisher):
-            self._status_publisher.put(msgspec.json.encode(status))
-
     def _close(self) -> None:
-        undeclare_all(self._entities, [self._status_publisher])
+        self._server.close()
         self._members.close()
         self._inbox.close()
