@@ -52,6 +52,7 @@ from ..wire.messages import (
     decode_abort,
 )
 from ..wire.session import ask
+from .activity import Activity
 from .initialization import Initialization
 from .inputs import TimedInputs
 from .links import OutLink
@@ -115,7 +116,8 @@ class Node:
         self._poll = self._inbox.poll
         self._take = self._sort_in
         self._put_progress: Callable[[bytes], None]
-        self.server = Server(plan, session, self._keys, self._inbox)
+        self._activity = Activity(plan)
+        self.server = Server(plan, session, self._keys, self._inbox, self._activity)
 
     def run(self) -> None:
         """Load, initialize and step to the last point, then report to the master.
@@ -168,7 +170,7 @@ class Node:
     def _load(self) -> None:
         """Instantiate the FMUs and wire rings, feeds and links together."""
         plan = self._plan
-        self.server.state = "loading"
+        self._activity.state = "loading"
         for item in plan.instances:
             instance = self._open_instance(item.name)
             if item.interpolation is not None:
@@ -207,7 +209,7 @@ class Node:
 
     def _meet(self) -> None:
         """Join the mesh: from now on all others are there."""
-        self.server.state = "waiting for the mesh"
+        self._activity.state = "waiting for the mesh"
         welcome = self._membership.join()
         self._progress_number = welcome.number
         self._heard = time.monotonic()
@@ -236,7 +238,7 @@ class Node:
 
     def _initialize(self) -> None:
         """Initialization Mode: set and get level by level, exchange over the wire, then make the outputs point 0."""
-        self.server.state = "initializing"
+        self._activity.state = "initializing"
         grid = self._plan.grid
         for runner in self._runners.values():
             runner.instance.enter_initialization(grid.start_time, grid.stop_time, runner.plan.start_values)
@@ -256,7 +258,7 @@ class Node:
 
     def _step_to_the_end(self) -> None:
         """The loop of the module's docstring."""
-        self.server.state = "running"
+        self._activity.state = "running"
         poll = self._poll
         if self._profiler is not None:
             self._profiler.start()
@@ -303,16 +305,16 @@ class Node:
     def _wait(self) -> None:
         """Wait for one message; nothing can be stepped before it comes."""
         started = time.monotonic()
-        self.server.waiting = True
+        self._activity.waiting = True
         message = self._inbox.wait(_LAZY_S if self._lazy_pending else _LOOK_S)
-        self.server.waiting = False
+        self._activity.waiting = False
         self._waited_long = message is None
         if self._profiler is not None:
             self._profiler.waited(time.monotonic() - started, running=self._grant > 0)
         if message is not None:
             self._take(message)
         now = time.monotonic()
-        self.server.waited_s += now - started
+        self._activity.waited_s += now - started
         if now - self._heard > self._plan.timeouts.step:
             text = f"the master has said nothing for {now - self._heard:.1f} s"
             raise DeadlineExceeded(text, hint="Is its process stopped, or its host gone?")
@@ -391,10 +393,10 @@ class Node:
 
     def _report_failure(self, error: FmuMeshError) -> bool:
         """Tell the master, unless it is the one that is gone; whether it knows now."""
-        if self.server.state == "running":
+        if self._activity.state == "running":
             for runner in self._runners.values():
                 runner.flush()
-        self.server.state = "failed"
+        self._activity.state = "failed"
         if self._master_is_gone:
             return True
         self.server.say_everything()

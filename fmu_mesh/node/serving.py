@@ -17,7 +17,7 @@ from functools import partial
 import msgspec
 import zenoh
 
-from ..errors import FmuError, FmuMeshError, StepFailed
+from ..errors import FmuError, FmuMeshError
 from ..model.description import Value, Variable
 from ..model.plan import NodePlan
 from ..wire.inbox import Inbox
@@ -25,7 +25,8 @@ from ..wire.keys import Keys
 from ..wire.messages import NodeReport
 from ..wire.session import ask, matches, undeclare_all
 from ..wire.values import ValueRefused, attachment, encode_value, json_encoding
-from ..wire.views import InstanceStatus, LogLine, SetAnswer
+from ..wire.views import LogLine, SetAnswer
+from .activity import Activity
 from .info import instance_info
 from .inputs import set_input
 from .settings import checked_setting
@@ -48,22 +49,20 @@ Job = Callable[[], None]
 class Server:
     """Serves the instances of one node.
 
-    Attributes:
-        state: what the node is doing, for `status`.
-        waited_s: how long the main thread has waited since the first point.
+    Args:
+        plan: what the node has to do.
+        session: the session of this process; stays the caller's.
+        inbox: the inbox of the node.
+        activity: what the node is doing.
     """
 
-    def __init__(self, plan: NodePlan, session: zenoh.Session, keys: Keys, inbox: Inbox) -> None:
-        self.state = "starting"
-        self.waiting = False
-        self.waited_s = 0.0
-        self._started: float | None = None
+    def __init__(self, plan: NodePlan, session: zenoh.Session, keys: Keys, inbox: Inbox, activity: Activity) -> None:
         self.on_hang: Callable[[FmuError], None] = lambda _error: None
         self._plan = plan
         self._session = session
         self._keys = keys
         self._inbox = inbox
-        self._runners: Mapping[str, Runner] = {}
+        self._activity = activity
         self._streams: list[InstanceStreams] = []
         self._waiting_rows = 0
         self._pending: list[_Pending] = []
@@ -71,7 +70,6 @@ class Server:
         self._entities: list[zenoh.Queryable[None] | zenoh.Subscriber[None]] = []
         self._status_publishers: dict[str, zenoh.Publisher] = {}
         self._log_publishers: dict[str, zenoh.Publisher] = {}
-        self._stalled_since: dict[str, tuple[int, float]] = {}
         for instance in plan.instances:
             self._declare_early(instance.name)
         self._closing = threading.Event()
@@ -82,7 +80,7 @@ class Server:
 
     def serve(self, runners: Mapping[str, Runner]) -> None:
         """From now on values can be asked for and set, and outputs be subscribed."""
-        self._runners = runners
+        self._activity.runners = runners
         for runner in runners.values():
             self._streams.append(
                 InstanceStreams(runner, self._session, self._keys, self._plan.grid, self._streams_changed)
@@ -103,7 +101,7 @@ class Server:
 
     def started(self) -> None:
         """All streams begin at the first point: subscriptions made before it are looked at now."""
-        self._started = time.monotonic()
+        self._activity.started()
         for streams in self._streams:
             streams.update()
         self.stepped()
@@ -147,38 +145,21 @@ class Server:
     def _tick(self, now: float) -> None:
         for pending in [p for p in self._pending if now - p.asked > _ANSWER_S]:
             self._pending.remove(pending)
-            pending.refuse(f"not at a point yet: {self._status(pending.instance).activity}")
+            pending.refuse(f"not at a point yet: {self._activity.status(pending.instance).activity}")
         for streams in self._streams:
             if dropped := streams.take_dropped():
                 text = f"{dropped} points were not published: the run is faster than samples can be sent"
                 self._publish_log(LogLine(streams.runner.name, "warning", "stream", text, streams.runner.point))
         for name, publisher in self._status_publishers.items():
             if matches(publisher):
-                publisher.put(msgspec.json.encode(self._status(name)))
-        self._look_for_hang(now)
-
-    def _look_for_hang(self, now: float) -> None:
-        """A step that meets its deadline; other calls of an FMU are watched by `fmu_mesh.fmu.guard.CallWatch`."""
-        if self.state != "running" or self.waiting:
-            return
-        for name, runner in self._runners.items():
-            stalled_s = now - self._stalled(name, now)
-            if stalled_s > self._plan.timeouts.step:
-                self.on_hang(
-                    StepFailed(
-                        f"the FMU has not returned for {stalled_s:.1f} s from doStep; its process is ended",
-                        instance=name,
-                        point=runner.point,
-                        time=self._plan.grid.time(runner.point),
-                        hint="If it needs that long, raise `timeouts.step` in the configuration.",
-                    )
-                )
-                return
+                publisher.put(msgspec.json.encode(self._activity.status(name)))
+        if (hang := self._activity.hang(now)) is not None:
+            self.on_hang(hang)
 
     def report_hang(self, error: FmuError, deadline_s: float) -> bool:
         """From a watching thread: tell the master that an FMU does not return; whether it knows now."""
-        runner = self._runners.get(error.instance or "")
-        if runner is not None and self.state != "initializing":
+        runner = self._activity.runners.get(error.instance or "")
+        if runner is not None and self._activity.state != "initializing":
             error.point, error.time = runner.point, self._plan.grid.time(runner.point)
         report = NodeReport(self._plan.node, error.point or 0, error.report())
         try:
@@ -210,14 +191,16 @@ class Server:
         """Answer everything under the instance's key that the query's key expression matches."""
         root = self._keys.instance(name)
         asked = query.key_expr
-        runner = self._runners.get(name)
+        runner = self._activity.runners.get(name)
         if query.payload is not None:
             self._answer_setting(name, query)
             return
         for what in ("info", "status"):
             if asked.intersects(zenoh.KeyExpr(f"{root}/{what}")):
                 if what == "status":
-                    query.reply(f"{root}/status", msgspec.json.encode(self._status(name)), encoding=json_encoding)
+                    query.reply(
+                        f"{root}/status", msgspec.json.encode(self._activity.status(name)), encoding=json_encoding
+                    )
                 elif runner is not None:
                     query.reply(
                         f"{root}/info", msgspec.json.encode(instance_info(self._plan, runner)), encoding=json_encoding
@@ -226,8 +209,8 @@ class Server:
         if runner is None or not wanted:
             query.drop()
             return
-        if self.state != "running":
-            query.reply_err(f"'{name}' has no values now: {self.state}")
+        if self._activity.state != "running":
+            query.reply_err(f"'{name}' has no values now: {self._activity.state}")
             query.drop()
             return
         known, unknown = self._split(runner, wanted)
@@ -305,7 +288,7 @@ class Server:
 
     def _answer_setting(self, name: str, query: zenoh.Query) -> None:
         """A query with a payload sets a value and is told from which point on it holds, or why it was refused."""
-        runner = self._runners.get(name)
+        runner = self._activity.runners.get(name)
         key = str(query.key_expr)
         if runner is None:
             query.reply_err(f"'{name}' is still being loaded")
@@ -338,38 +321,6 @@ class Server:
             )
 
         self._inbox.post(take)
-
-    # --- views
-
-    def _status(self, name: str) -> InstanceStatus:
-        runner = self._runners.get(name)
-        if runner is None:
-            return InstanceStatus(name, self.state, self.state, 0, self._plan.grid.time(0), 0.0, 0.0)
-        return InstanceStatus(
-            instance=name,
-            state=self.state,
-            activity=self._activity(runner),
-            point=runner.point,
-            time=self._plan.grid.time(runner.point),
-            step_time=runner.step_seconds / runner.step if runner.step else 0.0,
-            wait_time=self.waited_s,
-            running_time=time.monotonic() - self._started if self._started is not None else 0.0,
-        )
-
-    def _activity(self, runner: Runner) -> str:
-        if self.state != "running":
-            return self.state
-        if self.waiting:
-            return f"waiting at point {runner.point} for {runner.lacking()}"
-        now = time.monotonic()
-        return f"in doStep at point {runner.point} for {now - self._stalled(runner.name, now):.1f} s"
-
-    def _stalled(self, name: str, now: float) -> float:
-        """Since when an instance has been at its point, as far as was seen; costs the hot loop nothing."""
-        step = self._runners[name].step
-        if self.waiting or self._stalled_since.get(name, (-1, 0.0))[0] != step:
-            self._stalled_since[name] = (step, now)
-        return self._stalled_since[name][1]
 
     # --- publishing
 
