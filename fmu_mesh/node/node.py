@@ -35,7 +35,6 @@ from ..errors import (
 )
 from ..model.instance import Instance
 from ..model.plan import NodePlan
-from ..model.transfer import Transfer
 from ..wire.frames import FrameReceiver
 from ..wire.inbox import Inbox, Message
 from ..wire.keys import Keys
@@ -53,12 +52,13 @@ from ..wire.messages import (
 )
 from ..wire.session import ask
 from .activity import Activity
+from .feeding import connect_feeds
 from .initialization import Initialization
 from .inputs import TimedInputs
 from .links import OutLink
 from .profiling import Profiler
 from .serving import Server
-from .stepping import LocalFeed, RemoteFeed, Runner, Unit
+from .stepping import RemoteFeed, Runner, Unit
 
 __all__ = ["Node"]
 
@@ -176,34 +176,7 @@ class Node:
             if item.interpolation is not None:
                 instance = TimedInputs(instance, item.interpolation)
             self._runners[item.name] = Runner(item, instance, plan.grid, plan.ring_rows)
-        for link in plan.links_in:
-            self._remote[link.index] = (FrameReceiver(link, f"node '{plan.node}'", plan.ring_rows), [])
-        receivers = {
-            receiver.link.source: (receiver, feeds)
-            for receiver, feeds in self._remote.values()
-            if not receiver.link.initial_only
-        }
-        for runner in self._runners.values():
-            for feed in runner.plan.feeds:
-                points = runner.plan.step_points
-                if feed.source in self._runners:
-                    source = self._runners[feed.source]
-                    local = Transfer(
-                        feed,
-                        source.outputs.layout,
-                        runner.inputs,
-                        source_points=source.plan.step_points,
-                        target_points=points,
-                    )
-                    runner.local_feeds.append(LocalFeed(source, local))
-                else:
-                    receiver, feeds = receivers[feed.source]
-                    link = receiver.link
-                    transfer = Transfer(
-                        feed, link.layout, runner.inputs, source_points=link.step_points, target_points=points
-                    )
-                    feeds.append(RemoteFeed(receiver, transfer))
-                    runner.remote_feeds.append(feeds[-1])
+        self._remote = connect_feeds(plan, self._runners)
         self._units = [Unit([self._runners[name] for name in names]) for names in plan.units]
         self.server.serve(self._runners)
 
