@@ -10,14 +10,11 @@ from __future__ import annotations
 import os
 import queue
 import signal
-import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import IO
 
 import msgspec
 
@@ -26,6 +23,7 @@ from ..model.config import MujocoConfig
 from ..model.plan import RECORDER, Plan
 from ..ros.bag import is_bag
 from ..wire.runtime import MeshNote, remove_run_folder, remove_stale_folders, run_folder, runtime_folder, write_note
+from .child import Child, how_it_ended
 from .events import End, Event, Ready, Status, decode_event
 from .preparing import Options
 
@@ -37,8 +35,6 @@ _REPORT_S = 1.5
 _TOLD_S = 8.0
 _INTERRUPT_S = 0.9
 _KILL_S = 0.7
-_SHOWN_LINES = 200
-_LINE_BYTES = 1000
 _SILENCE_S = 10.0
 """The master says something ten times a second; after this time without a word it is taken for lost."""
 
@@ -66,7 +62,7 @@ class Launcher:
         self._on_event = on_event
         self._on_output = on_output
         self._happened: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
-        self._processes: dict[str, _Process] = {}
+        self._processes: dict[str, Child] = {}
         self._lost: list[tuple[str, int, float]] = []
         self._how: dict[str, str] = {}
         self._end: End | None = None
@@ -140,7 +136,7 @@ class Launcher:
         return [*(["--view"] if showing.view else []), *video]
 
     def _spawn(self, name: str, arguments: Sequence[str], folder: Path) -> None:
-        process = _Process(name, [sys.executable, "-m", "fmu_mesh", *arguments], self._happened.put)
+        process = Child(name, [sys.executable, "-m", "fmu_mesh", *arguments], self._happened.put)
         self._processes[name] = process
         if name == _MASTER:
             process.start(lambda line: self._take_event(line, folder), self._take_output, self._take_exit)
@@ -191,7 +187,7 @@ class Launcher:
     def _take_exit(self, name: str, code: int) -> None:
         if self._ending:
             return
-        self._how[name] = _how_it_ended(code)
+        self._how[name] = how_it_ended(code)
         if self._end is None and (code != 0 or name == _MASTER):
             self._lost.append((name, code, time.monotonic()))
 
@@ -309,90 +305,6 @@ class Launcher:
         return error
 
 
-class _Process:
-    """One child process and the threads that read what it writes."""
-
-    def __init__(self, name: str, command: list[str], post: Callable[[Callable[[], None]], None]) -> None:
-        self.name = name
-        self._command = command
-        self._post = post
-        self._popen: subprocess.Popen[bytes] | None = None
-        self._threads: list[threading.Thread] = []
-
-    def start(
-        self,
-        on_line: Callable[[bytes], None],
-        on_error_line: Callable[[str, bytes], None],
-        on_exit: Callable[[str, int], None],
-        *,
-        limited: bool = False,
-    ) -> None:
-        """Start it in a session of its own, so that Ctrl-C reaches only the launcher.
-
-        Where it is ``limited``, it may hold an FMU that writes without end: all is read, and the beginning handed on.
-        """
-        self._popen = popen = subprocess.Popen(
-            self._command,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            start_new_session=True,
-        )
-        assert popen.stdout is not None
-        assert popen.stderr is not None
-        read = self._read_beginning if limited else self._read
-        readers = [
-            threading.Thread(target=read, args=(popen.stdout, on_line), daemon=True),
-            threading.Thread(
-                target=read, args=(popen.stderr, lambda line: on_error_line(self.name, line)), daemon=True
-            ),
-        ]
-        waiter = threading.Thread(target=self._wait, args=(readers, on_exit), daemon=True)
-        self._threads = [*readers, waiter]
-        for thread in self._threads:
-            thread.start()
-
-    @property
-    def running(self) -> bool:
-        """Whether it has not ended yet."""
-        return self._popen is not None and self._popen.poll() is None
-
-    def signal(self, number: signal.Signals) -> None:
-        """Send a signal if it still runs."""
-        if self._popen is not None and self.running:
-            self._popen.send_signal(number)
-
-    def close(self) -> None:
-        """Wait for the readers and close the pipes; call when it has ended."""
-        for thread in self._threads:
-            thread.join(1.0)
-        if self._popen is not None:
-            for pipe in (self._popen.stdin, self._popen.stdout, self._popen.stderr):
-                if pipe is not None:
-                    pipe.close()
-
-    def _read(self, pipe: IO[bytes], on_line: Callable[[bytes], None]) -> None:
-        for line in pipe:
-            self._post(partial(on_line, line))
-
-    def _read_beginning(self, pipe: IO[bytes], on_line: Callable[[bytes], None]) -> None:
-        """Read all of it, so that the process never waits, but hand on `_SHOWN_LINES` lines only."""
-        count = 0
-        while line := pipe.readline(_LINE_BYTES):
-            count += 1
-            if count <= _SHOWN_LINES:
-                self._post(partial(on_line, line))
-            elif count == _SHOWN_LINES + 1:
-                self._post(partial(on_line, b"(it writes a lot; nothing more of it is shown)"))
-
-    def _wait(self, readers: Sequence[threading.Thread], on_exit: Callable[[str, int], None]) -> None:
-        assert self._popen is not None
-        code = self._popen.wait()
-        for reader in readers:
-            reader.join(1.0)
-        self._post(lambda: on_exit(self.name, code))
-
-
 def _remove_folders_without_note() -> None:
     """Remove the folders of launchers that were killed before they knew where their master can be reached."""
     for folder in runtime_folder().glob("*.*"):
@@ -404,12 +316,3 @@ def _remove_folders_without_note() -> None:
                 remove_run_folder(folder)
             except PermissionError:
                 continue
-
-
-def _how_it_ended(code: int) -> str:
-    if code >= 0:
-        return f"ended with exit code {code}"
-    try:
-        return f"was ended by {signal.Signals(-code).name}"
-    except ValueError:
-        return f"was ended by signal {-code}"

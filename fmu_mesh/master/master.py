@@ -14,18 +14,13 @@ The master never sees a value. Its work per grant depends on the number of nodes
 
 from __future__ import annotations
 
-import logging
 import operator
-import os
-import socket
 import time
 from collections.abc import Callable, Sequence
-from typing import Literal, Protocol
 
 import msgspec
 import zenoh
 
-from .. import __version__
 from ..errors import (
     DeadlineExceeded,
     ErrorReport,
@@ -35,44 +30,23 @@ from ..errors import (
     TerminationRequested,
     from_report,
 )
-from ..model.plan import RECORDER, Plan
+from ..model.plan import Plan
 from ..wire.inbox import Inbox
-from ..wire.keys import Keys, batched
-from ..wire.membership import MASTER, Registration, Welcome
-from ..wire.messages import (
-    FINISH,
-    GRANT,
-    HEADER,
-    PROGRESS,
-    NodeReport,
-    encode_abort,
-)
+from ..wire.keys import Keys
+from ..wire.membership import MASTER
+from ..wire.messages import FINISH, GRANT, PROGRESS, NodeReport
 from ..wire.profile import TIME_LINE_ENTRIES, MeshProfile
-from ..wire.session import matches, undeclare_all
-from ..wire.shared_memory import SharedInbox, SharedOutlet, available
+from ..wire.shared_memory import SharedInbox, available
 from ..wire.values import json_encoding
-from ..wire.views import Command, CommandAnswer, LogLine, MeshInfo, MeshState, MeshStatus
+from ..wire.views import Command, CommandAnswer, MeshInfo, MeshState, MeshStatus
+from .members import Members, spoken
 from .pacing import Clock, Pacer
 from .profiling import CLOCK, PAUSE, GrantWatch
+from .serving import STATUS_S, Events, Server, mesh_info
 
-__all__ = ["Events", "Master"]
-
-log = logging.getLogger(__name__)
+__all__ = ["Master"]
 
 _HEARTBEAT_S = 0.5
-_STATUS_S = 0.1
-
-
-class Events(Protocol):
-    """What the master tells whoever started it. Called on the master's main thread."""
-
-    def status(self, status: MeshStatus) -> None:
-        """The state of the run, about ten times a second."""
-        ...
-
-    def log(self, line: LogLine) -> None:
-        """A log message of an FMU, or about a setting that was refused."""
-        ...
 
 
 class Master:
@@ -97,7 +71,6 @@ class Master:
         config = plan.system.config
         self._plan = plan
         self._session = session
-        self._events = events
         self._endpoints = tuple(endpoints)
         self._config_file = config_file
         self._timeouts = config.timeouts
@@ -106,10 +79,6 @@ class Master:
         self._windows = [plan.nodes[node].window for node in self._nodes]
         self._progress = [-1] * len(self._nodes)
         self._slowest = -1
-        self._registered: dict[str, tuple[Registration, zenoh.Query]] = {}
-        self._outlets: dict[str, SharedOutlet] = {}
-        self._shared: tuple[str, ...] = ()
-        self._present: set[str] = set()
         self._reports: dict[str, NodeReport] = {}
         self._failure: FmuMeshError | None = None
         self.ended_by: TerminationRequested | None = None
@@ -122,7 +91,6 @@ class Master:
         self._pacer = Pacer(plan, config.simulation.real_time_factor)
         self._clock = Clock()
         self._published = 0.0
-        self._status_published = 0.0
         self._moved = time.monotonic()
         shares = config.zenoh.shared_memory and available()
         self._inbox = Inbox(
@@ -133,15 +101,10 @@ class Master:
             # It is looked at closely only where nodes wait for every single grant.
             SharedInbox(dict.fromkeys(self._nodes, 0), spins=plan.window == 1) if shares else None,
         )
-        self._grants = [
-            session.declare_publisher(key, congestion_control=zenoh.CongestionControl.BLOCK, express=True)
-            for key in self._keys.grants(self._nodes)
-        ]
-        self._senders: list[Callable[[bytes], None]] = [publisher.put for publisher in self._grants]
-        self._entities: list[zenoh.Queryable[None] | zenoh.Subscriber[None]] = []
-        self._status_publisher = session.declare_publisher(
-            self._keys.mesh_key("status"), encoding=json_encoding, congestion_control=zenoh.CongestionControl.DROP
-        )
+        self._members = Members(plan, session, self._keys, self._inbox, self._lose)
+        self._send = self._members.send
+        self._server = Server(session, self._keys, self._inbox, events, self.last_status)
+        self._publish_status = self._server.publish_status
 
     def run(self) -> None:
         """Run the mesh to its last point.
@@ -168,7 +131,7 @@ class Master:
         except FmuMeshError as error:
             self._state = "failed"
             self._failure = error
-            self._abort(error)
+            self._members.abort(error)
             raise
         finally:
             self._clock.stop()
@@ -196,37 +159,11 @@ class Master:
 
     def _wait_for_nodes(self) -> None:
         deadline = time.monotonic() + self._timeouts.start
-        while len(self._registered) < len(self._nodes):
+        while not self._members.complete:
             if time.monotonic() > deadline:
-                missing = [node for node in self._nodes if node not in self._registered]
-                if len(missing) > 1:  # the recorder only waits for the others
-                    missing = [node for node in missing if node != RECORDER]
-                there = [node for node in missing if node in self._present]
-                raise DeadlineExceeded(
-                    f"not ready within {self._timeouts.start:g} s: {', '.join(map(_spoken, missing))}",
-                    hint=f"Started, but not ready: {', '.join(there)}." if there else "None of them was started.",
-                )
+                raise self._members.absence()
             self._turn(0.25)
-        self._welcome()
-
-    def _welcome(self) -> None:
-        """Answer all nodes, and tell them who is reached through shared memory: the master is if all nodes are."""
-        shared = [node for node in self._nodes if node in self._outlets and self._registered[node][0].shared]
-        self._senders = [self._outlets[node].put for node in shared]
-        rest = [node for node in self._nodes if node not in shared]
-        if rest:
-            publishers = zip(self._grants, batched(self._nodes), strict=True)
-            self._senders += [publisher.put for publisher, nodes in publishers if not set(nodes).isdisjoint(rest)]
-        offer = self._inbox.offer if len(self._outlets) == len(self._nodes) else None
-        if offer is not None:
-            self._inbox.share()
-            shared.append(MASTER)
-        self._shared = tuple(shared)
-        entries = TIME_LINE_ENTRIES // len(self._nodes) if self.watch is not None else 0
-        for number, node in enumerate(self._nodes):
-            _, query = self._registered.pop(node)
-            query.reply(query.key_expr, msgspec.json.encode(Welcome(number, entries, self._shared, offer)))
-            query.drop()
+        self._members.welcome(TIME_LINE_ENTRIES // len(self._nodes) if self.watch is not None else 0)
 
     def _grant_to_the_end(self) -> None:
         if self.starts_paused:
@@ -242,7 +179,7 @@ class Master:
             if silent_s > 3 * self._timeouts.step and self._slowest < self._grant and self._hold is None:
                 raise DeadlineExceeded(
                     f"no progress for {silent_s:.1f} s",
-                    instance=_spoken(self._nodes[self._progress.index(self._slowest)]),
+                    instance=spoken(self._nodes[self._progress.index(self._slowest)]),
                     point=self._slowest,
                     time=self._plan.grid.time(self._slowest),
                 )
@@ -267,7 +204,7 @@ class Master:
             self._send(GRANT, grant)
         else:
             self._send_grant_as_sign_of_life()
-        return min(pause, _STATUS_S)
+        return min(pause, STATUS_S)
 
     def _send_grant_as_sign_of_life(self) -> None:
         """The same grant again, so that nodes that wait for a slow FMU of another one know that the master lives."""
@@ -299,7 +236,7 @@ class Master:
                     for number, node in enumerate(self._nodes)
                     if (self._progress[number] < 0 if self._state == "initializing" else node not in self._reports)
                 ]
-                raise DeadlineExceeded(f"{what} {', '.join(map(_spoken, missing))} within {timeout_s:g} s")
+                raise DeadlineExceeded(f"{what} {spoken(*missing)} within {timeout_s:g} s")
             if self._state == "initializing":
                 self._send_grant_as_sign_of_life()
             self._turn(0.1)
@@ -324,68 +261,21 @@ class Master:
         if self._failure is not None:
             raise self._failure
 
-    def _send(self, kind: int, point: int) -> None:
-        message = HEADER.pack(kind, 0, 0, point)
-        for send in self._senders:
-            send(message)
-
-    def _abort(self, error: FmuMeshError) -> None:
-        """Tell the nodes why the run ends, and give them the time to end by themselves."""
-        for send in self._senders:
-            send(encode_abort(error.report()))
-        for _, query in self._registered.values():  # nodes that still wait to be let in
-            query.reply_err(str(error))
-            query.drop()
-        self._registered.clear()
-
     def _fail(self, error: FmuMeshError) -> None:
         if self._failure is None:
             self._failure = error
 
-    # --- what arrives on foreign threads; all of it is posted to the main thread
+    # --- what arrives; all of it on the main thread
 
     def _declare(self) -> None:
-        post = self._inbox.post
-        session = self._session
-
-        def served(key: str, answer: Callable[[zenoh.Query], None]) -> None:
-            self._entities.append(session.declare_queryable(key, lambda query: post(lambda: answer(query))))
-
-        served(self._keys.register, self._register)
-        served(self._keys.report, self._take_report)
-        served(self._keys.mesh_key("info"), self._reply_with("info", self._info))
-        served(self._keys.mesh_key("status"), self._reply_with("status", self.last_status))
-        served(self._keys.mesh_key("plan"), self._reply_with("plan", lambda: self._plan.nodes))
-        served(self._keys.mesh_key("command"), self._command)
-        self._entities.append(
-            session.liveliness().declare_subscriber(
-                self._keys.node_token("*"), lambda sample: post(lambda: self._token_changed(sample)), history=True
-            )
-        )
-        self._entities.append(
-            session.declare_subscriber(f"{self._keys.root}/*/log", lambda sample: post(lambda: self._log(sample)))
-        )
-
-    def _register(self, query: zenoh.Query) -> None:
-        registration = msgspec.json.decode(query.payload.to_bytes() if query.payload else b"", type=Registration)
-        if registration.node not in self._plan.nodes:
-            query.reply_err(f"this mesh has no node '{registration.node}'")
-        elif registration.digest != self._plan.digest:
-            where = f"process {registration.pid} on {registration.host}"
-            query.reply_err(
-                f"node '{registration.node}' ({where}) has another configuration, or other FMUs, than the master"
-            )
-        elif registration.node in self._registered or self._state != "starting":
-            query.reply_err(f"node '{registration.node}' is there already; two processes run it")
-        else:
-            outlet = SharedOutlet.open(
-                registration.offer, MASTER, _spoken(registration.node), self._inbox.stash, self._timeouts.step
-            )
-            if outlet is not None and self._inbox.offer is not None:
-                self._outlets[registration.node] = outlet
-            self._registered[registration.node] = (registration, query)
-            return
-        query.drop()
+        server = self._server
+        server.serve(self._keys.register, self._members.register)
+        server.serve(self._keys.report, self._take_report)
+        server.show("info", self._info)
+        server.show("status", self.last_status)
+        server.show("plan", lambda: self._plan.nodes)
+        server.serve(self._keys.mesh_key("command"), self._command)
+        server.watch(self._members.token_changed)
 
     def _take_report(self, query: zenoh.Query) -> None:
         report = msgspec.json.decode(query.payload.to_bytes() if query.payload else b"", type=NodeReport)
@@ -401,27 +291,19 @@ class Master:
         query.reply(query.key_expr, b"")
         query.drop()
 
-    def _token_changed(self, sample: zenoh.Sample) -> None:
-        node = str(sample.key_expr).rsplit("/", 1)[1]
-        if sample.kind == zenoh.SampleKind.PUT:
-            self._present.add(node)
-        elif node in self._plan.nodes and node not in self._reports:
-            self._fail(self._lost(node))
-
-    def _lost(self, node: str) -> MeshLost:
+    def _lose(self, node: str) -> None:
+        """The process of a node is gone; whoever has reported may go."""
+        if node in self._reports:
+            return
         point = max(self._progress[self._nodes.index(node)], 0)
-        return MeshLost(
-            f"{_spoken(node)} was lost: its process does not answer any more",
-            instance=", ".join(item.name for item in self._plan.nodes[node].instances) or None,
-            point=point,
-            time=self._plan.grid.time(point),
+        self._fail(
+            MeshLost(
+                f"{spoken(node)} was lost: its process does not answer any more",
+                instance=", ".join(item.name for item in self._plan.nodes[node].instances) or None,
+                point=point,
+                time=self._plan.grid.time(point),
+            )
         )
-
-    def _log(self, sample: zenoh.Sample) -> None:
-        try:
-            self._events.log(msgspec.json.decode(sample.payload.to_bytes(), type=LogLine))
-        except msgspec.DecodeError as error:
-            log.warning("log_line_not_understood", extra={"key": str(sample.key_expr), "error": str(error)})
 
     def _command(self, query: zenoh.Query) -> None:
         """pause, resume, step N and stop; the grant is all that they move."""
@@ -453,40 +335,10 @@ class Master:
         query.reply(self._keys.mesh_key("command"), msgspec.json.encode(answer), encoding=json_encoding)
         query.drop()
 
-    def _reply_with(
-        self, what: Literal["info", "status", "plan"], view: Callable[[], object]
-    ) -> Callable[[zenoh.Query], None]:
-        key = self._keys.mesh_key(what)
-
-        def reply(query: zenoh.Query) -> None:
-            query.reply(key, msgspec.json.encode(view()), encoding=json_encoding)
-            query.drop()
-
-        return reply
-
     # --- views
 
     def _info(self) -> MeshInfo:
-        config = self._plan.system.config
-        grid = self._plan.grid
-        return MeshInfo(
-            mesh=config.mesh,
-            version=__version__,
-            config=self._config_file,
-            start_time=grid.start_time,
-            stop_time=grid.stop_time,
-            step_size=grid.step_size,
-            algorithm=config.simulation.algorithm,
-            window=self._plan.window,
-            real_time_factor=config.simulation.real_time_factor,
-            instances=tuple(self._plan.system.instances),
-            nodes=tuple(self._nodes),
-            result_file=self._plan.system.result_file,
-            endpoints=self._endpoints,
-            pid=os.getpid(),
-            host=socket.gethostname(),
-            shared_memory=self._shared,
-        )
+        return mesh_info(self._plan, self._config_file, self._endpoints, self._members.shared)
 
     def last_status(self) -> MeshStatus:
         """The state of the run right now."""
@@ -507,20 +359,7 @@ class Master:
             overruns=self._pacer.overruns,
         )
 
-    def _publish_status(self, *, final: bool = False) -> None:
-        now = time.monotonic()
-        if not final and now - self._status_published < _STATUS_S:
-            return
-        self._status_published = now
-        status = self.last_status()
-        self._events.status(status)
-        if matches(self._status_publisher):
-            self._status_publisher.put(msgspec.json.encode(status))
-
     def _close(self) -> None:
-        undeclare_all(self._entities, self._grants, [self._status_publisher])
+        self._server.close()
+        self._members.close()
         self._inbox.close()
-
-
-def _spoken(node: str) -> str:
-    return "the recorder" if node == "@record" else f"node '{node}'"

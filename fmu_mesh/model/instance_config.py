@@ -151,6 +151,13 @@ class FluidDynamicsConfig(CouplingConfig, frozen=True, kw_only=True):
     link: Annotated[str, Meta(description="Name of the body.")]
 
 
+Controllers = Annotated[list[ControllerConfig], Meta(description="Controllers of joints.")]
+Actuators = Annotated[list[ActuatorConfig], Meta(description="Actuators of joints, as in gazebo-fmi.")]
+FluidDynamics = Annotated[
+    list[FluidDynamicsConfig], Meta(description="Fluid dynamics of single bodies, as in gazebo-fmi.")
+]
+
+
 class MujocoConfig(Base, frozen=True, kw_only=True, tag_field=KIND, tag="mujoco"):
     """A world that the physics engine MuJoCo computes: its joints and bodies are variables."""
 
@@ -163,11 +170,9 @@ class MujocoConfig(Base, frozen=True, kw_only=True, tag_field=KIND, tag="mujoco"
         ),
     ] = None
     keyframe: Annotated[str | None, Meta(description="The model's keyframe to start from.")] = None
-    controllers: Annotated[list[ControllerConfig], Meta(description="Controllers of joints.")] = []
-    actuators: Annotated[list[ActuatorConfig], Meta(description="Actuators of joints, as in gazebo-fmi.")] = []
-    fluid_dynamics: Annotated[
-        list[FluidDynamicsConfig], Meta(description="Fluid dynamics of single bodies, as in gazebo-fmi.")
-    ] = []
+    controllers: Controllers = []
+    actuators: Actuators = []
+    fluid_dynamics: FluidDynamics = []
     start_values: StartValues = {}
     step_size: StepSize = None
     group: Group = None
@@ -190,11 +195,9 @@ class GazeboClassicConfig(Base, frozen=True, kw_only=True, tag_field=KIND, tag="
             "max_step_size.",
         ),
     ] = None
-    controllers: Annotated[list[ControllerConfig], Meta(description="Controllers of joints.")] = []
-    actuators: Annotated[list[ActuatorConfig], Meta(description="Actuators of joints, as in gazebo-fmi.")] = []
-    fluid_dynamics: Annotated[
-        list[FluidDynamicsConfig], Meta(description="Fluid dynamics of single links, as in gazebo-fmi.")
-    ] = []
+    controllers: Controllers = []
+    actuators: Actuators = []
+    fluid_dynamics: FluidDynamics = []
     start_values: StartValues = {}
     step_size: StepSize = None
     group: Group = None

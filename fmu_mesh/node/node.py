@@ -35,7 +35,6 @@ from ..errors import (
 )
 from ..model.instance import Instance
 from ..model.plan import NodePlan
-from ..model.transfer import Transfer
 from ..wire.frames import FrameReceiver
 from ..wire.inbox import Inbox, Message
 from ..wire.keys import Keys
@@ -52,12 +51,14 @@ from ..wire.messages import (
     decode_abort,
 )
 from ..wire.session import ask
+from .activity import Activity
+from .feeding import connect_feeds
 from .initialization import Initialization
 from .inputs import TimedInputs
 from .links import OutLink
 from .profiling import Profiler
 from .serving import Server
-from .stepping import LocalFeed, RemoteFeed, Runner, Unit
+from .stepping import RemoteFeed, Runner, Unit
 
 __all__ = ["Node"]
 
@@ -115,7 +116,8 @@ class Node:
         self._poll = self._inbox.poll
         self._take = self._sort_in
         self._put_progress: Callable[[bytes], None]
-        self.server = Server(plan, session, self._keys, self._inbox)
+        self._activity = Activity(plan)
+        self.server = Server(plan, session, self._keys, self._inbox, self._activity)
 
     def run(self) -> None:
         """Load, initialize and step to the last point, then report to the master.
@@ -168,46 +170,19 @@ class Node:
     def _load(self) -> None:
         """Instantiate the FMUs and wire rings, feeds and links together."""
         plan = self._plan
-        self.server.state = "loading"
+        self._activity.state = "loading"
         for item in plan.instances:
             instance = self._open_instance(item.name)
             if item.interpolation is not None:
                 instance = TimedInputs(instance, item.interpolation)
             self._runners[item.name] = Runner(item, instance, plan.grid, plan.ring_rows)
-        for link in plan.links_in:
-            self._remote[link.index] = (FrameReceiver(link, f"node '{plan.node}'", plan.ring_rows), [])
-        receivers = {
-            receiver.link.source: (receiver, feeds)
-            for receiver, feeds in self._remote.values()
-            if not receiver.link.initial_only
-        }
-        for runner in self._runners.values():
-            for feed in runner.plan.feeds:
-                points = runner.plan.step_points
-                if feed.source in self._runners:
-                    source = self._runners[feed.source]
-                    local = Transfer(
-                        feed,
-                        source.outputs.layout,
-                        runner.inputs,
-                        source_points=source.plan.step_points,
-                        target_points=points,
-                    )
-                    runner.local_feeds.append(LocalFeed(source, local))
-                else:
-                    receiver, feeds = receivers[feed.source]
-                    link = receiver.link
-                    transfer = Transfer(
-                        feed, link.layout, runner.inputs, source_points=link.step_points, target_points=points
-                    )
-                    feeds.append(RemoteFeed(receiver, transfer))
-                    runner.remote_feeds.append(feeds[-1])
+        self._remote = connect_feeds(plan, self._runners)
         self._units = [Unit([self._runners[name] for name in names]) for names in plan.units]
         self.server.serve(self._runners)
 
     def _meet(self) -> None:
         """Join the mesh: from now on all others are there."""
-        self.server.state = "waiting for the mesh"
+        self._activity.state = "waiting for the mesh"
         welcome = self._membership.join()
         self._progress_number = welcome.number
         self._heard = time.monotonic()
@@ -236,7 +211,7 @@ class Node:
 
     def _initialize(self) -> None:
         """Initialization Mode: set and get level by level, exchange over the wire, then make the outputs point 0."""
-        self.server.state = "initializing"
+        self._activity.state = "initializing"
         grid = self._plan.grid
         for runner in self._runners.values():
             runner.instance.enter_initialization(grid.start_time, grid.stop_time, runner.plan.start_values)
@@ -256,7 +231,7 @@ class Node:
 
     def _step_to_the_end(self) -> None:
         """The loop of the module's docstring."""
-        self.server.state = "running"
+        self._activity.state = "running"
         poll = self._poll
         if self._profiler is not None:
             self._profiler.start()
@@ -303,16 +278,16 @@ class Node:
     def _wait(self) -> None:
         """Wait for one message; nothing can be stepped before it comes."""
         started = time.monotonic()
-        self.server.waiting = True
+        self._activity.waiting = True
         message = self._inbox.wait(_LAZY_S if self._lazy_pending else _LOOK_S)
-        self.server.waiting = False
+        self._activity.waiting = False
         self._waited_long = message is None
         if self._profiler is not None:
             self._profiler.waited(time.monotonic() - started, running=self._grant > 0)
         if message is not None:
             self._take(message)
         now = time.monotonic()
-        self.server.waited_s += now - started
+        self._activity.waited_s += now - started
         if now - self._heard > self._plan.timeouts.step:
             text = f"the master has said nothing for {now - self._heard:.1f} s"
             raise DeadlineExceeded(text, hint="Is its process stopped, or its host gone?")
@@ -391,10 +366,10 @@ class Node:
 
     def _report_failure(self, error: FmuMeshError) -> bool:
         """Tell the master, unless it is the one that is gone; whether it knows now."""
-        if self.server.state == "running":
+        if self._activity.state == "running":
             for runner in self._runners.values():
                 runner.flush()
-        self.server.state = "failed"
+        self._activity.state = "failed"
         if self._master_is_gone:
             return True
         self.server.say_everything()

@@ -1,8 +1,8 @@
 """The node's face to the rest of the world: info, status, current values, settings, streams and log.
 
-Runs on a thread of its own. Values come from the rings (rows that were completed), or are read by the main thread at
-the next point; settings are checked here and made by the main thread. So a query never waits for a step, a step never
-waits for a query, and `status` answers while an FMU hangs.
+Runs on a thread of its own; what it answers is in `fmu_mesh.node.answering`. Values come from the rings (rows that were
+completed), or are read by the main thread at the next point. So a query never waits for a step, a step never waits for
+a query, and `status` answers while an FMU hangs.
 """
 
 from __future__ import annotations
@@ -17,61 +17,53 @@ from functools import partial
 import msgspec
 import zenoh
 
-from ..errors import FmuError, FmuMeshError, StepFailed
-from ..model.description import Value, Variable
+from ..errors import FmuError, FmuMeshError
 from ..model.plan import NodePlan
 from ..wire.inbox import Inbox
 from ..wire.keys import Keys
 from ..wire.messages import NodeReport
 from ..wire.session import ask, matches, undeclare_all
-from ..wire.values import ValueRefused, attachment, encode_value, json_encoding
-from ..wire.views import InstanceStatus, LogLine, SetAnswer
-from .info import instance_info
-from .inputs import set_input
-from .settings import checked_setting
+from ..wire.values import json_encoding
+from ..wire.views import LogLine
+from .activity import Activity
+from .answering import Answers, Job
 from .stepping import Runner
-from .streams import MAX_WAITING_ROWS, Batch, InstanceStreams, kind_of
+from .streams import MAX_WAITING_ROWS, Batch, InstanceStreams
 
 __all__ = ["Server"]
 
 log = logging.getLogger(__name__)
 
 _TICK_S = 0.25
-_ANSWER_S = 2.0
 _LAST_ROWS_S = 1.0
 _LAST_WORDS_S = 0.5
 _STREAM_SHARE = 4.0
-
-Job = Callable[[], None]
 
 
 class Server:
     """Serves the instances of one node.
 
-    Attributes:
-        state: what the node is doing, for `status`.
-        waited_s: how long the main thread has waited since the first point.
+    Args:
+        plan: what the node has to do.
+        session: the session of this process; stays the caller's.
+        inbox: the inbox of the node.
+        activity: what the node is doing.
     """
 
-    def __init__(self, plan: NodePlan, session: zenoh.Session, keys: Keys, inbox: Inbox) -> None:
-        self.state = "starting"
-        self.waiting = False
-        self.waited_s = 0.0
-        self._started: float | None = None
+    def __init__(self, plan: NodePlan, session: zenoh.Session, keys: Keys, inbox: Inbox, activity: Activity) -> None:
         self.on_hang: Callable[[FmuError], None] = lambda _error: None
         self._plan = plan
         self._session = session
         self._keys = keys
         self._inbox = inbox
-        self._runners: Mapping[str, Runner] = {}
+        self._activity = activity
         self._streams: list[InstanceStreams] = []
         self._waiting_rows = 0
-        self._pending: list[_Pending] = []
         self._jobs: queue.SimpleQueue[Job | None] = queue.SimpleQueue()
+        self._answers = Answers(plan, inbox, activity, self._jobs.put, self._publish_log)
         self._entities: list[zenoh.Queryable[None] | zenoh.Subscriber[None]] = []
         self._status_publishers: dict[str, zenoh.Publisher] = {}
         self._log_publishers: dict[str, zenoh.Publisher] = {}
-        self._stalled_since: dict[str, tuple[int, float]] = {}
         for instance in plan.instances:
             self._declare_early(instance.name)
         self._closing = threading.Event()
@@ -82,14 +74,14 @@ class Server:
 
     def serve(self, runners: Mapping[str, Runner]) -> None:
         """From now on values can be asked for and set, and outputs be subscribed."""
-        self._runners = runners
+        self._activity.runners = runners
         for runner in runners.values():
             self._streams.append(
                 InstanceStreams(runner, self._session, self._keys, self._plan.grid, self._streams_changed)
             )
             for kind in ("in", "param"):
                 key = f"{self._keys.instance(runner.name)}/{kind}/*"
-                take = partial(self._put_arrived, runner)
+                take = partial(self._answers.put_arrived, runner)
                 self._entities.append(self._session.declare_subscriber(key, take, allowed_origin=zenoh.Locality.REMOTE))
 
     def stepped(self) -> None:
@@ -103,7 +95,7 @@ class Server:
 
     def started(self) -> None:
         """All streams begin at the first point: subscriptions made before it are looked at now."""
-        self._started = time.monotonic()
+        self._activity.started()
         for streams in self._streams:
             streams.update()
         self.stepped()
@@ -145,40 +137,21 @@ class Server:
                 self._tick(now)
 
     def _tick(self, now: float) -> None:
-        for pending in [p for p in self._pending if now - p.asked > _ANSWER_S]:
-            self._pending.remove(pending)
-            pending.refuse(f"not at a point yet: {self._status(pending.instance).activity}")
+        self._answers.refuse_late(now)
         for streams in self._streams:
             if dropped := streams.take_dropped():
                 text = f"{dropped} points were not published: the run is faster than samples can be sent"
                 self._publish_log(LogLine(streams.runner.name, "warning", "stream", text, streams.runner.point))
         for name, publisher in self._status_publishers.items():
             if matches(publisher):
-                publisher.put(msgspec.json.encode(self._status(name)))
-        self._look_for_hang(now)
-
-    def _look_for_hang(self, now: float) -> None:
-        """A step that meets its deadline; other calls of an FMU are watched by `fmu_mesh.fmu.guard.CallWatch`."""
-        if self.state != "running" or self.waiting:
-            return
-        for name, runner in self._runners.items():
-            stalled_s = now - self._stalled(name, now)
-            if stalled_s > self._plan.timeouts.step:
-                self.on_hang(
-                    StepFailed(
-                        f"the FMU has not returned for {stalled_s:.1f} s from doStep; its process is ended",
-                        instance=name,
-                        point=runner.point,
-                        time=self._plan.grid.time(runner.point),
-                        hint="If it needs that long, raise `timeouts.step` in the configuration.",
-                    )
-                )
-                return
+                publisher.put(msgspec.json.encode(self._activity.status(name)))
+        if (hang := self._activity.hang(now)) is not None:
+            self.on_hang(hang)
 
     def report_hang(self, error: FmuError, deadline_s: float) -> bool:
         """From a watching thread: tell the master that an FMU does not return; whether it knows now."""
-        runner = self._runners.get(error.instance or "")
-        if runner is not None and self.state != "initializing":
+        runner = self._activity.runners.get(error.instance or "")
+        if runner is not None and self._activity.state != "initializing":
             error.point, error.time = runner.point, self._plan.grid.time(runner.point)
         report = NodeReport(self._plan.node, error.point or 0, error.report())
         try:
@@ -204,172 +177,7 @@ class Server:
             )
 
     def _query_arrived(self, name: str, query: zenoh.Query) -> None:
-        self._jobs.put(partial(self._answer, name, query))
-
-    def _answer(self, name: str, query: zenoh.Query) -> None:
-        """Answer everything under the instance's key that the query's key expression matches."""
-        root = self._keys.instance(name)
-        asked = query.key_expr
-        runner = self._runners.get(name)
-        if query.payload is not None:
-            self._answer_setting(name, query)
-            return
-        for what in ("info", "status"):
-            if asked.intersects(zenoh.KeyExpr(f"{root}/{what}")):
-                if what == "status":
-                    query.reply(f"{root}/status", msgspec.json.encode(self._status(name)), encoding=json_encoding)
-                elif runner is not None:
-                    query.reply(
-                        f"{root}/info", msgspec.json.encode(instance_info(self._plan, runner)), encoding=json_encoding
-                    )
-        wanted = self._variables_matching(runner, asked) if runner is not None else []
-        if runner is None or not wanted:
-            query.drop()
-            return
-        if self.state != "running":
-            query.reply_err(f"'{name}' has no values now: {self.state}")
-            query.drop()
-            return
-        known, unknown = self._split(runner, wanted)
-        self._reply_values(runner, query, known, runner.step)
-        if unknown:
-            self._read_at_next_point(runner, query, unknown)
-        else:
-            query.drop()
-
-    def _variables_matching(self, runner: Runner, asked: zenoh.KeyExpr) -> list[tuple[str, Variable]]:
-        """(key, variable) of all variables that a key expression matches."""
-        matching = []
-        for variable in runner.instance.description.variables:
-            kind = kind_of(variable)
-            if kind is not None:
-                key = self._keys.variable(runner.name, kind, variable.name)
-                if asked.intersects(zenoh.KeyExpr(key)):
-                    matching.append((key, variable))
-        return matching
-
-    def _split(
-        self, runner: Runner, wanted: list[tuple[str, Variable]]
-    ) -> tuple[list[tuple[str, Value]], list[tuple[str, Variable]]]:
-        """Values that the rings hold, and variables that only the FMU knows."""
-        names = {*runner.outputs.layout.names}
-        known = [(key, runner.outputs.value(runner.step, v.name)) for key, v in wanted if v.name in names]
-        return known, [(key, v) for key, v in wanted if v.name not in names]
-
-    def _reply_values(self, runner: Runner, query: zenoh.Query, values: list[tuple[str, Value]], step: int) -> None:
-        point = step * runner.plan.step_points
-        stamp = attachment(point, self._plan.grid.time(point))
-        for key, value in values:
-            query.reply(key, encode_value(value), encoding=json_encoding, attachment=stamp)
-
-    def _read_at_next_point(self, runner: Runner, query: zenoh.Query, wanted: list[tuple[str, Variable]]) -> None:
-        pending = _Pending(runner.name, query)
-        self._pending.append(pending)
-
-        def read() -> None:
-            values = runner.instance.get_values([variable.name for _, variable in wanted])
-            pairs = [(key, value) for (key, _), value in zip(wanted, values, strict=True)]
-            step = runner.step
-            self._jobs.put(lambda: self._finish(pending, lambda: self._reply_values(runner, query, pairs, step)))
-
-        self._inbox.post(read)
-
-    def _finish(self, pending: _Pending, reply: Job) -> None:
-        """Answer a query that waited for a point, unless it was refused in the meantime."""
-        if pending in self._pending:
-            self._pending.remove(pending)
-            reply()
-            pending.query.drop()
-
-    # --- settings
-
-    def _put_arrived(self, runner: Runner, sample: zenoh.Sample) -> None:
-        attachment = sample.attachment.to_bytes() if sample.attachment is not None else None
-        data = sample.payload.to_bytes()
-        self._jobs.put(partial(self._take_put, runner, str(sample.key_expr), data, attachment))
-
-    def _take_put(self, runner: Runner, key: str, data: bytes, attachment: bytes | None) -> None:
-        try:
-            new = checked_setting(runner, self._keys.instance(runner.name), key, data, attachment)
-        except ValueRefused as refused:
-            self._publish_log(LogLine(runner.name, "warning", "set", str(refused), runner.point))
-            return
-
-        def take() -> None:
-            try:
-                set_input(runner.instance, new.variable, new.value, new.time, runner.step)
-            except ValueRefused as refused:
-                self.log_message(LogLine(runner.name, "warning", "set", str(refused), runner.point))
-
-        self._inbox.post(take)
-
-    def _answer_setting(self, name: str, query: zenoh.Query) -> None:
-        """A query with a payload sets a value and is told from which point on it holds, or why it was refused."""
-        runner = self._runners.get(name)
-        key = str(query.key_expr)
-        if runner is None:
-            query.reply_err(f"'{name}' is still being loaded")
-            query.drop()
-            return
-        data = query.payload.to_bytes() if query.payload else b""
-        attachment = query.attachment.to_bytes() if query.attachment is not None else None
-        try:
-            new = checked_setting(runner, self._keys.instance(runner.name), key, data, attachment)
-        except ValueRefused as refused:
-            query.reply_err(str(refused))
-            query.drop()
-            return
-        pending = _Pending(name, query)
-        self._pending.append(pending)
-
-        def take() -> None:
-            try:
-                step = set_input(runner.instance, new.variable, new.value, new.time, runner.step)
-            except ValueRefused as refused:
-                reason = str(refused)
-                self._jobs.put(lambda: self._finish(pending, lambda: query.reply_err(reason)))
-                return
-            point = step * runner.plan.step_points
-            answer = SetAnswer(key, point, self._plan.grid.time(point))
-            self._jobs.put(
-                lambda: self._finish(
-                    pending, lambda: query.reply(key, msgspec.json.encode(answer), encoding=json_encoding)
-                )
-            )
-
-        self._inbox.post(take)
-
-    # --- views
-
-    def _status(self, name: str) -> InstanceStatus:
-        runner = self._runners.get(name)
-        if runner is None:
-            return InstanceStatus(name, self.state, self.state, 0, self._plan.grid.time(0), 0.0, 0.0)
-        return InstanceStatus(
-            instance=name,
-            state=self.state,
-            activity=self._activity(runner),
-            point=runner.point,
-            time=self._plan.grid.time(runner.point),
-            step_time=runner.step_seconds / runner.step if runner.step else 0.0,
-            wait_time=self.waited_s,
-            running_time=time.monotonic() - self._started if self._started is not None else 0.0,
-        )
-
-    def _activity(self, runner: Runner) -> str:
-        if self.state != "running":
-            return self.state
-        if self.waiting:
-            return f"waiting at point {runner.point} for {runner.lacking()}"
-        now = time.monotonic()
-        return f"in doStep at point {runner.point} for {now - self._stalled(runner.name, now):.1f} s"
-
-    def _stalled(self, name: str, now: float) -> float:
-        """Since when an instance has been at its point, as far as was seen; costs the hot loop nothing."""
-        step = self._runners[name].step
-        if self.waiting or self._stalled_since.get(name, (-1, 0.0))[0] != step:
-            self._stalled_since[name] = (step, now)
-        return self._stalled_since[name][1]
+        self._jobs.put(partial(self._answers.answer, name, query))
 
     # --- publishing
 
@@ -397,16 +205,3 @@ class Server:
 
     def _publish_log(self, line: LogLine) -> None:
         self._log_publishers[line.instance].put(msgspec.json.encode(line))
-
-
-class _Pending:
-    """A query that waits for its instance to come to a point."""
-
-    def __init__(self, instance: str, query: zenoh.Query) -> None:
-        self.instance = instance
-        self.query = query
-        self.asked = time.monotonic()
-
-    def refuse(self, reason: str) -> None:
-        self.query.reply_err(reason)
-        self.query.drop()

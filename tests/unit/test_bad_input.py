@@ -69,7 +69,7 @@ def nothing_is_spawned(monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(*_: object, **__: object) -> None:
         pytest.fail("a process was started before everything was checked")
 
-    monkeypatch.setattr("fmu_mesh.launch.launcher.subprocess.Popen", fail)
+    monkeypatch.setattr("fmu_mesh.launch.child.subprocess.Popen", fail)
 
 
 @pytest.fixture(params=[("launch",), ("launch", "--local"), ("check",)], ids=["launch", "local", "check"])

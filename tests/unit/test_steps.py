@@ -54,6 +54,12 @@ def outputs(instance: FmuInstance) -> list[Value]:
     return instance.get_values(names)
 
 
+def outputs_after(instance: FmuInstance, steps: range) -> list[Value]:
+    for step in steps:
+        instance.do_step(step)
+    return outputs(instance)
+
+
 # ---- sub-steps
 
 
@@ -219,15 +225,11 @@ def test_an_instance_goes_on_bit_by_bit_from_a_state_that_it_was_in(
         for step in range(6):
             instance.do_step(step)
         state = instance.get_state()
-        for step in range(6, 20):
-            instance.do_step(step)
-        there = outputs(instance)
+        there = outputs_after(instance, range(6, 20))
 
         instance.set_state(state)
-        for step in range(6, 20):
-            instance.do_step(step)
 
-        assert outputs(instance) == there
+        assert outputs_after(instance, range(6, 20)) == there
         instance.free_state(state)
 
 
@@ -242,17 +244,13 @@ def test_another_instance_goes_on_bit_by_bit_from_a_serialized_state(
         state = instance.get_state()
         data = instance.serialize_state(state)
         instance.free_state(state)
-        for step in range(6, 20):
-            instance.do_step(step)
-        there = outputs(instance)
+        there = outputs_after(instance, range(6, 20))
 
     with running(fmu, tmp_path, kind, 0.1) as other:
         state = other.deserialize_state(data)
         other.set_state(state)
-        for step in range(6, 20):
-            other.do_step(step)
 
-        assert outputs(other) == there
+        assert outputs_after(other, range(6, 20)) == there
         other.free_state(state)
 
 
@@ -309,15 +307,11 @@ def test_clocks_and_linear_inputs_go_on_from_a_state_too(kind: Kind, event_fmu: 
         for step in range(6):
             stairs.do_step(step)
         state = stairs.get_state()
-        for step in range(6, 20):
-            stairs.do_step(step)
-        there = outputs(stairs)
+        there = outputs_after(stairs, range(6, 20))
 
         stairs.set_state(state)
-        for step in range(6, 20):
-            stairs.do_step(step)
 
-        assert outputs(stairs) == there
+        assert outputs_after(stairs, range(6, 20)) == there
         stairs.free_state(state)
 
 

@@ -1,0 +1,118 @@
+"""One child process of the launcher, and the threads that read what it writes.
+
+Knows nothing of meshes; what happens is posted to the launcher's thread.
+"""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import threading
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import IO
+
+__all__ = ["Child", "how_it_ended"]
+
+_SHOWN_LINES = 200
+_LINE_BYTES = 1000
+
+
+class Child:
+    """One child process.
+
+    Args:
+        name: what it is called where its lines and its end are handed on.
+        command: the program and its arguments.
+        post: takes what is to be called on the launcher's thread.
+    """
+
+    def __init__(self, name: str, command: list[str], post: Callable[[Callable[[], None]], None]) -> None:
+        self.name = name
+        self._command = command
+        self._post = post
+        self._popen: subprocess.Popen[bytes] | None = None
+        self._threads: list[threading.Thread] = []
+
+    def start(
+        self,
+        on_line: Callable[[bytes], None],
+        on_error_line: Callable[[str, bytes], None],
+        on_exit: Callable[[str, int], None],
+        *,
+        limited: bool = False,
+    ) -> None:
+        """Start it in a session of its own, so that Ctrl-C reaches only the launcher.
+
+        Where it is ``limited``, it may hold an FMU that writes without end: all is read, and the beginning handed on.
+        """
+        self._popen = popen = subprocess.Popen(
+            self._command,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            start_new_session=True,
+        )
+        assert popen.stdout is not None
+        assert popen.stderr is not None
+        read = self._read_beginning if limited else self._read
+        readers = [
+            threading.Thread(target=read, args=(popen.stdout, on_line), daemon=True),
+            threading.Thread(
+                target=read, args=(popen.stderr, lambda line: on_error_line(self.name, line)), daemon=True
+            ),
+        ]
+        waiter = threading.Thread(target=self._wait, args=(readers, on_exit), daemon=True)
+        self._threads = [*readers, waiter]
+        for thread in self._threads:
+            thread.start()
+
+    @property
+    def running(self) -> bool:
+        """Whether it has not ended yet."""
+        return self._popen is not None and self._popen.poll() is None
+
+    def signal(self, number: signal.Signals) -> None:
+        """Send a signal if it still runs."""
+        if self._popen is not None and self.running:
+            self._popen.send_signal(number)
+
+    def close(self) -> None:
+        """Wait for the readers and close the pipes; call when it has ended."""
+        for thread in self._threads:
+            thread.join(1.0)
+        if self._popen is not None:
+            for pipe in (self._popen.stdin, self._popen.stdout, self._popen.stderr):
+                if pipe is not None:
+                    pipe.close()
+
+    def _read(self, pipe: IO[bytes], on_line: Callable[[bytes], None]) -> None:
+        for line in pipe:
+            self._post(partial(on_line, line))
+
+    def _read_beginning(self, pipe: IO[bytes], on_line: Callable[[bytes], None]) -> None:
+        """Read all of it, so that the process never waits, but hand on `_SHOWN_LINES` lines only."""
+        count = 0
+        while line := pipe.readline(_LINE_BYTES):
+            count += 1
+            if count <= _SHOWN_LINES:
+                self._post(partial(on_line, line))
+            elif count == _SHOWN_LINES + 1:
+                self._post(partial(on_line, b"(it writes a lot; nothing more of it is shown)"))
+
+    def _wait(self, readers: Sequence[threading.Thread], on_exit: Callable[[str, int], None]) -> None:
+        assert self._popen is not None
+        code = self._popen.wait()
+        for reader in readers:
+            reader.join(1.0)
+        self._post(lambda: on_exit(self.name, code))
+
+
+def how_it_ended(code: int) -> str:
+    """What a message says of an exit code, or of a signal if it is negative."""
+    if code >= 0:
+        return f"ended with exit code {code}"
+    try:
+        return f"was ended by {signal.Signals(-code).name}"
+    except ValueError:
+        return f"was ended by signal {-code}"

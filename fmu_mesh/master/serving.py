@@ -1,0 +1,147 @@
+"""The master's face to the rest of the world: what it answers to queries, its status, and the log of all instances.
+
+Everything that arrives, on foreign threads, is posted to the main thread.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import socket
+import time
+from collections.abc import Callable, Sequence
+from typing import Literal, Protocol
+
+import msgspec
+import zenoh
+
+from .. import __version__
+from ..model.plan import Plan
+from ..wire.inbox import Inbox
+from ..wire.keys import Keys
+from ..wire.session import matches, undeclare_all
+from ..wire.values import json_encoding
+from ..wire.views import LogLine, MeshInfo, MeshStatus
+
+__all__ = ["STATUS_S", "Events", "Server", "mesh_info"]
+
+log = logging.getLogger(__name__)
+
+STATUS_S = 0.1
+"""How often the status is published."""
+
+
+class Events(Protocol):
+    """What the master tells whoever started it. Called on the master's main thread."""
+
+    def status(self, status: MeshStatus) -> None:
+        """The state of the run, about ten times a second."""
+        ...
+
+    def log(self, line: LogLine) -> None:
+        """A log message of an FMU, or about a setting that was refused."""
+        ...
+
+
+class Server:
+    """Serves the queries of one run.
+
+    Args:
+        session: the session of this process; stays the caller's.
+        inbox: the inbox of the master.
+        status: the state of the run right now.
+    """
+
+    def __init__(
+        self, session: zenoh.Session, keys: Keys, inbox: Inbox, events: Events, status: Callable[[], MeshStatus]
+    ) -> None:
+        self._session = session
+        self._keys = keys
+        self._inbox = inbox
+        self._events = events
+        self._status = status
+        self._status_published = 0.0
+        self._entities: list[zenoh.Queryable[None] | zenoh.Subscriber[None]] = []
+        self._status_publisher = session.declare_publisher(
+            self._keys.mesh_key("status"), encoding=json_encoding, congestion_control=zenoh.CongestionControl.DROP
+        )
+
+    def serve(self, key: str, answer: Callable[[zenoh.Query], None]) -> None:
+        """From now on ``answer`` gets the queries of a key."""
+        post = self._inbox.post
+        self._entities.append(self._session.declare_queryable(key, lambda query: post(lambda: answer(query))))
+
+    def show(self, what: Literal["info", "status", "plan"], view: Callable[[], object]) -> None:
+        """From now on a key of the mesh is answered with a view."""
+        key = self._keys.mesh_key(what)
+
+        def reply(query: zenoh.Query) -> None:
+            query.reply(key, msgspec.json.encode(view()), encoding=json_encoding)
+            query.drop()
+
+        self.serve(key, reply)
+
+    def watch(self, token_changed: Callable[[zenoh.Sample], None]) -> None:
+        """From now on the log of all instances is handed on, and every change of a node's token."""
+        post = self._inbox.post
+        session = self._session
+        self._entities.append(
+            session.liveliness().declare_subscriber(
+                self._keys.node_token("*"), lambda sample: post(lambda: token_changed(sample)), history=True
+            )
+        )
+        self._entities.append(
+            session.declare_subscriber(f"{self._keys.root}/*/log", lambda sample: post(lambda: self._log(sample)))
+        )
+
+    def _log(self, sample: zenoh.Sample) -> None:
+        try:
+            self._events.log(msgspec.json.decode(sample.payload.to_bytes(), type=LogLine))
+        except msgspec.DecodeError as error:
+            log.warning("log_line_not_understood", extra={"key": str(sample.key_expr), "error": str(error)})
+
+    def publish_status(self, *, final: bool = False) -> None:
+        """Publish the status if it is time to."""
+        now = time.monotonic()
+        if not final and now - self._status_published < STATUS_S:
+            return
+        self._status_published = now
+        status = self._status()
+        self._events.status(status)
+        if matches(self._status_publisher):
+            self._status_publisher.put(msgspec.json.encode(status))
+
+    def close(self) -> None:
+        """Undeclare everything."""
+        undeclare_all(self._entities, [self._status_publisher])
+
+
+def mesh_info(plan: Plan, config_file: str, endpoints: Sequence[str], shared: Sequence[str]) -> MeshInfo:
+    """What `mesh/info` answers.
+
+    Args:
+        plan: the plan of the whole mesh.
+        config_file: name of the configuration file.
+        endpoints: where tools can reach this process.
+        shared: who gets all messages through shared memory.
+    """
+    config = plan.system.config
+    grid = plan.grid
+    return MeshInfo(
+        mesh=config.mesh,
+        version=__version__,
+        config=config_file,
+        start_time=grid.start_time,
+        stop_time=grid.stop_time,
+        step_size=grid.step_size,
+        algorithm=config.simulation.algorithm,
+        window=plan.window,
+        real_time_factor=config.simulation.real_time_factor,
+        instances=tuple(plan.system.instances),
+        nodes=tuple(plan.nodes),
+        result_file=plan.system.result_file,
+        endpoints=tuple(endpoints),
+        pid=os.getpid(),
+        host=socket.gethostname(),
+        shared_memory=tuple(shared),
+    )

@@ -1,0 +1,90 @@
+"""What a node is doing right now, as `status` shows it and as a step that does not return is found.
+
+The main thread only writes a few attributes; the server's thread looks at them and at how far the instances are.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+
+from ..errors import StepFailed
+from ..model.plan import NodePlan
+from ..wire.views import InstanceStatus
+from .stepping import Runner
+
+__all__ = ["Activity"]
+
+
+class Activity:
+    """What one node is doing.
+
+    Attributes:
+        state: in one or two words, for `status`.
+        waiting: whether the main thread waits for a message.
+        waited_s: how long it has waited since the first point.
+        runners: the instances, once all are loaded.
+    """
+
+    def __init__(self, plan: NodePlan) -> None:
+        self.state = "starting"
+        self.waiting = False
+        self.waited_s = 0.0
+        self.runners: Mapping[str, Runner] = {}
+        self._plan = plan
+        self._started: float | None = None
+        self._stalled_since: dict[str, tuple[int, float]] = {}
+
+    def started(self) -> None:
+        """The instances are at their first point."""
+        self._started = time.monotonic()
+
+    def status(self, name: str) -> InstanceStatus:
+        """What `status` answers for an instance of this process."""
+        runner = self.runners.get(name)
+        if runner is None:
+            return InstanceStatus(name, self.state, self.state, 0, self._plan.grid.time(0), 0.0, 0.0)
+        return InstanceStatus(
+            instance=name,
+            state=self.state,
+            activity=self._in_words(runner),
+            point=runner.point,
+            time=self._plan.grid.time(runner.point),
+            step_time=runner.step_seconds / runner.step if runner.step else 0.0,
+            wait_time=self.waited_s,
+            running_time=time.monotonic() - self._started if self._started is not None else 0.0,
+        )
+
+    def hang(self, now: float) -> StepFailed | None:
+        """The error of a step that has not returned in its time, if there is one.
+
+        Other calls of an FMU are watched by `fmu_mesh.fmu.guard.CallWatch`.
+        """
+        if self.state != "running" or self.waiting:
+            return None
+        for name, runner in self.runners.items():
+            stalled_s = now - self._stalled(name, now)
+            if stalled_s > self._plan.timeouts.step:
+                return StepFailed(
+                    f"the FMU has not returned for {stalled_s:.1f} s from doStep; its process is ended",
+                    instance=name,
+                    point=runner.point,
+                    time=self._plan.grid.time(runner.point),
+                    hint="If it needs that long, raise `timeouts.step` in the configuration.",
+                )
+        return None
+
+    def _in_words(self, runner: Runner) -> str:
+        if self.state != "running":
+            return self.state
+        if self.waiting:
+            return f"waiting at point {runner.point} for {runner.lacking()}"
+        now = time.monotonic()
+        return f"in doStep at point {runner.point} for {now - self._stalled(runner.name, now):.1f} s"
+
+    def _stalled(self, name: str, now: float) -> float:
+        """Since when an instance has been at its point, as far as was seen; costs the hot loop nothing."""
+        step = self.runners[name].step
+        if self.waiting or self._stalled_since.get(name, (-1, 0.0))[0] != step:
+            self._stalled_since[name] = (step, now)
+        return self._stalled_since[name][1]

@@ -1,0 +1,214 @@
+"""Answers to the queries of a node, and the settings that it takes.
+
+On the server's thread. Values come from rows that were completed, or are read by the main thread at the next point;
+settings are checked here and made by the main thread. A query that waits for a point is refused when that takes long.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from functools import partial
+
+import msgspec
+import zenoh
+
+from ..model.description import Value, Variable
+from ..model.plan import NodePlan
+from ..wire.inbox import Inbox
+from ..wire.keys import Keys
+from ..wire.values import ValueRefused, attachment, encode_value, json_encoding
+from ..wire.views import LogLine, SetAnswer
+from .activity import Activity
+from .info import instance_info
+from .inputs import set_input
+from .settings import checked_setting
+from .stepping import Runner
+from .streams import kind_of
+
+__all__ = ["Answers", "Job"]
+
+_ANSWER_S = 2.0
+
+Job = Callable[[], None]
+
+
+class Answers:
+    """Answers for the instances of one node.
+
+    Args:
+        plan: what the node has to do.
+        inbox: the inbox of the node, for what the main thread has to do.
+        activity: what the node is doing.
+        post: from any thread: has the server's thread do something.
+        log: publishes a log message; on the server's thread.
+    """
+
+    def __init__(
+        self,
+        plan: NodePlan,
+        inbox: Inbox,
+        activity: Activity,
+        post: Callable[[Job], None],
+        log: Callable[[LogLine], None],
+    ) -> None:
+        self._plan = plan
+        self._keys = Keys(plan.key_prefix, plan.mesh)
+        self._inbox = inbox
+        self._activity = activity
+        self._post = post
+        self._log = log
+        self._pending: list[_Pending] = []
+
+    def answer(self, name: str, query: zenoh.Query) -> None:
+        """Answer everything under the instance's key that the query's key expression matches."""
+        root = self._keys.instance(name)
+        asked = query.key_expr
+        runner = self._activity.runners.get(name)
+        if query.payload is not None:
+            self._answer_setting(name, query)
+            return
+        for what in ("info", "status"):
+            if asked.intersects(zenoh.KeyExpr(f"{root}/{what}")):
+                if what == "status":
+                    query.reply(
+                        f"{root}/status", msgspec.json.encode(self._activity.status(name)), encoding=json_encoding
+                    )
+                elif runner is not None:
+                    query.reply(
+                        f"{root}/info", msgspec.json.encode(instance_info(self._plan, runner)), encoding=json_encoding
+                    )
+        wanted = self._variables_matching(runner, asked) if runner is not None else []
+        if runner is None or not wanted:
+            query.drop()
+            return
+        if self._activity.state != "running":
+            query.reply_err(f"'{name}' has no values now: {self._activity.state}")
+            query.drop()
+            return
+        known, unknown = self._split(runner, wanted)
+        self._reply_values(runner, query, known, runner.step)
+        if unknown:
+            self._read_at_next_point(runner, query, unknown)
+        else:
+            query.drop()
+
+    def put_arrived(self, runner: Runner, sample: zenoh.Sample) -> None:
+        """On a foreign thread: take a value that was put; what is wrong with it goes into the log."""
+        attachment = sample.attachment.to_bytes() if sample.attachment is not None else None
+        data = sample.payload.to_bytes()
+        self._post(partial(self._take_put, runner, str(sample.key_expr), data, attachment))
+
+    def refuse_late(self, now: float) -> None:
+        """Refuse the queries that have waited too long for a point."""
+        for pending in [p for p in self._pending if now - p.asked > _ANSWER_S]:
+            self._pending.remove(pending)
+            pending.refuse(f"not at a point yet: {self._activity.status(pending.instance).activity}")
+
+    def _variables_matching(self, runner: Runner, asked: zenoh.KeyExpr) -> list[tuple[str, Variable]]:
+        """(key, variable) of all variables that a key expression matches."""
+        matching = []
+        for variable in runner.instance.description.variables:
+            kind = kind_of(variable)
+            if kind is not None:
+                key = self._keys.variable(runner.name, kind, variable.name)
+                if asked.intersects(zenoh.KeyExpr(key)):
+                    matching.append((key, variable))
+        return matching
+
+    def _split(
+        self, runner: Runner, wanted: list[tuple[str, Variable]]
+    ) -> tuple[list[tuple[str, Value]], list[tuple[str, Variable]]]:
+        """Values that the rings hold, and variables that only the FMU knows."""
+        names = {*runner.outputs.layout.names}
+        known = [(key, runner.outputs.value(runner.step, v.name)) for key, v in wanted if v.name in names]
+        return known, [(key, v) for key, v in wanted if v.name not in names]
+
+    def _reply_values(self, runner: Runner, query: zenoh.Query, values: list[tuple[str, Value]], step: int) -> None:
+        point = step * runner.plan.step_points
+        stamp = attachment(point, self._plan.grid.time(point))
+        for key, value in values:
+            query.reply(key, encode_value(value), encoding=json_encoding, attachment=stamp)
+
+    def _read_at_next_point(self, runner: Runner, query: zenoh.Query, wanted: list[tuple[str, Variable]]) -> None:
+        pending = _Pending(runner.name, query)
+        self._pending.append(pending)
+
+        def read() -> None:
+            values = runner.instance.get_values([variable.name for _, variable in wanted])
+            pairs = [(key, value) for (key, _), value in zip(wanted, values, strict=True)]
+            step = runner.step
+            self._post(lambda: self._finish(pending, lambda: self._reply_values(runner, query, pairs, step)))
+
+        self._inbox.post(read)
+
+    def _finish(self, pending: _Pending, reply: Job) -> None:
+        """Answer a query that waited for a point, unless it was refused in the meantime."""
+        if pending in self._pending:
+            self._pending.remove(pending)
+            reply()
+            pending.query.drop()
+
+    def _take_put(self, runner: Runner, key: str, data: bytes, attachment: bytes | None) -> None:
+        try:
+            new = checked_setting(runner, self._keys.instance(runner.name), key, data, attachment)
+        except ValueRefused as refused:
+            self._log(LogLine(runner.name, "warning", "set", str(refused), runner.point))
+            return
+
+        def take() -> None:
+            try:
+                set_input(runner.instance, new.variable, new.value, new.time, runner.step)
+            except ValueRefused as refused:
+                self._post(partial(self._log, LogLine(runner.name, "warning", "set", str(refused), runner.point)))
+
+        self._inbox.post(take)
+
+    def _answer_setting(self, name: str, query: zenoh.Query) -> None:
+        """A query with a payload sets a value and is told from which point on it holds, or why it was refused."""
+        runner = self._activity.runners.get(name)
+        key = str(query.key_expr)
+        if runner is None:
+            query.reply_err(f"'{name}' is still being loaded")
+            query.drop()
+            return
+        data = query.payload.to_bytes() if query.payload else b""
+        attachment = query.attachment.to_bytes() if query.attachment is not None else None
+        try:
+            new = checked_setting(runner, self._keys.instance(runner.name), key, data, attachment)
+        except ValueRefused as refused:
+            query.reply_err(str(refused))
+            query.drop()
+            return
+        pending = _Pending(name, query)
+        self._pending.append(pending)
+
+        def take() -> None:
+            try:
+                step = set_input(runner.instance, new.variable, new.value, new.time, runner.step)
+            except ValueRefused as refused:
+                reason = str(refused)
+                self._post(lambda: self._finish(pending, lambda: query.reply_err(reason)))
+                return
+            point = step * runner.plan.step_points
+            answer = SetAnswer(key, point, self._plan.grid.time(point))
+            self._post(
+                lambda: self._finish(
+                    pending, lambda: query.reply(key, msgspec.json.encode(answer), encoding=json_encoding)
+                )
+            )
+
+        self._inbox.post(take)
+
+
+class _Pending:
+    """A query that waits for its instance to come to a point."""
+
+    def __init__(self, instance: str, query: zenoh.Query) -> None:
+        self.instance = instance
+        self.query = query
+        self.asked = time.monotonic()
+
+    def refuse(self, reason: str) -> None:
+        self.query.reply_err(reason)
+        self.query.drop()
