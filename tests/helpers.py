@@ -60,8 +60,8 @@ def wait_until(condition: Callable[[], Value | None], what: str, deadline_s: flo
 
 
 def on_a_busy_machine(seconds: float) -> float:
-    """What takes ``seconds`` where a core is free may take this long now: as many times as processes share a core."""
-    return seconds * max(1.0, os.getloadavg()[0] / (os.cpu_count() or 1))
+    """What takes ``seconds`` on an idle machine may take this long now: as many times as processes want to run."""
+    return seconds * max(1.0, os.getloadavg()[0])
 
 
 def write_config(
