@@ -235,7 +235,7 @@ def test_a_wrong_option_is_told_as_it_was_written(
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (["chek", "mesh.yaml"], "there is no command 'chek'. Did you mean 'check'?"),
+        (["lunch", "mesh.yaml"], "there is no command 'lunch'. Did you mean 'launch'?"),
         (["mesh.yaml"], "Did you mean `fmu-mesh launch mesh.yaml`?"),
         (["Gain.fmu"], "Did you mean `fmu-mesh run Gain.fmu`?"),
         (["launch", "Gain.fmu"], "expected a configuration file; `fmu-mesh run Gain.fmu` runs one FMU"),
