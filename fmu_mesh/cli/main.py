@@ -14,14 +14,14 @@ from ..errors import ConfigurationError, FmuMeshError, Interrupted
 from ..model.findings import nearest
 from . import checking, free_running, inspecting, looking, playing, plotting, running, top
 
-__all__ = ["main"]
+__all__ = ["command_parser", "main"]
 
 Command = Callable[[argparse.Namespace], int]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code (design, section 7)."""
-    parser, names = _parser()
+    parser, names = command_parser()
     given = sys.argv[1:] if arguments is None else arguments
     if given and not given[0].startswith("-") and given[0] not in names:
         print(f"fmu-mesh: {_unknown(given[0], names)}", file=sys.stderr)
@@ -62,7 +62,7 @@ def _unknown(name: str, commands: Sequence[str]) -> ConfigurationError:
     return ConfigurationError(f"there is no command '{name}'.", hint=hint)
 
 
-def _parser() -> tuple[argparse.ArgumentParser, list[str]]:
+def command_parser() -> tuple[argparse.ArgumentParser, list[str]]:
     """The parser, and the names of all commands."""
     parser = argparse.ArgumentParser(
         prog="fmu-mesh",
