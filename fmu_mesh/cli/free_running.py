@@ -72,10 +72,20 @@ def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.Arg
     )
     run.add_argument("--output", type=Path, metavar="FILE.csv", help="record all outputs into a file")
     run.add_argument(
-        "--listen", type=endpoint, action="append", default=[], metavar="ENDPOINT", help="listen there; repeatable"
+        "--listen",
+        type=endpoint,
+        action="append",
+        default=[],
+        metavar="ENDPOINT",
+        help="listen there, such as tcp/0.0.0.0:7447; repeatable",
     )
     run.add_argument(
-        "--connect", type=endpoint, action="append", default=[], metavar="ENDPOINT", help="connect there; repeatable"
+        "--connect",
+        type=endpoint,
+        action="append",
+        default=[],
+        metavar="ENDPOINT",
+        help="connect there, such as tcp/HOST:PORT; repeatable",
     )
     run.add_argument("--no-progress", action="store_true", help="no progress line")
     run.set_defaults(run_command=_run)

@@ -74,7 +74,11 @@ def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.Arg
 
     router = add_command(commands, "router", "run a Zenoh router", [common])
     router.add_argument(
-        "--listen", type=endpoint, action="append", metavar="ENDPOINT", help="default: tcp/127.0.0.1:7447"
+        "--listen",
+        type=endpoint,
+        action="append",
+        metavar="ENDPOINT",
+        help="listen there; repeatable; default: tcp/127.0.0.1:7447",
     )
     router.set_defaults(run_command=_router)
 
