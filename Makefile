@@ -16,8 +16,6 @@ help: ## show this list
 
 demo: $(VENV)/.installed-plot ## the main job: two FMUs in two processes under a master, with result and plot
 	@$(BIN)/fmu-mesh launch configs/pendulum_delay.yaml --plot $(RESULT).png
-	@echo "Result: $(RESULT).csv"
-	@echo "Plot:   $(RESULT).png"
 
 test: $(VENV)/.installed-test ## all tests; PYTEST_ARGS='-k name' replaces the arguments
 	@$(BIN)/python -m pytest $(PYTEST_ARGS)

@@ -9,12 +9,13 @@ from typing import Any
 
 from ..launch.preparing import Options, prepare
 from ..model.description import Variable
-from ..model.findings import shown
+from ..model.findings import listed, shown
 from ..model.grouping import automatic_nodes
 from ..model.initialization import Loop
 from ..model.plan import Plan
 from ..model.schema import schema_text
 from ..model.system import Connection, SystemInstance
+from .arguments import add_command
 from .display import say
 from .tables import pairs, table
 
@@ -25,14 +26,14 @@ _PROBLEM_CHARACTERS = 100
 
 def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.ArgumentParser) -> None:
     """Add the commands of this module."""
-    check = commands.add_parser("check", parents=[common], help="check a configuration and show its plan; run nothing")
+    check = add_command(commands, "check", "check a configuration and show its plan; run nothing", [common])
     check.add_argument("config", type=Path, metavar="CONFIG", help="the configuration file")
     check.add_argument("--window", type=int, metavar="N", help="how many points a node may run ahead; 1 is lockstep")
     check.add_argument(
         "--set", action="append", default=[], metavar="INSTANCE.VARIABLE=VALUE", help="another start value; repeatable"
     )
     check.set_defaults(run_command=_check)
-    schema = commands.add_parser("schema", parents=[common], help="print the JSON Schema of configurations")
+    schema = add_command(commands, "schema", "print the JSON Schema of configurations", [common])
     schema.set_defaults(run_command=_schema)
 
 
@@ -56,6 +57,7 @@ def plan_page(plan: Plan) -> list[str]:
         ("Connections", _connections(plan)),
         ("Execution order within one point", _order(plan)),
         ("Groups", _groups(plan)),
+        ("Inputs that are not connected", _free_inputs(plan)),
         ("Initialization", _initialization(plan)),
         ("Recorded", _recorded(plan)),
         ("Warnings", _warnings(plan)),
@@ -131,6 +133,19 @@ def _connections(plan: Plan) -> list[str]:
             what = "goes on linearly in the step" if c.delay else "changes linearly in the step"
         rows.append([str(c), f"delay {c.delay}", what, _arithmetic(c), closing, c.units])
     return table(rows, indent=2)
+
+
+def _free_inputs(plan: Plan) -> list[str]:
+    """What keeps its start value unless somebody sets it; a connection that was forgotten shows here."""
+    connected = {(c.target_instance, c.target.name) for c in plan.connections}
+    lines = []
+    for name, instance in plan.system.instances.items():
+        free = [v for v in instance.description.variables if v.causality == "input" and (name, v.name) not in connected]
+        starts = [(v, instance.start_values.get(v.name, v.start)) for v in free]
+        shown_ = [f"{v.name}{f' = {shown(start)}' if start is not None else ''}{_unit(v)}" for v, start in starts]
+        if shown_:
+            lines.append([name, listed(shown_)])
+    return table(lines, indent=2)
 
 
 def _arithmetic(c: Connection) -> str:

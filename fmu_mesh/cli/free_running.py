@@ -6,8 +6,8 @@ It is a mesh of one instance, whose configuration is made here from the options,
 from __future__ import annotations
 
 import argparse
-import math
 import os
+import re
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +18,12 @@ from ..errors import ConfigurationError, LoadFailed
 from ..fmu import read_description
 from ..launch.launcher import Launcher
 from ..launch.preparing import Options, planned
+from ..model.config_base import NAME_PATTERN
 from ..model.description import ModelDescription
 from ..model.loading import LoadedConfig, parse
 from ..model.plan import Plan
 from ..wire.runtime import remove_run_folder, run_folder
+from .arguments import add_command, endpoint, no_fmu, number
 from .display import Display
 from .running import close, run_launcher
 
@@ -33,32 +35,32 @@ _CATCH_UP_S = 1.0
 
 def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.ArgumentParser) -> None:
     """Add the command of this module."""
-    run = commands.add_parser("run", parents=[common], help="run one FMU as a free-running node, without a file")
+    run = add_command(commands, "run", "run one FMU as a free-running node, without a file", [common])
     run.add_argument("fmu", type=Path, metavar="MODEL.fmu", help="the FMU")
     run.add_argument("--name", help="name of the mesh and of its instance; default: the model identifier")
-    run.add_argument("--step-size", type=_number, metavar="S", help="step size in s; default: that of the FMU")
+    run.add_argument("--step-size", type=number, metavar="S", help="step size in s; default: that of the FMU")
     run.add_argument(
         "--update-period",
-        type=_number,
+        type=number,
         default=_UPDATE_PERIOD_S,
         metavar="S",
         help="wall-clock time in s after which the steps that are due are taken (0.01)",
     )
     run.add_argument(
         "--real-time-factor",
-        type=_number,
+        type=number,
         default=1.0,
         metavar="F",
         help="1: wall clock (default); 2: twice as fast; 0: as fast as possible",
     )
     run.add_argument(
         "--catch-up",
-        type=_number,
+        type=number,
         default=_CATCH_UP_S,
         metavar="S",
         help="how far in s it may fall behind the wall clock before it gives up what it lost (1)",
     )
-    run.add_argument("--stop-time", type=_number, metavar="S", help="stop time in s; default: until it is stopped")
+    run.add_argument("--stop-time", type=number, metavar="S", help="stop time in s; default: until it is stopped")
     run.add_argument(
         "--set", action="append", default=[], metavar="VARIABLE=VALUE", help="another start value; repeatable"
     )
@@ -69,28 +71,38 @@ def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.Arg
         help="how inputs go from one time to the next; other types than Real hold (linear)",
     )
     run.add_argument("--output", type=Path, metavar="FILE.csv", help="record all outputs into a file")
-    run.add_argument("--listen", action="append", default=[], metavar="ENDPOINT", help="listen there; repeatable")
-    run.add_argument("--connect", action="append", default=[], metavar="ENDPOINT", help="connect there; repeatable")
+    run.add_argument(
+        "--listen",
+        type=endpoint,
+        action="append",
+        default=[],
+        metavar="ENDPOINT",
+        help="listen there, such as tcp/0.0.0.0:7447; repeatable",
+    )
+    run.add_argument(
+        "--connect",
+        type=endpoint,
+        action="append",
+        default=[],
+        metavar="ENDPOINT",
+        help="connect there, such as tcp/HOST:PORT; repeatable",
+    )
     run.add_argument("--no-progress", action="store_true", help="no progress line")
     run.set_defaults(run_command=_run)
-
-
-def _number(text: str) -> float:
-    value = float(text)
-    if not math.isfinite(value):
-        raise argparse.ArgumentTypeError(f"{text} is not a finite number")
-    return value
 
 
 def _run(arguments: argparse.Namespace) -> int:
     try:
         description = read_description(arguments.fmu)
     except LoadFailed as error:
-        raise ConfigurationError(error.message, hint=error.hint) from error
+        raise no_fmu(arguments.fmu, error) from error
     name = arguments.name if arguments.name is not None else description.model_identifier
+    if re.search(NAME_PATTERN, name) is None:
+        what = "a name of letters, digits, _ and - that starts with a letter or _"
+        raise ConfigurationError(f"'{name}' is not {what}", hint="Give the mesh such a name with --name.")
     options = Options(start_values=tuple(f"{name}.{change}" for change in arguments.set))
     text = msgspec.json.encode(_configuration(arguments, name, description)).decode()
-    loaded = _named_by_options(parse(text, arguments.fmu, options.start_values), arguments)
+    loaded = _named_by_options(parse(text, arguments.fmu, options.start_values), name, arguments)
     plan = planned(loaded, loaded.findings(), options)
     file = run_folder(plan.system.config.mesh, str(os.getpid())) / "run.yaml"
     try:
@@ -130,11 +142,12 @@ def _configuration(arguments: argparse.Namespace, name: str, description: ModelD
     }
 
 
-def _named_by_options(loaded: LoadedConfig, arguments: argparse.Namespace) -> LoadedConfig:
+def _named_by_options(loaded: LoadedConfig, name: str, arguments: argparse.Namespace) -> LoadedConfig:
     """The configuration whose findings name the options and no lines, because nobody has written a file."""
     names = {
         f"simulation.{field}": f"--{field.replace('_', '-')} {value:g}"
         for field in ("stop_time", "step_size", "real_time_factor", "update_period", "catch_up")
         if (value := getattr(arguments, field)) is not None
     }
-    return replace(loaded, lines={}, overrides={**loaded.overrides, **names})
+    names |= {place: text.replace(f"--set {name}.", "--set ", 1) for place, text in loaded.overrides.items()}
+    return replace(loaded, lines={}, overrides=names)

@@ -16,7 +16,8 @@ import msgspec
 from ..errors import ConfigurationError, LoadFailed
 from ..fmu import read_description, sha256_of
 from ..model.description import Causality, ModelDescription, Variable
-from ..model.findings import nearest, nearest_file, shown
+from ..model.findings import nearest, shown
+from .arguments import add_command, no_fmu
 from .tables import pairs
 
 __all__ = ["Inspection", "add_commands", "inspect_fmu", "inspection_page"]
@@ -64,7 +65,7 @@ class Inspection(msgspec.Struct, frozen=True, omit_defaults=False):
 
 def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.ArgumentParser) -> None:
     """Add the commands of this module."""
-    inspect = commands.add_parser("inspect", parents=[common], help="show what an FMU is; run nothing")
+    inspect = add_command(commands, "inspect", "show what an FMU is; run nothing", [common])
     inspect.add_argument("fmu", type=Path, metavar="MODEL.fmu", help="the FMU, or the folder of an unpacked one")
     inspect.add_argument(
         "variables",
@@ -91,8 +92,7 @@ def inspect_fmu(path: Path) -> Inspection:
             description = read_description(path, to_run=False)  # if it can be read, the page says why it cannot run
             reasons = (str(error),)
     except LoadFailed as error:
-        near = None if path.exists() else nearest_file(path)
-        raise ConfigurationError(error.message, hint=f"Did you mean '{near}'?" if near else error.hint) from error
+        raise no_fmu(path, error) from error
     return Inspection(
         file=str(path),
         sha256=sha256_of(path),
@@ -156,7 +156,7 @@ def _facts(inspection: Inspection, width: int) -> list[str]:
     needs = ["one process for each instance"] if description.only_once_per_process else []
     needs += ["the tool that made it"] if description.needs_execution_tool else []
     counts = [
-        f"{count} {title.lower()}"
+        f"{count} {title.lower() if count > 1 else title.lower().removesuffix('s')}"
         for causality, title in _CAUSALITIES
         if (count := len(description.with_causality(causality)))
     ]

@@ -6,7 +6,6 @@ Owns what these commands print; what they ask is `fmu_mesh.wire.client`.
 from __future__ import annotations
 
 import argparse
-import math
 from collections.abc import Callable
 from itertools import islice
 from typing import Any
@@ -18,6 +17,7 @@ from ..wire.client import MeshClient
 from ..wire.reaching import Meshes
 from ..wire.readings import Target
 from ..wire.views import Command, InstanceInfo, InstanceStatus, MeshInfo, MeshStatus
+from .arguments import add_command, count, endpoint, positive_seconds
 from .pages import (
     cells,
     instance_info,
@@ -31,7 +31,7 @@ from .pages import (
 )
 from .tables import table
 
-__all__ = ["add_commands", "positive_seconds", "reaching"]
+__all__ = ["add_commands", "reaching"]
 
 _TIMEOUT_S = 5.0
 _REFERENCE = "`instance.variable` (with `*` for any characters), or a key (with the wildcards of Zenoh)"
@@ -43,7 +43,7 @@ def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.Arg
     """Add the commands of this module."""
 
     def add(name: str, run: Run, text: str, *, json: bool = True) -> argparse.ArgumentParser:
-        parser: argparse.ArgumentParser = commands.add_parser(name, parents=[common, reaching()], help=text)
+        parser = add_command(commands, name, text, [common, reaching()])
         if json:
             parser.add_argument("--json", action="store_true", help="JSON, one object per line")
         parser.set_defaults(run_command=lambda arguments: _with_meshes(arguments, run))
@@ -65,7 +65,7 @@ def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.Arg
     set_.add_argument("value", metavar="VALUE", help="a number, true, false, text, or [a, list] for an array")
     watch = add("watch", _watch, "show every value of variables until the mesh ends")
     watch.add_argument("key", nargs="+", metavar="KEY", help=_REFERENCE)
-    watch.add_argument("--count", type=_positive, metavar="N", help="end after N values")
+    watch.add_argument("--count", type=count, metavar="N", help="end after N values")
     for name, text in (
         ("pause", "hold a mesh at a point"),
         ("resume", "let a paused mesh run on"),
@@ -75,7 +75,7 @@ def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.Arg
         parser = add(name, _command, text)
         parser.add_argument("mesh", metavar="MESH", help="name or key of the mesh")
         if name == "step":
-            parser.add_argument("points", nargs="?", type=_positive, default=1, metavar="N", help="points (1)")
+            parser.add_argument("points", nargs="?", type=count, default=1, metavar="N", help="points (1)")
 
 
 def reaching() -> argparse.ArgumentParser:
@@ -83,6 +83,7 @@ def reaching() -> argparse.ArgumentParser:
     options = argparse.ArgumentParser(add_help=False)
     options.add_argument(
         "--connect",
+        type=endpoint,
         action="append",
         default=[],
         metavar="ENDPOINT",
@@ -97,21 +98,6 @@ def reaching() -> argparse.ArgumentParser:
 def _with_meshes(arguments: argparse.Namespace, run: Run) -> int:
     with Meshes(arguments.connect, arguments.timeout) as meshes:
         return run(arguments, meshes)
-
-
-def positive_seconds(text: str) -> float:
-    """A time in s of the command line."""
-    value = float(text)
-    if not (math.isfinite(value) and value > 0.0):
-        raise argparse.ArgumentTypeError(f"{text} is not a time above 0")
-    return value
-
-
-def _positive(text: str) -> int:
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"{text} is not a number of 1 or more")
-    return value
 
 
 # --- ls, status, info

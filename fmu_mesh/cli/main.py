@@ -7,20 +7,26 @@ import logging
 import os
 import sys
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 from .. import __version__
 from ..errors import ConfigurationError, FmuMeshError, Interrupted
+from ..model.findings import nearest
 from . import checking, free_running, inspecting, looking, playing, plotting, running, top
 
-__all__ = ["main"]
+__all__ = ["command_parser", "main"]
 
 Command = Callable[[argparse.Namespace], int]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code (design, section 7)."""
-    parser = _parser()
-    options = parser.parse_args(arguments)
+    parser, names = command_parser()
+    given = sys.argv[1:] if arguments is None else arguments
+    if given and not given[0].startswith("-") and given[0] not in names:
+        print(f"fmu-mesh: {_unknown(given[0], names)}", file=sys.stderr)
+        return ConfigurationError.exit_code
+    options = parser.parse_args(given)
     if options.command is None:
         parser.print_help()
         return ConfigurationError.exit_code
@@ -45,7 +51,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0
 
 
-def _parser() -> argparse.ArgumentParser:
+def _unknown(name: str, commands: Sequence[str]) -> ConfigurationError:
+    """What to say to something that is no command, such as a file that something is to be done with."""
+    suffix = Path(name).suffix
+    near = nearest(name, commands)
+    if suffix in (".yaml", ".yml", ".fmu"):
+        hint = f"Did you mean `fmu-mesh {'run' if suffix == '.fmu' else 'launch'} {name}`?"
+    else:
+        hint = f"Did you mean '{near}'?" if near is not None else "`fmu-mesh --help` lists them."
+    return ConfigurationError(f"there is no command '{name}'.", hint=hint)
+
+
+def command_parser() -> tuple[argparse.ArgumentParser, list[str]]:
+    """The parser, and the names of all commands."""
     parser = argparse.ArgumentParser(
         prog="fmu-mesh",
         description="A service mesh for co-simulation: FMUs as Zenoh nodes under one master.",
@@ -57,6 +75,6 @@ def _parser() -> argparse.ArgumentParser:
     common.add_argument("--debug", action="store_true", help="show the traceback of an error")
     parser.set_defaults(debug=False)
     commands = parser.add_subparsers(dest="command", metavar="COMMAND")
-    for module in (running, free_running, checking, inspecting, looking, top, plotting, playing):
+    for module in (running, free_running, checking, inspecting, looking, top, playing, plotting):
         module.add_commands(commands, common)
-    return parser
+    return parser, [*commands.choices]

@@ -11,6 +11,7 @@ from ..model.loading import load
 from ..ros.bag_reading import Bag, chosen_topics
 from ..ros.playing import grid_of, play, schedule
 from ..wire.reaching import Meshes
+from .arguments import add_command, endpoint, number, positive_seconds
 
 __all__ = ["add_commands"]
 
@@ -19,7 +20,7 @@ _TIMEOUT_S = 60.0
 
 def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.ArgumentParser) -> None:
     """Add the command of this module."""
-    command = commands.add_parser("play", parents=[common], help="feed a recorded bag into the inputs of a mesh")
+    command = add_command(commands, "play", "feed a recorded bag into the inputs of a mesh", [common])
     command.add_argument("bag", type=Path, metavar="BAG", help="an MCAP file, or the folder of a `ros2 bag`")
     command.add_argument("mesh", nargs="?", metavar="MESH", help="name or key of the mesh; default: the only one")
     command.add_argument(
@@ -30,7 +31,7 @@ def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.Arg
         help="what goes where; repeatable; default: the topics that the mesh subscribes to",
     )
     command.add_argument(
-        "--start", type=float, metavar="T", help="simulation time of the first message in s; default: its stamp"
+        "--start", type=number, metavar="T", help="simulation time of the first message in s; default: its stamp"
     )
     command.add_argument(
         "--stamps", choices=("header", "log"), default="header", help="header stamps where there are some, or log times"
@@ -38,9 +39,11 @@ def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.Arg
     command.add_argument(
         "--config", type=Path, metavar="CONFIG", help="the configuration, where it is not on this host"
     )
-    command.add_argument("--connect", action="append", default=[], metavar="ENDPOINT", help="where the mesh is")
     command.add_argument(
-        "--timeout", type=float, default=_TIMEOUT_S, metavar="S", help="deadline of every wait in s (60)"
+        "--connect", type=endpoint, action="append", default=[], metavar="ENDPOINT", help="where the mesh is"
+    )
+    command.add_argument(
+        "--timeout", type=positive_seconds, default=_TIMEOUT_S, metavar="S", help="deadline of every wait in s (60)"
     )
     command.set_defaults(run_command=_play)
 
@@ -61,13 +64,13 @@ def _play(arguments: argparse.Namespace) -> int:
         count, first = play(client, moments, step_points, arguments.timeout)
     past = sum(len(moment.values) for moment in moments) - count
     print(f"played {count} values of {names} from point {first} to point {moments[-1].point}")
-    for number, why in (
+    for several, why in (
         (merged, "were followed by another one for the same point"),
         (past, "were past already, and followed by another one"),
         (beyond, "are at or after the end of the simulation"),
     ):
-        if number:
-            print(f"{number} values {why}")
+        if several:
+            print(f"{several} values {why}")
     return 0
 
 

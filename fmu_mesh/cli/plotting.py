@@ -18,14 +18,15 @@ from numpy.typing import NDArray
 
 from ..errors import ConfigurationError
 from ..model.description import Variable
-from ..model.findings import listed, nearest
+from ..model.findings import listed, nearest, nearest_file
 from ..model.plan import Plan
 from ..model.types import is_float
+from .arguments import add_command
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["Results", "add_commands", "draw", "plot_results", "read_results", "reduced", "require_matplotlib"]
+__all__ = ["Results", "add_commands", "check_plot", "draw", "plot_results", "read_results", "reduced"]
 
 _TIME = "time"
 _WORDS = {"true": 1.0, "false": 0.0, "": float("nan"), '""': float("nan")}
@@ -52,7 +53,7 @@ class Results(msgspec.Struct, frozen=True):
 
 def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.ArgumentParser) -> None:
     """Add the command of this module."""
-    plot = commands.add_parser("plot", parents=[common], help="draw a result file")
+    plot = add_command(commands, "plot", "draw a result file", [common])
     plot.add_argument("results", type=Path, metavar="RESULTS.csv", help="the result file")
     plot.add_argument("--output", type=Path, metavar="FILE.png", help="default: beside the result file")
     plot.add_argument(
@@ -62,7 +63,7 @@ def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.Arg
 
 
 def _plot(arguments: argparse.Namespace) -> int:
-    require_matplotlib()
+    _require_matplotlib()
     output = arguments.output if arguments.output is not None else arguments.results.with_suffix(".png")
     results = read_results(arguments.results, arguments.variables)
     draw(results, output, title=arguments.results.stem, variables={})
@@ -70,12 +71,33 @@ def _plot(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def require_matplotlib() -> None:
-    """Make sure that plots can be drawn, before a run whose end is to be one.
+def check_plot(plot: Path, result: str | None) -> None:
+    """Make sure that a plot can be drawn, before a run whose end is to be one.
+
+    Args:
+        plot: the picture.
+        result: the result file to draw, or None where nothing is recorded.
 
     Raises:
-        ConfigurationError: matplotlib is not installed.
+        ConfigurationError: matplotlib is not installed, it has no such format, or the result cannot be drawn.
     """
+    _require_matplotlib()
+    from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415  matplotlib is an extra, and slow to import
+
+    formats = FigureCanvasAgg.get_supported_filetypes()
+    if plot.suffix.removeprefix(".").lower() not in formats:
+        raise ConfigurationError(f"a plot cannot be written as '{plot}'.", hint="Name it .png, .svg or .pdf.")
+    if result is None:
+        raise ConfigurationError("nothing is recorded, so there is nothing to plot.", hint="Name a file with --output.")
+    if Path(result).suffix == ".mcap":
+        raise _is_mcap(Path(result))
+
+
+def _is_mcap(path: Path) -> ConfigurationError:
+    return ConfigurationError(f"'{path}' is an MCAP, and plots are drawn from CSV.", hint="Record into a .csv file.")
+
+
+def _require_matplotlib() -> None:
     if importlib.util.find_spec("matplotlib") is None:
         raise ConfigurationError("plots need matplotlib.", hint="Install it with `pip install 'fmu-mesh[plot]'`.")
 
@@ -109,12 +131,14 @@ def read_results(path: Path, wanted: Sequence[str] | None = None) -> Results:
         ConfigurationError: there is no such file or variable, or it is no result file; says in which line.
     """
     if path.suffix == ".mcap":
-        raise ConfigurationError(f"'{path}' is an MCAP, and plots are drawn from CSV.", hint="Record into a .csv file.")
+        raise _is_mcap(path)
     try:
         with path.open(encoding="utf-8", newline="") as file:
             names, first, values = _read(path, file)
     except OSError as error:
-        raise ConfigurationError(f"the result file '{path}' cannot be read: {error.strerror}.") from error
+        near = nearest_file(path) if isinstance(error, FileNotFoundError) else None
+        hint = f"Did you mean '{near}'?" if near is not None else None
+        raise ConfigurationError(f"the result file '{path}' cannot be read: {error.strerror}.", hint=hint) from error
     except (UnicodeDecodeError, csv.Error) as error:
         raise ConfigurationError(f"'{path}' is no result file: {error}.") from error
     chosen = _chosen(path, names[1:], wanted)

@@ -28,8 +28,9 @@ from ..wire.profile import MeshProfile
 from ..wire.router import run_router
 from ..wire.runtime import enter_run_folder, fmu_folder, leave_run_folder, remove_stale_folders, run_folder
 from ..wire.views import LogLine
+from .arguments import add_command, endpoint, number
 from .display import Display, say, stdout_as_stderr, summary
-from .plotting import plot_results, require_matplotlib
+from .plotting import check_plot, plot_results
 from .profiling import add_profile, show_profile
 
 __all__ = ["add_commands", "close", "run_launcher"]
@@ -37,7 +38,7 @@ __all__ = ["add_commands", "close", "run_launcher"]
 
 def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.ArgumentParser) -> None:
     """Add the commands of this module."""
-    launch = commands.add_parser("launch", parents=[common], help="run a mesh: one process per node, and the master")
+    launch = add_command(commands, "launch", "run a mesh: one process per node, and the master", [common])
     _add_config(launch)
     launch.add_argument("--local", action="store_true", help="run everything in this one process")
     _add_paused(launch)
@@ -47,7 +48,7 @@ def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.Arg
     add_profile(launch)
     launch.set_defaults(run_command=_launch)
 
-    node = commands.add_parser("node", parents=[common], help="run one node by hand")
+    node = add_command(commands, "node", "run one node by hand", [common])
     _add_config(node)
     node.add_argument("node", metavar="INSTANCE", help="name of the instance, or of its group")
     _add_showing(node)
@@ -55,7 +56,7 @@ def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.Arg
     node.add_argument("--run", default=BY_HAND, help=argparse.SUPPRESS)
     node.set_defaults(run_command=_node)
 
-    master = commands.add_parser("master", parents=[common], help="run the master and the recorder by hand")
+    master = add_command(commands, "master", "run the master and the recorder by hand", [common])
     _add_config(master)
     _add_paused(master)
     master.add_argument("--plot", type=Path, metavar="FILE.png", help="plot the result when done")
@@ -65,14 +66,20 @@ def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.Arg
     master.add_argument("--run", default=BY_HAND, help=argparse.SUPPRESS)
     master.set_defaults(run_command=_master)
 
-    gateway = commands.add_parser("gateway", parents=[common], help="run the gateway to ROS by hand")
+    gateway = add_command(commands, "gateway", "run the gateway to ROS by hand", [common])
     _add_config(gateway)
     gateway.add_argument("--events", action="store_true", help=argparse.SUPPRESS)
     gateway.add_argument("--run", default=BY_HAND, help=argparse.SUPPRESS)
     gateway.set_defaults(run_command=_gateway)
 
-    router = commands.add_parser("router", parents=[common], help="run a Zenoh router")
-    router.add_argument("--listen", action="append", metavar="ENDPOINT", help="default: tcp/127.0.0.1:7447")
+    router = add_command(commands, "router", "run a Zenoh router", [common])
+    router.add_argument(
+        "--listen",
+        type=endpoint,
+        action="append",
+        metavar="ENDPOINT",
+        help="listen there; repeatable; default: tcp/127.0.0.1:7447",
+    )
     router.set_defaults(run_command=_router)
 
 
@@ -82,16 +89,27 @@ def _add_config(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--set", action="append", default=[], metavar="INSTANCE.VARIABLE=VALUE", help="another start value; repeatable"
     )
-    parser.add_argument("--output", type=Path, metavar="FILE.csv", help="another result file")
     parser.add_argument(
-        "--connect", action="append", default=[], metavar="ENDPOINT", help="connect there instead; repeatable"
+        "--real-time-factor",
+        type=number,
+        metavar="F",
+        help="1: wall clock; 2: twice as fast; 0: as fast as possible; default: that of the configuration",
+    )
+    parser.add_argument("--output", type=Path, metavar="FILE", help="another result file, .csv or .mcap")
+    parser.add_argument(
+        "--connect",
+        type=endpoint,
+        action="append",
+        default=[],
+        metavar="ENDPOINT",
+        help="connect there, such as tcp/HOST:PORT, instead of to zenoh.connect of the configuration; repeatable",
     )
 
 
 def _add_showing(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--view", action="store_true", help="show the world of the physics engine in a window")
     parser.add_argument(
-        "--video", type=Path, metavar="FILE.mp4", help="make a film of it, .mp4 or .gif; needs no screen"
+        "--video", type=Path, metavar="FILE.mp4", help="make a film of that world, .mp4 or .gif; needs no screen"
     )
 
 
@@ -118,6 +136,7 @@ def _options(arguments: argparse.Namespace) -> Options:
     return Options(
         start_values=tuple(arguments.set),
         window=arguments.window,
+        real_time_factor=arguments.real_time_factor,
         output=arguments.output,
         connect=tuple(arguments.connect),
         profile=getattr(arguments, "profile", None) is not None,
@@ -127,14 +146,18 @@ def _options(arguments: argparse.Namespace) -> Options:
 
 
 def _launch(arguments: argparse.Namespace) -> int:
-    if arguments.plot is not None:
-        require_matplotlib()
     options = _options(arguments)
     if arguments.local and options.paused:
         raise ConfigurationError("--paused is for a mesh that others can reach, and --local has none of it.")
     if arguments.local and options.profile:
         raise ConfigurationError("--profile measures nodes, and --local has none", hint="Leave one of them out.")
+    if arguments.local and options.real_time_factor:
+        raise ConfigurationError(
+            "--real-time-factor is kept by the master, and --local has none", hint="Leave one of them out."
+        )
     plan = prepare(arguments.config, options, say)
+    if arguments.plot is not None:
+        check_plot(arguments.plot, plan.system.result_file)
     profile: MeshProfile | None = None
     with Display(plan, show_progress=not arguments.no_progress) as display:
         if arguments.local:
@@ -227,9 +250,9 @@ def _master(arguments: argparse.Namespace) -> int:
         except FmuMeshError as error:
             return error.exit_code  # the launcher has the event, and tells
         return 0
-    if arguments.plot is not None:
-        require_matplotlib()
     plan = prepare(arguments.config, options, say)
+    if arguments.plot is not None:
+        check_plot(arguments.plot, plan.system.result_file)
     ends: list[End] = []
 
     def show(event: Event) -> None:

@@ -18,7 +18,8 @@ from ..errors import DeadlineExceeded, Interrupted
 from ..wire.client import MeshClient
 from ..wire.reaching import Meshes
 from ..wire.views import InstanceStatus, MeshStatus
-from .looking import positive_seconds, reaching
+from .arguments import add_command, positive_seconds
+from .looking import reaching
 from .pages import progress, seconds
 from .tables import table
 
@@ -32,7 +33,7 @@ Look = tuple[MeshStatus, dict[str, InstanceStatus]]
 
 def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.ArgumentParser) -> None:
     """Add the command of this module."""
-    top = commands.add_parser("top", parents=[common, reaching()], help="show a live table of all instances of a mesh")
+    top = add_command(commands, "top", "show a live table of all instances of a mesh", [common, reaching()])
     top.add_argument("mesh", nargs="?", metavar="MESH", help="name or key of the mesh, if there are several")
     top.add_argument("--once", action="store_true", help="show it once, and end")
     top.add_argument(

@@ -151,7 +151,7 @@ def engine() -> ModuleType:
     try:
         import mujoco  # noqa: PLC0415  an extra, and slow to import
     except ImportError as error:
-        text = f"MuJoCo is not installed ({error})"
+        text = "MuJoCo is not installed"
         raise LoadFailed(text, hint="Install it with `pip install 'fmu-mesh[physics]'`.") from error
     mujoco.set_mju_user_warning(warnings.append)
     module: ModuleType = mujoco

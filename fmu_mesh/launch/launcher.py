@@ -106,6 +106,8 @@ class Launcher:
         changes = [f"--set={change}" for change in self._options.start_values]
         if self._options.window is not None:
             changes.append(f"--window={self._options.window}")
+        if self._options.real_time_factor is not None:
+            changes.append(f"--real-time-factor={self._options.real_time_factor!r}")
         if self._options.output is not None:
             changes.append(f"--output={self._options.output}")
         granting = ["--profile"] if self._options.profile else []

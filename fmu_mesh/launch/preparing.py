@@ -29,6 +29,7 @@ class Options(msgspec.Struct, frozen=True):
     Attributes:
         start_values: `instance.variable=value` each.
         window: in points.
+        real_time_factor: simulated over wall-clock time instead of the configured one; 0 for as fast as possible.
         output: the result file instead of the configured one.
         connect: Zenoh endpoints instead of the configured ones.
         profile: whether the nodes measure where their time goes.
@@ -38,6 +39,7 @@ class Options(msgspec.Struct, frozen=True):
 
     start_values: tuple[str, ...] = ()
     window: int | None = None
+    real_time_factor: float | None = None
     output: Path | None = None
     connect: tuple[str, ...] = ()
     profile: bool = False
@@ -92,6 +94,10 @@ def _with_options(loaded: LoadedConfig, options: Options) -> LoadedConfig:
     if options.window is not None and options.window < 1:
         raise ConfigurationError(f"--window {options.window}: a window has at least 1 point")
     config = replace(loaded.config, zenoh=zenoh_section(loaded, options))
+    if (factor := options.real_time_factor) is not None:
+        config = replace(config, simulation=replace(config.simulation, real_time_factor=factor))
+        overrides = {"simulation.real_time_factor": f"--real-time-factor {factor:g}"}
+        loaded = replace(loaded, overrides={**loaded.overrides, **overrides})
     if options.output is not None:
         config = replace(config, record=replace(config.record, file=str(options.output.absolute())))
     return replace(loaded, config=config)
@@ -124,7 +130,10 @@ def _descriptions(
         if isinstance(found, LoadFailed):
             text = found.message.rstrip(".") + (f" ({found.hint.rstrip('.')})" if found.hint else "")
             place = f"instances.{name}.{_key_of_path(instance)}"
-            findings.append(loaded.finding(place, text, expected_model(instance), _similar(path)))
+            expected = expected_model(instance)
+            if not path.exists() and Path(instance.path).exists():
+                expected += "; paths are relative to the configuration file"
+            findings.append(loaded.finding(place, text, expected, _similar(path)))
         else:
             descriptions[name] = found
             findings += _strict_findings(loaded, name, instance, found)

@@ -9,8 +9,8 @@ import logging
 import os
 import socket
 import sys
-from collections.abc import Callable
-from contextlib import ExitStack, closing
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 
 import msgspec
@@ -197,7 +197,8 @@ def run_master(
         tidy_run_folder(folder)
         _refuse_second(folder, MASTER, f"the master of mesh '{config.mesh}'")
         enter_run_folder(folder, MASTER)
-        session = open_session(wiring(config.zenoh, config_file, folder, MASTER, ()))
+        with _told(plan, emit):
+            session = open_session(wiring(config.zenoh, config_file, folder, MASTER, ()))
         stack.callback(session.close)
         endpoints = own_endpoints(session) if config.zenoh.mode == "peer" else tuple(config.zenoh.connect)
         public = tuple(endpoint for endpoint in endpoints if not endpoint.startswith("unixsock-stream/"))
@@ -206,8 +207,7 @@ def run_master(
             write_note(folder, note)
             stack.callback((folder / "mesh.json").unlink, missing_ok=True)
         emit(Ready(public))
-        recorder: Recorder | None = None
-        error: FmuMeshError | None = None
+        recorder, error = None, None
         master = Master(plan, session, _Emitter(emit), endpoints=public, config_file=str(config_file))
         master.watch = GrantWatch() if options.profile else None
         master.starts_paused = options.paused
@@ -228,6 +228,18 @@ def run_master(
         emit(End(status, master.seconds, rows, result_file, report, master.profile(), ended_by))
         if error is not None:
             raise error
+
+
+@contextmanager
+def _told(plan: Plan, emit: Callable[[Event], None]) -> Iterator[None]:
+    """Emit the end of a run that fails before its first point, such as at a port that is in use."""
+    try:
+        yield
+    except FmuMeshError as error:
+        mesh, grid, report = plan.system.config.mesh, plan.grid, error.report()
+        status = MeshStatus(mesh, "failed", 0, grid.last_point, grid.time(0), 0.0, 0.0, progress={}, error=report)
+        emit(End(status, 0.0, 0, plan.system.result_file, report))
+        raise
 
 
 def _refuse_second(folder: Path, process: str, who: str) -> None:

@@ -24,7 +24,7 @@ __all__ = [
 NAME_PATTERN = r"^[A-Za-z_][A-Za-z0-9_-]*$"
 SHA256_PATTERN = r"^[0-9A-Fa-f]{64}$"
 KEY_PREFIX_PATTERN = r"^[^/*$?#@\s]+(/[^/*$?#@\s]+)*$"
-ENDPOINT_PATTERN = r"^[a-z0-9_-]+/\S+$"
+ENDPOINT_PATTERN = r"^((tcp|udp|tls|quic|ws)/\S+:[0-9]+([?#]\S*)?|(?!(tcp|udp|tls|quic|ws)/)[a-z0-9_-]+/\S+)$"
 
 Name = Annotated[
     str, Meta(pattern=NAME_PATTERN, title="a name of letters, digits, _ and - that starts with a letter or _")

@@ -94,7 +94,7 @@ def resolve_connections(
             source_index=source[1],
             target_index=target[1],
         )
-        if _causality_is_right(connection, findings):
+        if _causality_is_right(connection, variables, findings):
             _check_types(connection, findings)
             _check_delay(connection, findings)
             connections.append(_with_units(connection, config, findings))
@@ -120,7 +120,8 @@ def resolve_variable(
     """
     instance, dot, name = reference.partition(".")
     if not instance or not dot or not name:
-        findings.add(path, f"'{reference}'", "instance.variable")
+        names = [v.name for v in (variables.get(instance) or {}).values() if v.causality == causality]
+        findings.add(path, f"'{reference}'", f"{instance}.{names[0]}" if len(names) == 1 else "instance.variable")
         return None
     if instance not in variables:
         expected = f"one of the instances {listed(list(variables))}"
@@ -228,7 +229,7 @@ def _check_single_source(
     findings.add(path, found, "one source for an input")
 
 
-def _causality_is_right(connection: Connection, findings: Findings) -> bool:
+def _causality_is_right(connection: Connection, variables: Variables, findings: Findings) -> bool:
     source, target = connection.source, connection.target
     source_name = f"{connection.source_instance}.{source.name}"
     target_name = f"{connection.target_instance}.{target.name}"
@@ -236,11 +237,20 @@ def _causality_is_right(connection: Connection, findings: Findings) -> bool:
         found = f"the wrong way round: '{source_name}' is an input and '{target_name}' an output"
         findings.add(connection.path, found, "output -> input", f"{target_name} -> {source_name}")
         return False
+    outputs = _names_of(connection.source_instance, "output", variables)
+    inputs = _names_of(connection.target_instance, "input", variables)
     if source.causality != "output":
-        findings.add(f"{connection.path}.from", f"'{source_name}' is {_a(source.causality)}", "an output")
+        findings.add(f"{connection.path}.from", f"'{source_name}' is {_a(source.causality)}", f"an output{outputs}")
     if target.causality != "input":
-        findings.add(f"{connection.path}.to", f"'{target_name}' is {_a(target.causality)}", "an input")
+        findings.add(f"{connection.path}.to", f"'{target_name}' is {_a(target.causality)}", f"an input{inputs}")
     return source.causality == "output" and target.causality == "input"
+
+
+def _names_of(instance: str, causality: str, variables: Variables) -> str:
+    """Which variables of an instance would be right, to follow `an output` or `an input`."""
+    own = variables[instance] or {}
+    names = [variable.name for variable in own.values() if variable.causality == causality]
+    return f" of '{instance}': {listed(names)}"
 
 
 def _check_types(connection: Connection, findings: Findings) -> None:

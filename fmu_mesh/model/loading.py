@@ -23,6 +23,7 @@ from fmu_mesh.model.yaml_text import Plain, read
 __all__ = ["MAXIMUM_BYTES", "LoadedConfig", "examine", "load", "parse"]
 
 MAXIMUM_BYTES = 4 * 1024 * 1024
+_ARCHIVE = b"PK\x03\x04"
 
 _ARROW = "->"
 _OTHER_ARROW = re.compile(r"\s*(?:-+>|=+>|→|⟶|~>|>)\s*")
@@ -151,7 +152,10 @@ def _text(path: Path, findings: Findings) -> str:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         line = data.count(b"\n", 0, error.start) + 1
-        findings.add("", f"the byte 0x{data[error.start]:02x} in line {line}", "text in UTF-8")
+        found = f"the byte 0x{data[error.start]:02x} in line {line}", "text in UTF-8"
+        if data.startswith(_ARCHIVE):
+            found = "an archive, as FMUs are", f"a configuration file; `fmu-mesh run {path}` runs one FMU"
+        findings.add("", *found)
         return ""
 
 

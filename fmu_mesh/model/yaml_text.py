@@ -44,6 +44,16 @@ _WORDS: dict[str, bool | None] = {
     **dict.fromkeys(("true", "True", "TRUE"), True),
     **dict.fromkeys(("false", "False", "FALSE"), False),
 }
+_INDENTED = "lines that belong together in one column, what belongs to them further to the right"
+_IN_WORDS = {
+    "'\\t' that cannot start": ("a tab at the beginning", "blanks: YAML takes no tabs there"),
+    "but found '<block mapping start>'": ("a line that begins in another column than those above it", _INDENTED),
+    "but found '-'": ("an item of a list ('- ...') among keys", f"`key: value` there, or {_INDENTED}"),
+    "mapping values are not allowed": ("a second ':' in one line, or a line too far to the right", _INDENTED),
+    "could not find expected ':'": ("a line without ':'", "`key: value`, with a blank after the colon"),
+}
+"""What the most frequent errors of syntax are called in words: what is there, and what is expected."""
+
 _LONGEST_INTEGER = 40  # characters; leading zeros are rare
 _INTEGERS = range(-(2**63), 2**64)  # of 64 bits; what is beyond is a float, and text in another base
 
@@ -65,7 +75,9 @@ def read(text: str, findings: Findings, lines: dict[str, int]) -> Plain:
         mark = error.problem_mark or error.context_mark
         context = f" {error.context}" if error.context else ""
         lines[""] = mark.line + 1 if mark is not None else 1
-        findings.add("", f"{error.problem or 'a syntax error'}{context}", "YAML 1.2")
+        problem = f"{error.problem or 'a syntax error'}{context}"
+        found, expected = next((words for part, words in _IN_WORDS.items() if part in problem), (problem, "YAML 1.2"))
+        findings.add("", found, expected)
     except YAMLError as error:
         findings.add("", " ".join(str(error).split()), "YAML 1.2")
     except (ValueError, OverflowError):  # ruamel.yaml lets those of `chr` through

@@ -49,7 +49,7 @@ def checked_setting(runner: Runner, root: str, key: str, data: bytes, attachment
         )
     if kind == "param" and variable.variability != "tunable":
         raise ValueRefused(
-            f"'{runner.name}.{name}' is a {variable.variability} parameter; only tunable ones can be set"
+            f"'{runner.name}.{name}' is a {variable.variability} parameter; only tunable ones can be set while it runs"
         )
     if kind not in ("in", "param"):
         raise ValueRefused(f"'{runner.name}.{name}' is no input and no parameter, so it cannot be set")

@@ -19,7 +19,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import ConfigurationError
+from ..files import open_alone
 from ..model.types import Value, VariableType, is_text
 
 __all__ = ["CsvFile"]
@@ -43,11 +43,7 @@ class CsvFile:
         self.rows = 0
         self._has_text = any(is_text(type_) for _, type_ in columns)
         self._encode = msgspec.json.Encoder().encode_lines
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            self._file = path.open("wb", buffering=1 << 16)
-        except OSError as error:
-            raise ConfigurationError(f"the result file '{path}' cannot be written: {error.strerror}") from error
+        self._file = open_alone(path)
         header = io.StringIO()
         csv.writer(header, lineterminator="\n").writerow(["time", *(name for name, _ in columns)])
         self._file.write(header.getvalue().encode())

@@ -17,7 +17,7 @@ from msgspec.structs import replace
 from ..errors import ConfigurationError
 from ..model.config import RosConfig, RosTopicConfig
 from ..model.description import Value
-from ..model.findings import listed, nearest
+from ..model.findings import listed, nearest, nearest_file
 from ..model.loading import LoadedConfig
 from ..model.types import nested
 from ..wire.views import InstanceInfo
@@ -70,11 +70,21 @@ class Bag:
                 "reading a bag needs the package rosbags", hint="Install it: pip install 'fmu-mesh[ros]'."
             ) from error
         self.path = path
+        if not path.exists():
+            near = nearest_file(path)
+            raise ConfigurationError(
+                f"the bag '{path}' does not exist.", hint=f"Did you mean '{near}'?" if near is not None else None
+            )
+        if path.is_dir() and not (path / "metadata.yaml").is_file():
+            raise ConfigurationError(
+                f"the folder '{path}' is no bag: it has no metadata.yaml.",
+                hint="Name the folder that `ros2 bag record` made, or an .mcap file.",
+            )
         try:
             self._reader: AnyReader = AnyReader([path])
             self._reader.open()
         except (AnyReaderError, OSError, ValueError) as error:
-            raise ConfigurationError(f"'{path}' cannot be read as a bag: {error}.") from error
+            raise ConfigurationError(f"'{path}' cannot be read as a bag: {str(error).rstrip('.')}.") from error
 
     def __enter__(self) -> Self:
         return self

@@ -15,7 +15,15 @@ from typing import Any, ParamSpec, TypeVar
 from ..errors import CallRefused, ConfigurationError, DeadlineExceeded, FmuError, FmuMeshError
 from ..model.description import Value, Variable
 from .driving import DriveSettings, FmuDriver, Turn
-from .node_parameters import RosNode, declare_parameters, names_of, parameter_values, undeclare_parameters, value_of
+from .node_parameters import (
+    RosNode,
+    declare_parameters,
+    names_of,
+    parameter_values,
+    undeclare_parameters,
+    undeclared,
+    value_of,
+)
 from .node_settings import RESERVED, PacedTime, read_settings
 from .node_topics import Topic, fill, message_time, topics_of, values_in
 from .peer import message_class, ros_module
@@ -167,6 +175,9 @@ class FmuNode:
 
     def _tell(self, driver: FmuDriver, settings: DriveSettings, topics: Sequence[Topic]) -> None:
         """What a user may want to know of this FMU."""
+        for name, near in undeclared(self._node).items():
+            hint = f"did you mean '{near}'?" if near is not None else "it is ignored"
+            self._log.warning(f"the parameter '{name}' is set, but is no variable of the FMU; {hint}")
         description = driver.description
         if settings.step_size is None:
             self._log.info(f"no step_size is given; the FMU's own is used: {driver.step_size!r} s")

@@ -34,7 +34,8 @@ def message_types(loaded: LoadedConfig, findings: Findings) -> MessageTypes | No
     try:
         return MessageTypes(section.distribution, custom)
     except ConfigurationError as error:
-        findings.add("ros.messages" if custom else "ros", error.message, error.hint or "definitions that are complete")
+        expected = f"a Python that has it. {error.hint}" if error.hint else "definitions that are complete"
+        findings.add("ros.messages" if custom else "ros", error.message, expected)
         return None
 
 

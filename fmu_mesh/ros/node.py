@@ -117,6 +117,14 @@ def _transition(act: Callable[[RosNode], None]) -> Callable[[Any, Any], Any]:
     return on_transition
 
 
+def _wrong_arguments(error: Exception) -> str:
+    """What is wrong with the command line of a node, in one line."""
+    text = str(error).splitlines()[0] if str(error) else repr(error)
+    if "'INTEGER'" in text and "'DOUBLE'" in text:
+        return f"{text.rstrip('.')}. Write it with a point, such as 1.0."
+    return text
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the node until ROS is shut down; returns the exit code."""
     try:
@@ -125,8 +133,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except ConfigurationError as error:
         print(f"fmu_mesh.ros.node: {error}", file=sys.stderr)  # noqa: T201 nobody else is there to tell
         return error.exit_code
-    rclpy.init(args=None if arguments is None else [sys.argv[0], *arguments])
-    node = create_node()
+    try:
+        rclpy.init(args=None if arguments is None else [sys.argv[0], *arguments])
+        node = create_node()
+    except Exception as error:  # noqa: BLE001 whatever rclpy raises: the arguments are wrong, and it says which
+        print(f"fmu_mesh.ros.node: {_wrong_arguments(error)}", file=sys.stderr)  # noqa: T201 as above
+        rclpy.try_shutdown()
+        return ConfigurationError.exit_code
     try:
         done = ros_module("rclpy.lifecycle").TransitionCallbackReturn.SUCCESS
         if node.get_parameter("autostart").value and node.trigger_configure() == done:

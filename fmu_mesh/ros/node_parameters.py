@@ -12,6 +12,7 @@ from typing import Any
 from ..adapter import FMIAdapter
 from ..errors import CallRefused, ConfigurationError
 from ..model.description import ModelDescription, Value, Variable
+from ..model.findings import nearest
 from ..model.types import nested
 from .names import NameProblem, name_problems, ros_name
 from .peer import ros_module
@@ -22,6 +23,7 @@ __all__ = [
     "names_of",
     "parameter_values",
     "undeclare_parameters",
+    "undeclared",
     "value_of",
 ]
 
@@ -86,6 +88,15 @@ def declare_parameters(
             node.declare_parameter(name, None, descriptor(description=about, dynamic_typing=True))
         settable[name] = variable
     return settable
+
+
+def undeclared(node: RosNode) -> dict[str, str | None]:
+    """Parameters that somebody has set and that the node does not have, each with the nearest one that it has."""
+    # rclpy takes what is set for a parameter that nobody declares without a word, and shows it nowhere else.
+    there = node.list_parameters([], 0).names
+    set_ = node._parameter_overrides  # noqa: SLF001 nothing public tells them
+    names = [name for name in set_ if not node.has_parameter(name)]
+    return {name: nearest(name, there) for name in names if not name.startswith("qos_overrides.")}
 
 
 def undeclare_parameters(node: RosNode, names: Sequence[str]) -> None:

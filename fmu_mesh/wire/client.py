@@ -211,11 +211,13 @@ class MeshClient:
 
     def _targets_by_name(self, reference: str) -> list[Target]:
         instance, _, name = reference.partition(".")
-        if not name:
-            raise ConfigurationError(
-                f"'{reference}' names no variable.", hint=f"Write '{reference}.VARIABLE', or '{reference}.*' for all."
-            )
         names = self.info().instances
+        if not name:
+            if not any(_fits(instance, candidate) for candidate in names):
+                instance = "INSTANCE"
+            raise ConfigurationError(
+                f"'{reference}' names no variable.", hint=f"Write '{instance}.VARIABLE', or '{instance}.*' for all."
+            )
         instances = [candidate for candidate in names if _fits(instance, candidate)]
         if not instances:
             raise self._unknown_instance(instance)

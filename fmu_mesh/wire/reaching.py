@@ -92,6 +92,8 @@ class Meshes:
                 raise _not_running(reference, clients)
         if len(clients) == 1:
             return clients[0]
+        if len({client.keys.root for client in clients}) < len(clients):
+            raise _same_name(clients, listed(names))
         raise ConfigurationError(
             f"{len(clients)} meshes are running: {listed(names)}.",
             hint=f"Say which one by a full key, such as '{clients[0].keys.root}/INSTANCE/out/VARIABLE'.",
@@ -108,6 +110,8 @@ class Meshes:
             return found[0]
         if found:
             roots = listed([client.keys.root for client in found])
+            if len({client.keys.root for client in found}) < len(found):
+                raise _same_name(found, roots)
             raise ConfigurationError(f"{len(found)} meshes are named '{mesh}': {roots}.", hint="Give the key.")
         raise _not_running(mesh, self.clients)
 
@@ -145,7 +149,10 @@ def _open(stack: ExitStack, endpoints: Sequence[str], timeout_s: float) -> zenoh
     if errors:
         raise errors[0]
     if not sessions:
-        raise DeadlineExceeded(f"nobody answered at {', '.join(endpoints)} within {timeout_s:g} s.")
+        raise DeadlineExceeded(
+            f"nobody answered at {', '.join(endpoints)} within {timeout_s:g} s.",
+            hint="`launch` and `ls` show where a mesh can be reached, on the host where it runs.",
+        )
     stack.callback(sessions[0].close)
     return sessions[0]
 
@@ -155,6 +162,14 @@ def _means(client: MeshClient, reference: str) -> bool:
     if reference in (client.keys.mesh, client.keys.root):
         return True
     return client.is_key(reference) and key_expression(reference).intersects(zenoh.KeyExpr(f"{client.keys.root}/**"))
+
+
+def _same_name(clients: Sequence[MeshClient], names: str) -> ConfigurationError:
+    """Meshes that no name and no key tells apart, such as one that was launched twice."""
+    where = ", ".join(endpoint for client in clients for endpoint in client.endpoints[:1])
+    return ConfigurationError(
+        f"{len(clients)} meshes are running: {names}.", hint=f"Say which one by --connect and its endpoint: {where}."
+    )
 
 
 def _not_running(reference: str, clients: Sequence[MeshClient]) -> ConfigurationError:

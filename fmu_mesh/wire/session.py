@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import threading
 import time
 from collections.abc import Iterable
@@ -26,6 +27,14 @@ STUCK_US = 1000 * LEASE_MS
 Credit keeps every queue of a living peer from filling up, so only a stopped process blocks a sender. While it does, the
 lease does not fire; this has to end what the lease cannot.
 """
+
+_OWN_SOURCE = re.compile(r" at /\S+\.rs:\d+\.?")
+_CANNOT_LISTEN = (
+    ("Address already in use", "another process does", "End that process, or take another port; 0 is a free one."),
+    ("Cannot assign requested address", "this host has no such address", "0.0.0.0 stands for all that it has."),
+    ("Permission denied", "this user may not", "Take a port above 1023."),
+)
+"""The system's words for why an endpoint cannot be listened at, ours, and the way out."""
 
 
 class Wiring(msgspec.Struct, frozen=True):
@@ -56,8 +65,20 @@ def open_session(wiring: Wiring) -> zenoh.Session:
     try:
         return zenoh.open(_configuration(wiring))
     except zenoh.ZError as error:
+        raise _cannot_open(wiring, str(error)) from error
+
+
+def _cannot_open(wiring: Wiring, reason: str) -> ConfigurationError:
+    """Why there is no session, without the places in Zenoh's own sources."""
+    reason = _OWN_SOURCE.sub("", reason)
+    endpoint = next((endpoint for endpoint in wiring.listen if endpoint in reason), None)
+    if endpoint is None:
         endpoints = ", ".join((*wiring.listen, *wiring.connect)) or "no endpoints"
-        raise ConfigurationError(f"no Zenoh session can be opened ({endpoints}): {error}") from error
+        return ConfigurationError(f"no Zenoh session can be opened ({endpoints}): {reason}")
+    for words, what, hint in _CANNOT_LISTEN:
+        if words in reason:
+            return ConfigurationError(f"nothing can listen at {endpoint}: {what}", hint=hint)
+    return ConfigurationError(f"nothing can listen at {endpoint}: {reason}")
 
 
 def _configuration(wiring: Wiring) -> zenoh.Config:

@@ -251,7 +251,7 @@ def test_set_takes_effect_at_the_point_that_it_answers(call: Call) -> None:
     ("name", "value", "reason"),
     [
         ("gain.u", "1", "'gain.u' is connected to 'pendulum'; only unconnected inputs can be set"),
-        ("pendulum.l", "1", "'pendulum.l' is a fixed parameter; only tunable ones can be set"),
+        ("pendulum.l", "1", "'pendulum.l' is a fixed parameter; only tunable ones can be set while it runs"),
         ("gain.y", "1", "'gain.y' is no input and no parameter, so it cannot be set"),
         ("gain.k", "true", "'gain.k': true is no Real value for it"),
         ("gain.k", "fast", "'gain.k': \"fast\" is no Real value for it"),

@@ -314,7 +314,7 @@ def test_what_cannot_be_played_is_told(
     monkeypatch.setenv("FMU_MESH_RUNTIME_DIR", str(place.folder / "run"))
     wait_until(lambda: main(["status", "played"]) == 0, "the mesh")
     cases = [
-        (["no.mcap"], "'no.mcap' cannot be read as a bag"),
+        (["no.mcap"], "the bag 'no.mcap' does not exist"),
         ([str(bag)], f"no topic of '{bag}' is one that the mesh subscribes to"),
         ([str(bag), "--topic", "/pendulum/b=delay.x"], "Did you mean '/pendulum/a'?"),
         ([str(bag), "--topic", "/pendulum/a=delay.z"], "the unknown variable 'z' of instance 'delay'"),

@@ -554,6 +554,35 @@ def test_while_an_fmu_hangs_the_node_answers_and_its_end_is_bounded_and_clean(
     assert list(temporary.iterdir()) == []
 
 
+def test_a_misspelt_parameter_is_told_with_the_nearest_right_one(ros: Ros, said: Said) -> None:
+    node = ros.fmu(fmu_path=PENDULUM, update_perid=0.1, l=2.0)
+
+    node.trigger_configure()
+
+    assert "'update_perid' is set, but is no variable of the FMU; did you mean 'update_period'?" in said.of("perid")[0]
+    assert said.of("the parameter 'l'") == []
+
+
+@pytest.mark.parametrize(
+    ("argument", "says"),
+    [
+        ("update_period:=1", "Trying to set parameter 'update_period' to '1' of type 'INTEGER'"),
+        ("fmu_path=Gain.fmu", "fmu_path=Gain.fmu"),
+    ],
+)
+def test_wrong_arguments_of_the_process_are_told_without_a_traceback(ros: Ros, argument: str, says: str) -> None:
+    command = [sys.executable, "-m", "fmu_mesh.ros.node", "--ros-args", "-p", argument]
+
+    done = subprocess.run(
+        command, env={**os.environ, **ros.environment}, capture_output=True, text=True, check=False, timeout=DEADLINE_S
+    )
+
+    assert done.returncode == 2
+    assert "fmu_mesh.ros.node: " in done.stderr
+    assert says in done.stderr
+    assert "Traceback" not in done.stderr
+
+
 def test_without_ros_the_module_says_how_to_get_it() -> None:
     program = "import sys; sys.modules['rclpy'] = None; from fmu_mesh.ros.node import main; sys.exit(main([]))"
 

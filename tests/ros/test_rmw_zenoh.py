@@ -139,5 +139,5 @@ def test_parameters_are_got_and_set_by_the_services_of_ros(met: Met) -> None:
     assert answers[0] == [[3, 1.0], [0, 0.0]]
     assert answers[1] == [True, ""]
     assert answers[2] == [[3, 2.5]]
-    assert answers[3] == [False, "'pendulum.l' is a fixed parameter; only tunable ones can be set"]
+    assert answers[3] == [False, "'pendulum.l' is a fixed parameter; only tunable ones can be set while it runs"]
     assert answers[4] == [False, "there is no parameter 'nobody.k'"]

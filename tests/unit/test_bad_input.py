@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import socket
 import subprocess
 import sys
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from fmu_mesh.cli.main import main
+from fmu_mesh.errors import ConfigurationError
+from fmu_mesh.record.csv_file import CsvFile
 from tests.helpers import FMUS
 
 GOOD = f"""\
@@ -58,6 +62,27 @@ BAD = [
     pytest.param(("step_size: 0.01", "step_size: .nan"), ["simulation.step_size", "nan"], id="not a number"),
     pytest.param(("stop_time: 1,", "stop_time: 1.005,"), ["simulation.stop_time"], id="not a multiple"),
     pytest.param(("stop_time: 1,", "stop_time: -1,"), ["mesh.yaml:2", "simulation.stop_time"], id="stop before start"),
+    pytest.param(
+        ("pendulum.a -> delay.x", "pendulum.a -> delay.y"),
+        ["connections[0].to", "'delay.y' is an output", "expected an input of 'delay': x"],
+        id="output to output",
+    ),
+    pytest.param(
+        ("pendulum.a -> delay.x", "pendulum.a -> delay.d"),
+        ["'delay.d' is a parameter", "expected an input of 'delay': x"],
+        id="output to parameter",
+    ),
+    pytest.param(
+        ("pendulum.a -> delay.x", "pendulum.a -> delay"), ["'delay'", "expected delay.x"], id="no variable named"
+    ),
+    pytest.param(("  delay: {", "\tdelay: {"), ["mesh.yaml:5", "a tab", "YAML takes no tabs"], id="a tab"),
+    pytest.param(("  delay: {", "   delay: {"), ["mesh.yaml:5", "in another column"], id="a line too far right"),
+    pytest.param(("  delay: {", "  - delay: {"), ["mesh.yaml:5", "an item of a list"], id="a list among keys"),
+    pytest.param(
+        ("record:", "zenoh: {listen: [tcp/127.0.0.1]}\nrecord:"),
+        ["zenoh.listen[0]", "a Zenoh endpoint such as tcp/192.168.1.2:7447"],
+        id="an endpoint without a port",
+    ),
     pytest.param(("TransportDelay.fmu", "TransportDelai.fmu"), ["instances.delay.fmu", "TransportDelay"], id="no FMU"),
 ]
 
@@ -205,6 +230,114 @@ def test_a_wrong_option_is_told_as_it_was_written(
     assert main(["launch", str(file), option]) == 2
 
     assert says in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["lunch", "mesh.yaml"], "there is no command 'lunch'. Did you mean 'launch'?"),
+        (["mesh.yaml"], "Did you mean `fmu-mesh launch mesh.yaml`?"),
+        (["Gain.fmu"], "Did you mean `fmu-mesh run Gain.fmu`?"),
+        (["launch", "Gain.fmu"], "expected a configuration file; `fmu-mesh run Gain.fmu` runs one FMU"),
+        (["run", "mesh.yaml"], "A configuration is run by `fmu-mesh launch mesh.yaml`."),
+        (["inspect", "mesh.yaml"], "A configuration is run by `fmu-mesh launch mesh.yaml`."),
+        (["run", "Gian.fmu"], "'Gian.fmu' does not exist. Did you mean 'Gain.fmu'?"),
+        (["run", "Gain.fmu", "--name", "my gain"], "'my gain' is not a name"),
+        (["run", "Gain.fmu", "--set", "kk=2"], "--set kk=2: the unknown variable 'kk'"),
+        (["launch", "mesh.yaml", "--plot", "plot.xyz"], "a plot cannot be written as 'plot.xyz'"),
+        (["launch", "mesh.yaml", "--plot", "plot.png", "--output", "x.mcap"], "plots are drawn from CSV"),
+        (["launch", "mesh.yaml", "--real-time-factor", "-1"], "--real-time-factor -1"),
+        (["launch", "mesh.yaml", "--real-time-factor", "1", "--local"], "kept by the master, and --local has none"),
+        (["plot", "mesh.csv"], "the result file 'mesh.csv' cannot be read"),
+        (["play", "mesh.yam"], "the bag 'mesh.yam' does not exist. Did you mean 'mesh.yaml'?"),
+        (["play", "."], "it has no metadata.yaml"),
+    ],
+)
+def test_the_wrong_thing_for_a_command_is_told_with_the_right_one(
+    arguments: list[str],
+    says: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    nothing_is_spawned: None,  # noqa: ARG001 it is there for what it does
+) -> None:
+    (tmp_path / "mesh.yaml").write_text(GOOD, encoding="utf-8")
+    (tmp_path / "Gain.fmu").symlink_to(FMUS / "Gain.fmu")
+    monkeypatch.chdir(tmp_path)
+
+    assert main(arguments) == 2
+
+    said = capsys.readouterr()
+    assert says in said.err
+    assert said.out == ""
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["get", "--connect", "localhost", "pendulum.a"], "'localhost' is no Zenoh endpoint such as tcp/"),
+        (["launch", "mesh.yaml", "--connect", "tcp/localhost"], "'tcp/localhost' is no Zenoh endpoint such as tcp/"),
+        (["step", "pair", "some"], "'some' is not a whole number of 1 or more"),
+        (["top", "--interval", "often"], "'often' is no number"),
+        (["run", "Gain.fmu", "--step-size", "small"], "'small' is no number"),
+    ],
+)
+def test_a_wrong_value_of_an_option_is_told_in_words(
+    arguments: list[str], says: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        main(arguments)
+
+    assert says in capsys.readouterr().err
+
+
+def test_a_path_from_the_working_folder_is_told_to_be_relative_to_the_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "configs").mkdir()
+    (tmp_path / "Gain.fmu").symlink_to(FMUS / "Gain.fmu")
+    text = "mesh: one\nsimulation: {stop_time: 1, step_size: 0.1}\ninstances: {gain: {fmu: Gain.fmu}}\n"
+    (tmp_path / "configs/mesh.yaml").write_text(text, encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+
+    assert main(["check", "configs/mesh.yaml"]) == 2
+
+    assert "paths are relative to the configuration file" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", ["launch", "run"])
+def test_a_port_in_use_is_told_and_is_no_loss_of_the_master(
+    command: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "mesh.yaml"
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        endpoint = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
+        file.write_text(GOOD + f"zenoh: {{listen: [{endpoint}]}}\n", encoding="utf-8")
+        what = [str(file)] if command == "launch" else [str(FMUS / "Gain.fmu"), "--listen", endpoint]
+
+        code = main([command, *what])
+
+    assert code == 2
+    said = capfd.readouterr().err
+    assert f"nothing can listen at {endpoint}: another process does. End that process, or take another port" in said
+
+
+def test_two_runs_do_not_write_into_one_result_file(tmp_path: Path) -> None:
+    kept = b"time,gain.y\n0.0,1.0\n"
+    file = tmp_path / "result.csv"
+    with CsvFile(file, [("gain.y", "Float64")]) as first:
+        first.flush()
+
+        with pytest.raises(ConfigurationError, match="another run is writing the result file"):
+            CsvFile(file, [("gain.y", "Float64")])
+
+        first.write(np.array([0.0]), [np.array([1.0])])
+    assert file.read_bytes() == kept
+    with CsvFile(file, [("gain.y", "Float64")]):
+        pass
+    assert file.read_bytes() == b"time,gain.y\n"
 
 
 def test_the_command_itself_ends_with_exit_code_2_and_no_traceback(tmp_path: Path) -> None:

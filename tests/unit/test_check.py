@@ -123,6 +123,9 @@ Connections
 Execution order within one point
   a, b  (at the same time)
 
+Inputs that are not connected
+  a  u = 0.0
+
 Initialization
   level 0: a.y
 

@@ -4,6 +4,7 @@ import importlib
 import importlib.metadata
 import pkgutil
 import re
+import shlex
 import subprocess
 import sys
 import tarfile
@@ -16,6 +17,7 @@ from hatchling.builders.sdist import SdistBuilder
 from hatchling.builders.wheel import WheelBuilder
 
 import fmu_mesh
+from fmu_mesh.cli.main import command_parser
 
 ROOT = Path(__file__).parents[2]
 MODULES = sorted(
@@ -100,6 +102,63 @@ def test_a_commit_is_checked_by_the_tools_of_make_check() -> None:
 
     assert checks
     assert {Path(hook["entry"].split()[0]).name for hook in hooks} == checks
+
+
+PAGES = [*sorted(ROOT.glob("*.md")), *sorted(ROOT.glob("docs/**/*.md")), *sorted(ROOT.glob("examples/**/*.md"))]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_every_link_of_a_page_leads_somewhere(page: Path) -> None:
+    links = [link for link in re.findall(r"\]\(([^)\s]+)\)", prose(page)) if not re.match(r"[a-z]+:", link)]
+    dead = []
+    for link in links:
+        name, _, heading = link.partition("#")
+        target = (page.parent / name).resolve() if name else page
+        if not target.exists() or (heading and heading not in headings(target)):
+            dead.append(link)
+
+    assert dead == []
+
+
+def prose(page: Path) -> str:
+    """A page without its listings."""
+    return re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+
+
+def headings(page: Path) -> set[str]:
+    """The names under which the headings of a page can be linked to."""
+    found = re.findall(r"^#+ (.*)$", prose(page), re.MULTILINE)
+    words = [re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", heading).strip().lower() for heading in found]
+    return {re.sub(r"[^\w\- ]", "", heading).replace(" ", "-") for heading in words}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_every_command_of_a_page_is_one_that_there_is(page: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    lines = re.findall(r"^(?:    \$ |\.venv/bin/)?(fmu-mesh [ -~]*)$", page.read_text(encoding="utf-8"), re.MULTILINE)
+    wrong = []
+    for line in lines:
+        arguments = [word for word in shlex.split(line, comments=True)[1:] if word != "&"]
+        try:
+            command_parser()[0].parse_args(arguments)
+        except SystemExit:
+            wrong.append((line, capsys.readouterr().err))
+
+    assert wrong == []
+
+
+@pytest.mark.parametrize("name", command_parser()[1])
+def test_the_help_of_a_command_fits_80_columns_and_begins_with_what_it_does(
+    name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+
+    with pytest.raises(SystemExit, match="0"):
+        command_parser()[0].parse_args([name, "--help"])
+
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= 80
+    described = lines[lines.index("") + 1]
+    assert described[0].isupper()
 
 
 @pytest.mark.parametrize("page", sorted(path.name for path in ROOT.glob("*.md")))

@@ -261,8 +261,9 @@ CONNECTIONS = [
      "expected one of the instances pendulum, delay. Did you mean 'delay'?")),
     ("pendulum.moda -> delay.x", ("[0].from: the unknown variable 'moda' of instance 'pendulum'; "
      "expected one of the outputs of 'pendulum': a, der(a,2), count, flag, mode, name. Did you mean 'mode'?")),
-    ("pendulum.a -> delay.y", "[0].to: 'delay.y' is an output; expected an input"),
-    ("pendulum.l -> delay.x", "[0].from: 'pendulum.l' is a parameter; expected an output"),
+    ("pendulum.a -> delay.y", "[0].to: 'delay.y' is an output; expected an input of 'delay': x, body[1].u, i, b, e, s"),
+    ("pendulum.l -> delay.x", ("[0].from: 'pendulum.l' is a parameter; "
+     "expected an output of 'pendulum': a, der(a,2), count, flag, mode, name")),
     ("delay.x -> pendulum.a", ("[0]: the wrong way round: 'delay.x' is an input and 'pendulum.a' an output; "
      "expected output -> input. Did you mean 'pendulum.a -> delay.x'?")),
     ("pendulum.a -> delay.i", ("[0]: pendulum.a -> delay.i connects a Real to an Integer; "
@@ -379,7 +380,8 @@ def test_a_variable_that_is_called_like_an_element_wins() -> None:
          "expected a source of type Int8 or Boolean")),
         ("delay.data -> delay.v", ("connections[0]: delay.data -> delay.v connects a Binary to a Float64; expected a "
          "source of type Float64 or Float32 or Int32 or UInt32 or Int16 or UInt16 or Int8 or UInt8")),
-        ("delay.z -> delay.z", "connections[0].to: 'delay.z' is an output; expected an input"),
+        ("delay.z -> delay.z", ("connections[0].to: 'delay.z' is an output; "
+         "expected an input of 'delay': u, v, n, byte, w")),
     ],
 )  # fmt: skip
 def test_arrays_and_types_that_do_not_fit_are_refused(connection: str, expected: str) -> None:

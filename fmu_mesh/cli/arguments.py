@@ -1,0 +1,83 @@
+"""What the commands have in common: how one is added, and numbers that say what is wrong with them.
+
+A name of a function that stands as `type=` shows in argparse's own message for a text that is no number, so these have
+messages of their own.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from ..errors import ConfigurationError, LoadFailed
+from ..model.config_base import ENDPOINT_PATTERN
+from ..model.findings import nearest_file
+
+__all__ = ["add_command", "count", "endpoint", "no_fmu", "number", "positive_seconds"]
+
+Parsers = Sequence[argparse.ArgumentParser]
+
+
+def add_command(
+    commands: argparse._SubParsersAction[Any], name: str, text: str, parents: Parsers
+) -> argparse.ArgumentParser:
+    """A command whose own help begins with the line that the list of all commands has for it."""
+    description = f"{text[0].upper()}{text[1:]}."
+    parser: argparse.ArgumentParser = commands.add_parser(name, parents=parents, help=text, description=description)
+    return parser
+
+
+def number(text: str) -> float:
+    """A finite number."""
+    value = _read(text)
+    if not math.isfinite(value):
+        raise argparse.ArgumentTypeError(f"{text} is not a finite number")
+    return value
+
+
+def positive_seconds(text: str) -> float:
+    """A time in s above 0."""
+    value = _read(text)
+    if not (math.isfinite(value) and value > 0.0):
+        raise argparse.ArgumentTypeError(f"{text} is not a time above 0")
+    return value
+
+
+def count(text: str) -> int:
+    """A whole number of 1 or more."""
+    try:
+        value = int(text)
+    except ValueError:
+        value = 0
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number of 1 or more")
+    return value
+
+
+def endpoint(text: str) -> str:
+    """A Zenoh endpoint."""
+    if not re.search(ENDPOINT_PATTERN, text):
+        raise argparse.ArgumentTypeError(f"'{text}' is no Zenoh endpoint such as tcp/192.168.1.2:7447")
+    return text
+
+
+def no_fmu(path: Path, error: LoadFailed) -> ConfigurationError:
+    """What to say where an FMU was asked for, and something else, or nothing, is there."""
+    hint = error.hint
+    if not path.exists():
+        near = nearest_file(path)
+        hint = f"Did you mean '{near}'?" if near is not None else hint
+    elif path.suffix in (".yaml", ".yml"):
+        hint = f"A configuration is run by `fmu-mesh launch {path}`."
+    return ConfigurationError(error.message, hint=hint)
+
+
+def _read(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"'{text}' is no number") from None
