@@ -91,7 +91,7 @@ class FmuInstance(KeepsFmuState, ABC):
         self._live = False
         self._keep: list[object] = []
         self._describe(description)
-        self._extracted = extract(path, folder, terms)
+        self._extracted = extract(path, folder, terms, model=description)
         try:
             self._instantiate(self._extracted)
             self._live = True
