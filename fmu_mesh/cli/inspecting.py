@@ -37,6 +37,7 @@ _CAUSALITIES: Final[tuple[tuple[Causality, str], ...]] = (
 )
 _CAPABILITIES: Final = (
     ("can_handle_variable_step_size", "variable step size"),
+    ("can_reject_steps", "repeat a step"),
     ("can_get_and_set_state", "get and set its state"),
     ("can_serialize_state", "serialize its state"),
 )

@@ -344,10 +344,12 @@ class FmuInstance(KeepsFmuState, ABC):
             text = f"{function} returned {STATUS_NAMES[error.status]}{self._said()}"
             raise InitializationFailed(text, instance=self.name) from error
 
-    def _failed(self, what: str, variable: str | None = None) -> StepFailed | InitializationFailed:
+    def _failed(
+        self, what: str, variable: str | None = None, hint: str | None = None
+    ) -> StepFailed | InitializationFailed:
         kind = StepFailed if self._state == "stepping" else InitializationFailed
         self._state = "failed"
-        return kind(f"{what}{self._said()}", instance=self.name, variable=variable)
+        return kind(f"{what}{self._said()}", instance=self.name, variable=variable, hint=hint)
 
     def _said(self) -> str:
         messages, self._last_messages = self._last_messages, []

@@ -124,6 +124,7 @@ def _convert(
             tolerance=_number(getattr(experiment, "tolerance", None)),
         ),
         can_handle_variable_step_size=can("canHandleVariableCommunicationStepSize"),
+        can_reject_steps=can("canRejectSteps"),
         can_interpolate_inputs=can("canInterpolateInputs"),
         has_event_mode=can("hasEventMode"),
         can_get_and_set_state=bool(interface.canGetAndSetFMUstate),

@@ -118,8 +118,9 @@ class LocalMesh:
         try:
             self._run()
         except FmuMeshError as error:
-            if self.rows and error.hint is None:
-                error.hint = f"What was recorded up to then ({self.rows} rows) is in '{self._plan.system.result_file}'."
+            if self.rows:
+                kept = f"What was recorded up to then ({self.rows} rows) is in '{self._plan.system.result_file}'."
+                error.hint = f"{error.hint} {kept}" if error.hint else kept
             raise
 
     def _check_one_process(self) -> None:

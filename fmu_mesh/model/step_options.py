@@ -86,8 +86,8 @@ def _cannot_retry(description: ModelDescription) -> str | None:
         return "a model-exchange FMU has no steps of its own to discard"
     if not description.can_handle_variable_step_size:
         return "the FMU does not handle a variable communication step size"
-    if description.fmi_version.startswith("1."):
-        return "FMI 1.0 has no FMU state to go back to"
+    if description.fmi_version.startswith("1.") and not description.can_reject_steps:
+        return "the FMU cannot repeat a step (canRejectSteps)"
     if description.fmi_version.startswith("2.") and not description.can_get_and_set_state:
         return "the FMU cannot get and set its state, so it cannot go back to where the step began"
     return None
