@@ -15,7 +15,7 @@ import msgspec
 
 from ..errors import ConfigurationError, LoadFailed
 from ..fmu import read_description, sha256_of
-from ..model.description import Causality, ModelDescription, Variable
+from ..model.description import Causality, Kind, ModelDescription, Variable
 from ..model.findings import nearest, nearest_file, shown
 from .tables import pairs
 
@@ -40,6 +40,8 @@ _CAPABILITIES: Final = (
     ("can_reject_steps", "repeat a step"),
     ("can_get_and_set_state", "get and set its state"),
     ("can_serialize_state", "serialize its state"),
+    ("can_interpolate_inputs", "interpolate inputs"),
+    ("has_event_mode", "event mode"),
 )
 
 
@@ -157,7 +159,7 @@ def _facts(inspection: Inspection, width: int) -> list[str]:
     needs = ["one process for each instance"] if description.only_once_per_process else []
     needs += ["the tool that made it"] if description.needs_execution_tool else []
     counts = [
-        f"{count} {title.lower()}"
+        f"{count} {title.lower().removesuffix('s') if count == 1 else title.lower()}"
         for causality, title in _CAUSALITIES
         if (count := len(description.with_causality(causality)))
     ]
@@ -170,6 +172,9 @@ def _facts(inspection: Inspection, width: int) -> list[str]:
         )
         if value is not None
     ]
+    states = [f"{description.continuous_states} continuous"] if description.continuous_states else []
+    if indicators := description.event_indicators:
+        states.append(f"{indicators} event indicator{'s' if indicators > 1 else ''}")
     times += [f"tolerance {_number(experiment.tolerance)}"] if experiment.tolerance is not None else []
     size = f" ({inspection.bytes} bytes)" if inspection.bytes is not None else " (a folder)"
     facts = [
@@ -177,7 +182,7 @@ def _facts(inspection: Inspection, width: int) -> list[str]:
         ("SHA-256", inspection.sha256 or ""),
         ("Model", description.model_name),
         ("Description", description.description or ""),
-        ("Kind", f"FMI {description.fmi_version} {description.kind.replace('_', '-')}"),
+        ("Kind", f"FMI {description.fmi_version} {' or '.join(_KIND_WORDS[kind] for kind in description.kinds)}"),
         ("Identifier", description.model_identifier),
         ("GUID", description.guid),
         ("Made by", description.generation_tool or ""),
@@ -187,6 +192,7 @@ def _facts(inspection: Inspection, width: int) -> list[str]:
         ("Needs", ", ".join(needs)),
         ("Experiment", ", ".join(times)),
         ("Variables", ", ".join(counts) or "none"),
+        ("States", ", ".join(states)),
         ("Clocks", ", ".join(map(str, description.clocks))),
     ]
     lines = pairs((name, " ".join(value.split())) for name, value in facts)
@@ -194,6 +200,7 @@ def _facts(inspection: Inspection, width: int) -> list[str]:
     return [part for line in lines for part in _wrapped(line, width, indent)]
 
 
+_KIND_WORDS: Final[dict[Kind, str]] = {"co_simulation": "co-simulation", "model_exchange": "model exchange"}
 _PLATFORM_WORDS: Final = {"c-code": "C sources"}
 
 

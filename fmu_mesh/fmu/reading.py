@@ -65,8 +65,7 @@ def read_description(
 
 def _kind(source: FmpyDescription, wanted: str, path: Path) -> Kind:
     """The kind to use: the wanted one, or the one that there is; co-simulation comes first."""
-    kinds: tuple[Kind, ...] = ("co_simulation", "model_exchange")
-    there = [kind for kind in kinds if _interface(source, kind) is not None]
+    there = [kind for kind in _WORDS if _interface(source, kind) is not None]
     for kind in there:
         if wanted in ("auto", kind):
             return kind
@@ -138,6 +137,7 @@ def _convert(
         event_indicators=int(source.numberOfEventIndicators),
         clocks=tuple(map(_clock, root.iterfind("ModelVariables/Clock"))),
         platforms=platforms,
+        kinds=tuple(one for one in _WORDS if _interface(source, one) is not None),
         problems=problems,
     )
 

@@ -159,6 +159,7 @@ class ModelDescription(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     event_indicators: int = 0
     clocks: tuple[Clock, ...] = ()
     platforms: tuple[str, ...] = ()
+    kinds: tuple[Kind, ...] = ()
     problems: tuple[str, ...] = ()
 
     def variable(self, name: str) -> Variable | None:

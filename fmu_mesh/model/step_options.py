@@ -76,9 +76,9 @@ def capability_warnings(
     for name in config:
         description = descriptions[name]
         if description.needs_execution_tool:
-            tool = description.generation_tool or "the tool that made it"
-            found = f"the FMU of '{name}' needs an execution tool ({tool})"
-            findings.add(f"instances.{name}.fmu", found, f"{tool} installed on the host that runs it")
+            tool = description.generation_tool
+            found = f"the FMU of '{name}' needs an execution tool ({tool or 'it does not say which'})"
+            findings.add(f"instances.{name}.fmu", found, f"{tool or 'that tool'} on the host that runs it")
 
 
 def _cannot_retry(description: ModelDescription) -> str | None:

@@ -55,6 +55,17 @@ def test_the_page_says_what_an_fmu_is(capsys: pytest.CaptureFixture[str]) -> Non
         assert f"{line}\n" in page
 
 
+def test_the_page_says_all_kinds_what_they_can_and_how_many_states_there_are(
+    event_fmu: Callable[..., Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    page = " ".join(inspected(capsys, event_fmu("Ball", 3)).split())
+
+    assert "Kind FMI 3.0 co-simulation or model exchange " in page
+    assert "Can variable step size, get and set its state, serialize its state, event mode " in page
+    assert "Variables 4 outputs, 2 parameters, 1 independent variable, 6 local variables " in page
+    assert "States 2 continuous, 1 event indicator " in page
+
+
 def test_the_json_has_everything(capsys: pytest.CaptureFixture[str]) -> None:
     told = json.loads(inspected(capsys, PENDULUM, "--json"))
 

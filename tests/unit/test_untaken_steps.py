@@ -118,6 +118,21 @@ def test_retrying_is_refused_by_check_if_an_fmu_of_fmi_1_cannot_repeat_a_step(
     assert "true, but the FMU cannot repeat a step (canRejectSteps); expected false" in capsys.readouterr().err
 
 
+def test_a_message_that_comes_at_every_step_is_shown_a_few_times_and_counted(
+    steps: Steps, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fmu = {"fmu": str(steps(1)), "start_values": {"longest_step": 0.0005}}
+    config = write_config(tmp_path, instances={"m": fmu}, connections=[], stop_time=0.02)
+
+    assert main(["launch", "--local", "--no-progress", str(config)]) == 0
+
+    said = capsys.readouterr().err.splitlines()
+    assert said == [
+        *(f"m at point {point}: the step is too long" for point in range(5)),
+        "m: the step is too long (15 more times)",
+    ]
+
+
 # ---- pending
 
 
