@@ -7,6 +7,7 @@ import fnmatch
 import shutil
 import sys
 import textwrap
+from base64 import b64encode
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -250,8 +251,14 @@ def _start(variable: Variable) -> str:
     unit = variable.unit or ""
     if variable.start is None:
         return f"[{unit}]" if unit else ""
-    start = variable.start
-    text = shown(msgspec.json.encode(start).decode() if isinstance(start, list | bytes) else start)
+    match variable.start:
+        case list() as rows:
+            text = msgspec.json.encode(rows).decode()
+        case bytes() as data:
+            text = shown(b64encode(data).decode())
+        case start:
+            item = next((item for item, number in variable.items if number == start), None)
+            text = f"{item} ({start})" if item is not None else shown(start)
     return f"= {text} {unit}".rstrip()
 
 
