@@ -8,7 +8,7 @@ Initialization Mode is left; inputs that are set later hold from the first step 
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -30,6 +30,9 @@ __all__ = ["Fmi1Instance"]
 _GET_OR_SET = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_size_t, ctypes.c_void_p)
 _DO_STEP = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_double, ctypes.c_double, ctypes.c_char)
 _INITIALIZE = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_double, ctypes.c_char, ctypes.c_double)
+_SET_DERIVATIVES = ctypes.CFUNCTYPE(
+    ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_size_t, ctypes.c_void_p, ctypes.c_void_p
+)
 _NEW, _REPEATED = b"\x01", b"\x00"
 """`newStep` of fmiDoStep."""
 _TERMINATE = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p)
@@ -86,6 +89,7 @@ class Fmi1Instance(FmuInstance):
             status = self._waited()
         model = self._description
         repeats = status == DISCARD and model.can_handle_variable_step_size and model.can_reject_steps
+        repeats = repeats and not self._options.linear_inputs  # the parts of a step have no derivatives of their own
         if repeats:
             status = self._repeat(time, step_size)
         if status <= WARNING:
@@ -117,6 +121,26 @@ class Fmi1Instance(FmuInstance):
             raise self._failed("fmiDoStep returned pending, and fmiGetStatus does not tell when the step is done")
         return status
 
+    def set_input_derivatives(self, derivatives: Mapping[str, float]) -> None:
+        """First time derivatives (1/s) of Real inputs for the next step (FMI 1.0 CS, 3.3)."""
+        variables = [self._variables[name] for name in derivatives]
+        self._derivatives: list[float] = [
+            -slope if variable.negated else slope
+            for variable, slope in zip(variables, derivatives.values(), strict=True)
+        ]
+        self._derivative_references = [variable.value_reference for variable in variables]
+
+    def _step_with_derivatives(self, component: int, time: float, step_size: float, new_step: bytes) -> int:
+        """fmiDoStep, after the derivatives of the inputs, which are set after their values."""
+        count = len(self._derivatives)
+        references = (ctypes.c_uint * count)(*self._derivative_references)
+        orders = (ctypes.c_int * count)(*[1] * count)
+        slopes = (ctypes.c_double * count)(*self._derivatives)
+        status = self._set_derivatives(component, references, count, orders, slopes)
+        if status > WARNING:
+            raise self._failed(f"fmiSetRealInputDerivatives returned {STATUS_NAMES[status]}")
+        return self._step_of_fmu(component, time, step_size, new_step)
+
     def get_values(self, names: Sequence[str]) -> list[Value]:
         """Current values of variables by name; before the end of Initialization Mode this initializes the slave."""
         if self._state == "initialization":
@@ -144,6 +168,11 @@ class Fmi1Instance(FmuInstance):
         self._component = fmu.component
         self._do_step: Callable[[int, float, float, bytes], int] = _DO_STEP((self._prefixed("DoStep"), fmu.dll))
         self._step_status = StepStatus(fmu.dll, fmu.component, self._prefixed(""))
+        if self._options.linear_inputs:
+            self._step_of_fmu: Callable[[int, float, float, bytes], int] = self._do_step
+            self._do_step = self._step_with_derivatives
+            self._set_derivatives = _SET_DERIVATIVES((self._prefixed("SetRealInputDerivatives"), fmu.dll))
+            self.set_input_derivatives({})
 
     def _enter_initialization(self, start_time: float, stop_time: float | None, start_values: dict[str, Value]) -> None:
         self._times = start_time, stop_time

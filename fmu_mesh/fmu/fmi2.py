@@ -210,7 +210,9 @@ class Fmi2Instance(Fmi2Values):
         last_time = self._step_status.last_successful_time()
         self._last_messages = messages  # what it says to the questions is not why the step failed
         model = self._description
-        can_retry = model.can_handle_variable_step_size and model.can_get_and_set_state
+        can_retry = (
+            model.can_handle_variable_step_size and model.can_get_and_set_state and not self._options.linear_inputs
+        )
         hint = RETRY if can_retry else SMALLER_STEPS
         raise self._failed(discarded("fmi2DoStep", last_time, None), hint=hint)
 

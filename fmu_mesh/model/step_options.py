@@ -103,8 +103,6 @@ def _cannot_extrapolate(connection: Connection, description: ModelDescription, *
         return None
     if description.fmi_version.startswith("3."):
         reason = "co-simulation in FMI 3.0 takes no input derivatives (it would run as model exchange)"
-    elif description.fmi_version.startswith("1."):
-        reason = "co-simulation in FMI 1.0 gets no input derivatives here (it would run as model exchange)"
     elif not description.can_interpolate_inputs:
         reason = f"the FMU of '{connection.target_instance}' does not interpolate inputs (canInterpolateInputs)"
     elif retries:

@@ -1,15 +1,21 @@
-"""Steps of FMI 1.0 and 2.0 that an FMU does not simply take: discarded ones, and those that go on by themselves."""
+"""Steps of FMI 1.0 and 2.0 that are not simply taken: discarded, pending, or with derivatives of inputs."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
+from typing import cast
 
 import pytest
 
 from fmu_mesh.cli.main import main
 from fmu_mesh.errors import StepFailed
-from fmu_mesh.model.instance import StepOptions
+from fmu_mesh.fmu import open_instance, read_description, stepped
+from fmu_mesh.fmu.extrapolation import TakesDerivatives
+from fmu_mesh.model.instance import LinearInput, StepOptions
+from fmu_mesh.model.ring import Layout, Ring
+from fmu_mesh.simtime import TimeGrid
 from tests.fmus.helpers import find_fmu
 from tests.fmus.packing import repacked
 from tests.helpers import write_config
@@ -131,6 +137,42 @@ def test_a_message_that_comes_at_every_step_is_shown_a_few_times_and_counted(
         *(f"m at point {point}: the step is too long" for point in range(5)),
         "m: the step is too long (15 more times)",
     ]
+
+
+# ---- linear inputs
+
+
+@pytest.mark.parametrize(("version", "name", "sign"), [(1, "u", 1.0), (2, "u", 1.0), (1, "opposite_u", -1.0)])
+@pytest.mark.parametrize("delay", [0, 1])
+def test_an_input_is_linear_within_a_step(
+    version: int, name: str, sign: float, delay: int, steps: Steps, tmp_path: Path
+) -> None:
+    options = StepOptions(linear_inputs=(LinearInput(name, delay),))
+    description = read_description(steps(version))
+    inputs, outputs = Ring(Layout.of([(name, "Float64")]), 8), Ring(Layout.of([("y", "Float64")]), 8)
+    for row in range(8):
+        inputs.put(row, name, row * 0.5)
+    with closing(open_instance(steps(version), "m", description, tmp_path, options=options)) as inner:
+        instance = stepped(inner, options)
+        instance.enter_initialization(0.0, None, {})
+        instance.exit_initialization()
+        instance.bind(inputs, (outputs,), TimeGrid(0.0, 0.25, 8), 1)
+        for step in range(4):
+            instance.do_step(step)
+
+    # Of delay 0 a row is the value at the end of its step; of delay 1 that at its start, from where it goes on.
+    expected = [0.0, 0.5, 1.0, 1.5] if delay == 0 else [0.0, 1.0, 1.5, 2.0]
+    assert [outputs.value(step, "y") for step in range(1, 5)] == [sign * value for value in expected]
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_a_discarded_step_with_a_linear_input_is_a_failure(version: int, steps: Steps, tmp_path: Path) -> None:
+    options = StepOptions(linear_inputs=(LinearInput("u", 1),))
+
+    with running(steps(version), tmp_path, "co_simulation", 0.25, options, longest_step=0.2) as instance:
+        cast("TakesDerivatives", instance).set_input_derivatives({"u": 0.0})
+        with pytest.raises(StepFailed, match=r"DoStep returned discard; .*Smaller steps \(`step_size`\) may help"):
+            instance.do_step(0)
 
 
 # ---- pending

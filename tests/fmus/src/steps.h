@@ -2,7 +2,8 @@
  *
  * Steps that are not simply taken, in FMI 1.0 or 2.0 (the FMU defines the names): one longer than `longest_step` is
  * discarded up to there, and with `polls` above 0 a step goes on by itself, until it was asked for its status that many
- * times (for ever, if that is below 0), and ends with the status `ends_as`. What the standard forbids is an error.
+ * times (for ever, if that is below 0), and ends with the status `ends_as`. The output is the
+ * input at the end of the step. What the standard forbids is an error.
  */
 #include <stddef.h>
 #include <stdlib.h>
@@ -21,6 +22,7 @@ typedef struct {
     Logger logger;
     int running, pending, discarded, polled;
     double accepted, start, size;
+    double slope; /* of U, for the next step */
     double r[REALS];
     int i[INTEGERS];
 } Model;
@@ -72,7 +74,8 @@ static Status end(Model *m)
     }
     m->accepted = m->start + m->size;
     m->r[REACHED] = m->accepted;
-    m->r[Y] = m->r[U];
+    m->r[Y] = m->r[U] + m->slope * m->size;
+    m->slope = 0.0;
     return (Status)m->i[ENDS_AS];
 }
 
@@ -90,6 +93,16 @@ static Status started(Model *m, double time, double size, int repeats)
     if (m->i[POLLS] == 0) return end(m);
     m->pending = 1;
     return (Status)PENDING;
+}
+
+EXPORT Status NAME(SetRealInputDerivatives)(Component c, const Reference vr[], size_t n, const int order[],
+                                            const double value[])
+{
+    Model *m = c;
+
+    if (!m->running || m->pending || n != 1 || vr[0] != U || order[0] != 1) return fail(m, "these derivatives");
+    m->slope = value[0];
+    return OK;
 }
 
 EXPORT Status NAME(GetStatus)(Component c, const StatusKind kind, Status *value)

@@ -108,7 +108,6 @@ REFUSED(SerializeFMUstate, fmi2FMUstate state, fmi2Byte bytes[], size_t size)
 REFUSED(DeSerializeFMUstate, const fmi2Byte bytes[], size_t size, fmi2FMUstate *state)
 REFUSED(GetDirectionalDerivative, const Reference unknown[], size_t n, const Reference known[], size_t m,
         const fmi2Real seed[], fmi2Real value[])
-REFUSED(SetRealInputDerivatives, const Reference vr[], size_t n, const fmi2Integer order[], const fmi2Real value[])
 REFUSED(GetRealOutputDerivatives, const Reference vr[], size_t n, const fmi2Integer order[], fmi2Real value[])
 REFUSED(GetIntegerStatus, const StatusKind kind, fmi2Integer *value)
 REFUSED(GetStringStatus, const StatusKind kind, fmi2String *value)
