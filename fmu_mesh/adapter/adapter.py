@@ -22,6 +22,7 @@ from typing import Any, Literal, Self
 
 from ..errors import FmuError
 from ..fmu import FmuInstance, LogMessage, open_instance, read_description
+from ..fmu.guard import floating_point_changed, kept_state, restore_floating_point
 from ..model.description import ModelDescription, Value
 from ..model.trajectory import Trajectory
 from ..model.types import is_float
@@ -88,7 +89,8 @@ class FMIAdapter:
         self._point = 0
         self._folder = folder = Path(tempfile.mkdtemp(prefix="fmu_mesh-"))
         try:
-            self._instance = open_instance(path, name, description, folder, _forward)
+            with kept_state(keep_mode=True):
+                self._instance = open_instance(path, name, description, folder, _forward)
             self._release = weakref.finalize(self, _release, self._instance, folder)
         except BaseException:
             shutil.rmtree(folder, ignore_errors=True)
@@ -376,13 +378,26 @@ class FMIAdapter:
 
     @contextmanager
     def _fmu_called(self) -> Iterator[None]:
+        """Around every call of the FMU: what it does to the process is undone, and a failure is told and noted.
+
+        In the stepping loop that is the floating-point mode only, as in a mesh: the rest takes longer than a step.
+        """
+        stepping = self._mode == "stepping"
+        own_mode = stepping and floating_point_changed()  # the caller's, which is none of our business
         try:
-            yield
+            if stepping:
+                yield
+            else:
+                with kept_state(keep_mode=True):
+                    yield
         except FmuError as error:
-            if self._mode == "stepping":
+            if stepping:
                 error.point, error.time = self._point, self.simulation_time
             self._mode = "failed"
             raise
+        finally:
+            if stepping and not own_mode and floating_point_changed():
+                restore_floating_point()
 
 
 def _forward(message: LogMessage) -> None:
@@ -391,5 +406,6 @@ def _forward(message: LogMessage) -> None:
 
 
 def _release(instance: FmuInstance, folder: Path) -> None:
-    instance.close()
+    with kept_state(keep_mode=True):
+        instance.close()
     shutil.rmtree(folder, ignore_errors=True)

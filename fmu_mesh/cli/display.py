@@ -5,11 +5,12 @@ from __future__ import annotations
 import ctypes
 import os
 import sys
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Final, Self
 
 from rich.console import Console
 from rich.markup import escape
@@ -22,6 +23,9 @@ from ..wire.views import LogLine, MeshStatus
 
 __all__ = ["Display", "say", "stdout_as_stderr", "summary"]
 
+_SHOWN_TIMES: Final = 5
+_COUNTED: Final = 1000
+"""How many different messages are counted."""
 _STYLES = {"ok": "dim", "warning": "yellow", "discard": "yellow", "error": "red", "fatal": "red"}
 
 
@@ -44,6 +48,7 @@ class Display:
             disable=not show_progress or not self._console.is_terminal,
             transient=True,
         )
+        self._times: Counter[tuple[str, str]] = Counter()
         total = plan.grid.last_point if plan.grid.stop_time is not None else None
         self._task = self._progress.add_task(plan.system.config.mesh, total=total, text="starting")
 
@@ -55,6 +60,10 @@ class Display:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._progress.stop()
+        for (instance, message), times in self._times.items():
+            if times > _SHOWN_TIMES:
+                more = f"{times - _SHOWN_TIMES} more {'times' if times > _SHOWN_TIMES + 1 else 'time'}"
+                self._console.print(f"[dim]{escape(instance)}: {escape(message)} ({more})[/]")
 
     def event(self, event: Event) -> None:
         """Show one event of the master."""
@@ -80,7 +89,12 @@ class Display:
         self._progress.update(self._task, completed=point, text=f"t = {self._plan.grid.time(point):.6g} s")
 
     def log(self, line: LogLine) -> None:
-        """Show one log message of an FMU."""
+        """Show one log message of an FMU; the same text is shown a few times, and then only counted."""
+        key = line.instance, line.message
+        if key in self._times or len(self._times) < _COUNTED:
+            self._times[key] += 1
+            if self._times[key] > _SHOWN_TIMES:
+                return
         style = _STYLES.get(line.status, "dim")
         where = f"{line.instance} at point {line.point}"
         self._console.print(f"[{style}]{escape(where)}: {escape(line.message)}[/]")

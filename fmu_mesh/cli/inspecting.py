@@ -7,6 +7,7 @@ import fnmatch
 import shutil
 import sys
 import textwrap
+from base64 import b64encode
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -15,7 +16,7 @@ import msgspec
 
 from ..errors import ConfigurationError, LoadFailed
 from ..fmu import read_description, sha256_of
-from ..model.description import Causality, ModelDescription, Variable
+from ..model.description import Causality, Kind, ModelDescription, Variable
 from ..model.findings import nearest, shown
 from .arguments import add_command, no_fmu
 from .tables import pairs
@@ -38,8 +39,11 @@ _CAUSALITIES: Final[tuple[tuple[Causality, str], ...]] = (
 )
 _CAPABILITIES: Final = (
     ("can_handle_variable_step_size", "variable step size"),
+    ("can_reject_steps", "repeat a step"),
     ("can_get_and_set_state", "get and set its state"),
     ("can_serialize_state", "serialize its state"),
+    ("can_interpolate_inputs", "interpolate inputs"),
+    ("has_event_mode", "event mode"),
 )
 
 
@@ -169,6 +173,9 @@ def _facts(inspection: Inspection, width: int) -> list[str]:
         )
         if value is not None
     ]
+    states = [f"{description.continuous_states} continuous"] if description.continuous_states else []
+    if indicators := description.event_indicators:
+        states.append(f"{indicators} event indicator{'s' if indicators > 1 else ''}")
     times += [f"tolerance {_number(experiment.tolerance)}"] if experiment.tolerance is not None else []
     size = f" ({inspection.bytes} bytes)" if inspection.bytes is not None else " (a folder)"
     facts = [
@@ -176,7 +183,7 @@ def _facts(inspection: Inspection, width: int) -> list[str]:
         ("SHA-256", inspection.sha256 or ""),
         ("Model", description.model_name),
         ("Description", description.description or ""),
-        ("Kind", f"FMI {description.fmi_version} {description.kind.replace('_', '-')}"),
+        ("Kind", f"FMI {description.fmi_version} {' or '.join(_KIND_WORDS[kind] for kind in description.kinds)}"),
         ("Identifier", description.model_identifier),
         ("GUID", description.guid),
         ("Made by", description.generation_tool or ""),
@@ -186,6 +193,7 @@ def _facts(inspection: Inspection, width: int) -> list[str]:
         ("Needs", ", ".join(needs)),
         ("Experiment", ", ".join(times)),
         ("Variables", ", ".join(counts) or "none"),
+        ("States", ", ".join(states)),
         ("Clocks", ", ".join(map(str, description.clocks))),
     ]
     lines = pairs((name, " ".join(value.split())) for name, value in facts)
@@ -193,6 +201,7 @@ def _facts(inspection: Inspection, width: int) -> list[str]:
     return [part for line in lines for part in _wrapped(line, width, indent)]
 
 
+_KIND_WORDS: Final[dict[Kind, str]] = {"co_simulation": "co-simulation", "model_exchange": "model exchange"}
 _PLATFORM_WORDS: Final = {"c-code": "C sources"}
 
 
@@ -242,8 +251,14 @@ def _start(variable: Variable) -> str:
     unit = variable.unit or ""
     if variable.start is None:
         return f"[{unit}]" if unit else ""
-    start = variable.start
-    text = shown(msgspec.json.encode(start).decode() if isinstance(start, list | bytes) else start)
+    match variable.start:
+        case list() as rows:
+            text = msgspec.json.encode(rows).decode()
+        case bytes() as data:
+            text = shown(b64encode(data).decode())
+        case start:
+            item = next((item for item, number in variable.items if number == start), None)
+            text = f"{item} ({start})" if item is not None else shown(start)
     return f"= {text} {unit}".rstrip()
 
 

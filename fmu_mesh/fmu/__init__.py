@@ -1,7 +1,6 @@
 """FMUs: reading, extracting, loading and calling them. The only package that imports fmpy."""
 
 from .archive import Terms, sha256_of
-from .examining import PLATFORM
 from .fmi1 import Fmi1Instance
 from .fmi2 import Fmi2Instance
 from .fmi3 import Fmi3Instance
@@ -11,7 +10,6 @@ from .reading import read_description
 from .sources import compile_sources
 
 __all__ = [
-    "PLATFORM",
     "Fmi1Instance",
     "Fmi2Instance",
     "Fmi3Instance",

@@ -7,7 +7,7 @@ keeps it as a problem of the description. FMPy is only handed XML that has passe
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any, Final
@@ -18,13 +18,7 @@ from lxml import etree
 from ..errors import LoadFailed
 from .archive import Contents, Terms, look_into
 
-__all__ = ["HAS_SOURCES", "PLATFORM", "examine", "library_names", "require_library", "safe_xml", "source_names"]
-
-PLATFORM: Final = str(fmpy.platform)
-"""This platform as FMI 1.0 and 2.0 name it (FMI 2.0, 2.3), such as linux64; FMI 3.0 says x86_64-linux."""
-
-HAS_SOURCES: Final = "c-code"
-"""What stands among the platforms of an FMU that brings its sources."""
+__all__ = ["examine", "library_names", "require_library", "safe_xml", "source_names"]
 
 _SHOWN: Final = 3
 _SCHEMA_FILES: Final = {
@@ -106,26 +100,39 @@ def source_names(names: Iterable[str]) -> list[str]:
     return sorted(name for name in names if re.fullmatch(r"sources/.*\.(c|cc|cpp|cxx)", name))
 
 
-def require_library(path: Path, names: Collection[str], identifier: str, fmi_version: str) -> None:
+def require_library(path: Path, names: Collection[str], identifiers: Sequence[str], fmi_version: str) -> None:
     """Whether an FMU has a library for this platform, or sources to make one from.
+
+    Args:
+        path: the FMU.
+        names: of its files.
+        identifiers: the model identifier of the kind to use, then that of the other kind if there is one.
+        fmi_version: of it.
 
     Raises:
         LoadFailed: it can run elsewhere only, or its library has another name; the message says what it has.
     """
+    identifier, *others_of_it = identifiers
     if not identifier or "/" in identifier or "\\" in identifier or identifier.startswith("."):
         raise LoadFailed(f"'{path}' has the model identifier '{identifier}', which cannot be the name of a library.")
     wanted = library_names(identifier, fmi_version)
     if any(name in names for name in wanted):
         return
     folder = wanted[0].rpartition("/")[0]
-    others = sorted(name for name in names if name.startswith(f"{folder}/") and name.endswith(_SUFFIX))
-    if others:
+    there = sorted(name for name in names if name.startswith(f"{folder}/") and name.endswith(_SUFFIX))
+    known = [name for one in others_of_it for name in library_names(one, fmi_version) if name in there]
+    if others := [name for name in there if name not in known]:
         raise LoadFailed(
             f"'{path}' has no '{wanted[0]}', although its model identifier is '{identifier}'; it has "
             f"'{others[0]}' (FMI 2.0, 2.3: the library must have that name)."
         )
     if source_names(names):
         return
+    if known:
+        raise LoadFailed(
+            f"'{path}' has no '{wanted[0]}'; it has only '{known[0]}', the library of its other kind.",
+            hint="Leave `kind` to the other one, or export it with both libraries.",
+        )
     there = sorted({name.split("/")[1] for name in names if re.fullmatch(r"binaries/[^/]+/.+", name)})
     raise LoadFailed(
         f"'{path}' has no binary for this platform ({folder.rpartition('/')[2]}); it has: "

@@ -8,7 +8,7 @@ Initialization Mode is left; inputs that are set later hold from the first step 
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -23,12 +23,19 @@ from .buffers import Buffer, NumberBuffer, StringBuffer
 from .callbacks import FMI1_CALLBACKS, register, unregister
 from .calls import Function, Pointer, hot
 from .instance import STATUS_NAMES, WARNING, FmuInstance, Verb
+from .step_status import PENDING, SMALLER_STEPS, StepStatus, discarded
+from .substeps import DISCARD, SMALLEST, take_sub_steps
 
 __all__ = ["Fmi1Instance"]
 
 _GET_OR_SET = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_size_t, ctypes.c_void_p)
 _DO_STEP = "int (*)(void *, double, double, char)"
 _INITIALIZE = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_double, ctypes.c_char, ctypes.c_double)
+_SET_DERIVATIVES = ctypes.CFUNCTYPE(
+    ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_size_t, ctypes.c_void_p, ctypes.c_void_p
+)
+_NEW, _REPEATED = b"\x01", b"\x00"
+"""`newStep` of fmiDoStep."""
 _TERMINATE = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p)
 _SUFFIX: Final[dict[VariableType, str]] = {
     "Float64": "Real",
@@ -71,9 +78,71 @@ class Fmi1Instance(FmuInstance):
 
     def advance(self, time: float, step_size: float) -> None:
         """One step of ``step_size`` from ``time`` (both in s) without rings, for callers with their own time base."""
-        status = self._do_step(self._self, time, step_size, b"\x01")
+        status = self._do_step(self._self, time, step_size, _NEW)
         if status > WARNING:
+            self._finish(time, step_size, status)
+
+    def _finish(self, time: float, step_size: float, status: int) -> None:
+        """Bring a step to its end that was not simply taken.
+
+        Raises:
+            StepFailed: it cannot be.
+        """
+        if status == PENDING:
+            status = self._waited()
+        model = self._description
+        repeats = status == DISCARD and model.can_handle_variable_step_size and model.can_reject_steps
+        repeats = repeats and not self._options.linear_inputs  # the parts of a step have no derivatives of their own
+        if repeats:
+            status = self._repeat(time, step_size)
+        if status <= WARNING:
+            return
+        if status != DISCARD:
             raise self._failed(f"fmiDoStep returned {STATUS_NAMES[status]}")
+        messages = self._last_messages
+        last_time = self._step_status.last_successful_time()
+        self._last_messages = messages  # what it says to the question is not why the step failed
+        raise self._failed(discarded("fmiDoStep", last_time, SMALLEST if repeats else None), hint=SMALLER_STEPS)
+
+    def _repeat(self, time: float, step_size: float) -> int:
+        """Take a step that was discarded in smaller ones; a step that repeats another one is told so (FMI 1.0, 3.4)."""
+        new_step = _REPEATED
+
+        def attempt(start: float, size: float) -> int:
+            nonlocal new_step
+            status = self._do_step(self._self, start, size, new_step)
+            if status == PENDING:
+                status = self._waited()
+            new_step = _REPEATED if status == DISCARD else _NEW
+            return status
+
+        return take_sub_steps(attempt, time, step_size)
+
+    def _waited(self) -> int:
+        status = self._step_status.wait()
+        if status is None:
+            raise self._failed("fmiDoStep returned pending, and fmiGetStatus does not tell when the step is done")
+        return status
+
+    def set_input_derivatives(self, derivatives: Mapping[str, float]) -> None:
+        """First time derivatives (1/s) of Real inputs for the next step (FMI 1.0 CS, 3.3)."""
+        variables = [self._variables[name] for name in derivatives]
+        self._derivatives: list[float] = [
+            -slope if variable.negated else slope
+            for variable, slope in zip(variables, derivatives.values(), strict=True)
+        ]
+        self._derivative_references = [variable.value_reference for variable in variables]
+
+    def _step_with_derivatives(self, component: Pointer, time: float, step_size: float, new_step: bytes) -> int:
+        """fmiDoStep, after the derivatives of the inputs, which are set after their values."""
+        count = len(self._derivatives)
+        references = (ctypes.c_uint * count)(*self._derivative_references)
+        orders = (ctypes.c_int * count)(*[1] * count)
+        slopes = (ctypes.c_double * count)(*self._derivatives)
+        status = self._set_derivatives(self._component, references, count, orders, slopes)
+        if status > WARNING:
+            raise self._failed(f"fmiSetRealInputDerivatives returned {STATUS_NAMES[status]}")
+        return self._step_of_fmu(component, time, step_size, new_step)
 
     def get_values(self, names: Sequence[str]) -> list[Value]:
         """Current values of variables by name; before the end of Initialization Mode this initializes the slave."""
@@ -101,6 +170,12 @@ class Fmi1Instance(FmuInstance):
         self._fmu = fmu
         self._component = fmu.component
         self._do_step = hot(getattr(fmu.dll, self._prefixed("DoStep")), _DO_STEP)
+        self._step_status = StepStatus(fmu.dll, fmu.component, self._prefixed(""))
+        if self._options.linear_inputs:
+            self._step_of_fmu: Function = self._do_step
+            self._do_step = self._step_with_derivatives
+            self._set_derivatives = _SET_DERIVATIVES((self._prefixed("SetRealInputDerivatives"), fmu.dll))
+            self.set_input_derivatives({})
 
     def _enter_initialization(self, start_time: float, stop_time: float | None, start_values: dict[str, Value]) -> None:
         self._times = start_time, stop_time

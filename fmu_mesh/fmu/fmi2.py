@@ -15,7 +15,7 @@ import numpy as np
 from fmpy.fmi1 import FMICallException
 from fmpy.fmi2 import FMU2Slave, fmi2Terminated
 
-from ..errors import FmuMeshError, TerminationRequested
+from ..errors import TerminationRequested
 from ..model.description import Variable
 from ..model.ring import Part, Ring
 from ..model.types import Value, VariableType
@@ -24,6 +24,7 @@ from .buffers import Buffer, NumberBuffer, StringBuffer
 from .callbacks import FMI2_CALLBACKS, register, unregister
 from .calls import Function, Pointer, hot
 from .instance import STATUS_NAMES, WARNING, FmuInstance, Verb
+from .step_status import PENDING, RETRY, SMALLER_STEPS, StepStatus, discarded
 from .substeps import DISCARD, SMALLEST, take_sub_steps
 
 __all__ = ["Fmi2Instance", "Fmi2Values"]
@@ -37,7 +38,8 @@ _SUFFIX: Final[dict[VariableType, str]] = {
     "Boolean": "Boolean",
     "String": "String",
 }
-PENDING: Final = 5
+_ENDS: Final = 6
+"""Stands for the status of a step that was a wish to end the simulation."""
 _DIRECT: Final = ("Float64", "Int32")
 """The types that lie in a ring as in C; a Boolean and an Enumeration are an `int` in FMI 2.0 (2.1.2)."""
 
@@ -144,7 +146,7 @@ class Fmi2Instance(Fmi2Values):
         time = self._start_time + step * self._points * self._base_step_size  # `grid.time`, without a call
         status = do_step(component, time, self._step_size, 1)
         if status > WARNING:
-            raise self._not_done(status)
+            self._finish(status)
         self._step = step + 1
         slot = (step + 1) & output_mask
         for function, references, count, rows in getters:
@@ -161,7 +163,7 @@ class Fmi2Instance(Fmi2Values):
         try:
             self._fmu.doStep(currentCommunicationPoint=time, communicationStepSize=step_size)
         except FMICallException as error:
-            raise self._not_done(error.status) from error
+            self._finish(error.status)
 
     def set_input_derivatives(self, derivatives: Mapping[str, float]) -> None:
         """First time derivatives (1/s) of Real inputs for the next step (FMI 2.0, 4.2.1)."""
@@ -181,21 +183,46 @@ class Fmi2Instance(Fmi2Values):
     def _instantiate(self, folder: Path) -> None:
         super()._instantiate(folder)
         self._do_step: Function = hot(self._fmu.dll.fmi2DoStep, _DO_STEP)
+        self._step_status = StepStatus(self._fmu.dll, self._component, "fmi2")
         if self._options.retry_discarded_steps:
-            self._retrying = _Retrying(self._fmu, self._do_step, self._asks_to_end, self._failed)
+            self._retrying = _Retrying(self._fmu, self._do_step, self._waited, self._asks_to_end, self._failed)
             self._do_step = self._retrying
         if self._options.linear_inputs:
             self._step_of_fmu, self._do_step = self._do_step, self._step_with_derivatives
             self._derivatives = {}
 
-    def _not_done(self, status: int) -> FmuMeshError:
-        """Why a step was not taken (FMI 2.0, 4.2.1): it failed, or the FMU asks to end the simulation."""
-        if status == DISCARD:
-            if self._asks_to_end() if self._retrying is None else self._retrying.ends:
-                return TerminationRequested("the FMU asked to end the simulation", instance=self.name)
-            if self._retrying is not None:
-                return self._failed(f"fmi2DoStep returned discard down to 1/{SMALLEST} of the step")
-        return self._failed(f"fmi2DoStep returned {STATUS_NAMES[status]}")
+    def _finish(self, status: int) -> None:
+        """Bring a step to its end that was not simply taken (FMI 2.0, 4.2.1).
+
+        Raises:
+            StepFailed: it cannot be.
+            TerminationRequested: the FMU asks to end the simulation.
+        """
+        if status == PENDING:
+            status = self._waited()
+        if status <= WARNING:
+            return
+        if status != DISCARD:
+            raise self._failed(f"fmi2DoStep returned {STATUS_NAMES[status]}")
+        messages = self._last_messages
+        if self._asks_to_end() if self._retrying is None else self._retrying.ends:
+            raise TerminationRequested("the FMU asked to end the simulation", instance=self.name)
+        if self._retrying is not None:
+            raise self._failed(discarded("fmi2DoStep", None, SMALLEST), hint=SMALLER_STEPS)
+        last_time = self._step_status.last_successful_time()
+        self._last_messages = messages  # what it says to the questions is not why the step failed
+        model = self._description
+        can_retry = (
+            model.can_handle_variable_step_size and model.can_get_and_set_state and not self._options.linear_inputs
+        )
+        hint = RETRY if can_retry else SMALLER_STEPS
+        raise self._failed(discarded("fmi2DoStep", last_time, None), hint=hint)
+
+    def _waited(self) -> int:
+        status = self._step_status.wait()
+        if status is None:
+            raise self._failed("fmi2DoStep returned pending, and fmi2GetStatus does not tell when the step is done")
+        return status
 
     def _asks_to_end(self) -> bool:
         """Whether a discarded step is a wish to end the simulation; most FMUs do not know of this question."""
@@ -225,12 +252,14 @@ class _Retrying:
         self,
         fmu: Any,  # noqa: ANN401 FMPy is untyped
         do_step: Function,
+        waited: Callable[[], int],
         asks_to_end: Callable[[], bool],
         failed: Callable[[str], Exception],
     ) -> None:
         self.ends = False
         self._fmu = fmu
         self._do_step = do_step
+        self._waited = waited
         self._asks_to_end = asks_to_end
         self._failed = failed
         self._state = ctypes.c_void_p()
@@ -239,10 +268,12 @@ class _Retrying:
         def attempt(start: float, size: float) -> int:
             self._fmu.fmi2GetFMUstate(self._fmu.component, ctypes.byref(self._state))
             status = self._do_step(component, start, size, 0)
+            if status == PENDING:
+                status = self._waited()
             if status == DISCARD:
                 self.ends = self._asks_to_end()
                 if self.ends:
-                    return PENDING
+                    return _ENDS
                 self._fmu.fmi2SetFMUstate(self._fmu.component, self._state)
             return status
 

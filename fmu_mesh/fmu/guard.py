@@ -47,6 +47,10 @@ DEFAULT_MODE: Final = (1.0, 2.0**-53, 2.0**-54, 5e-324)
 _ONE, _HALF_ULP, _QUARTER_ULP, _TINY = DEFAULT_MODE
 
 _libm = ctypes.CDLL(None)
+_ENVIRONMENT_BYTES: Final = 512
+"""More than a `fenv_t` has anywhere."""
+_ACTION_BYTES: Final = 512
+"""More than a `struct sigaction` has anywhere."""
 _DEFAULT_ENVIRONMENT: Final = ctypes.c_void_p(-1)
 """`FE_DFL_ENV` of the C libraries on x86 and ARM."""
 
@@ -62,21 +66,34 @@ def restore_floating_point() -> None:
 
 
 @contextmanager
-def kept_state() -> Iterator[None]:
-    """What a call inside does to the state of the process is undone at the end."""
+def kept_state(*, keep_mode: bool = False) -> Iterator[None]:
+    """What a call inside does to the state of the process is undone at the end.
+
+    Args:
+        keep_mode: whether the floating-point mode is afterwards what it was before; else it is the default one.
+    """
     folder, language = _working_directory(), locale.setlocale(locale.LC_ALL)
+    actions = [(number, _action(number)) for number in _SIGNALS]
+    environment = ctypes.create_string_buffer(_ENVIRONMENT_BYTES)
+    if keep_mode:
+        _libm.fegetenv(environment)
     try:
         yield
     finally:
-        restore_floating_point()
+        _libm.fesetenv(environment if keep_mode else _DEFAULT_ENVIRONMENT)
         if folder is not None and _working_directory() != folder:
             os.chdir(folder)
         if locale.setlocale(locale.LC_ALL) != language:
             locale.setlocale(locale.LC_ALL, language)
-        if threading.current_thread() is threading.main_thread():
-            for number in _SIGNALS:
-                if (handler := signal.getsignal(number)) is not None:
-                    signal.signal(number, handler)  # Python cannot see whether it is still installed
+        for number, action in actions:
+            _libm.sigaction(number, action, None)
+
+
+def _action(number: int) -> ctypes.Array[ctypes.c_char]:
+    """What happens at a signal, as C has it: Python does not know of handlers that others have installed."""
+    action = ctypes.create_string_buffer(_ACTION_BYTES)
+    _libm.sigaction(number, None, action)
+    return action
 
 
 def _working_directory() -> str | None:

@@ -98,7 +98,7 @@ class FmuInstance(KeepsFmuState, ABC):
         self._live = False
         self._keep: list[object] = []
         self._describe(description)
-        self._extracted = extract(path, folder, terms)
+        self._extracted = extract(path, folder, terms, model=description)
         try:
             self._instantiate(self._extracted)
             self._self = pointer(self._component)
@@ -351,10 +351,12 @@ class FmuInstance(KeepsFmuState, ABC):
             text = f"{function} returned {STATUS_NAMES[error.status]}{self._said()}"
             raise InitializationFailed(text, instance=self.name) from error
 
-    def _failed(self, what: str, variable: str | None = None) -> StepFailed | InitializationFailed:
+    def _failed(
+        self, what: str, variable: str | None = None, hint: str | None = None
+    ) -> StepFailed | InitializationFailed:
         kind = StepFailed if self._state == "stepping" else InitializationFailed
         self._state = "failed"
-        return kind(f"{what}{self._said()}", instance=self.name, variable=variable)
+        return kind(f"{what}{self._said()}", instance=self.name, variable=variable, hint=hint)
 
     def _said(self) -> str:
         messages, self._last_messages = self._last_messages, []

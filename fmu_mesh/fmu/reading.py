@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import xml.etree.ElementTree as ET
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any, Final, Literal, cast
 
 import fmpy
 from fmpy.model_description import ModelDescription as FmpyDescription
@@ -24,7 +24,7 @@ from .variables import variables_of
 __all__ = ["read_description"]
 
 _VERSIONS = ("1.0", "2.0", "3.0")
-_WORDS = {"co_simulation": "co-simulation", "model_exchange": "model exchange"}
+_WORDS: Final[dict[Kind, str]] = {"co_simulation": "co-simulation", "model_exchange": "model exchange"}
 
 
 def read_description(
@@ -53,7 +53,9 @@ def read_description(
     kind = _kind(source, kind, path)
     platforms = tuple(fmpy.supported_platforms(str(path)))
     if to_run:
-        require_library(path, contents.names, _interface(source, kind).modelIdentifier or "", version)
+        others = [_interface(source, other) for other in _WORDS if other != kind]
+        identifiers = [one.modelIdentifier or "" for one in (_interface(source, kind), *others) if one is not None]
+        require_library(path, contents.names, identifiers, version)
     root = ET.fromstring(contents.xml["modelDescription.xml"])  # noqa: S314 - `examine` has found it safe
     try:
         return _convert(source, kind, root, platforms, problems)
@@ -63,14 +65,14 @@ def read_description(
 
 def _kind(source: FmpyDescription, wanted: str, path: Path) -> Kind:
     """The kind to use: the wanted one, or the one that there is; co-simulation comes first."""
-    kinds: tuple[Kind, ...] = ("co_simulation", "model_exchange")
-    there = [kind for kind in kinds if _interface(source, kind) is not None]
+    there = [kind for kind in _WORDS if _interface(source, kind) is not None]
     for kind in there:
         if wanted in ("auto", kind):
             return kind
     has = _WORDS[there[0]] if there else "scheduled execution"
+    missed = next((words for kind, words in _WORDS.items() if kind == wanted), "co-simulation or model exchange")
     raise LoadFailed(
-        f"'{path}' is for {has} only, not for {_WORDS.get(wanted, 'co-simulation or model exchange')}.",
+        f"'{path}' is for {has} only, not for {missed}.",
         hint="`kind: auto` takes what there is." if there else None,
     )
 
@@ -121,6 +123,7 @@ def _convert(
             tolerance=_number(getattr(experiment, "tolerance", None)),
         ),
         can_handle_variable_step_size=can("canHandleVariableCommunicationStepSize"),
+        can_reject_steps=can("canRejectSteps"),
         can_interpolate_inputs=can("canInterpolateInputs"),
         has_event_mode=can("hasEventMode"),
         can_get_and_set_state=bool(interface.canGetAndSetFMUstate),
@@ -134,6 +137,7 @@ def _convert(
         event_indicators=int(source.numberOfEventIndicators),
         clocks=tuple(map(_clock, root.iterfind("ModelVariables/Clock"))),
         platforms=platforms,
+        kinds=tuple(one for one in _WORDS if _interface(source, one) is not None),
         problems=problems,
     )
 

@@ -14,7 +14,8 @@ import shlex
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Callable, Sequence
+import xml.etree.ElementTree as ET
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Final
 
@@ -24,7 +25,8 @@ from fmpy.model_description import ModelDescription as FmpyDescription
 from fmpy.model_description import read_model_description
 
 from ..errors import LoadFailed
-from .archive import Terms, unpack
+from ..model.description import ModelDescription
+from .archive import Terms, look_into, unpack
 from .examining import library_names, source_names
 
 __all__ = ["cache_folder", "compile_sources", "extract"]
@@ -35,9 +37,13 @@ COMPILE_S: Final = 600.0
 """How long a compiler may take, in s."""
 
 _SHOWN_LINES: Final = 12
+_SUFFIX = str(fmpy.sharedLibraryExtension)
 _HEADERS = Path(fmpy.__file__).parent / "c-code"
+_OWN_HEADERS = Path(__file__).parent / "headers"
+"""Those of FMI 1.0 under its own names."""
 _FLAGS: Final = ("-O2", "-fPIC", "-ffp-contract=off", "-w")
-_LINK_FLAGS: Final = ("-shared", "-Wl,--no-undefined", "-lm", "-ldl", "-lpthread")
+# -Bsymbolic: sources call their own functions, even if the C library or Python has one of that name, too.
+_LINK_FLAGS: Final = ("-shared", "-Wl,--no-undefined", "-Wl,-Bsymbolic", "-lm", "-ldl", "-lpthread")
 
 
 class _Build(msgspec.Struct, frozen=True):
@@ -58,29 +64,35 @@ def extract(
     parent: Path,
     terms: Terms = Terms(),  # noqa: B008 a frozen Struct
     tell: Callable[[str], None] = log.info,
+    model: ModelDescription | None = None,
 ) -> Path:
     """Unpack the FMU at ``path`` into a new private folder below ``parent`` and return it, ready to be loaded.
 
-    Without a binary for this platform its sources are compiled, or what was compiled before is used again.
+    Without a binary for this platform its sources are compiled, or what was compiled before is used again. With
+    ``model``, that is the library of its kind; else of co-simulation, or of model exchange if there is nothing else.
 
     Raises:
         LoadFailed: the archive is broken or breaks ``terms``, or the sources do not compile; nothing is left behind.
     """
     with unpack(path, parent, terms) as folder:
-        names = {file.relative_to(folder).as_posix() for file in folder.glob("binaries/*/*")}
-        if not any(name.endswith(fmpy.sharedLibraryExtension) for name in names & _own(names)):
-            _add_library(path, folder, tell)
+        libraries = {file.relative_to(folder).as_posix() for file in folder.glob(f"binaries/*/*{_SUFFIX}")}
+        if not (_own(libraries) if model is None else _has_library(libraries, model)):
+            _add_library(path, folder, model, tell)
     return folder.with_suffix("")
 
 
-def compile_sources(path: Path, terms: Terms, tell: Callable[[str], None]) -> None:
+def compile_sources(path: Path, model: ModelDescription, terms: Terms, tell: Callable[[str], None]) -> None:
     """Compile the sources of the FMU at ``path`` into the cache, if they are not there yet; ``tell`` before it begins.
+
+    Nothing happens if it has a binary of the kind of ``model`` for this platform.
 
     Raises:
         LoadFailed: there is no compiler, or they do not compile; the message has the compiler's first lines.
     """
+    if _has_library(look_into(path, terms).names, model):
+        return
     with tempfile.TemporaryDirectory(prefix="fmu_mesh-") as folder:
-        extract(path, Path(folder), terms, tell)
+        extract(path, Path(folder), terms, tell, model)
 
 
 def cache_folder() -> Path:
@@ -91,35 +103,55 @@ def cache_folder() -> Path:
     return (Path(base) if base else Path.home() / ".cache") / "fmu_mesh"
 
 
+def _has_library(names: Collection[str], model: ModelDescription) -> bool:
+    """Whether the library of a kind of an FMU is among the names of its files."""
+    return any(name in names for name in library_names(model.model_identifier, model.fmi_version))
+
+
 def _own(names: set[str]) -> set[str]:
     """Those of ``names`` that are for this platform."""
-    folders = {f"binaries/{fmpy.platform}/", f"binaries/{fmpy.platform_tuple}/"}
-    return {name for name in names if any(name.startswith(folder) for folder in folders)}
+    return {
+        name for name in names if name.startswith((f"binaries/{fmpy.platform}/", f"binaries/{fmpy.platform_tuple}/"))
+    }
 
 
-def _add_library(path: Path, folder: Path, tell: Callable[[str], None]) -> None:
+def _add_library(path: Path, folder: Path, model: ModelDescription | None, tell: Callable[[str], None]) -> None:
     """Put the compiled library of an FMU where its binary would be."""
     names = [file.relative_to(folder).as_posix() for file in folder.glob("sources/**/*") if file.is_file()]
     if not source_names(names):
         return  # loading it says what is missing
     description = read_model_description(str(folder), validate=False)
-    build = _build(path, description, names)
+    kind = model.kind if model is not None else "co_simulation" if description.coSimulation else "model_exchange"
+    build = _build(path, description, names, kind, _listed_files(folder / "modelDescription.xml", kind))
     library = _compiled(path, folder / "sources", build, tell)
     target = folder / library_names(build.identifier, description.fmiVersion)[0]
     target.parent.mkdir(parents=True, exist_ok=True)
     shutil.copyfile(library, target)
 
 
-def _build(path: Path, description: FmpyDescription, names: Sequence[str]) -> _Build:
+def _listed_files(file: Path, kind: str) -> list[str]:
+    """The source files that FMI 2.0 lists for a kind, or for the other one of the same library.
+
+    FMPy keeps the list of only one of them.
+    """
+    root = ET.parse(file).getroot()  # noqa: S314 `examine` has found it safe
+    own, other = ("CoSimulation", "ModelExchange")[:: 1 if kind == "co_simulation" else -1]
+    units = [unit for name in (own, other) for unit in root.findall(name)]
+    identifiers = [unit.get("modelIdentifier") for unit in units]
+    lists = [unit.findall("SourceFiles/File") for unit in units if unit.get("modelIdentifier") == identifiers[0]]
+    return [str(entry.get("name")) for entry in next(filter(None, lists), [])]
+
+
+def _build(path: Path, description: FmpyDescription, names: Sequence[str], kind: str, listed: list[str]) -> _Build:
     """The files and options that a description lists (FMI 2.0, 2.2.3 SourceFiles; FMI 3.0, 2.5.1.4 buildDescription).
 
     FMI 1.0 has no list, and some tools forget theirs; then all files at the root of `sources` are taken.
     """
-    unit = description.coSimulation or description.modelExchange
+    unit = description.coSimulation if kind == "co_simulation" else description.modelExchange
     identifier = str(unit.modelIdentifier)
     fitting = [one for one in description.buildConfigurations if one.modelIdentifier in (identifier, None)]
     sets = fitting[0].sourceFileSets if fitting else []
-    sources = [name for one in sets for name in one.sourceFiles]
+    sources = listed or [name for one in sets for name in one.sourceFiles]
     if not sources:
         sources = [name.removeprefix("sources/") for name in source_names(names) if name.count("/") == 1]
     includes = [name for one in sets for name in one.includeDirectories]
@@ -158,7 +190,7 @@ def _compiled(path: Path, sources: Path, build: _Build, tell: Callable[[str], No
         target.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix="build-", dir=target.parent) as scratch:
             draft = Path(scratch) / target.name
-            folders = [sources, *(sources / name for name in build.includes), _HEADERS]
+            folders = [sources, *(sources / name for name in build.includes), _OWN_HEADERS, _HEADERS]
             files = [str(sources / name) for name in build.sources]
             command = [*own, *(f"-I{folder}" for folder in folders), "-o", str(draft), *files, *_LINK_FLAGS]
             _run(path, command, Path(scratch))
@@ -209,9 +241,10 @@ def _compiler(path: Path, *, plus: bool) -> list[str]:
 def _key(sources: Path, build: _Build, command: Sequence[str]) -> str:
     """A hash of everything that a library is made from."""
     digest = hashlib.sha256(msgspec.json.encode([build, command, fmpy.__version__, fmpy.platform_tuple]))
-    for file in sorted(sources.rglob("*")):
-        if file.is_file():
-            content = file.read_bytes()
-            digest.update(f"\0{file.relative_to(sources).as_posix()}\0{len(content)}\0".encode())
-            digest.update(content)
+    for folder in (sources, _OWN_HEADERS):
+        for file in sorted(folder.rglob("*")):
+            if file.is_file():
+                content = file.read_bytes()
+                digest.update(f"\0{file.relative_to(folder).as_posix()}\0{len(content)}\0".encode())
+                digest.update(content)
     return digest.hexdigest()[:32]

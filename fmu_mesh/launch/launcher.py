@@ -256,8 +256,9 @@ class Launcher:
         if type(error) in (Interrupted, MeshLost) and rows > (error.point or 0):
             # What is recorded is newer than what the last progress said.
             error.point, error.time = rows - 1, self._plan.grid.time(rows - 1)
-        if rows and error.hint is None:
-            error.hint = f"What was recorded up to then ({rows} rows) is in '{self._plan.system.result_file}'."
+        if rows:
+            kept = f"What was recorded up to then ({rows} rows) is in '{self._plan.system.result_file}'."
+            error.hint = f"{error.hint} {kept}" if error.hint else kept
         raise error
 
     def _own_account(self) -> FmuMeshError:

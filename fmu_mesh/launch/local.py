@@ -12,8 +12,10 @@ import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
+from typing import NamedTuple
 
 import numpy as np
 
@@ -116,8 +118,9 @@ class LocalMesh:
         try:
             self._run()
         except FmuMeshError as error:
-            if self.rows and error.hint is None:
-                error.hint = f"What was recorded up to then ({self.rows} rows) is in '{self._plan.system.result_file}'."
+            if self.rows:
+                kept = f"What was recorded up to then ({self.rows} rows) is in '{self._plan.system.result_file}'."
+                error.hint = f"{error.hint} {kept}" if error.hint else kept
             raise
 
     def _check_one_process(self) -> None:
@@ -201,7 +204,7 @@ class LocalMesh:
             member.set_initial_inputs(known)
         for member in members.values():
             member.instance.exit_initialization()
-            member.bind(grid)
+            member.bind(grid, members)
 
     def _iterate(self, loop: Loop, members: dict[str, _Member], known: dict[tuple[str, str], Value]) -> None:
         """Bring an algebraic loop to consistent values, which are known then."""
@@ -224,8 +227,8 @@ class LocalMesh:
 
     def _loop(self, members: dict[str, _Member], file: ResultFile | None) -> None:
         plan, grid = self._plan, self._plan.grid
-        recorded = [(members[instance], variable) for instance, variable in plan.system.recorded]
-        types = [member.type_of(variable) for member, variable in recorded]
+        types = [members[instance].type_of(variable) for instance, variable in plan.system.recorded]
+        recorded = [members[instance].reader(variable) for instance, variable in plan.system.recorded]
         buffer: list[list[Value]] = []
         first = 0
         self._save = lambda: self._save_rows(
@@ -235,7 +238,7 @@ class LocalMesh:
             for point in range(grid.last_point + 1):
                 self.point = point
                 if file is not None:
-                    buffer.append([member.value_at(point, variable) for member, variable in recorded])
+                    buffer.append([read(point // points) for read, points in recorded])
                     if len(buffer) == _ROWS:
                         _write(file, grid, first, buffer, types)
                         first, buffer = point + 1, []
@@ -245,7 +248,7 @@ class LocalMesh:
                 if point == grid.last_point:
                     break
                 for self._stepping, member in members.items():
-                    member.step_from(point, members)
+                    member.step_from(point)
         except TerminationRequested as asked:
             asked.point, asked.time = self.point, grid.time(self.point)
             self.ended_by = asked
@@ -282,6 +285,8 @@ class _Member:
         # A slower instance asks for a value as old as its own step.
         oldest = max(instance.step_points for instance in plan.system.instances.values())
         self._outputs = Ring(self.plan.outputs, 1 << (2 * oldest).bit_length())
+        self._points = self.plan.step_points
+        self._feeds: list[_Feed] = []
         self.step = 0
         self.settled: set[str] = set()
 
@@ -312,33 +317,53 @@ class _Member:
         if values:
             self.instance.set_values(values)
 
-    def bind(self, grid: TimeGrid) -> None:
+    def bind(self, grid: TimeGrid, members: Mapping[str, _Member]) -> None:
+        """Get ready for `step_from`: what it needs at every point is looked up here, once."""
         arrays = [column.name for column in self.plan.inputs.columns if column.shape]
         for name, value in zip(arrays, self.instance.get_values(arrays) if arrays else [], strict=True):
             self._inputs.put(0, name, value)  # what is not connected keeps it
         self.instance.bind(self._inputs, (self._outputs,), grid, self.plan.step_points)
+        self._do_step = self.instance.do_step
+        for c in self.connections:
+            read, points = members[c.source_instance].reader(c.source_name)
+            late = self.plan.step_points if c.delay else 0
+            same = (c.factor, c.offset) == (1.0, 0.0)
+            change = None if same else partial(scaled, factor=c.factor, offset=c.offset)
+            self._feeds.append(_Feed(read, points, late, change, self._inputs.writer(c.target_name)))
 
     def type_of(self, variable: str) -> VariableType:
         """The type of an output, or of an element of it."""
         return self.plan.outputs.column(variable).type
 
-    def value_at(self, point: int, variable: str) -> Value:
-        """The output at ``point``: that of the last own point at or before it."""
-        return self._outputs.value(point // self.plan.step_points, variable)
+    def reader(self, variable: str) -> tuple[Callable[[int], Value], int]:
+        """An output as a function of the own step, and how many points that has.
 
-    def step_from(self, point: int, members: dict[str, _Member]) -> None:
+        At a point it is that of the last own step that ended there or before: ``read(point // points)``.
+        """
+        return self._outputs.reader(variable), self.plan.step_points
+
+    def step_from(self, point: int) -> None:
         """Take the own step that ends at ``point + 1``, if there is one, with the inputs that the delays prescribe."""
-        points = self.plan.step_points
-        if (point + 1) % points:
+        end = point + 1
+        if end % self._points:
             return
-        for c in self.connections:
-            taken_at = point + 1 - points if c.delay else point + 1
-            value = members[c.source_instance].value_at(taken_at, c.source_name)
-            self._inputs.put(0, c.target_name, scaled(value, c.factor, c.offset))
-        self.instance.do_step(self.step)
+        for read, points, late, change, write in self._feeds:
+            value = read((end - late) // points)
+            write(0, value if change is None else change(value))
+        self._do_step(self.step)
         if floating_point_changed():
             restore_floating_point()
         self.step += 1
+
+
+class _Feed(NamedTuple):
+    """How an input gets its value: ``read`` a source whose steps have ``points``, ``late`` points before the end."""
+
+    read: Callable[[int], Value]
+    points: int
+    late: int
+    change: Callable[[Value], Value] | None
+    write: Callable[[int, Value], None]
 
 
 def _at(value: Value, index: tuple[int, ...]) -> Value:

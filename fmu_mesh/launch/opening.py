@@ -11,7 +11,7 @@ from pathlib import Path
 import msgspec
 
 from ..errors import ConfigurationError
-from ..fmu import PLATFORM, FmuInstance, LogMessage, Terms, compile_sources, read_description
+from ..fmu import FmuInstance, LogMessage, Terms, compile_sources, read_description
 from ..fmu import open_instance as open_fmu
 from ..fmu import stepped as stepped_fmu
 from ..hosts import (
@@ -70,8 +70,7 @@ def describe(
             return describe_pid()
         case _:
             description = read_description(path, terms, config.kind)
-            if PLATFORM not in description.platforms:
-                compile_sources(path, terms, tell)
+            compile_sources(path, description, terms, tell)
             return description
 
 

@@ -14,7 +14,7 @@ import msgspec
 from msgspec.structs import replace
 
 from fmu_mesh.model.config import ConnectionConfig
-from fmu_mesh.model.description import Variable
+from fmu_mesh.model.description import ModelDescription, Variable
 from fmu_mesh.model.findings import Findings, listed, nearest
 from fmu_mesh.model.types import FMI2_TYPES, TYPES, VariableType, element_name, is_float, split_element, takes
 from fmu_mesh.model.units import Linear, conversion
@@ -140,17 +140,27 @@ def resolve_variable(
     return own[name], ()
 
 
-def unit_warnings(connections: Sequence[Connection], findings: Findings) -> None:
+def unit_warnings(
+    connections: Sequence[Connection], descriptions: Mapping[str, ModelDescription], findings: Findings
+) -> None:
     """Note the connections between different units that nothing converts, because one of them is not defined.
 
     Such units are compared as they are written; a model may write one unit in several ways, so this is a warning.
+    FMI 1.0 has display units only, which no value ever is in (FMI 1.0, 3.3), so its units are never defined.
     """
     for connection in connections:
         source, target = connection.source.unit, connection.target.unit
-        defined = connection.source.base_unit is not None and connection.target.base_unit is not None
-        if source and target and source != target and not defined and not connection.units and _is_identity(connection):
-            found = f"{connection} connects the unit '{source}' to the unit '{target}'"
-            findings.add(connection.path, found, "the same unit, or a factor that converts it")
+        undefined = [(owner, end) for owner, end in _ends(connection) if end.base_unit is None]
+        if source and target and source != target and undefined and not connection.units and _is_identity(connection):
+            owner, end = undefined[0]
+            old = descriptions[owner].fmi_version.startswith("1.")
+            reason = "FMI 1.0 gives units a name only" if old else f"its model does not define '{end.unit}'"
+            found = (
+                f"{connection} connects the unit '{source}' to the unit '{target}' and converts nothing, because there "
+                f"are no base units of {owner}.{end.name}: {reason}"
+            )
+            expected = "the same unit, a factor that converts it, or `ignore_units: true` if both are the same"
+            findings.add(connection.path, found, expected)
 
 
 def _with_units(connection: Connection, config: ConnectionConfig, findings: Findings) -> Connection:

@@ -147,6 +147,7 @@ class ModelDescription(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     generation_tool: str | None = None
     default_experiment: DefaultExperiment = DefaultExperiment()
     can_handle_variable_step_size: bool = False
+    can_reject_steps: bool = False
     can_get_and_set_state: bool = False
     can_serialize_state: bool = False
     only_once_per_process: bool = False
@@ -158,6 +159,7 @@ class ModelDescription(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     event_indicators: int = 0
     clocks: tuple[Clock, ...] = ()
     platforms: tuple[str, ...] = ()
+    kinds: tuple[Kind, ...] = ()
     problems: tuple[str, ...] = ()
 
     def variable(self, name: str) -> Variable | None:

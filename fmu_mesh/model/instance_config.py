@@ -86,7 +86,7 @@ class InstanceConfig(Base, frozen=True, kw_only=True, tag_field=KIND, tag="fmu")
         bool,
         Meta(
             description="Whether a step that an FMI 2.0 FMU discards is tried again in smaller ones; then its state is "
-            "kept before every step. FMI 3.0 needs no such wish."
+            "kept before every step. FMI 1.0 and 3.0 need no such wish."
         ),
     ] = False
     start_values: StartValues = {}

@@ -76,9 +76,9 @@ def capability_warnings(
     for name in config:
         description = descriptions[name]
         if description.needs_execution_tool:
-            tool = description.generation_tool or "the tool that made it"
-            found = f"the FMU of '{name}' needs an execution tool ({tool})"
-            findings.add(f"instances.{name}.fmu", found, f"{tool} installed on the host that runs it")
+            tool = description.generation_tool
+            found = f"the FMU of '{name}' needs an execution tool ({tool or 'it does not say which'})"
+            findings.add(f"instances.{name}.fmu", found, f"{tool or 'that tool'} on the host that runs it")
 
 
 def _cannot_retry(description: ModelDescription) -> str | None:
@@ -86,8 +86,8 @@ def _cannot_retry(description: ModelDescription) -> str | None:
         return "a model-exchange FMU has no steps of its own to discard"
     if not description.can_handle_variable_step_size:
         return "the FMU does not handle a variable communication step size"
-    if description.fmi_version.startswith("1."):
-        return "FMI 1.0 has no FMU state to go back to"
+    if description.fmi_version.startswith("1.") and not description.can_reject_steps:
+        return "the FMU cannot repeat a step (canRejectSteps)"
     if description.fmi_version.startswith("2.") and not description.can_get_and_set_state:
         return "the FMU cannot get and set its state, so it cannot go back to where the step began"
     return None
@@ -103,8 +103,6 @@ def _cannot_extrapolate(connection: Connection, description: ModelDescription, *
         return None
     if description.fmi_version.startswith("3."):
         reason = "co-simulation in FMI 3.0 takes no input derivatives (it would run as model exchange)"
-    elif description.fmi_version.startswith("1."):
-        reason = "co-simulation in FMI 1.0 gets no input derivatives here (it would run as model exchange)"
     elif not description.can_interpolate_inputs:
         reason = f"the FMU of '{connection.target_instance}' does not interpolate inputs (canInterpolateInputs)"
     elif retries:

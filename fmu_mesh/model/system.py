@@ -126,7 +126,7 @@ def build(
         nodes = automatic_nodes(config, edges, descriptions)
         instances = {name: replace(own, node=nodes.get(name, own.node)) for name, own in instances.items()}
     warnings = loaded.findings()
-    unit_warnings(connections, warnings)
+    unit_warnings(connections, descriptions, warnings)
     capability_warnings(config.instances, descriptions, warnings)
     return System(config, grid, instances, connections, recorded, result_file, tuple(warnings))
 

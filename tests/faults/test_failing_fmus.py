@@ -11,6 +11,8 @@ from typing import Any
 import pytest
 import zenoh
 
+from fmu_mesh.fmu.step_status import RETRY
+from tests.fmus.helpers import find_fmu
 from tests.helpers import Place, rows_of, wait_until, write_config
 
 
@@ -31,7 +33,14 @@ def with_faulty(place: Place, faulty: Path, start_values: Mapping[str, float | b
 @pytest.mark.parametrize("options", [(), ("--local",)], ids=["distributed", "local"])
 @pytest.mark.parametrize(
     ("fault", "status", "says"),
-    [("fail_at", "error", "the reactor is empty"), ("discard_at", "discard", "the step does not converge")],
+    [
+        ("fail_at", "error", "the reactor is empty. "),
+        (
+            "discard_at",
+            "discard; the last successful time is 1 s",
+            f"the step does not converge. {RETRY} ",
+        ),
+    ],
 )
 def test_a_failed_step_is_told_with_instance_point_time_and_the_message_of_the_fmu(
     place: Place, faulty: Path, fault: str, status: str, says: str, options: tuple[str, ...]
@@ -43,14 +52,30 @@ def test_a_failed_step_is_told_with_instance_point_time_and_the_message_of_the_f
     assert launched.wait() == 3
     rows = rows_of(config.with_suffix(".csv"))
     assert launched.errors.splitlines()[-1] == (
-        f"fmu-mesh: instance faulty, point 1000, t = 1 s: fmi2DoStep returned {status}; the FMU says: {says}. "
+        f"fmu-mesh: instance faulty, point 1000, t = 1 s: fmi2DoStep returned {status}; the FMU says: {says}"
         f"What was recorded up to then ({len(rows)} rows) is in '{config.with_suffix('.csv')}'."
     )
-    assert f"faulty at point 1000: {says}" in launched.errors  # as it came, too
+    assert f"faulty at point 1000: {says.partition('.')[0]}" in launched.errors  # as it came, too
     assert "Traceback" not in launched.errors
     # In one process all is there; of several, one may not have sent its last rows when it hears of the failure.
     assert len(rows) == 1001 if options else len(rows) <= 1001
     assert [row[0] for row in rows] == [point * 0.001 for point in range(len(rows))]
+    place.assert_nothing_left()
+
+
+@pytest.mark.parametrize("options", [(), ("--local",)], ids=["distributed", "local"])
+@pytest.mark.parametrize("name", ["Steps1", "Steps2"])
+def test_a_step_that_is_pending_for_ever_ends_at_the_deadline_of_the_step(
+    place: Place, tmp_path: Path, name: str, options: tuple[str, ...]
+) -> None:
+    instances = {"pump": {"fmu": str(find_fmu(name, tmp_path)), "start_values": {"polls": -1}}}
+    config = write_config(place.folder, instances=instances, connections=[], timeouts={"step": 1.0})
+
+    launched = place.run("launch", config, *options)
+
+    assert launched.wait() == 3
+    assert launched.message.startswith("fmu-mesh: instance pump, point 0, t = 0 s: the FMU has not returned for ")
+    assert " s from doStep; its process is ended. " in launched.message
     place.assert_nothing_left()
 
 

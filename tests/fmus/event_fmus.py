@@ -11,6 +11,7 @@ import hashlib
 import subprocess
 import tempfile
 import zipfile
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -18,7 +19,7 @@ from typing import Literal
 
 from fmus.build import find_compiler
 
-__all__ = ["MODELS", "build_event_fmu"]
+__all__ = ["MODELS", "build_event_fmu", "event_source_fmu"]
 
 SOURCES = Path(__file__).resolve().parent / "src" / "events"
 FIRST_INTEGER = 100
@@ -142,6 +143,37 @@ def build_event_fmu(name: str, version: Version, folder: Path, **changes: str) -
         archive.writestr(f"binaries/{platform}/{name}.so", _compiled(name, model, version, guid))
     Path(archive.filename or "").replace(built)
     return built
+
+
+def event_source_fmu(
+    name: str,
+    version: Version,
+    target: Path,
+    description: Callable[[str], str] = lambda text: text,
+    add: Mapping[str, str] = {},
+    only: str | None = None,
+) -> Path:
+    """Write ``target``: the same FMU with its sources only.
+
+    Args:
+        name: a key of `MODELS`.
+        version: of FMI.
+        target: the archive.
+        description: makes another model description of it.
+        add: more files of the archive, or others instead of those that there would be.
+        only: the one kind that it declares.
+    """
+    guid = f"{{source of {name}{version}}}"
+    shared = f'#define FMU_GUID "{guid}"\n#ifndef MODEL_IDENTIFIER\n#define MODEL_IDENTIFIER {name}\n#endif\n'
+    text = {1: _fmi1, 2: _fmi2, 3: _fmi3}[version](name, MODELS[name], guid, {"only": only} if only else {})
+    members = {"modelDescription.xml": description(text), "sources/variables.h": _header(MODELS[name])}
+    for file in ("model.h", f"fmi{version}.c", "stepping.c", f"{name}.c"):
+        content = (SOURCES / file).read_text(encoding="utf-8")
+        members[f"sources/{file}"] = shared + content if file == "model.h" else content
+    with zipfile.ZipFile(target, "w", zipfile.ZIP_DEFLATED) as archive:
+        for member, content in (members | dict(add)).items():
+            archive.writestr(member, content)
+    return target
 
 
 def _compiled(name: str, model: Model, version: Version, guid: str) -> bytes:

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from fmu_mesh.cli.main import main
-from tests.fmus.helpers import FMUS
+from tests.fmus.helpers import FMUS, find_fmu
 from tests.fmus.packing import repacked, unpacked
 
 PENDULUM = FMUS / "DampedPendulum.fmu"
@@ -53,6 +53,31 @@ def test_the_page_says_what_an_fmu_is(capsys: pytest.CaptureFixture[str]) -> Non
         "  l  Real  fixed  = 1.0 m      Length, greater than 0",
     ):
         assert f"{line}\n" in page
+
+
+def test_the_page_says_all_kinds_what_they_can_and_how_many_states_there_are(
+    event_fmu: Callable[..., Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    page = " ".join(inspected(capsys, event_fmu("Ball", 3)).split())
+
+    assert "Kind FMI 3.0 co-simulation or model exchange " in page
+    assert "Can variable step size, get and set its state, serialize its state, event mode " in page
+    assert "Variables 4 outputs, 2 parameters, 1 independent variable, 6 local variables " in page
+    assert "States 2 continuous, 1 event indicator " in page
+
+
+def test_start_values_are_shown_as_a_configuration_has_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    page = inspected(capsys, find_fmu("AllTypes3", tmp_path), "*_in")
+
+    for name, start in {
+        "float64_array_in": "[[0.0,0.0,0.0],[0.0,0.0,0.0]]",
+        "enumeration_in": "low (1)",
+        "string_in": "''",
+        "binary_in": "''",
+        "boolean_in": "false",
+    }.items():
+        (line,) = [one for one in page.splitlines() if one.split()[0] == name]
+        assert line.rpartition(" = ")[2] == start
 
 
 def test_the_json_has_everything(capsys: pytest.CaptureFixture[str]) -> None:

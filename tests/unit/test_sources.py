@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
+import math
+import re
 import shutil
 import subprocess
 import sys
 import zipfile
+from contextlib import closing
 from pathlib import Path
+from typing import Literal
 
 import pytest
 import yaml
 
 from fmu_mesh.cli.main import main
 from fmu_mesh.errors import LoadFailed
-from fmu_mesh.fmu import read_description
+from fmu_mesh.fmu import open_instance, read_description
 from fmu_mesh.fmu.sources import extract
-from tests.fmus.helpers import FMUS, NO_COMPILER
+from fmu_mesh.model.description import Kind
+from tests.fmus import event_fmus
+from tests.fmus.event_fmus import Version, event_source_fmu
+from tests.fmus.helpers import FMUS, NO_COMPILER, find_fmu
 from tests.fmus.packing import repacked, unpacked, without_binaries
 
 pytestmark = pytest.mark.skipif(NO_COMPILER is not None, reason=str(NO_COMPILER))
@@ -165,6 +172,125 @@ def test_without_a_compiler_check_refuses_with_the_ways_out(
     assert "no binary for this platform (linux64) but sources, and there is no compiler" in said
     assert "no-such-compiler" in said
     assert "$CC" in said
+
+
+# ---- the kind that runs
+
+
+def two_libraries(text: str) -> str:
+    """A description whose kinds have libraries of their own."""
+    text = text.replace('<ModelExchange modelIdentifier="Ball"', '<ModelExchange modelIdentifier="Ball_me"')
+    return text.replace('<CoSimulation modelIdentifier="Ball"', '<CoSimulation modelIdentifier="Ball_cs"')
+
+
+def bounces(fmu: Path, kind: Literal["auto"] | Kind = "auto") -> float:
+    """Runs a ball for 2 s and returns the time of its last bounce in s."""
+    config = fmu.parent / "ball.yaml"
+    content = {
+        "mesh": "ball",
+        "simulation": {"stop_time": 2, "step_size": 0.1},
+        "instances": {"ball": {"fmu": fmu.name, "kind": kind}},
+        "record": {"file": "ball.csv", "variables": ["ball.last_bounce"]},
+    }
+    config.write_text(yaml.safe_dump(content), encoding="utf-8")
+    assert main(["launch", "--local", str(config)]) == 0
+    return float((fmu.parent / "ball.csv").read_text().splitlines()[-1].split(",")[1])
+
+
+LAST_BOUNCE = math.sqrt(2 / 9.81) * (1 + 2 * (0.7 + 0.49 + 0.343))
+
+
+@pytest.mark.parametrize("version", [1, 2, 3])
+def test_a_source_fmu_for_model_exchange_only_is_compiled_and_runs(version: Version, tmp_path: Path) -> None:
+    fmu = event_source_fmu("Ball", version, tmp_path / "ball.fmu", only=None if version == 1 else "model_exchange")
+
+    assert bounces(fmu) == pytest.approx(LAST_BOUNCE, abs=1e-5)
+
+
+@pytest.mark.parametrize("name", ["AllTypes1", "AllTypes3"])
+def test_a_source_fmu_for_co_simulation_is_compiled_in_fmi_1_and_3(name: str, tmp_path: Path) -> None:
+    fmu = without_binaries(tmp_path / "sources.fmu", source=find_fmu(name, tmp_path))
+    description = read_description(fmu)
+
+    with closing(open_instance(fmu, "m", description, tmp_path)) as instance:
+        instance.enter_initialization(0.0, 1.0, {})
+        instance.exit_initialization()
+
+
+@pytest.mark.parametrize("version", [2, 3])
+@pytest.mark.parametrize(("kind", "library"), [("model_exchange", "Ball_me.so"), ("co_simulation", "Ball_cs.so")])
+def test_of_two_kinds_with_libraries_of_their_own_that_of_the_kind_that_runs_is_compiled(
+    kind: Kind, library: str, version: Version, tmp_path: Path, cache: Path
+) -> None:
+    fmu = event_source_fmu("Ball", version, tmp_path / "ball.fmu", two_libraries)
+
+    assert bounces(fmu, kind) == pytest.approx(LAST_BOUNCE, abs=1e-5)
+
+    assert [one.name for one in libraries(cache)] == [library]
+
+
+def test_each_kind_is_compiled_from_the_files_that_fmi_2_lists_for_it(tmp_path: Path) -> None:
+    files = "".join(f'<File name="{name}"/>' for name in ("fmi2.c", "stepping.c", "Ball.c"))
+    lists = {"ModelExchange": files, "CoSimulation": '<File name="other.c"/>'}
+
+    def listed(text: str) -> str:
+        for kind, names in lists.items():
+            text = re.sub(f"(<{kind}[^>]*)/>", rf"\1><SourceFiles>{names}</SourceFiles></{kind}>", text)
+        return text
+
+    fmu = event_source_fmu("Ball", 2, tmp_path / "ball.fmu", listed, {"sources/other.c": "#error this is another kind"})
+
+    assert bounces(fmu, "model_exchange") == pytest.approx(LAST_BOUNCE, abs=1e-5)
+    with pytest.raises(LoadFailed, match=r"do not compile: .*this is another kind"):
+        extract(fmu, tmp_path / "parent", model=read_description(fmu, kind="co_simulation"))
+
+
+def test_of_the_build_configurations_of_fmi_3_that_of_the_kind_that_runs_is_taken(tmp_path: Path, cache: Path) -> None:
+    def configuration(identifier: str, *files: str) -> str:
+        names = "".join(f'<SourceFile name="{name}"/>' for name in files)
+        definition = f'<PreprocessorDefinition name="MODEL_IDENTIFIER" value="{identifier}"/>'
+        return (
+            f'<BuildConfiguration modelIdentifier="{identifier}"><SourceFileSet language="C99">{names}{definition}'
+            "</SourceFileSet></BuildConfiguration>"
+        )
+
+    ours = configuration("Ball_me", "fmi3.c", "stepping.c", "Ball.c")
+    build = f'<fmiBuildDescription fmiVersion="3.0">{configuration("Ball_cs", "no.c")}{ours}</fmiBuildDescription>'
+    fmu = event_source_fmu(
+        "Ball", 3, tmp_path / "ball.fmu", two_libraries, {"sources/buildDescription.xml": build, "sources/no.c": "!"}
+    )
+
+    assert bounces(fmu, "model_exchange") == pytest.approx(LAST_BOUNCE, abs=1e-5)
+    assert [one.name for one in libraries(cache)] == ["Ball_me.so"]
+
+
+def test_a_library_of_the_other_kind_is_no_reason_not_to_compile(tmp_path: Path, cache: Path) -> None:
+    add = {"binaries/linux64/Ball_cs.so": "not looked at"}
+    fmu = event_source_fmu("Ball", 2, tmp_path / "ball.fmu", two_libraries, add)
+
+    assert bounces(fmu, "model_exchange") == pytest.approx(LAST_BOUNCE, abs=1e-5)
+
+    assert [one.name for one in libraries(cache)] == ["Ball_me.so"]
+
+
+def test_a_library_of_the_other_kind_without_sources_is_told_with_the_way_out(tmp_path: Path) -> None:
+    sources = event_source_fmu("Ball", 2, tmp_path / "sources.fmu", two_libraries)
+    library: dict[str | zipfile.ZipInfo, bytes] = {"binaries/linux64/Ball_cs.so": b"not looked at"}
+    fmu = repacked(tmp_path / "ball.fmu", source=sources, keep=lambda name: "sources/" not in name, add=library)
+
+    with pytest.raises(LoadFailed, match=r"has only 'binaries/linux64/Ball_cs.so', the library of its") as caught:
+        read_description(fmu, kind="model_exchange")
+
+    assert caught.value.hint == "Leave `kind` to the other one, or export it with both libraries."
+
+
+def test_sources_of_fmi_1_need_not_bring_the_headers_of_the_standard(tmp_path: Path) -> None:
+    text = (Path(event_fmus.SOURCES) / "fmi1.c").read_text(encoding="utf-8")
+    text = text.replace("fmi1Functions.h", "fmiModelFunctions.h").replace("fmi1", "fmi")
+    text = text.replace("#define EXPORT(name) JOIN(MODEL_IDENTIFIER, name)", "#define EXPORT(name) name")
+    fmu = event_source_fmu("Ball", 1, tmp_path / "ball.fmu", add={"sources/fmi1.c": text})
+
+    assert bounces(fmu) == pytest.approx(LAST_BOUNCE, abs=1e-5)
 
 
 def test_two_processes_at_once_compile_without_harm(tmp_path: Path, cache: Path) -> None:

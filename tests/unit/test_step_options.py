@@ -151,7 +151,7 @@ def test_check_shows_the_solver_the_slopes_and_what_needs_a_tool(event_fmu: Even
 
     assert "Integral3.fmu (FMI 3.0 model exchange, cvode 1e-08)" in page
     assert "changes linearly in the step" in page
-    assert "the FMU of 'ball' needs an execution tool (the tool that made it)" in page
+    assert "the FMU of 'ball' needs an execution tool (it does not say which); expected that tool on the host" in page
 
 
 def test_two_instances_of_an_fmu_that_allows_one_share_no_process(event_fmu: EventFmu, tmp_path: Path) -> None:

@@ -119,7 +119,7 @@ def test_a_step_that_is_always_discarded_fails_and_says_so(
 def test_without_the_wish_a_discarded_step_of_fmi_2_is_a_failure(event_fmu: EventFmu, tmp_path: Path) -> None:
     with (
         running(event_fmu("Stairs", 2), tmp_path, "co_simulation", longest_step=0.1) as stairs,
-        pytest.raises(StepFailed, match=r"fmi2DoStep returned discard; the FMU says: the step is too long"),
+        pytest.raises(StepFailed, match=r"fmi2DoStep returned discard; .*; the FMU says: the step is too long"),
     ):
         stairs.do_step(0)
 

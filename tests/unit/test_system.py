@@ -434,8 +434,9 @@ def test_different_units_without_a_factor_are_a_warning() -> None:
     assert warning == Finding(
         str(FILE),
         "connections[0]",
-        "pendulum.a -> delay.x connects the unit 'rad' to the unit 'm'",
-        "the same unit, or a factor that converts it",
+        "pendulum.a -> delay.x connects the unit 'rad' to the unit 'm' and converts nothing, because there are no base "
+        "units of pendulum.a: its model does not define 'rad'",
+        "the same unit, a factor that converts it, or `ignore_units: true` if both are the same",
         None,
         6,
     )

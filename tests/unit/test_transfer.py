@@ -8,6 +8,7 @@ import pytest
 from fmu_mesh.model.plan import Feed
 from fmu_mesh.model.ring import Layout, Ring
 from fmu_mesh.model.transfer import Transfer
+from fmu_mesh.model.types import Value
 
 RATES = [(source, target, delay) for source in range(1, 6) for target in range(1, 6) for delay in (0, 1)]
 SOURCE = Layout.of([("a", "Float64"), ("b", "Float64"), ("c", "Float64"), ("n", "Int32"), ("m", "Int32")])
@@ -165,3 +166,18 @@ def test_single_numbers_are_handed_over_bit_by_bit(
         step_once(step)
 
         assert [part.tobytes() for part in by_step.parts] == [part.tobytes() for part in by_ring.parts]
+
+
+def test_a_reader_and_a_writer_of_a_column_do_what_value_and_put_do() -> None:
+    layout = Layout.of([("a", "Float64"), ("f", "Float64", (2, 2)), ("g", "Float32"), ("n", "Int64"), ("s", "String")])
+    written, put = Ring(layout, 4), Ring(layout, 4)
+    values: dict[str, Value] = {"a": 0.1, "f[2,1]": 2.5, "g": 0.1, "n": 2**63 - 1, "s": "text"}
+
+    for name, value in values.items():
+        written.writer(name)(6, value)
+        put.put(6, name, value)
+
+    assert [written.value(6, name) for name in values] == [put.value(6, name) for name in values]
+    assert [written.reader(name)(6) for name in values] == [put.value(6, name) for name in values]
+    assert [written.reader(name)(7) for name in values] == [0.0, 0.0, 0.0, 0, ""]
+    assert [type(written.reader(name)(6)) for name in values] == [float, float, float, int, str]

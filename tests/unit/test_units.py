@@ -14,6 +14,8 @@ from fmu_mesh.errors import ConfigurationError
 from fmu_mesh.fmu import read_description
 from fmu_mesh.launch.preparing import prepare
 from fmu_mesh.model.units import BaseUnit, Linear, conversion
+from tests.fmus.helpers import find_fmu
+from tests.fmus.packing import repacked
 from tests.helpers import FMUS, write_config
 
 RAD = BaseUnit(rad=1)
@@ -178,7 +180,36 @@ def test_where_a_unit_is_not_defined_nothing_is_converted_and_a_warning_says_so(
 
     [warning] = prepare(path).system.warnings
 
-    assert warning.found == "pendulum.a -> gain.u connects the unit 'rad' to the unit 'furlong'"
+    assert warning.found == (
+        "pendulum.a -> gain.u connects the unit 'rad' to the unit 'furlong' and converts "
+        "nothing, because there are no base units of gain.u: its model does not define 'furlong'"
+    )
+    assert warning.expected == "the same unit, a factor that converts it, or `ignore_units: true` if both are the same"
+
+
+def test_units_of_fmi_1_are_names_and_its_display_units_convert_nothing(tmp_path: Path) -> None:
+    """A display unit is for people: every value is in the unit itself (FMI 1.0, 3.3)."""
+
+    def with_units(text: str) -> str:
+        degrees = '<BaseUnit unit="deg"><DisplayUnitDefinition displayUnit="rad" gain="57.3"/></BaseUnit>'
+        text = text.replace("  <DefaultExp", f"  <UnitDefinitions>{degrees}</UnitDefinitions>\n  <DefaultExp")
+        return text.replace('<Real start="0"/>', '<Real start="0" unit="deg" displayUnit="rad"/>', 1)
+
+    old = repacked(tmp_path / "old.fmu", source=find_fmu("AllTypes1", tmp_path), description=with_units)
+    instances = {"pendulum": {"fmu": "DampedPendulum"}, "old": {"fmu": str(old)}}
+    path = write_config(tmp_path, instances=instances, connections=["pendulum.a -> old.real_in"])
+
+    plan = prepare(path)
+
+    assert plan.system.instances["old"].description.problems == ()
+    assert (plan.connections[0].factor, plan.connections[0].offset) == (1.0, 0.0)
+    [warning] = plan.system.warnings
+    assert warning.found == (
+        "pendulum.a -> old.real_in connects the unit 'rad' to the unit 'deg' and converts nothing, because there are "
+        "no base units of old.real_in: FMI 1.0 gives units a name only"
+    )
+    same = write_config(tmp_path, instances=instances, connections=["old.real_out -> old.real_in"])
+    assert "Warnings" not in plan_page(prepare(same))
 
 
 def test_a_temperature_is_shifted_and_a_difference_is_not(tmp_path: Path) -> None:

@@ -2,7 +2,7 @@
  *
  * An FMU that does what its instance name says, in the call that it names: `hang_fmi2Terminate`,
  * `segfault_fmi2DoStep`, `rounding_fmi2Instantiate`, ... With any other name, such as `polite`, it does nothing.
- * Its outputs tell what the process it runs in looks like, so that a neighbour shows what another instance did.
+ * What follows an `@` is not looked at. Its outputs tell what the process it runs in looks like, so that a neighbour shows what another instance did.
  *
  * Not on the skeleton: the skeleton owns the life cycle, and this misbehaves in it.
  */
@@ -100,7 +100,9 @@ static void called(const char *name, const char *function)
     const char *separator = strchr(name, '_');
     char what[64];
 
-    if (separator == NULL || strcmp(separator + 1, function) != 0) return;
+    if (separator == NULL || strcspn(separator + 1, "@") != strlen(function) ||
+        strncmp(separator + 1, function, strlen(function)) != 0)
+        return;
     snprintf(what, sizeof what, "%.*s", (int)(separator - name), name);
     misbehave(what);
 }

@@ -1,0 +1,37 @@
+/* SPDX-License-Identifier: Apache-2.0 */
+#ifndef FMIMODELFUNCTIONS_H
+#define FMIMODELFUNCTIONS_H
+
+#include "fmi1_names.h"
+
+#define fmiGetModelTypesPlatform fmiFullName(_fmiGetModelTypesPlatform)
+#define fmiInstantiateModel fmiFullName(_fmiInstantiateModel)
+#define fmiFreeModelInstance fmiFullName(_fmiFreeModelInstance)
+#define fmiSetTime fmiFullName(_fmiSetTime)
+#define fmiSetContinuousStates fmiFullName(_fmiSetContinuousStates)
+#define fmiCompletedIntegratorStep fmiFullName(_fmiCompletedIntegratorStep)
+#define fmiInitialize fmiFullName(_fmiInitialize)
+#define fmiGetDerivatives fmiFullName(_fmiGetDerivatives)
+#define fmiGetEventIndicators fmiFullName(_fmiGetEventIndicators)
+#define fmiEventUpdate fmiFullName(_fmiEventUpdate)
+#define fmiGetContinuousStates fmiFullName(_fmiGetContinuousStates)
+#define fmiGetNominalContinuousStates fmiFullName(_fmiGetNominalContinuousStates)
+#define fmiGetStateValueReferences fmiFullName(_fmiGetStateValueReferences)
+#define fmiTerminate fmiFullName(_fmiTerminate)
+
+DllExport const char *fmiGetModelTypesPlatform(void);
+DllExport fmi1InstantiateModelTYPE fmiInstantiateModel;
+DllExport fmi1FreeModelInstanceTYPE fmiFreeModelInstance;
+DllExport fmi1SetTimeTYPE fmiSetTime;
+DllExport fmi1SetContinuousStatesTYPE fmiSetContinuousStates;
+DllExport fmi1CompletedIntegratorStepTYPE fmiCompletedIntegratorStep;
+DllExport fmi1InitializeTYPE fmiInitialize;
+DllExport fmi1GetDerivativesTYPE fmiGetDerivatives;
+DllExport fmi1GetEventIndicatorsTYPE fmiGetEventIndicators;
+DllExport fmi1EventUpdateTYPE fmiEventUpdate;
+DllExport fmi1GetContinuousStatesTYPE fmiGetContinuousStates;
+DllExport fmi1GetNominalContinuousStatesTYPE fmiGetNominalContinuousStates;
+DllExport fmi1GetStateValueReferencesTYPE fmiGetStateValueReferences;
+DllExport fmi1TerminateTYPE fmiTerminate;
+
+#endif
