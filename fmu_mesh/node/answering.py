@@ -158,7 +158,7 @@ class Answers:
 
         def take() -> None:
             try:
-                set_input(runner.instance, new.variable, new.value, new.time, runner.step)
+                set_input(runner, new.variable, new.value, new.time)
             except ValueRefused as refused:
                 self._post(partial(self._log, LogLine(runner.name, "warning", "set", str(refused), runner.point)))
 
@@ -185,7 +185,7 @@ class Answers:
 
         def take() -> None:
             try:
-                step = set_input(runner.instance, new.variable, new.value, new.time, runner.step)
+                step = set_input(runner, new.variable, new.value, new.time)
             except ValueRefused as refused:
                 reason = str(refused)
                 self._post(lambda: self._finish(pending, lambda: query.reply_err(reason)))

@@ -18,6 +18,7 @@ from ..model.types import is_float
 from ..model.wrapping import AroundInstance
 from ..simtime import TimeGrid
 from ..wire.values import ValueRefused
+from .stepping import Runner
 
 __all__ = ["TimedInputs", "set_input"]
 
@@ -28,7 +29,7 @@ class TimedInputs(AroundInstance[Instance]):
     """An `Instance` whose unconnected inputs follow trajectories; everything else goes to the one within.
 
     The step from t sets each of these inputs to its value at t. A value that comes without a time holds from the next
-    step on, one whose time is past does so too, unless a later one is in use.
+    step on, one whose time is past does so too, unless a later one is in use. Every instance of a mesh can be one.
 
     Args:
         instance: the one within.
@@ -48,6 +49,10 @@ class TimedInputs(AroundInstance[Instance]):
     def bind(self, inputs: Ring, outputs: Sequence[Ring], grid: TimeGrid, points: int, step: int = 0) -> None:
         """As the one within; from now on there is a time, and values that came before it get theirs."""
         self._instance.bind(inputs, outputs, grid, points, step)
+        self.start(grid, points, step)
+
+    def start(self, grid: TimeGrid, points: int, step: int) -> None:
+        """From now on there is a time, that of own step ``step`` with ``points`` of ``grid`` each."""
         self._grid, self._points, self._step = grid, points, step
         early, self._early = self._early, []
         for name, value, time in early:
@@ -100,15 +105,21 @@ class TimedInputs(AroundInstance[Instance]):
         return 8 * math.ulp(max(abs(self._grid.start_time), abs(time)))
 
 
-def set_input(instance: Instance, name: str, value: Value, time: float | None, step: int) -> int:
+def set_input(runner: Runner, name: str, value: Value, time: float | None) -> int:
     """On the main thread, between steps: set a variable; returns the own step that is the first to use it.
+
+    The first value with a time makes the instance one that follows them: without any, a step costs what it costs.
 
     Raises:
         FmuError: the FMU refused it.
         ValueRefused: too many values wait for their time.
     """
-    variable = instance.description.variable(name)
-    if isinstance(instance, TimedInputs) and variable is not None and variable.causality == "input":
-        return instance.add(name, value, time)
-    instance.set_values({name: value})
-    return step
+    variable = runner.instance.description.variable(name)
+    is_input = variable is not None and variable.causality == "input"
+    if is_input and time is not None and not isinstance(runner.instance, TimedInputs):
+        runner.instance = timed = TimedInputs(runner.instance, "hold")
+        timed.start(runner.grid, runner.plan.step_points, runner.step)
+    if is_input and isinstance(runner.instance, TimedInputs):
+        return runner.instance.add(name, value, time)
+    runner.instance.set_values({name: value})
+    return runner.step

@@ -14,7 +14,7 @@ __all__ = ["Setting", "checked_setting"]
 
 
 class Setting(msgspec.Struct, frozen=True):
-    """A value for a variable; ``time`` (s) is from when on, where the instance takes that into account."""
+    """A value for a variable; ``time`` (s) is from when on, of an input; None: from the next point on."""
 
     variable: str
     value: Value
@@ -54,7 +54,7 @@ def checked_setting(runner: Runner, root: str, key: str, data: bytes, attachment
     if kind not in ("in", "param"):
         raise ValueRefused(f"'{runner.name}.{name}' is no input and no parameter, so it cannot be set")
     try:
-        time = decode_time(attachment) if attachment is not None and runner.plan.interpolation is not None else None
+        time = decode_time(attachment) if attachment is not None else None
         return Setting(name, decode_value(data, variable), time)
     except ValueRefused as refused:
         raise ValueRefused(f"'{runner.name}.{name}': {refused}") from refused

@@ -63,14 +63,14 @@ class Runner:
         self.remote_feeds: list[RemoteFeed] = []
         self.local_feeds: list[LocalFeed] = []
         self.step_seconds = 0.0
-        self._grid = grid
+        self.grid = grid
 
     def bind(self) -> None:
         """Let the instance work on the rings, and read the current outputs. Call after Initialization Mode."""
         connected = [target for feed in self.plan.feeds for _, target, _, _ in feed.columns]
         fill_unconnected(self.inputs, connected, self.instance.get_values)
         outputs = (self.outputs,) if self.watched is None else (self.outputs, self.watched)
-        self.instance.bind(self.inputs, outputs, self._grid, self.plan.step_points, self.step)
+        self.instance.bind(self.inputs, outputs, self.grid, self.plan.step_points, self.step)
 
     def watch(self, names: Sequence[str]) -> None:
         """From now on also read these outputs after every step; they are not among the plan's columns."""
@@ -87,8 +87,8 @@ class Runner:
     def covered(self) -> int:
         """The last point for which nobody has to wait for this instance: its outputs hold until its next own point."""
         if self.step >= self.last_step:
-            return self._grid.last_point
-        return min((self.step + 1) * self.plan.step_points - 1, self._grid.last_point)
+            return self.grid.last_point
+        return min((self.step + 1) * self.plan.step_points - 1, self.grid.last_point)
 
     def limit(self, grant: int) -> int:
         """The own step up to which this instance may step now: k < grant and every input is there."""

@@ -7,12 +7,10 @@ callbacks only put into a bounded queue. What does not fit is left out, counted 
 
 from __future__ import annotations
 
-import heapq
-import itertools
 import logging
 import queue
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -23,7 +21,7 @@ from ..model.description import Value
 from ..simtime import TimeGrid
 from ..wire.keys import Keys
 from ..wire.session import undeclare_all
-from ..wire.values import decode_stamp, encode_value, json_encoding
+from ..wire.values import decode_stamp, encode_time, encode_value, json_encoding
 from .cdr import CdrError, Codec
 from .messages import Assembler, Disassembler
 from .profile import Profile, Put
@@ -36,7 +34,6 @@ __all__ = ["Gateway"]
 log = logging.getLogger(__name__)
 
 _WAITING_EVENTS = 1 << 16
-_HELD_MESSAGES = 1 << 12
 _REPEAT_S = 1.0
 
 Event = Callable[[], None]
@@ -78,7 +75,6 @@ class Gateway:
         self._publishers: dict[str, zenoh.Publisher] = {}
         self._watches: dict[str, _Watch] = {}
         self._clock: _Clock | None = None
-        self._stamped: list[_Input] = []
         self._reached = -1
         self._complete = -1
         self._now = -1
@@ -90,7 +86,7 @@ class Gateway:
                 self._open_output(topic)
             else:
                 self._open_input(topic)
-        if not self._watches and self._plan.time_source is not None and (self._stamped or self._plan.clock_points):
+        if not self._watches and self._plan.time_source is not None and self._plan.clock_points:
             self._watch(self._plan.time_source)
         if self._plan.clock_points is not None:
             profile = next(iter(self._profiles.values()))
@@ -140,13 +136,15 @@ class Gateway:
         return self._watches.setdefault(key, _Watch(f"{port.instance}.{port.variable.name}", port.step_points))
 
     def _value_arrived(self, watch: _Watch, sample: zenoh.Sample) -> None:
-        if sample.attachment is None:  # what somebody puts on the key of an input
-            return
-        self._post(partial(self._take_value, watch, sample.payload.to_bytes(), sample.attachment.to_bytes()))
+        if sample.attachment is not None:  # otherwise it is what somebody puts on the key of an input
+            self._post(partial(self._take_value, watch, sample.payload.to_bytes(), sample.attachment.to_bytes()))
 
     def _take_value(self, watch: _Watch, data: bytes, attachment: bytes) -> None:
         try:
             stamp = decode_stamp(attachment)
+        except msgspec.DecodeError:  # likewise: it says from when on it holds, and no point
+            return
+        try:
             value: Value = msgspec.json.decode(data)
         except msgspec.DecodeError as error:
             watch.complain(f"a value that is not understood: {error}")
@@ -171,15 +169,11 @@ class Gateway:
             self._now = now
             if self._clock is not None:
                 self._clock.advance(now)
-            for own in self._stamped:
-                self._set_all(own, own.due(self._grid.time(now)))
 
     # --- from ROS to the mesh
 
     def _open_input(self, topic: Topic) -> None:
         own = _Input(Disassembler(topic, self._types), self._grid.stop_time)
-        if topic.stamped:
-            self._stamped.append(own)
         for port in topic.ports:
             key = self._keys.variable(port.instance, port.kind, port.variable.name)
             if key not in self._publishers:
@@ -199,16 +193,9 @@ class Gateway:
         except CdrError as error:
             own.complain(f"a message of {len(data)} bytes is no '{own.topic.message}': {error}")
             return
-        if stamp is None or not self._watches:
-            self._set_all(own, [values])
-        else:
-            own.hold(stamp, values)
-            self._set_all(own, own.due(self._grid.time(max(self._now, 0))))
-
-    def _set_all(self, own: _Input, messages: Sequence[list[Value]]) -> None:
-        for values in messages:
-            for key, value in zip(own.keys, values, strict=True):
-                self._publishers[key].put(encode_value(value))
+        attachment = own.attachment(stamp)
+        for key, value in zip(own.keys, values, strict=True):
+            self._publishers[key].put(encode_value(value), attachment=attachment)
 
     # --- the queue
 
@@ -275,7 +262,7 @@ class _Watch(_Complaints):
 
 
 class _Input(_Complaints):
-    """A subscribed topic, and its messages whose time has not come yet."""
+    """A subscribed topic."""
 
     def __init__(self, disassembler: Disassembler, stop_time: float | None) -> None:
         super().__init__(disassembler.topic.name)
@@ -283,32 +270,16 @@ class _Input(_Complaints):
         self.topic = disassembler.topic
         self.keys: list[str] = []
         self._stop_time = stop_time
-        self._held: list[tuple[float, int, list[Value]]] = []
-        self._number = itertools.count()
-        self._last = -1.0
 
-    def hold(self, stamp: float, values: list[Value]) -> None:
-        """Keep a message until its time."""
-        if self._stop_time is not None and stamp > self._stop_time:
+    def attachment(self, stamp: float | None) -> bytes | None:
+        """What tells from when on a value holds, for a message with this stamp in s; None: as soon as it comes."""
+        if stamp is not None and self._stop_time is not None and stamp > self._stop_time:
             self.complain(
                 "its stamps are behind the end of the simulation, so its messages hold as they come; "
                 "does its publisher run with use_sim_time?"
             )
-            stamp = self._last
-        if len(self._held) >= _HELD_MESSAGES:
-            self.complain(f"more than {_HELD_MESSAGES} messages wait for their time; the others are left out")
-        elif stamp < self._last:
-            self.complain("a message is older than the one before, and left out")
-        else:
-            heapq.heappush(self._held, (stamp, next(self._number), values))
-
-    def due(self, time_s: float) -> list[list[Value]]:
-        """The messages whose time has come, in the order of their stamps."""
-        messages = []
-        while self._held and self._held[0][0] <= time_s:
-            self._last, _, values = heapq.heappop(self._held)
-            messages.append(values)
-        return messages
+            return None
+        return encode_time(stamp) if stamp is not None else None
 
 
 class _Clock:

@@ -19,6 +19,7 @@ __all__ = [
     "decode_stamp",
     "decode_time",
     "decode_value",
+    "encode_time",
     "encode_value",
     "json_encoding",
 ]
@@ -62,6 +63,11 @@ def decode_time(data: bytes) -> float:
     if not math.isfinite(time):
         raise ValueRefused(f"the time {time} in its attachment is not finite")
     return time
+
+
+def encode_time(time: float) -> bytes:
+    """The attachment of a value that is sent to an input and holds from ``time`` (s) on."""
+    return msgspec.json.encode(_Moment(time))
 
 
 class _Moment(msgspec.Struct, frozen=True):

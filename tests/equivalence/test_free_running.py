@@ -6,9 +6,10 @@ import json
 import signal
 from typing import Any
 
+import pytest
 import zenoh
 
-from tests.helpers import DEADLINE_S, FMUS, Place, rows_of, wait_until
+from tests.helpers import DEADLINE_S, FMUS, Place, rows_of, wait_until, write_config
 
 
 def session_to(place: Place) -> zenoh.Session:
@@ -60,6 +61,28 @@ def test_inputs_follow_their_time_stamps_and_the_run_ends_at_its_stop_time(place
     place.assert_nothing_left()
 
 
+@pytest.mark.parametrize("window", ["1", "1000"])
+def test_an_input_of_a_mesh_holds_from_its_time_on_however_far_the_other_instances_are(
+    place: Place, window: str
+) -> None:
+    config = write_config(
+        place.folder,
+        instances={"free": {"fmu": "Gain"}, "pendulum": {"fmu": "DampedPendulum"}},
+        connections=[],
+    )
+    process = place.start("launch", config, "--paused", "--window", window, "--no-progress")
+    with session_to(place) as session:
+        for time, value in ((0.5, 3.0), (0.25, 2.0), (0.9, 4.0)):
+            answer = ask(session, "fmu_mesh/pair/free/in/u", value, json.dumps({"time": time}))
+            assert answer["time"] == time
+        ask(session, "fmu_mesh/pair/mesh/command", {"command": "resume"})
+
+    assert process.wait() == 0, process.errors
+    rows = rows_of(config.with_suffix(".csv"))
+    expected = [0.0] * 251 + [2.0] * 250 + [3.0] * 400 + [4.0] * 100
+    assert [row[1] for row in rows] == expected
+
+
 def test_it_runs_by_the_wall_clock_until_it_is_interrupted_and_leaves_nothing(place: Place) -> None:
     process = place.start("run", FMUS / "DampedPendulum.fmu", "--no-progress")
     status = wait_until(lambda: place.run("status", "--json").output, "a status")
@@ -79,7 +102,7 @@ def test_options_that_do_not_fit_are_told_by_their_names(place: Place) -> None:
     process = place.run("run", FMUS / "Gain.fmu", "--stop-time", "0.055", "--set", "q=1", "--real-time-factor", "-1")
 
     assert process.wait() == 2
-    for option in ("--stop-time 0.055: ", "--set Gain.q=1: ", "--real-time-factor -1: "):
+    for option in ("--stop-time 0.055: ", "--set q=1: ", "--real-time-factor -1: "):
         assert option in process.errors
     place.assert_nothing_left()
 

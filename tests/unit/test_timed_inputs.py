@@ -9,8 +9,11 @@ from typing import Literal
 import pytest
 
 from fmu_mesh.fmu import Fmi2Instance, read_description
+from fmu_mesh.model.instance import Instance
+from fmu_mesh.model.plan import InstancePlan
 from fmu_mesh.model.ring import Layout, Ring
 from fmu_mesh.node.inputs import TimedInputs, set_input
+from fmu_mesh.node.stepping import Runner
 from fmu_mesh.simtime import TimeGrid
 from fmu_mesh.wire.values import ValueRefused, decode_time
 from tests.helpers import FMUS
@@ -108,9 +111,43 @@ def test_values_that_come_before_the_first_point_wait_for_it(tmp_path: Path) -> 
     steps.inputs.close()
 
 
-def test_a_parameter_is_set_at_once_whatever_its_time(linear: Steps) -> None:
-    assert set_input(linear.inputs, "k", 2.0, 99.0, 0) == 0
-    assert linear.go(1) == [10.0]
+def runner_of(instance: Instance) -> Runner:
+    """A runner in the middle of a run, whose steps are a tenth of a second."""
+    outputs = Layout.of([("y", "Float64")])
+    plan = InstancePlan("gain", "Gain.fmu", {}, 1, outputs, Layout(), (), {})
+    runner = Runner(plan, instance, TimeGrid(1.0, STEP_SIZE, 60), 64)
+    runner.bind()
+    return runner
+
+
+def test_a_parameter_is_set_at_once_whatever_its_time(tmp_path: Path) -> None:
+    gain = Steps(tmp_path, "hold").inputs
+    runner = runner_of(gain)
+
+    assert set_input(runner, "k", 2.0, 99.0) == 0
+    assert gain.get_values(["k"]) == [2.0]
+    gain.close()
+
+
+def test_an_instance_follows_times_from_the_first_value_with_one_on(tmp_path: Path) -> None:
+    path = FMUS / "Gain.fmu"
+    instance = Fmi2Instance(path, "gain", read_description(path), tmp_path)
+    instance.enter_initialization(1.0, None, {"u": 5.0})
+    instance.exit_initialization()
+    runner = runner_of(instance)
+    used = []
+    for step in range(6):
+        runner.instance.do_step(step)
+        runner.step = step + 1
+        used.append(runner.instance.get_values(["y"]))
+        if step == 0:
+            assert set_input(runner, "u", 6.0, None) == 1
+            assert runner.instance is instance
+        if step == 1:
+            assert set_input(runner, "u", 7.0, 1.4) == 4
+
+    assert used == [[5.0], [6.0], [6.0], [6.0], [7.0], [7.0]]
+    runner.instance.close()
 
 
 def test_so_many_values_may_wait_for_their_time_and_no_more(linear: Steps) -> None:
