@@ -263,10 +263,12 @@ class Node:
         while not self._finished:
             stepped = False
             for unit in tuple(self._units):
+                self.server.advancing = unit
                 try:
                     stepped = unit.advance(self._grant) or stepped
                 except TerminationRequested as asked:
                     self._end_early(unit, asked)
+            self.server.advancing = None
             taken = False
             while (message := poll()) is not None:
                 self._take(message)
@@ -391,6 +393,7 @@ class Node:
 
     def _report_failure(self, error: FmuMeshError) -> bool:
         """Tell the master, unless it is the one that is gone; whether it knows now."""
+        self.server.advancing = None
         if self.server.state == "running":
             for runner in self._runners.values():
                 runner.flush()

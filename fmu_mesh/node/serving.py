@@ -29,7 +29,7 @@ from ..wire.views import InstanceStatus, LogLine, SetAnswer
 from .info import instance_info
 from .inputs import set_input
 from .settings import checked_setting
-from .stepping import Runner
+from .stepping import Runner, Unit
 from .streams import MAX_WAITING_ROWS, Batch, InstanceStreams, kind_of
 
 __all__ = ["Server"]
@@ -50,12 +50,14 @@ class Server:
 
     Attributes:
         state: what the node is doing, for `status`.
+        advancing: the unit that the main thread steps, if it does.
         waited_s: how long the main thread has waited since the first point.
     """
 
     def __init__(self, plan: NodePlan, session: zenoh.Session, keys: Keys, inbox: Inbox) -> None:
         self.state = "starting"
         self.waiting = False
+        self.advancing: Unit | None = None
         self.waited_s = 0.0
         self._started: float | None = None
         self.on_hang: Callable[[FmuError], None] = lambda _error: None
@@ -71,7 +73,7 @@ class Server:
         self._entities: list[zenoh.Queryable[None] | zenoh.Subscriber[None]] = []
         self._status_publishers: dict[str, zenoh.Publisher] = {}
         self._log_publishers: dict[str, zenoh.Publisher] = {}
-        self._stalled_since: dict[str, tuple[int, float]] = {}
+        self._under_way: tuple[str, int, float] | None = None
         for instance in plan.instances:
             self._declare_early(instance.name)
         self._closing = threading.Event()
@@ -155,25 +157,35 @@ class Server:
         for name, publisher in self._status_publishers.items():
             if matches(publisher):
                 publisher.put(msgspec.json.encode(self._status(name)))
-        self._look_for_hang(now)
+        self._look_at_steps(now)
 
-    def _look_for_hang(self, now: float) -> None:
-        """A step that meets its deadline; other calls of an FMU are watched by `fmu_mesh.fmu.guard.CallWatch`."""
-        if self.state != "running" or self.waiting:
+    def _look_at_steps(self, now: float) -> None:
+        """End a burst of steps that takes long, and find a step that meets its deadline.
+
+        Other calls of an FMU are watched by `fmu_mesh.fmu.guard.CallWatch`.
+        """
+        if (unit := self.advancing) is None or self.state != "running":
+            self._under_way = None
             return
-        for name, runner in self._runners.items():
-            stalled_s = now - self._stalled(name, now)
-            if stalled_s > self._plan.timeouts.step:
-                self.on_hang(
-                    StepFailed(
-                        f"the FMU has not returned for {stalled_s:.1f} s from doStep; its process is ended",
-                        instance=name,
-                        point=runner.point,
-                        time=self._plan.grid.time(runner.point),
-                        hint="If it needs that long, raise `timeouts.step` in the configuration.",
-                    )
+        runner = unit.current
+        under_way_s = now - self._since(runner, now)
+        unit.hurry = True
+        if under_way_s > self._plan.timeouts.step:
+            self.on_hang(
+                StepFailed(
+                    f"the FMU has not returned for {under_way_s:.1f} s from doStep; its process is ended",
+                    instance=runner.name,
+                    point=runner.point,
+                    time=self._plan.grid.time(runner.point),
+                    hint="If it needs that long, raise `timeouts.step` in the configuration.",
                 )
-                return
+            )
+
+    def _since(self, runner: Runner, now: float) -> float:
+        """Since when the step of a runner has been under way, as far as was seen; costs the hot loop nothing."""
+        if self._under_way is None or self._under_way[:2] != (runner.name, runner.step):
+            self._under_way = (runner.name, runner.step, now)
+        return self._under_way[2]
 
     def report_hang(self, error: FmuError, deadline_s: float) -> bool:
         """From a watching thread: tell the master that an FMU does not return; whether it knows now."""
@@ -361,15 +373,12 @@ class Server:
             return self.state
         if self.waiting:
             return f"waiting at point {runner.point} for {runner.lacking()}"
+        unit = self.advancing
+        current = unit.current if unit is not None else runner
+        if current is not runner:
+            return f"waiting at point {runner.point} for its turn: '{current.name}' is in doStep"
         now = time.monotonic()
-        return f"in doStep at point {runner.point} for {now - self._stalled(runner.name, now):.1f} s"
-
-    def _stalled(self, name: str, now: float) -> float:
-        """Since when an instance has been at its point, as far as was seen; costs the hot loop nothing."""
-        step = self._runners[name].step
-        if self.waiting or self._stalled_since.get(name, (-1, 0.0))[0] != step:
-            self._stalled_since[name] = (step, now)
-        return self._stalled_since[name][1]
+        return f"in doStep at point {runner.point} for {now - self._since(runner, now):.1f} s"
 
     # --- publishing
 

@@ -26,6 +26,7 @@
 #define LEAK_BYTES (1 << 30)
 #define PAGE_BYTES 4096
 #define SLOW_SECONDS 5
+#define TARDY_SECONDS 1
 #define FAULT_TIME 0.0045 /* s; steps that end later have the fault */
 
 enum { U, THIRD, SUBNORMAL, PLAIN_LOCALE, FOLDER, COUNT };
@@ -81,6 +82,7 @@ static void misbehave(const char *what)
     if (strcmp(what, "hang") == 0)
         for (;;) pause();
     if (strcmp(what, "slow") == 0) sleep(SLOW_SECONDS);
+    if (strncmp(what, "tardy", 5) == 0) sleep(TARDY_SECONDS); /* with a number: there may be several */
     if (strcmp(what, "segfault") == 0) *nowhere = 1;
     if (strcmp(what, "abort") == 0) abort();
     if (strcmp(what, "exit") == 0) exit(0);
