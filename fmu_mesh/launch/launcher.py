@@ -15,13 +15,14 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import IO
 
 import msgspec
 
-from ..errors import FmuError, FmuMeshError, Interrupted, MeshLost, from_report
+from ..errors import DeadlineExceeded, FmuError, FmuMeshError, Interrupted, MeshLost, from_report
 from ..model.config import MujocoConfig
 from ..model.plan import RECORDER, Plan
 from ..ros.bag import is_bag
@@ -39,6 +40,10 @@ _INTERRUPT_S = 0.9
 _KILL_S = 0.7
 _SHOWN_LINES = 200
 _LINE_BYTES = 1000
+_GOING_ON = ("starting", "initializing", "running", "paused")
+_GATEWAY_S = 2.0
+"""A gateway ends with its mesh; one that has ended so long before it has lost its link."""
+
 _SILENCE_S = 10.0
 """The master says something ten times a second; after this time without a word it is taken for lost."""
 
@@ -68,6 +73,8 @@ class Launcher:
         self._happened: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._processes: dict[str, _Process] = {}
         self._lost: list[tuple[str, int, float]] = []
+        self._gateway_ready = False
+        self._gateway_ended: float | None = None
         self._how: dict[str, str] = {}
         self._end: End | None = None
         self._point: int | None = None
@@ -173,6 +180,10 @@ class Launcher:
             write_note(folder, note)
         elif isinstance(event, Status):
             self._point = event.status.point
+            ended = self._gateway_ended
+            if event.status.state in _GOING_ON and ended is not None and self._heard - ended > _GATEWAY_S:
+                self._gateway_ended = None
+                self._lost.append((_GATEWAY, 0, ended))
         elif isinstance(event, End):
             self._end = event
         self._on_event(event)
@@ -183,6 +194,7 @@ class Launcher:
         except msgspec.DecodeError:
             self._take_output(_GATEWAY, line)
             return
+        self._gateway_ready = True
         self._spawn_nodes()
 
     def _take_output(self, name: str, line: bytes) -> None:
@@ -194,6 +206,8 @@ class Launcher:
         self._how[name] = _how_it_ended(code)
         if self._end is None and (code != 0 or name == _MASTER):
             self._lost.append((name, code, time.monotonic()))
+        elif name == _GATEWAY:
+            self._gateway_ended = time.monotonic()
 
     def _interrupt(self) -> None:
         master = self._processes.get(_MASTER)
@@ -253,6 +267,8 @@ class Launcher:
             if self._end.error is None:
                 return self._end
             error = self._with_cause(from_report(self._end.error))
+            if isinstance(error, DeadlineExceeded) and _GATEWAY in self._processes and not self._gateway_ready:
+                error = DeadlineExceeded(f"{_GATEWAY} was not ready within {self._timeouts.start:g} s")
         else:
             error = self._own_account()
         if type(error) in (Interrupted, MeshLost) and rows > (error.point or 0):
@@ -275,7 +291,8 @@ class Launcher:
         name = named[0][0]
         if name in (_MASTER, _GATEWAY):
             text = f"{name} was lost: its process {self._how[name]}"
-            return MeshLost(text, point=point, time=self._plan.grid.time(point))
+            hint = "Was it stopped for some seconds? Then the mesh lets go of it." if not named[0][1] else None
+            return MeshLost(text, point=point, time=self._plan.grid.time(point), hint=hint)
         instances = ", ".join(item.name for item in self._plan.nodes[name].instances)
         text = f"node '{name}' was lost: its process {self._how[name]}"
         return MeshLost(text, instance=instances, point=point, time=self._plan.grid.time(point))
@@ -318,6 +335,7 @@ class _Process:
         self._post = post
         self._popen: subprocess.Popen[bytes] | None = None
         self._threads: list[threading.Thread] = []
+        self._left_others = False
 
     def start(
         self,
@@ -363,31 +381,43 @@ class _Process:
             self._popen.send_signal(number)
 
     def close(self) -> None:
-        """Wait for the readers and close the pipes; call when it has ended."""
+        """End what it has left behind, wait for the readers and close the pipes; call when it has ended."""
+        if self._left_others:
+            self._signal_others(signal.SIGKILL)
         for thread in self._threads:
             thread.join(1.0)
-        if self._popen is not None:
-            for pipe in (self._popen.stdin, self._popen.stdout, self._popen.stderr):
-                if pipe is not None:
-                    pipe.close()
+        if self._popen is not None and self._popen.stdin is not None:
+            self._popen.stdin.close()
+
+    def _signal_others(self, number: signal.Signals) -> None:
+        """Send a signal to what it has started and left behind, as an FMU may do: its session has a group."""
+        assert self._popen is not None
+        with suppress(ProcessLookupError, PermissionError):
+            os.killpg(self._popen.pid, number)
+            self._left_others = True
+
+    # Each reader closes its pipe: a process that was left behind may hold the other end open, and nobody waits for it.
 
     def _read(self, pipe: IO[bytes], on_line: Callable[[bytes], None]) -> None:
-        for line in pipe:
-            self._post(partial(on_line, line))
+        with pipe:
+            for line in pipe:
+                self._post(partial(on_line, line))
 
     def _read_beginning(self, pipe: IO[bytes], on_line: Callable[[bytes], None]) -> None:
         """Read all of it, so that the process never waits, but hand on `_SHOWN_LINES` lines only."""
         count = 0
-        while line := pipe.readline(_LINE_BYTES):
-            count += 1
-            if count <= _SHOWN_LINES:
-                self._post(partial(on_line, line))
-            elif count == _SHOWN_LINES + 1:
-                self._post(partial(on_line, b"(it writes a lot; nothing more of it is shown)"))
+        with pipe:
+            while line := pipe.readline(_LINE_BYTES):
+                count += 1
+                if count <= _SHOWN_LINES:
+                    self._post(partial(on_line, line))
+                elif count == _SHOWN_LINES + 1:
+                    self._post(partial(on_line, b"(it writes a lot; nothing more of it is shown)"))
 
     def _wait(self, readers: Sequence[threading.Thread], on_exit: Callable[[str, int], None]) -> None:
         assert self._popen is not None
         code = self._popen.wait()
+        self._signal_others(signal.SIGTERM)
         for reader in readers:
             reader.join(1.0)
         self._post(lambda: on_exit(self.name, code))

@@ -222,6 +222,24 @@ def test_an_fmu_that_fills_standard_output_neither_blocks_nor_garbles_the_launch
         assert "\033" not in launched.errors
 
 
+def test_a_process_that_an_fmu_leaves_behind_ends_with_the_run(place: Place, hostile: Path) -> None:
+    config = mesh_of(place, hostile, ["orphan_fmi2Instantiate"])
+
+    launched = place.run("launch", config)
+
+    assert launched.wait() == 0
+    assert len(rows_of(config.with_suffix(".csv"))) == 11
+    place.assert_nothing_left()
+
+
+def test_a_daemon_that_an_fmu_starts_keeps_no_run_from_its_end(place: Place, hostile: Path) -> None:
+    """It has left the session of its process, but not the pipe that was standard output there."""
+    launched = place.run("launch", mesh_of(place, hostile, ["daemon_fmi2Instantiate"]))
+
+    assert launched.wait() == 0
+    assert [process.parent() for process in place.processes() if "node" in process.cmdline()]
+
+
 def test_an_fmu_that_ignores_signals_does_not_take_ctrl_c_away(place: Place, hostile: Path) -> None:
     config = mesh_of(place, hostile, ["handlers_fmi2Instantiate"], stop_time=1000.0)
     launched = place.start("launch", config, "--local")

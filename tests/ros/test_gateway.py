@@ -121,6 +121,23 @@ def test_a_gateway_that_dies_ends_the_run_with_its_name_and_what_was_recorded(pl
     place.assert_nothing_left(2.0)
 
 
+def test_a_gateway_that_was_stopped_until_the_mesh_let_go_of_it_ends_the_run_with_its_name(
+    place: Place, ros: Ros
+) -> None:
+    mesh = place.start("launch", configured(place, ros, factor=1, stop_time=600.0), "--no-progress")
+    wait_until(lambda: len(ros.floats("angle")) > 20, "samples")
+    [gateway] = [process for process in place.processes() if "gateway" in process.cmdline()]
+    links = len(mesh.child("master").net_connections(kind="unix"))
+    gateway.suspend()
+    wait_until(lambda: len(mesh.child("master").net_connections(kind="unix")) < links, "the end of its link")
+
+    gateway.resume()
+
+    assert mesh.wait() == 4
+    assert "the gateway to ROS was lost: its process ended" in mesh.message
+    place.assert_nothing_left(2.0)
+
+
 def test_a_mesh_runs_on_where_nobody_of_ros_is_there(place: Place, ros: Ros) -> None:
     config = configured(place, ros, factor=0, stop_time=1.0, connect=[f"tcp/127.0.0.1:{free_port()}"])
 

@@ -75,6 +75,14 @@ static void install_handlers(void)
     sigaction(SIGTERM, &ignore, NULL);
 }
 
+/* A process that outlives this one, and keeps its standard output open. */
+static void leave_orphan(int in_own_session)
+{
+    if (fork() != 0) return;
+    if (in_own_session) setsid();
+    for (;;) pause();
+}
+
 static void misbehave(const char *what)
 {
     int *volatile nowhere = NULL;
@@ -94,6 +102,8 @@ static void misbehave(const char *what)
     if (strcmp(what, "flushing") == 0) flush_to_zero();
     if (strcmp(what, "traps") == 0) feenableexcept(FE_DIVBYZERO | FE_INVALID);
     if (strcmp(what, "handlers") == 0) install_handlers();
+    if (strcmp(what, "orphan") == 0) leave_orphan(0);
+    if (strcmp(what, "daemon") == 0) leave_orphan(1);
 }
 
 /* Does what the instance name says, if it says so for this function. */
