@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import sys
 from collections.abc import Callable
 from itertools import islice
 from typing import Any
@@ -96,7 +97,11 @@ def reaching() -> argparse.ArgumentParser:
 
 def _with_meshes(arguments: argparse.Namespace, run: Run) -> int:
     with Meshes(arguments.connect, arguments.timeout) as meshes:
-        return run(arguments, meshes)
+        code = run(arguments, meshes)
+        for error in meshes.silent:  # others have answered
+            print(f"fmu-mesh: {error}", file=sys.stderr)
+            code = code or error.exit_code
+        return code
 
 
 def positive_seconds(text: str) -> float:

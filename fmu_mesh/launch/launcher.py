@@ -389,7 +389,7 @@ class _Process:
         if self._popen is not None and self._popen.stdin is not None:
             self._popen.stdin.close()
 
-    def _signal_others(self, number: signal.Signals) -> None:
+    def _signal_others(self, number: int) -> None:
         """Send a signal to what it has started and left behind, as an FMU may do: its session has a group."""
         assert self._popen is not None
         with suppress(ProcessLookupError, PermissionError):
