@@ -450,6 +450,7 @@ class Master:
                 self._pacer.start(self._slowest)
             case "step":
                 self._state, self._hold = "paused", max(self._hold or 0, self._grant) + max(1, command.points)
+                self._clock.stop()
                 self._pacer.start(self._slowest)
             case "stop":
                 self._stop_asked = True

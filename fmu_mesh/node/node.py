@@ -208,7 +208,13 @@ class Node:
     def _meet(self) -> None:
         """Join the mesh: from now on all others are there."""
         self.server.state = "waiting for the mesh"
-        welcome = self._membership.join()
+        try:
+            welcome = self._membership.join()
+        except MeshLost as error:
+            if not self._membership.given_up:
+                raise
+            self._master_is_gone = True
+            raise MeshLost("the master is gone", hint="See the messages of its process.") from error
         self._progress_number = welcome.number
         self._heard = time.monotonic()
         if welcome.profile:
@@ -365,6 +371,7 @@ class Node:
         if sample.kind == zenoh.SampleKind.PUT:
             self._master_was_there = True
         elif not self._finished:
+            self._membership.give_up()
             self._inbox.post(self._end_without_master)
 
     def _end_without_master(self) -> None:
