@@ -19,8 +19,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import ConfigurationError
 from ..model.types import Value, VariableType, is_text
+from ..model.writing import open_result_file
 
 __all__ = ["CsvFile"]
 
@@ -35,7 +35,7 @@ class CsvFile:
         columns: (name, type) of every column but `time`.
 
     Raises:
-        ConfigurationError: the file cannot be written.
+        ConfigurationError: the file cannot be written, or another run writes into it.
     """
 
     def __init__(self, path: Path, columns: Sequence[tuple[str, VariableType]]) -> None:
@@ -43,11 +43,7 @@ class CsvFile:
         self.rows = 0
         self._has_text = any(is_text(type_) for _, type_ in columns)
         self._encode = msgspec.json.Encoder().encode_lines
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            self._file = path.open("wb", buffering=1 << 16)
-        except OSError as error:
-            raise ConfigurationError(f"the result file '{path}' cannot be written: {error.strerror}") from error
+        self._file = open_result_file(path)
         header = io.StringIO()
         csv.writer(header, lineterminator="\n").writerow(["time", *(name for name, _ in columns)])
         self._file.write(header.getvalue().encode())

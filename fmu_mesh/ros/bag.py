@@ -21,6 +21,7 @@ from ..model.config import RosConfig
 from ..model.findings import Findings
 from ..model.loading import LoadedConfig
 from ..model.types import nested, split_element
+from ..model.writing import open_result_file
 from .cdr import Codec
 from .mapping import message_types
 from .messages import Assembler
@@ -119,11 +120,7 @@ class McapFile:
         self.path = path
         self.rows = 0
         index = {name: number for number, (name, _) in enumerate(columns)}
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            self._file = path.open("wb", buffering=1 << 16)
-        except OSError as error:
-            raise ConfigurationError(f"the result file '{path}' cannot be written: {error.strerror}") from error
+        self._file = open_result_file(path)
         self._mcap = writer(self._file)
         self._mcap.start(profile="ros2", library="fmu_mesh")
         self._types = topics.types
