@@ -6,6 +6,7 @@ Owns what these commands print; what they ask is `fmu_mesh.wire.client`.
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Callable
 from itertools import islice
 from typing import Any
@@ -97,7 +98,11 @@ def reaching() -> argparse.ArgumentParser:
 
 def _with_meshes(arguments: argparse.Namespace, run: Run) -> int:
     with Meshes(arguments.connect, arguments.timeout) as meshes:
-        return run(arguments, meshes)
+        code = run(arguments, meshes)
+        for error in meshes.silent:  # others have answered
+            print(f"fmu-mesh: {error}", file=sys.stderr)
+            code = code or error.exit_code
+        return code
 
 
 # --- ls, status, info

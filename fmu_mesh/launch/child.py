@@ -5,10 +5,12 @@ Knows nothing of meshes; what happens is posted to the launcher's thread.
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import threading
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from functools import partial
 from typing import IO
 
@@ -33,6 +35,7 @@ class Child:
         self._post = post
         self._popen: subprocess.Popen[bytes] | None = None
         self._threads: list[threading.Thread] = []
+        self._left_others = False
 
     def start(
         self,
@@ -78,31 +81,43 @@ class Child:
             self._popen.send_signal(number)
 
     def close(self) -> None:
-        """Wait for the readers and close the pipes; call when it has ended."""
+        """End what it has left behind, wait for the readers and close the pipes; call when it has ended."""
+        if self._left_others:
+            self._signal_others(signal.SIGKILL)
         for thread in self._threads:
             thread.join(1.0)
-        if self._popen is not None:
-            for pipe in (self._popen.stdin, self._popen.stdout, self._popen.stderr):
-                if pipe is not None:
-                    pipe.close()
+        if self._popen is not None and self._popen.stdin is not None:
+            self._popen.stdin.close()
+
+    def _signal_others(self, number: int) -> None:
+        """Send a signal to what it has started and left behind, as an FMU may do: its session has a group."""
+        assert self._popen is not None
+        with suppress(ProcessLookupError, PermissionError):
+            os.killpg(self._popen.pid, number)
+            self._left_others = True
+
+    # Each reader closes its pipe: a process that was left behind may hold the other end open, and nobody waits for it.
 
     def _read(self, pipe: IO[bytes], on_line: Callable[[bytes], None]) -> None:
-        for line in pipe:
-            self._post(partial(on_line, line))
+        with pipe:
+            for line in pipe:
+                self._post(partial(on_line, line))
 
     def _read_beginning(self, pipe: IO[bytes], on_line: Callable[[bytes], None]) -> None:
         """Read all of it, so that the process never waits, but hand on `_SHOWN_LINES` lines only."""
         count = 0
-        while line := pipe.readline(_LINE_BYTES):
-            count += 1
-            if count <= _SHOWN_LINES:
-                self._post(partial(on_line, line))
-            elif count == _SHOWN_LINES + 1:
-                self._post(partial(on_line, b"(it writes a lot; nothing more of it is shown)"))
+        with pipe:
+            while line := pipe.readline(_LINE_BYTES):
+                count += 1
+                if count <= _SHOWN_LINES:
+                    self._post(partial(on_line, line))
+                elif count == _SHOWN_LINES + 1:
+                    self._post(partial(on_line, b"(it writes a lot; nothing more of it is shown)"))
 
     def _wait(self, readers: Sequence[threading.Thread], on_exit: Callable[[str, int], None]) -> None:
         assert self._popen is not None
         code = self._popen.wait()
+        self._signal_others(signal.SIGTERM)
         for reader in readers:
             reader.join(1.0)
         self._post(lambda: on_exit(self.name, code))

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import threading
-from typing import BinaryIO
+from collections import deque
 
 import msgspec
 
@@ -13,6 +14,9 @@ from ..wire.profile import MeshProfile
 from ..wire.views import LogLine, MeshStatus
 
 __all__ = ["End", "Event", "EventWriter", "Log", "Ready", "Status", "decode_event"]
+
+
+_MOST_WAITING = 10_000
 
 
 class Ready(msgspec.Struct, frozen=True, tag="ready"):
@@ -67,18 +71,48 @@ def decode_event(line: bytes) -> Event:
 
 
 class EventWriter:
-    """Writes events for the launcher; from any thread."""
+    """Writes events for the launcher; from any thread.
 
-    def __init__(self, stream: BinaryIO | None = None) -> None:
-        self._stream = stream if stream is not None else sys.stdout.buffer
-        self._lock = threading.Lock()
+    The launcher may be stopped (Ctrl-Z) and read nothing for as long as its user likes. Nobody waits for it: a thread
+    of its own writes, and of statuses that are not written yet the newest is kept. Only the last event waits until it
+    is written, or the launcher is gone.
+
+    Args:
+        descriptor: where to write; by default standard output.
+    """
+
+    def __init__(self, descriptor: int | None = None) -> None:
+        self._descriptor = descriptor if descriptor is not None else sys.stdout.fileno()
+        self._changed = threading.Condition()
+        self._waiting: deque[Event] = deque()
+        self._writing = False
+        self._gone = False
+        threading.Thread(target=self._run, name="events", daemon=True).start()
 
     def __call__(self, event: Event) -> None:
         """Write one event."""
-        line = msgspec.json.encode(event) + b"\n"
-        with self._lock:
+        with self._changed:
+            waiting = self._waiting
+            if waiting and isinstance(event, Status) and isinstance(waiting[-1], Status):
+                waiting.pop()
+            if len(waiting) < _MOST_WAITING or isinstance(event, End):
+                waiting.append(event)
+            self._changed.notify_all()
+            if isinstance(event, End):
+                # The end of standard input ends this process when the launcher is gone (`fmu_mesh.launch.process`).
+                self._changed.wait_for(lambda: self._gone or not (waiting or self._writing))
+
+    def _run(self) -> None:
+        while not self._gone:
+            with self._changed:
+                self._changed.wait_for(lambda: bool(self._waiting))
+                event, self._writing = self._waiting.popleft(), True
+            line = msgspec.json.encode(event) + b"\n"
             try:
-                self._stream.write(line)
-                self._stream.flush()
-            except BrokenPipeError:
-                return  # the launcher is gone; the end of standard input ends this process
+                while line:  # not through a buffered file, whose lock would keep the process from ending
+                    line = line[os.write(self._descriptor, line) :]
+            except OSError:  # nobody reads any more
+                self._gone = True
+            with self._changed:
+                self._writing = False
+                self._changed.notify_all()

@@ -16,7 +16,7 @@ from ..ros.topics import RosPlan
 from ..ros.types import MessageTypes
 from ..wire.keys import Keys
 from ..wire.runtime import leave_run_folder, run_folder, socket_endpoint
-from ..wire.session import Wiring, open_session
+from ..wire.session import Wiring, close_session, open_session
 from .events import Event, Ready
 from .preparing import Options, prepare
 from .process import die_with_parent, ended_by_signals
@@ -67,13 +67,13 @@ def run_gateway(config_file: Path, options: Options, emit: Callable[[Event], Non
         stack.callback(leave_run_folder, folder)
         if child or not (connect := options.connect or _client_endpoints(loaded)):
             connect = (socket_endpoint(folder, MASTER),)
-        mesh = open_session(Wiring(mode="client", connect=connect))
-        stack.callback(mesh.close)
+        mesh = open_session(Wiring(mode="client", connect=connect, patience_s=loaded.config.timeouts.start))
+        stack.callback(close_session, mesh)
         # A peer that gossips, as the nodes of ROS are: a router passes nothing on between peers, it makes them meet.
         listen = tuple(section.listen) or (_ANY_LOOPBACK_PORT,)
         wiring = Wiring(mode="peer", listen=listen, connect=tuple(section.connect), gossip=True)
         ros = open_session(wiring)
-        stack.callback(ros.close)
+        stack.callback(close_session, ros)
         keys = Keys(loaded.config.zenoh.key_prefix, loaded.config.mesh)
         profiles = stack.enter_context(open_profiles(section, ros, types, ros_plan))
         stack.enter_context(parameter_services(ros_plan, types, mesh, keys, profiles))

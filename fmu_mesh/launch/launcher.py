@@ -18,7 +18,7 @@ from pathlib import Path
 
 import msgspec
 
-from ..errors import FmuError, FmuMeshError, Interrupted, MeshLost, from_report
+from ..errors import DeadlineExceeded, FmuError, FmuMeshError, Interrupted, MeshLost, from_report
 from ..model.config import MujocoConfig
 from ..model.plan import RECORDER, Plan
 from ..ros.bag import is_bag
@@ -35,6 +35,10 @@ _REPORT_S = 1.5
 _TOLD_S = 8.0
 _INTERRUPT_S = 0.9
 _KILL_S = 0.7
+_GOING_ON = ("starting", "initializing", "running", "paused")
+_GATEWAY_S = 2.0
+"""A gateway ends with its mesh; one that has ended so long before it has lost its link."""
+
 _SILENCE_S = 10.0
 """The master says something ten times a second; after this time without a word it is taken for lost."""
 
@@ -64,6 +68,8 @@ class Launcher:
         self._happened: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._processes: dict[str, Child] = {}
         self._lost: list[tuple[str, int, float]] = []
+        self._gateway_ready = False
+        self._gateway_ended: float | None = None
         self._how: dict[str, str] = {}
         self._end: End | None = None
         self._point: int | None = None
@@ -171,6 +177,10 @@ class Launcher:
             write_note(folder, note)
         elif isinstance(event, Status):
             self._point = event.status.point
+            ended = self._gateway_ended
+            if event.status.state in _GOING_ON and ended is not None and self._heard - ended > _GATEWAY_S:
+                self._gateway_ended = None
+                self._lost.append((_GATEWAY, 0, ended))
         elif isinstance(event, End):
             self._end = event
         self._on_event(event)
@@ -181,6 +191,7 @@ class Launcher:
         except msgspec.DecodeError:
             self._take_output(_GATEWAY, line)
             return
+        self._gateway_ready = True
         self._spawn_nodes()
 
     def _take_output(self, name: str, line: bytes) -> None:
@@ -192,6 +203,8 @@ class Launcher:
         self._how[name] = how_it_ended(code)
         if self._end is None and (code != 0 or name == _MASTER):
             self._lost.append((name, code, time.monotonic()))
+        elif name == _GATEWAY:
+            self._gateway_ended = time.monotonic()
 
     def _interrupt(self) -> None:
         master = self._processes.get(_MASTER)
@@ -251,6 +264,8 @@ class Launcher:
             if self._end.error is None:
                 return self._end
             error = self._with_cause(from_report(self._end.error))
+            if isinstance(error, DeadlineExceeded) and _GATEWAY in self._processes and not self._gateway_ready:
+                error = DeadlineExceeded(f"{_GATEWAY} was not ready within {self._timeouts.start:g} s")
         else:
             error = self._own_account()
         if type(error) in (Interrupted, MeshLost) and rows > (error.point or 0):
@@ -274,7 +289,8 @@ class Launcher:
         name = named[0][0]
         if name in (_MASTER, _GATEWAY):
             text = f"{name} was lost: its process {self._how[name]}"
-            return MeshLost(text, point=point, time=self._plan.grid.time(point))
+            hint = "Was it stopped for some seconds? Then the mesh lets go of it." if not named[0][1] else None
+            return MeshLost(text, point=point, time=self._plan.grid.time(point), hint=hint)
         instances = ", ".join(item.name for item in self._plan.nodes[name].instances)
         text = f"node '{name}' was lost: its process {self._how[name]}"
         return MeshLost(text, instance=instances, point=point, time=self._plan.grid.time(point))

@@ -36,7 +36,7 @@ from ..wire.runtime import (
     tidy_run_folder,
     write_note,
 )
-from ..wire.session import open_session, own_endpoints
+from ..wire.session import close_session, open_session, own_endpoints
 from ..wire.views import LogLine, MeshStatus
 from .events import End, Event, Log, Ready, Status
 from .opening import open_instance, stepped
@@ -105,7 +105,7 @@ class _NodeProcess:
             session = open_session(
                 wiring(self._zenoh, self._config_file, self._folder, self._plan.node, self._plan.peers())
             )
-            stack.callback(session.close)
+            stack.callback(close_session, session)
             self._watch = stack.enter_context(closing(CallWatch(self._take_hang)))
             stack.callback(self._close_instances)
             self._node = node = Node(self._plan, session, self._open)
@@ -199,13 +199,12 @@ def run_master(
         enter_run_folder(folder, MASTER)
         with _told(plan, emit):
             session = open_session(wiring(config.zenoh, config_file, folder, MASTER, ()))
-        stack.callback(session.close)
+        stack.callback(close_session, session)
         endpoints = own_endpoints(session) if config.zenoh.mode == "peer" else tuple(config.zenoh.connect)
         public = tuple(endpoint for endpoint in endpoints if not endpoint.startswith("unixsock-stream/"))
         note = MeshNote(config.mesh, config.zenoh.key_prefix, public, os.getpid(), str(config_file))
         if not child:
             write_note(folder, note)
-            stack.callback((folder / "mesh.json").unlink, missing_ok=True)
         emit(Ready(public))
         recorder, error = None, None
         master = Master(plan, session, _Emitter(emit), endpoints=public, config_file=str(config_file))

@@ -77,6 +77,7 @@ class Master:
         self._keys = Keys(config.zenoh.key_prefix, config.mesh)
         self._nodes = list(plan.nodes)
         self._windows = [plan.nodes[node].window for node in self._nodes]
+        self._most_instances = max(len(node.instances) for node in plan.nodes.values())
         self._progress = [-1] * len(self._nodes)
         self._slowest = -1
         self._reports: dict[str, NodeReport] = {}
@@ -121,10 +122,9 @@ class Master:
             self._grant_to_the_end()
             self._state = "stopping"
             self._send(FINISH, 0)
-            most_instances = max(len(node.instances) for node in self._plan.nodes.values())
             self._wait_for(
                 lambda: len(self._reports) == len(self._nodes),
-                self._timeouts.stop + self._timeouts.terminate * most_instances,
+                self._timeouts.stop + self._timeouts.terminate * self._most_instances,
                 "the end was not reported by",
             )
             self._state = "done"
@@ -173,10 +173,12 @@ class Master:
             self._clock.start()
         self._pacer.start(0)
         self._moved = time.monotonic()
+        # Each of them has its own deadline for a step; the instances of a group take theirs one after the other.
+        patience_s = 3 * self._timeouts.step * self._most_instances
         while self._slowest < self._last_point and not self._stop_asked:
             self._turn(self._publish_grant())
             silent_s = time.monotonic() - self._moved
-            if silent_s > 3 * self._timeouts.step and self._slowest < self._grant and self._hold is None:
+            if silent_s > patience_s and self._slowest < self._grant and self._hold is None:
                 raise DeadlineExceeded(
                     f"no progress for {silent_s:.1f} s",
                     instance=spoken(self._nodes[self._progress.index(self._slowest)]),
@@ -199,8 +201,11 @@ class Master:
         if self.watch is not None:
             self.watch.look(self._holder(credit, grant))
         if grant > self._grant:
+            now = time.monotonic()
+            if self._slowest >= self._grant:  # they had nothing to do until now: the wall clock held them
+                self._moved = now
             self._grant = grant
-            self._published = time.monotonic()
+            self._published = now
             self._send(GRANT, grant)
         else:
             self._send_grant_as_sign_of_life()
@@ -247,15 +252,15 @@ class Master:
         Raises:
             FmuMeshError: a node failed or was lost.
         """
-        message = self._inbox.wait(timeout_s)
+        message, moved = self._inbox.wait(timeout_s), False
         while message is not None:
             kind, number, _, point, _ = message
-            if kind == PROGRESS and number < len(self._progress):
-                self._progress[number] = max(self._progress[number], point)
+            if kind == PROGRESS and number < len(self._progress) and point > self._progress[number]:
+                self._progress[number] = point
+                moved = True
             message = self._inbox.poll()
-        slowest = min(self._progress)
-        if slowest > self._slowest:
-            self._slowest = slowest
+        if moved:  # whoever it was: the slowest may be the last of a row of slow ones
+            self._slowest = min(self._progress)
             self._moved = time.monotonic()
         self._publish_status()
         if self._failure is not None:
@@ -327,6 +332,7 @@ class Master:
                 self._pacer.start(self._slowest)
             case "step":
                 self._state, self._hold = "paused", max(self._hold or 0, self._grant) + max(1, command.points)
+                self._clock.stop()
                 self._pacer.start(self._slowest)
             case "stop":
                 self._stop_asked = True

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from ..errors import StepFailed
 from ..model.plan import NodePlan
 from ..wire.views import InstanceStatus
-from .stepping import Runner
+from .stepping import Runner, Unit
 
 __all__ = ["Activity"]
 
@@ -23,6 +23,7 @@ class Activity:
         state: in one or two words, for `status`.
         waiting: whether the main thread waits for a message.
         waited_s: how long it has waited since the first point.
+        advancing: the unit that the main thread steps, if it does.
         runners: the instances, once all are loaded.
     """
 
@@ -33,7 +34,8 @@ class Activity:
         self.runners: Mapping[str, Runner] = {}
         self._plan = plan
         self._started: float | None = None
-        self._stalled_since: dict[str, tuple[int, float]] = {}
+        self.advancing: Unit | None = None
+        self._under_way: tuple[str, int, float] | None = None
 
     def started(self) -> None:
         """The instances are at their first point."""
@@ -55,36 +57,41 @@ class Activity:
             running_time=time.monotonic() - self._started if self._started is not None else 0.0,
         )
 
-    def hang(self, now: float) -> StepFailed | None:
-        """The error of a step that has not returned in its time, if there is one.
+    def look_at_steps(self, now: float) -> StepFailed | None:
+        """End a burst of steps that takes long; the error of a step that has not returned in its time, if there is one.
 
         Other calls of an FMU are watched by `fmu_mesh.fmu.guard.CallWatch`.
         """
-        if self.state != "running" or self.waiting:
+        if (unit := self.advancing) is None or self.state != "running":
+            self._under_way = None
             return None
-        for name, runner in self.runners.items():
-            stalled_s = now - self._stalled(name, now)
-            if stalled_s > self._plan.timeouts.step:
-                return StepFailed(
-                    f"the FMU has not returned for {stalled_s:.1f} s from doStep; its process is ended",
-                    instance=name,
-                    point=runner.point,
-                    time=self._plan.grid.time(runner.point),
-                    hint="If it needs that long, raise `timeouts.step` in the configuration.",
-                )
-        return None
+        runner = unit.current
+        under_way_s = now - self._since(runner, now)
+        unit.hurry = True
+        if under_way_s <= self._plan.timeouts.step:
+            return None
+        return StepFailed(
+            f"the FMU has not returned for {under_way_s:.1f} s from doStep; its process is ended",
+            instance=runner.name,
+            point=runner.point,
+            time=self._plan.grid.time(runner.point),
+            hint="If it needs that long, raise `timeouts.step` in the configuration.",
+        )
 
     def _in_words(self, runner: Runner) -> str:
         if self.state != "running":
             return self.state
         if self.waiting:
             return f"waiting at point {runner.point} for {runner.lacking()}"
+        unit = self.advancing
+        current = unit.current if unit is not None else runner
+        if current is not runner:
+            return f"waiting at point {runner.point} for its turn: '{current.name}' is in doStep"
         now = time.monotonic()
-        return f"in doStep at point {runner.point} for {now - self._stalled(runner.name, now):.1f} s"
+        return f"in doStep at point {runner.point} for {now - self._since(runner, now):.1f} s"
 
-    def _stalled(self, name: str, now: float) -> float:
-        """Since when an instance has been at its point, as far as was seen; costs the hot loop nothing."""
-        step = self.runners[name].step
-        if self.waiting or self._stalled_since.get(name, (-1, 0.0))[0] != step:
-            self._stalled_since[name] = (step, now)
-        return self._stalled_since[name][1]
+    def _since(self, runner: Runner, now: float) -> float:
+        """Since when the step of a runner has been under way, as far as was seen; costs the hot loop nothing."""
+        if self._under_way is None or self._under_way[:2] != (runner.name, runner.step):
+            self._under_way = (runner.name, runner.step, now)
+        return self._under_way[2]

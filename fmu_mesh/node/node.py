@@ -183,7 +183,13 @@ class Node:
     def _meet(self) -> None:
         """Join the mesh: from now on all others are there."""
         self._activity.state = "waiting for the mesh"
-        welcome = self._membership.join()
+        try:
+            welcome = self._membership.join()
+        except MeshLost as error:
+            if not self._membership.given_up:
+                raise
+            self._master_is_gone = True
+            raise MeshLost("the master is gone", hint="See the messages of its process.") from error
         self._progress_number = welcome.number
         self._heard = time.monotonic()
         if welcome.profile:
@@ -238,10 +244,12 @@ class Node:
         while not self._finished:
             stepped = False
             for unit in tuple(self._units):
+                self._activity.advancing = unit
                 try:
                     stepped = unit.advance(self._grant) or stepped
                 except TerminationRequested as asked:
                     self._end_early(unit, asked)
+            self._activity.advancing = None
             taken = False
             while (message := poll()) is not None:
                 self._take(message)
@@ -338,6 +346,7 @@ class Node:
         if sample.kind == zenoh.SampleKind.PUT:
             self._master_was_there = True
         elif not self._finished:
+            self._membership.give_up()
             self._inbox.post(self._end_without_master)
 
     def _end_without_master(self) -> None:
@@ -366,6 +375,7 @@ class Node:
 
     def _report_failure(self, error: FmuMeshError) -> bool:
         """Tell the master, unless it is the one that is gone; whether it knows now."""
+        self._activity.advancing = None
         if self._activity.state == "running":
             for runner in self._runners.values():
                 runner.flush()

@@ -145,7 +145,7 @@ class Server:
         for name, publisher in self._status_publishers.items():
             if matches(publisher):
                 publisher.put(msgspec.json.encode(self._activity.status(name)))
-        if (hang := self._activity.hang(now)) is not None:
+        if (hang := self._activity.look_at_steps(now)) is not None:
             self.on_hang(hang)
 
     def report_hang(self, error: FmuError, deadline_s: float) -> bool:

@@ -129,7 +129,12 @@ class Runner:
 
 
 class Unit:
-    """Runners that are stepped together, in the order of the plan."""
+    """Runners that are stepped together, in the order of the plan.
+
+    Attributes:
+        hurry: set it on another thread, and the burst that is under way ends after the current step. How long a burst
+            takes is known from those before it only, and an FMU may become slow from one step to the next.
+    """
 
     def __init__(self, runners: Sequence[Runner]) -> None:
         self.runners = runners
@@ -139,9 +144,16 @@ class Unit:
         self._point = 0
         self._burst = 1
         self._starved = False
+        self.hurry = False
+
+    @property
+    def current(self) -> Runner:
+        """The runner whose step is under way while this is advanced."""
+        return min(self.runners, key=lambda runner: (runner.step + 1) * runner.plan.step_points)
 
     def advance(self, grant: int) -> bool:
         """Step as far as inputs and ``grant`` allow, for one burst at most; whether anything was stepped."""
+        self.hurry = False
         started = perf_counter()
         steps = self._advance_single(self._single, grant) if self._single is not None else self._advance_cycle(grant)
         if not steps:
@@ -150,7 +162,7 @@ class Unit:
         if steps == self._burst and elapsed < _BURST_S:
             self._burst = min(2 * self._burst, 4096)
         elif elapsed > 2 * _BURST_S:
-            self._burst = max(1, self._burst // 2)
+            self._burst = max(1, min(self._burst, steps) // 2)
         for runner in self.runners:
             runner.step_seconds += elapsed
             if elapsed >= _BURST_S:
@@ -178,22 +190,22 @@ class Unit:
             if one + half_ulp - quarter_ulp != one or not tiny + tiny:  # as `floating_point_changed`, without a call
                 restore_floating_point()
             runner.step = step + 1
-        self._starved = end == limit
-        return end - first
+            if self.hurry:
+                break
+        self._starved = runner.step == limit
+        return runner.step - first
 
     def _advance_cycle(self, grant: int) -> int:
         first = self._point
         limit = self._cycle_limit(grant)
         end = min(limit, first + self._burst)
-        if self._one_rate:
-            self._step_together(first, end)
-        else:
-            self._step_at_own_rates(first, end)
-        self._point = max(first, end)
+        end = self._step_together(first, end) if self._one_rate else self._step_at_own_rates(first, end)
+        self._point = end
         self._starved = end == limit
-        return max(0, end - first)
+        return end - first
 
-    def _step_together(self, first: int, end: int) -> None:
+    def _step_together(self, first: int, end: int) -> int:
+        """From point ``first`` to ``end``, or less far in a hurry; returns how far."""
         one, half_ulp, quarter_ulp, tiny = DEFAULT_MODE
         members = [
             (runner, [feed.step for feed in runner.local_feeds], runner.instance.do_step) for runner in self.runners
@@ -206,8 +218,12 @@ class Unit:
                 if one + half_ulp - quarter_ulp != one or not tiny + tiny:  # as in `_advance_single`
                     restore_floating_point()
                 runner.step = point + 1
+            if self.hurry:
+                return point + 1
+        return max(first, end)
 
-    def _step_at_own_rates(self, first: int, end: int) -> None:
+    def _step_at_own_rates(self, first: int, end: int) -> int:
+        """As `_step_together`."""
         for point in range(first, end):
             for runner in self.runners:
                 # A slower instance steps when the end of its step is reached: only then all its inputs can be there.
@@ -220,6 +236,9 @@ class Unit:
                 if floating_point_changed():
                     restore_floating_point()
                 runner.step = step + 1
+            if self.hurry:
+                return point + 1
+        return max(first, end)
 
     def _cycle_limit(self, grant: int) -> int:
         """The point up to which the whole cycle may step: bounded by the grant and by what comes from outside."""

@@ -35,7 +35,7 @@ class CsvFile:
         columns: (name, type) of every column but `time`.
 
     Raises:
-        ConfigurationError: the file cannot be written.
+        ConfigurationError: the file cannot be written, or another run writes into it.
     """
 
     def __init__(self, path: Path, columns: Sequence[tuple[str, VariableType]]) -> None:

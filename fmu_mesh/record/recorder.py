@@ -70,6 +70,8 @@ class Recorder:
         self._progress_told_at = 0.0
         self._number = 0
         self._finished = False
+        # At the end the main thread writes what is left, and on a slow disk the thread may still be at it.
+        self._writing = threading.Lock()
         self._flushed = time.monotonic()
         capacity = (plan.window + 8) * len(plan.links_in) + 1024
         shared = shared_inbox(plan, spins=False)  # nobody waits for it, but others need the processor
@@ -91,6 +93,7 @@ class Recorder:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         if self._thread.is_alive():
+            self._membership.give_up()
             self._inbox.post(self._end)
         self._thread.join(5.0)
         try:
@@ -174,6 +177,10 @@ class Recorder:
         return min(source.covered(self._plan.grid.last_point) for source in self._sources.values())
 
     def _write_complete_rows(self) -> None:
+        with self._writing:
+            self._write_rows()
+
+    def _write_rows(self) -> None:
         end = self._complete() + 1
         first = self._written
         if end > first:

@@ -34,7 +34,7 @@ from .views import (
     SetAnswer,
 )
 
-__all__ = ["MeshClient", "key_expression"]
+__all__ = ["MeshClient", "is_key", "key_expression"]
 
 View = TypeVar("View")
 
@@ -124,7 +124,7 @@ class MeshClient:
 
         In the short form `*` stands for any characters; in a key the wildcards are those of Zenoh.
         """
-        if not self.is_key(reference):
+        if not is_key(reference, self.keys):
             return self._targets_by_name(reference)
         asked = key_expression(reference)
         instances = [
@@ -203,10 +203,6 @@ class MeshClient:
                 stack.callback(subscriber.undeclare)
             yield iter(arrived.get, None) if there.wait(self._timeout_s) else iter(())
 
-    def is_key(self, reference: str) -> bool:
-        """Whether a reference is a key; otherwise it is a name, or `instance.variable`."""
-        return reference.startswith(f"{self.keys.prefix}/") or "/" in reference.partition(".")[0]
-
     # --- names
 
     def _targets_by_name(self, reference: str) -> list[Target]:
@@ -276,6 +272,11 @@ class MeshClient:
             finally:
                 listener.undeclare()
         raise DeadlineExceeded(f"no answer from {who} within {self._timeout_s:g} s.", hint="--timeout waits longer.")
+
+
+def is_key(reference: str, keys: Keys) -> bool:
+    """Whether a reference is a key; otherwise it is a name, or `instance.variable`."""
+    return reference.startswith(f"{keys.prefix}/") or "/" in reference.partition(".")[0]
 
 
 def key_expression(text: str) -> zenoh.KeyExpr:

@@ -89,6 +89,9 @@ class Membership:
         session: the session of this process; stays the caller's.
         inbox: its inbox, made with `shared_inbox`.
 
+    Attributes:
+        given_up: whether `give_up` was called.
+
     Call sequence: `join` once, then `sender` for everything that is sent to, and `close` at the end.
     """
 
@@ -100,6 +103,11 @@ class Membership:
         self._outlets: dict[str, SharedOutlet] = {}
         self._shared: frozenset[str] = frozenset()
         self._stack = ExitStack()
+        self.given_up = False
+
+    def give_up(self) -> None:
+        """From any thread: let `join` end with an error, because there is nothing to join any more."""
+        self.given_up = True
 
     def answer_hello(self, query: zenoh.Query) -> None:
         """On a foreign thread: a target asks; tell it whether its shared memory can be reached from here."""
@@ -113,20 +121,29 @@ class Membership:
 
         Raises:
             DeadlineExceeded: somebody was not there in time.
-            MeshLost: the master refused this node; the message says why.
+            MeshLost: the master refused this node, the message says why; or this node has given up.
         """
         plan, inbox = self._plan, self._inbox
         deadline_s = plan.timeouts.start
         hello = msgspec.json.encode(Hello(plan.node, inbox.offer))
         shared = inbox.offer is not None
         for node in dict.fromkeys(link.source_node for link in plan.links_in):
-            answer = ask(self._session, self._keys.hello(node), hello, deadline_s, f"node '{node}'")
+            key, who = self._keys.hello(node), f"node '{node}'"
+            answer = ask(self._session, key, hello, deadline_s, who, over=lambda: self.given_up)
             shared = shared and answer == _SHARED
         registration = Registration(
             plan.node, plan.digest, os.getpid(), socket.gethostname(), offer=inbox.offer, shared=shared
         )
         payload = msgspec.json.encode(registration)
-        answer = ask(self._session, self._keys.register, payload, deadline_s, "the master", 2 * deadline_s)
+        answer = ask(
+            self._session,
+            self._keys.register,
+            payload,
+            deadline_s,
+            "the master",
+            2 * deadline_s,
+            over=lambda: self.given_up,
+        )
         welcome = decode_json(answer, Welcome)
         self._shared = frozenset(welcome.shared)
         if welcome.offer is not None and self._outlet(welcome.offer, MASTER, "the master") is None:

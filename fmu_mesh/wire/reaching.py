@@ -7,39 +7,45 @@ open sessions in client mode: the master, which is their way in, passes everythi
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Sequence
-from contextlib import ExitStack
 from types import TracebackType
-from typing import Self
+from typing import NamedTuple, Self
 
 import zenoh
 
 from ..errors import ConfigurationError, DeadlineExceeded, FmuMeshError
 from ..model.findings import listed, nearest
-from .client import MeshClient, key_expression
+from .client import MeshClient, is_key, key_expression
 from .keys import Keys
-from .runtime import MeshNote, meshes
-from .session import Wiring, open_session
+from .runtime import meshes
+from .session import Wiring, close_session, open_session
 
 __all__ = ["Meshes"]
+
+_GRACE_S = 1.0
 
 
 class Meshes:
     """The meshes that can be reached, as long as the `with` block lasts.
+
+    Where the notes tell of several, only what is asked for is opened: a mesh that does not answer is no reason to keep
+    somebody from another one.
 
     Args:
         endpoints: Zenoh endpoints to connect to; without any, the notes of this user's meshes on this host tell.
         timeout_s: the deadline of every wait in s.
 
     Attributes:
-        clients: one client per mesh, in the order of their names.
+        silent: why meshes that have a note are not among `all`.
     """
 
     def __init__(self, endpoints: Sequence[str], timeout_s: float) -> None:
-        self.clients: list[MeshClient] = []
+        self.silent: list[FmuMeshError] = []
         self._endpoints = tuple(endpoints)
         self._timeout_s = timeout_s
-        self._stack = ExitStack()
+        self._found: list[_Found] = []
+        self._openings: list[_Opening] = []
 
     def __enter__(self) -> Self:
         """Connect.
@@ -47,56 +53,66 @@ class Meshes:
         Raises:
             DeadlineExceeded: an endpoint does not answer.
         """
-        with ExitStack() as stack:
+        try:
             if self._endpoints:
-                self._connect(stack)
+                self._connect()
             else:
                 for note in meshes():
-                    self._open_note(stack, note)
-            self._stack = stack.pop_all()
-        self.clients.sort(key=lambda client: client.keys.mesh)
+                    opening = self._open(note.endpoints, f"mesh '{note.mesh}' did not answer")
+                    self._found.append(_Found(Keys(note.key_prefix, note.mesh), note.endpoints, opening))
+        except BaseException:
+            self._close()
+            raise
+        self._found.sort(key=lambda found: found.keys.mesh)
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._stack.close()
+        self._close()
 
     def all(self) -> list[MeshClient]:
-        """All meshes, at least one.
+        """All meshes that answer, at least one.
 
         Raises:
             ConfigurationError: there is none.
+            DeadlineExceeded: none of them answers.
         """
-        if self.clients:
-            return self.clients
-        if self._endpoints:
-            raise ConfigurationError(f"no mesh can be reached at {', '.join(self._endpoints)}.")
-        raise ConfigurationError(
-            "no mesh is running here.", hint="Start one with `fmu-mesh launch CONFIG`, or reach another with --connect."
-        )
+        clients: list[MeshClient] = []
+        self.silent = []
+        running = self._running()
+        for found in running:
+            found.opening.start()
+        for found in running:
+            try:
+                clients.append(self._client(found))
+            except FmuMeshError as error:
+                self.silent.append(error)
+        if not clients:
+            raise self.silent[0]
+        return clients
 
     def one(self, reference: str | None) -> MeshClient:
         """The mesh that a reference (a key, a name, or nothing) means.
 
         Raises:
             ConfigurationError: there is none, or more than one.
+            DeadlineExceeded: it does not answer.
         """
-        clients = self.all()
-        names = [client.keys.mesh for client in clients]
+        running = self._running()
         if reference is not None:
-            named = [client for client in clients if _means(client, reference)]
+            named = [found for found in running if _means(found.keys, reference)]
             if len(named) == 1:
-                return named[0]
-            if not named and any(client.is_key(reference) for client in clients):
-                raise _not_running(reference, clients)
-        if len(clients) == 1:
-            return clients[0]
-        if len({client.keys.root for client in clients}) < len(clients):
-            raise _same_name(clients, listed(names))
+                return self._client(named[0])
+            if not named and any(is_key(reference, found.keys) for found in running):
+                raise _not_running(reference, running)
+        if len(running) == 1:
+            return self._client(running[0])
+        if len({found.keys.root for found in running}) < len(running):
+            raise _same_name(running, listed([found.keys.mesh for found in running]))
         raise ConfigurationError(
-            f"{len(clients)} meshes are running: {listed(names)}.",
-            hint=f"Say which one by a full key, such as '{clients[0].keys.root}/INSTANCE/out/VARIABLE'.",
+            f"{len(running)} meshes are running: {listed([found.keys.mesh for found in running])}.",
+            hint=f"Say which one by a full key, such as '{running[0].keys.root}/INSTANCE/out/VARIABLE'.",
         )
 
     def named(self, mesh: str) -> MeshClient:
@@ -104,77 +120,148 @@ class Meshes:
 
         Raises:
             ConfigurationError: there is none, or more than one.
+            DeadlineExceeded: it does not answer.
         """
-        found = [client for client in self.all() if mesh in (client.keys.mesh, client.keys.root)]
-        if len(found) == 1:
-            return found[0]
-        if found:
-            roots = listed([client.keys.root for client in found])
-            if len({client.keys.root for client in found}) < len(found):
-                raise _same_name(found, roots)
-            raise ConfigurationError(f"{len(found)} meshes are named '{mesh}': {roots}.", hint="Give the key.")
-        raise _not_running(mesh, self.clients)
+        running = self._running()
+        named = [found for found in running if mesh in (found.keys.mesh, found.keys.root)]
+        if len(named) == 1:
+            return self._client(named[0])
+        if named:
+            roots = listed([found.keys.root for found in named])
+            if len({found.keys.root for found in named}) < len(named):
+                raise _same_name(named, roots)
+            raise ConfigurationError(f"{len(named)} meshes are named '{mesh}': {roots}.", hint="Give the key.")
+        raise _not_running(mesh, running)
 
-    def _connect(self, stack: ExitStack) -> None:
+    def _running(self) -> list[_Found]:
+        """What was found, at least one.
+
+        Raises:
+            ConfigurationError: there is none.
+        """
+        if self._found:
+            return self._found
+        if self._endpoints:
+            raise ConfigurationError(f"no mesh can be reached at {', '.join(self._endpoints)}.")
+        raise ConfigurationError(
+            "no mesh is running here.", hint="Start one with `fmu-mesh launch CONFIG`, or reach another with --connect."
+        )
+
+    def _connect(self) -> None:
         """Every mesh whose master shows at the endpoints."""
-        session = _open(stack, self._endpoints, self._timeout_s)
-        for reply in session.liveliness().get("**/mesh", timeout=self._timeout_s):
+        opening = self._open(self._endpoints, "nobody answered")
+        for reply in opening.session().liveliness().get("**/mesh", timeout=self._timeout_s):
             if reply.ok is not None:
                 prefix, mesh, _ = str(reply.ok.key_expr).rsplit("/", 2)
-                self.clients.append(MeshClient(session, Keys(prefix, mesh), self._endpoints, self._timeout_s))
+                self._found.append(_Found(Keys(prefix, mesh), self._endpoints, opening))
 
-    def _open_note(self, stack: ExitStack, note: MeshNote) -> None:
-        session = _open(stack, note.endpoints, self._timeout_s)
-        keys = Keys(note.key_prefix, note.mesh)
-        self.clients.append(MeshClient(session, keys, note.endpoints, self._timeout_s))
+    def _open(self, endpoints: Sequence[str], else_: str) -> _Opening:
+        self._openings.append(_Opening(endpoints, else_, self._timeout_s))
+        return self._openings[-1]
+
+    def _client(self, found: _Found) -> MeshClient:
+        return MeshClient(found.opening.session(), found.keys, found.endpoints, self._timeout_s)
+
+    def _close(self) -> None:
+        for opening in self._openings:
+            opening.close()
 
 
-def _open(stack: ExitStack, endpoints: Sequence[str], timeout_s: float) -> zenoh.Session:
-    """A session in client mode.
+class _Opening:
+    """A session in client mode that is opened when it is wanted.
 
-    Opened on a thread: `open_session` is patient with endpoints that start late, a person at a terminal is not.
+    On a thread: several are opened at the same time. It comes back soon after the deadline; a process that ended while
+    it was still inside Zenoh could be aborted by that.
+
+    Args:
+        endpoints: where.
+        else_: what to say when it is not open in time.
+        timeout_s: from its start on, in s.
     """
-    sessions: list[zenoh.Session] = []
-    errors: list[FmuMeshError] = []
 
-    def open_it() -> None:
-        try:
-            sessions.append(open_session(Wiring(mode="client", connect=tuple(endpoints))))
-        except FmuMeshError as error:
-            errors.append(error)
+    def __init__(self, endpoints: Sequence[str], else_: str, timeout_s: float) -> None:
+        self._endpoints = tuple(endpoints)
+        self._else = else_
+        self._timeout_s = timeout_s
+        self._end = 0.0
+        self._sessions: list[zenoh.Session] = []
+        self._errors: list[FmuMeshError] = []
+        self._late = False
+        self._thread: threading.Thread | None = None
 
-    thread = threading.Thread(target=open_it, name="open", daemon=True)
-    thread.start()
-    thread.join(timeout_s)
-    if errors:
-        raise errors[0]
-    if not sessions:
+    def start(self) -> None:
+        """Begin to open it, if that has not begun."""
+        if self._thread is None:
+            self._end = time.monotonic() + self._timeout_s
+            self._thread = threading.Thread(target=self._run, name="open", daemon=True)
+            self._thread.start()
+
+    def session(self) -> zenoh.Session:
+        """The session, as soon as it is open.
+
+        Raises:
+            FmuMeshError: it cannot be opened, or not in time.
+        """
+        self.start()
+        self._join()
+        if self._sessions:
+            return self._sessions[0]
+        if self._errors and not self._late:
+            raise self._errors[0]
+        where = ", ".join(self._endpoints)
         raise DeadlineExceeded(
-            f"nobody answered at {', '.join(endpoints)} within {timeout_s:g} s.",
+            f"{self._else} at {where} within {self._timeout_s:g} s.",
             hint="`launch` and `ls` show where a mesh can be reached, on the host where it runs.",
         )
-    stack.callback(sessions[0].close)
-    return sessions[0]
+
+    def close(self) -> None:
+        """Close it if it is open."""
+        self._join()
+        for session in self._sessions:
+            close_session(session)
+
+    def _join(self) -> None:
+        if self._thread is not None:
+            self._thread.join(max(0.0, self._end + _GRACE_S - time.monotonic()))
+
+    def _run(self) -> None:
+        try:
+            wiring = Wiring(mode="client", connect=self._endpoints, patience_s=self._timeout_s)
+            self._sessions.append(open_session(wiring))
+        except FmuMeshError as error:
+            self._errors.append(error)
+            self._late = time.monotonic() >= self._end
 
 
-def _means(client: MeshClient, reference: str) -> bool:
+class _Found(NamedTuple):
+    """A mesh, and how it is reached."""
+
+    keys: Keys
+    endpoints: tuple[str, ...]
+    opening: _Opening
+
+
+def _means(keys: Keys, reference: str) -> bool:
     """Whether a reference says that it is about this mesh."""
-    if reference in (client.keys.mesh, client.keys.root):
+    if reference in (keys.mesh, keys.root):
         return True
-    return client.is_key(reference) and key_expression(reference).intersects(zenoh.KeyExpr(f"{client.keys.root}/**"))
+    return is_key(reference, keys) and key_expression(reference).intersects(zenoh.KeyExpr(f"{keys.root}/**"))
 
 
-def _same_name(clients: Sequence[MeshClient], names: str) -> ConfigurationError:
+def _same_name(found: Sequence[_Found], names: str) -> ConfigurationError:
     """Meshes that no name and no key tells apart, such as one that was launched twice."""
-    where = ", ".join(endpoint for client in clients for endpoint in client.endpoints[:1])
+    where = ", ".join(endpoint for one in found for endpoint in one.endpoints[:1])
     return ConfigurationError(
-        f"{len(clients)} meshes are running: {names}.", hint=f"Say which one by --connect and its endpoint: {where}."
+        f"{len(found)} meshes are running: {names}.", hint=f"Say which one by --connect and its endpoint: {where}."
     )
 
 
-def _not_running(reference: str, clients: Sequence[MeshClient]) -> ConfigurationError:
-    names = [name for client in clients for name in (client.keys.mesh, client.keys.root)]
+def _not_running(reference: str, running: Sequence[_Found]) -> ConfigurationError:
+    names = [name for found in running for name in (found.keys.mesh, found.keys.root)]
     suggestion = nearest(reference, names)
-    running = listed([client.keys.mesh for client in clients])
-    hint = f"Did you mean '{suggestion}'?" if suggestion is not None else f"Running: {running}."
+    hint = (
+        f"Did you mean '{suggestion}'?"
+        if suggestion is not None
+        else f"Running: {listed([found.keys.mesh for found in running])}."
+    )
     return ConfigurationError(f"no mesh '{reference}' is running.", hint=hint)

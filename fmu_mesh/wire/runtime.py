@@ -139,7 +139,9 @@ def leave_run_folder(folder: Path) -> None:
         held.close()
     tidy_run_folder(folder)
     note = _read_note(folder / "mesh.json")
-    if note is not None and not is_alive(note.pid):
+    if note is not None and note.pid == os.getpid():  # the master of processes started by hand
+        (folder / "mesh.json").unlink(missing_ok=True)
+    elif note is not None and not is_alive(note.pid):
         remove_run_folder(folder)  # the launcher was killed
         return
     for empty in (folder / "fmus", folder):

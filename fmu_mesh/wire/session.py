@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 import json
+import queue
 import re
 import threading
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from functools import partial
 from itertools import chain
 from pathlib import Path
 from typing import Any, Protocol
 
 import msgspec
 import zenoh
+from zenoh.handlers import Callback
 
 from ..errors import ConfigurationError, DeadlineExceeded, MeshLost
 
-__all__ = ["Wiring", "ask", "matches", "open_session", "own_endpoints", "undeclare_all"]
+__all__ = ["Wiring", "ask", "close_session", "matches", "open_session", "own_endpoints", "undeclare_all"]
 
 LEASE_MS = 4_000
 """A stopped (not dead) process is noticed after this time; a dead one within milliseconds."""
@@ -37,6 +41,10 @@ _CANNOT_LISTEN = (
 """The system's words for why an endpoint cannot be listened at, ours, and the way out."""
 
 
+_CLOSE_S = 1.0
+_LOOK_S = 0.05
+
+
 class Wiring(msgspec.Struct, frozen=True):
     """How one process is connected.
 
@@ -46,6 +54,7 @@ class Wiring(msgspec.Struct, frozen=True):
         connect: endpoints to connect to; tried again until they answer.
         gossip: whether peers learn of each other through those they know (meshes over several hosts).
         config: a Zenoh configuration file to start from.
+        patience_s: how long a client tries to connect, in s.
     """
 
     mode: str = "peer"
@@ -53,6 +62,7 @@ class Wiring(msgspec.Struct, frozen=True):
     connect: tuple[str, ...] = ()
     gossip: bool = False
     config: Path | None = None
+    patience_s: float = 20.0
 
 
 def open_session(wiring: Wiring) -> zenoh.Session:
@@ -95,7 +105,7 @@ def _configuration(wiring: Wiring) -> zenoh.Config:
         "connect/endpoints": list(wiring.connect),
         # Processes start in any order: an endpoint that does not answer yet is tried again, in the background.
         "connect/exit_on_failure": False,
-        "connect/timeout_ms": -1 if wiring.mode == "peer" else 20_000,
+        "connect/timeout_ms": -1 if wiring.mode == "peer" else round(1000 * wiring.patience_s),
         "connect/retry": {"period_init_ms": 20, "period_max_ms": 250, "period_increase_factor": 1.5},
         "listen/exit_on_failure": True,
         "transport/link/tx/lease": LEASE_MS,
@@ -111,6 +121,17 @@ def _configuration(wiring: Wiring) -> zenoh.Config:
     for key, value in settings.items():
         config.insert_json5(key, json.dumps(value))
     return config
+
+
+def close_session(session: zenoh.Session) -> None:
+    """Close a session, without waiting long for others.
+
+    Where an endpoint accepts and says nothing, or lets all packets fall, Zenoh waits ten seconds for it first. Whoever
+    has to close a session has nothing left to send, and the end of the process closes what is open then.
+    """
+    closing = threading.Thread(target=session.close, name="close", daemon=True)
+    closing.start()
+    closing.join(_CLOSE_S)
 
 
 def own_endpoints(session: zenoh.Session, deadline_s: float = 5.0) -> tuple[str, ...]:
@@ -140,7 +161,13 @@ def undeclare_all(*entities: Iterable[_Declared]) -> None:
 
 
 def ask(  # noqa: PLR0913, PLR0917  the parts of one question
-    session: zenoh.Session, key: str, payload: bytes | None, deadline_s: float, what: str, answer_s: float | None = None
+    session: zenoh.Session,
+    key: str,
+    payload: bytes | None,
+    deadline_s: float,
+    what: str,
+    answer_s: float | None = None,
+    over: Callable[[], bool] = lambda: False,
 ) -> bytes:
     """Query ``key`` until somebody is there to answer, and return the answer's payload.
 
@@ -154,10 +181,11 @@ def ask(  # noqa: PLR0913, PLR0917  the parts of one question
         deadline_s: how long to wait for an answer, in s.
         what: what is being waited for, for the error.
         answer_s: how long somebody who is there may take to answer, in s, if that is longer.
+        over: whether the answer is not wanted any more.
 
     Raises:
         DeadlineExceeded: nobody answered within ``deadline_s`` seconds.
-        MeshLost: the answer was an error; its text is the message.
+        MeshLost: the answer was an error; its text is the message. Or it is not wanted any more.
     """
     end = time.monotonic() + deadline_s
     changed = threading.Event()
@@ -167,13 +195,21 @@ def ask(  # noqa: PLR0913, PLR0917  the parts of one question
             while (left := end - time.monotonic()) > 0:
                 changed.clear()
                 if matches(querier):
-                    for reply in querier.get(payload=payload):
-                        if reply.ok is not None:
-                            return reply.ok.payload.to_bytes()
-                        text = reply.err.payload.to_bytes().decode(errors="replace") if reply.err else ""
-                        if text != "Timeout":
-                            raise MeshLost(text)
-                changed.wait(min(left, 0.05))
+                    # Zenoh does not tell when whoever took the query is gone: it would wait for the timeout.
+                    replies: queue.SimpleQueue[zenoh.Reply | None] = queue.SimpleQueue()
+                    querier.get(Callback(replies.put, partial(replies.put, None)), payload=payload)
+                    while not over():
+                        with suppress(queue.Empty):
+                            if (reply := replies.get(timeout=_LOOK_S)) is None:
+                                break
+                            if reply.ok is not None:
+                                return reply.ok.payload.to_bytes()
+                            text = reply.err.payload.to_bytes().decode(errors="replace") if reply.err else ""
+                            if text != "Timeout":
+                                raise MeshLost(text)
+                if over():
+                    raise MeshLost(f"{what} has not answered yet, and the asker gave up")
+                changed.wait(min(left, _LOOK_S))
         finally:
             listener.undeclare()
     raise DeadlineExceeded(f"nobody answered for {what} within {deadline_s:g} s")

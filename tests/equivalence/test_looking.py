@@ -26,7 +26,7 @@ import pytest
 import zenoh
 
 from fmu_mesh.cli.main import main
-from tests.helpers import DEADLINE_S
+from tests.helpers import DEADLINE_S, wait_until
 
 FMUS = Path(__file__).parents[2] / "fmus"
 ROOT = "fmu_mesh/looked_at"
@@ -309,6 +309,19 @@ def test_a_paused_mesh_steps_answers_and_runs_on(call: Call, session: zenoh.Sess
         code, out, _ = call("resume", ROOT)
     assert (code, out.split(" at ")[0]) == (0, "mesh 'looked_at' is running")
     statuses.until(lambda sample: decoded(sample) >= ("running", held + 20))
+
+
+def test_the_clock_stands_while_a_mesh_rests_after_a_step_that_was_given_while_it_ran(call: Call) -> None:
+    def status() -> dict[str, Any]:
+        view: dict[str, Any] = json.loads(call("status", "looked_at", "--json")[1])
+        return view
+
+    try:
+        goal = json.loads(call("step", "looked_at", "5", "--json")[1])["hold"]
+        wait_until(lambda: status()["point"] == goal, "the end of the step")
+        assert len({status()["points_per_second"] for _ in range(3)}) == 1
+    finally:
+        assert call("resume", ROOT)[0] == 0
 
 
 def test_an_instance_that_does_not_answer_is_named_within_the_deadline(call: Call) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.helpers import Launched, Place, row_count, rows_of, wait_until, write_config
+from tests.helpers import DEADLINE_S, Launched, Place, row_count, rows_of, wait_until, write_config
 
 
 def start(place: Place, config: Path, role: str, *options: str) -> Launched:
@@ -57,7 +57,8 @@ def test_a_node_that_nobody_starts_is_named_after_the_deadline(place: Place, ord
     assert {role: launched.wait() for role, launched in by_hand.items()} == dict.fromkeys(order, 4)
     assert "node 'delay'" in by_hand["master"].message
     assert "within 2 s" in by_hand["master"].message
-    assert "within 2 s" in by_hand["pendulum"].message
+    message = by_hand["pendulum"].message  # the master tells those that have registered
+    assert "within 2 s" in message or "the master is gone" in message
     place.assert_nothing_left()
 
 
@@ -137,6 +138,24 @@ def test_when_a_process_started_by_hand_is_killed_the_others_end_and_say_so(plac
         assert ("the master" if victim == "master" else "node 'pendulum' was lost") in launched.message
     assert len(rows_of(config.with_suffix(".csv"))) > 100
     place.assert_nothing_left()  # the others have tidied up for the one that was killed
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL], ids=lambda number: number.name)
+def test_a_master_that_ends_before_all_nodes_are_there_ends_those_that_are(
+    place: Place, number: signal.Signals
+) -> None:
+    """Long before the deadline of the start: what it waited for cannot come any more."""
+    config = write_config(place.folder, timeouts={"start": 10 * DEADLINE_S})
+    master = start(place, config, "master")
+    place.note()
+    node = start(place, config, "pendulum")
+    wait_until(lambda: "waiting for the mesh" in place.run("status", "pendulum").output, "a node that waits")
+
+    master.signal(number)
+
+    assert master.wait() == (130 if number == signal.SIGINT else -signal.SIGKILL)
+    assert node.wait() in (4, 130)
+    place.assert_nothing_left()
 
 
 def test_ctrl_c_at_the_master_started_by_hand_ends_the_nodes_too(place: Place) -> None:

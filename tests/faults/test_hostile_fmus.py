@@ -91,6 +91,85 @@ def test_an_fmu_that_takes_its_time_to_initialize_makes_no_other_node_believe_th
     assert len(rows_of(slow.with_suffix(".csv"))) == 11
 
 
+def test_a_step_that_hangs_in_a_group_is_told_of_the_instance_that_hangs(place: Place, hostile: Path) -> None:
+    config = mesh_of(place, hostile, ["first", "hang_fmi2DoStep"], group="together", timeouts=SHORT)
+
+    launched = place.run("launch", config)
+
+    assert launched.wait() == 3
+    assert launched.message.startswith("fmu-mesh: instance hang_fmi2DoStep, point 4, t = 0.004 s: the FMU has not ")
+    place.assert_nothing_left()
+
+
+def test_an_instance_that_has_nothing_to_step_does_not_hang_while_another_one_of_its_group_steps(
+    place: Place, hostile: Path
+) -> None:
+    config = write_config(
+        place.folder,
+        instances={
+            "tardy_fmi2DoStep": {"fmu": str(hostile), "group": "together"},
+            "rare": {"fmu": str(hostile), "group": "together", "step_size": 0.005},
+        },
+        connections=[],
+        stop_time=0.010,
+        timeouts={"step": 3.0},
+    )
+
+    launched = place.run("launch", config)
+
+    assert launched.wait() == 0
+    assert len(rows_of(config.with_suffix(".csv"))) == 11
+
+
+def test_an_fmu_that_becomes_slow_from_one_step_to_the_next_keeps_on_telling_its_progress(
+    place: Place, hostile: Path
+) -> None:
+    """More than four hundred steps take no time, and the next twelve together more than a mesh may stand still."""
+    config = write_config(
+        place.folder,
+        instances={"tardy_fmi2DoStep": {"fmu": str(hostile)}},
+        connections=[],
+        stop_time=0.00461,
+        simulation={"step_size": 1e-5},
+        timeouts={"step": 3.0},
+        record={"file": None},
+    )
+
+    assert place.run("launch", config).wait() == 0
+
+
+@pytest.mark.parametrize("group", [None, "together"])
+def test_slow_steps_one_after_the_other_may_take_longer_than_one_step_may(
+    place: Place, hostile: Path, group: str | None
+) -> None:
+    names = [f"tardy{number}_fmi2DoStep" for number in range(7)]
+    config = mesh_of(
+        place, hostile, names, group=group, stop_time=0.006, timeouts={"step": 2.0}, simulation={"window": 1}
+    )
+
+    launched = place.run("launch", config)
+
+    assert launched.wait() == 0
+    assert len(rows_of(config.with_suffix(".csv"))) == 7
+
+
+def test_a_step_that_the_wall_clock_was_waited_for_has_its_whole_time(place: Place, hostile: Path) -> None:
+    """Points are seven seconds apart, and a mesh may stand still for six."""
+    config = mesh_of(
+        place,
+        hostile,
+        ["tardy_fmi2DoStep"],
+        stop_time=2.0,
+        timeouts={"step": 2.0},
+        simulation={"step_size": 1.0, "real_time_factor": 1 / 7},
+    )
+
+    launched = place.run("launch", config)
+
+    assert launched.wait() == 0
+    assert len(rows_of(config.with_suffix(".csv"))) == 3
+
+
 @pytest.mark.parametrize(
     ("fault", "says"),
     [
@@ -160,6 +239,24 @@ def test_an_fmu_that_fills_standard_output_neither_blocks_nor_garbles_the_launch
         assert "(it writes a lot; nothing more of it is shown)" in launched.errors
         assert len(launched.errors) < 500_000
         assert "\033" not in launched.errors
+
+
+def test_a_process_that_an_fmu_leaves_behind_ends_with_the_run(place: Place, hostile: Path) -> None:
+    config = mesh_of(place, hostile, ["orphan_fmi2Instantiate"])
+
+    launched = place.run("launch", config)
+
+    assert launched.wait() == 0
+    assert len(rows_of(config.with_suffix(".csv"))) == 11
+    place.assert_nothing_left()
+
+
+def test_a_daemon_that_an_fmu_starts_keeps_no_run_from_its_end(place: Place, hostile: Path) -> None:
+    """It has left the session of its process, but not the pipe that was standard output there."""
+    launched = place.run("launch", mesh_of(place, hostile, ["daemon_fmi2Instantiate"]))
+
+    assert launched.wait() == 0
+    assert [process.parent() for process in place.processes() if "node" in process.cmdline()]
 
 
 def test_an_fmu_that_ignores_signals_does_not_take_ctrl_c_away(place: Place, hostile: Path) -> None:

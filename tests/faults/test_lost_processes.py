@@ -128,3 +128,25 @@ def test_a_killed_process_of_a_group_is_named_with_all_its_instances(place: Plac
     assert "instance first, second, point" in launched.message
     assert "node 'both' was lost" in launched.message
     place.assert_nothing_left()
+
+
+def test_a_mesh_that_does_not_answer_keeps_nobody_from_another_one(place: Place) -> None:
+    for name in ("one", "two"):
+        place.start(
+            "launch",
+            write_config(place.folder, name=name, stop_time=FAR_S, simulation={"real_time_factor": 1}),
+        )
+    results = [place.folder / f"{name}.csv" for name in ("one", "two")]
+    wait_until(lambda: min(map(row_count, results)) > 10, "rows")
+    for process in place.processes():  # a launcher that is stopped, too, does not end its mesh meanwhile
+        if any("two" in part for part in process.cmdline()):
+            process.suspend()
+
+    status = place.run("status", "one", "--timeout", "10")
+    both = place.run("ls", "--timeout", "10")
+
+    assert status.wait() == 0
+    assert "running" in status.output
+    assert both.wait() == 4
+    assert "one" in both.output
+    assert both.message.startswith("fmu-mesh: mesh 'two' did not answer at tcp/")

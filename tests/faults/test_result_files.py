@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import signal
 import sys
 from pathlib import Path
 
 import pytest
 
-from tests.helpers import Place, write_config
+from tests.helpers import Place, row_count, rows_of, wait_until, write_config
 
 MODES = pytest.mark.parametrize("options", [(), ("--local",)], ids=["distributed", "local"])
 
@@ -48,4 +49,21 @@ def test_a_full_disk_ends_the_run_and_is_told_as_such(place: Place, stop_time: f
     assert launched.wait() == 2
     assert "the result file '/dev/full' cannot be written: No space left on device" in launched.message
     assert "rows) is in" not in launched.message
+    place.assert_nothing_left()
+
+
+@MODES
+def test_a_second_run_does_not_write_into_the_file_of_the_first(place: Place, options: tuple[str, ...]) -> None:
+    """Nor does it take away what is there already."""
+    first = place.start("launch", write_config(place.folder, stop_time=10_000.0, simulation={"real_time_factor": 1}))
+    result = place.folder / "pair.csv"
+    wait_until(lambda: row_count(result) > 10, "rows")
+
+    second = place.run("launch", write_config(place.folder, name="other", record={"file": "pair.csv"}), *options)
+
+    assert second.wait() == 2
+    assert f"another run is writing the result file '{result}'" in second.message
+    first.signal(signal.SIGINT)
+    assert first.wait() == 130
+    assert len(rows_of(result)) > 10
     place.assert_nothing_left()

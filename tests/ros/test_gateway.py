@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import signal
+import socket
 import struct
 from collections.abc import Iterator
 from pathlib import Path
@@ -119,6 +120,33 @@ def test_a_gateway_that_dies_ends_the_run_with_its_name_and_what_was_recorded(pl
     assert "the gateway to ROS was lost: its process was ended by SIGKILL" in mesh.message
     assert len(rows_of(place.folder / "lab.csv")) > 20
     place.assert_nothing_left(2.0)
+
+
+def test_a_gateway_that_was_stopped_until_the_mesh_let_go_of_it_ends_the_run_with_its_name(
+    place: Place, ros: Ros
+) -> None:
+    mesh = place.start("launch", configured(place, ros, factor=1, stop_time=600.0), "--no-progress")
+    wait_until(lambda: len(ros.floats("angle")) > 20, "samples")
+    [gateway] = [process for process in place.processes() if "gateway" in process.cmdline()]
+    links = len(mesh.child("master").net_connections(kind="unix"))
+    gateway.suspend()
+    wait_until(lambda: len(mesh.child("master").net_connections(kind="unix")) < links, "the end of its link")
+
+    gateway.resume()
+
+    assert mesh.wait() == 4
+    assert "the gateway to ROS was lost: its process ended" in mesh.message
+    place.assert_nothing_left(2.0)
+
+
+def test_a_mesh_runs_on_where_somebody_accepts_and_says_nothing(place: Place, ros: Ros) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        endpoint = f"tcp/127.0.0.1:{silent.getsockname()[1]}"
+
+        assert place.run("launch", configured(place, ros, factor=0, stop_time=1.0, connect=[endpoint])).wait() == 0
+
+    assert len(rows_of(place.folder / "lab.csv")) == 101
+    place.assert_nothing_left()
 
 
 def test_a_mesh_runs_on_where_nobody_of_ros_is_there(place: Place, ros: Ros) -> None:

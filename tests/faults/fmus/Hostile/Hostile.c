@@ -26,6 +26,7 @@
 #define LEAK_BYTES (1 << 30)
 #define PAGE_BYTES 4096
 #define SLOW_SECONDS 5
+#define TARDY_SECONDS 1
 #define FAULT_TIME 0.0045 /* s; steps that end later have the fault */
 
 enum { U, THIRD, SUBNORMAL, PLAIN_LOCALE, FOLDER, COUNT };
@@ -74,6 +75,14 @@ static void install_handlers(void)
     sigaction(SIGTERM, &ignore, NULL);
 }
 
+/* A process that outlives this one, and keeps its standard output open. */
+static void leave_orphan(int in_own_session)
+{
+    if (fork() != 0) return;
+    if (in_own_session) setsid();
+    for (;;) pause();
+}
+
 static void misbehave(const char *what)
 {
     int *volatile nowhere = NULL;
@@ -81,6 +90,7 @@ static void misbehave(const char *what)
     if (strcmp(what, "hang") == 0)
         for (;;) pause();
     if (strcmp(what, "slow") == 0) sleep(SLOW_SECONDS);
+    if (strncmp(what, "tardy", 5) == 0) sleep(TARDY_SECONDS); /* with a number: there may be several */
     if (strcmp(what, "segfault") == 0) *nowhere = 1;
     if (strcmp(what, "abort") == 0) abort();
     if (strcmp(what, "exit") == 0) exit(0);
@@ -92,6 +102,8 @@ static void misbehave(const char *what)
     if (strcmp(what, "flushing") == 0) flush_to_zero();
     if (strcmp(what, "traps") == 0) feenableexcept(FE_DIVBYZERO | FE_INVALID);
     if (strcmp(what, "handlers") == 0) install_handlers();
+    if (strcmp(what, "orphan") == 0) leave_orphan(0);
+    if (strcmp(what, "daemon") == 0) leave_orphan(1);
 }
 
 /* Does what the instance name says, if it says so for this function. */

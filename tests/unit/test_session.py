@@ -1,0 +1,56 @@
+"""Sessions: their end waits for nobody."""
+
+from __future__ import annotations
+
+import socket
+import threading
+from typing import cast
+
+import pytest
+import zenoh
+
+from fmu_mesh.errors import MeshLost
+from fmu_mesh.wire.session import Wiring, ask, close_session, open_session
+from tests.helpers import DEADLINE_S
+
+
+class Slow:
+    """A session that waits for somebody while it is closed."""
+
+    def __init__(self) -> None:
+        self.somebody = threading.Event()
+        self.closed = threading.Event()
+
+    def close(self) -> None:
+        assert self.somebody.wait(DEADLINE_S)
+        self.closed.set()
+
+
+def test_nobody_waits_for_a_session_that_waits_for_somebody_who_does_not_answer() -> None:
+    session = Slow()
+
+    close_session(cast("zenoh.Session", session))
+
+    assert not session.closed.is_set()
+    session.somebody.set()
+    assert session.closed.wait(DEADLINE_S)
+
+
+def test_a_session_towards_somebody_who_accepts_and_says_nothing_opens_and_closes() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        endpoint = f"tcp/127.0.0.1:{silent.getsockname()[1]}"
+        session = open_session(Wiring(connect=(endpoint,)))
+        accepted, _ = silent.accept()
+
+        close_session(session)
+
+        accepted.close()
+
+
+def test_a_question_that_nobody_wants_answered_any_more_ends() -> None:
+    session = open_session(Wiring())
+
+    with pytest.raises(MeshLost, match="the asker gave up"):
+        ask(session, "nobody/there", b"", 10 * DEADLINE_S, "nobody", over=lambda: True)
+
+    close_session(session)
