@@ -118,7 +118,8 @@ class LocalMesh:
         try:
             self._run()
         except FmuMeshError as error:
-            if self.rows:
+            # Where the file itself is the trouble, how much of it there is can only be seen in it.
+            if self.rows and not isinstance(error, ConfigurationError):
                 kept = f"What was recorded up to then ({self.rows} rows) is in '{self._plan.system.result_file}'."
                 error.hint = f"{error.hint} {kept}" if error.hint else kept
             raise

@@ -52,11 +52,11 @@ def test_over_zenoh_the_floats_are_those_of_one_process(
 @shares
 @pytest.mark.skipif(os.geteuid() != 0 or shutil.which("unshare") is None, reason="needs root and unshare")
 def test_a_node_in_a_container_of_its_own_joins_through_zenoh(place: Place) -> None:
-    config = write_config(place.folder, stop_time=3.0, simulation={"real_time_factor": 1.0})
+    config = write_config(place.folder, stop_time=3.0)
     inside = ("unshare", "--pid", "--fork", "--mount-proc", "--kill-child")
 
     by_hand = [
-        place.start("master", config),
+        place.start("master", config, "--paused"),
         place.start("node", config, "pendulum"),
         place.start("node", config, "delay", prefix=inside),
     ]
@@ -67,6 +67,7 @@ def test_a_node_in_a_container_of_its_own_joins_through_zenoh(place: Place) -> N
         found: list[str] = json.loads(asked.output)["shared_memory"] if asked.wait() == 0 else []
         return found
 
-    assert wait_until(shared, "a mesh that runs") == ["pendulum"]  # the others get something from the container
+    assert wait_until(shared, "a mesh that is there") == ["pendulum"]  # the others get something from the container
+    wait_until(lambda: place.run("resume", "pair").wait() == 0, "a mesh that runs")
     assert [launched.wait() for launched in by_hand] == [0, 0, 0]
     assert config.with_suffix(".csv").read_bytes() == local_result(place, config)

@@ -101,7 +101,7 @@ def test_a_second_process_for_a_node_is_refused_and_the_first_goes_on(place: Pla
 
 
 def test_a_node_with_another_configuration_is_refused_with_the_reason(place: Place) -> None:
-    config = write_config(place.folder, timeouts={"start": 5.0})
+    config = write_config(place.folder, timeouts={"start": 60.0})
     master = start(place, config, "master")
     place.note()
 
@@ -174,7 +174,7 @@ def test_ctrl_c_at_the_master_started_by_hand_ends_the_nodes_too(place: Place) -
 
 @pytest.mark.parametrize("next_start", ["launch", "node"])
 def test_what_a_killed_process_has_left_is_removed_by_the_next_start(place: Place, next_start: str) -> None:
-    config = write_config(place.folder, timeouts={"start": 20.0})
+    config = write_config(place.folder, timeouts={"start": 60.0})
     killed = start(place, config, "pendulum")
     wait_until(place.extracted, "an FMU that is extracted")
     killed.signal(signal.SIGKILL)

@@ -71,7 +71,7 @@ def test_a_feedback_loop_at_500_hz_gives_the_floats_of_one_process_while_ros_wat
 
     command(place, "resume", "loop")
     ros.until(lambda: node._state_machine.current_state[1] == "inactive", "the end of the mesh")
-    ros.turn(0.2)
+    ros.until(lambda: messages and messages[-1].header.stamp.sec == 2, "the message of the last point")
 
     assert launched.wait() == 0, launched.errors
     expected = rows_of(reference)
