@@ -68,8 +68,8 @@ class HeldMesh:
         for name, value in inputs.items():
             instance, _, variable = name.partition(".")
             self._ask(f"{instance}/in/{variable}", json.dumps(value))
-        self._ask("mesh/command", '{"command":"step","points":1}')
-        self.point += 1
+        answer, _ = self._ask("mesh/command", '{"command":"step","points":1}')
+        self.point = int(answer["hold"])
         return [self._output(name) for name in outputs]
 
     def stop(self) -> None:
@@ -81,15 +81,15 @@ class HeldMesh:
         self._session.close()
 
     def _hold(self) -> int:
-        """Hold the mesh once it runs, and return the point that all its nodes have come to."""
-        end = time.monotonic() + self._deadline_s
+        """Hold the mesh once it runs, and return the point at which all its nodes have come to rest."""
+        end, hold = time.monotonic() + self._deadline_s, None
         while time.monotonic() < end:
             status, _ = self._ask("mesh/status")
-            points = set(status["progress"].values())
-            if status["state"] == "running":
-                self._ask("mesh/command", '{"command":"pause"}')
-            elif status["state"] == "paused" and len(points) == 1:
-                return int(points.pop())
+            if hold is None and status["state"] in ("running", "paused"):
+                answer, _ = self._ask("mesh/command", '{"command":"pause"}')
+                hold = int(answer["hold"])
+            elif hold is not None and min(status["progress"].values()) >= hold:
+                return hold
         raise MeshError(f"the mesh does not stand still within {self._deadline_s:g} s; it is {status['state']}")
 
     def _output(self, name: str) -> float:
