@@ -58,14 +58,13 @@ from .inputs import TimedInputs
 from .links import OutLink
 from .profiling import Profiler
 from .serving import Server
-from .stepping import RemoteFeed, Runner, Unit
+from .stepping import LAZY_S, RemoteFeed, Runner, Unit
 
 __all__ = ["Node"]
 
 log = logging.getLogger(__name__)
 
 _LOOK_S = 0.5
-_LAZY_S = 0.05
 _TELL_S = 0.1
 _LAST_WORD_S = 0.3
 _NO_MASTER_S = 1.0
@@ -276,7 +275,7 @@ class Node:
         """Send what a consumer could be waiting for; what is only recorded at least every 50 ms, and at the end."""
         now = time.monotonic()
         done = self._covered() == self._plan.grid.last_point
-        lazy = done or self._waited_long or now - self._lazy_flushed > _LAZY_S
+        lazy = done or self._waited_long or now - self._lazy_flushed > LAZY_S
         if lazy:
             self._lazy_flushed = now
         for runner in self._runners.values():
@@ -287,7 +286,7 @@ class Node:
         """Wait for one message; nothing can be stepped before it comes."""
         started = time.monotonic()
         self._activity.waiting = True
-        message = self._inbox.wait(_LAZY_S if self._lazy_pending else _LOOK_S)
+        message = self._inbox.wait(LAZY_S if self._lazy_pending else _LOOK_S)
         self._activity.waiting = False
         self._waited_long = message is None
         if self._profiler is not None:

@@ -19,10 +19,13 @@ from ..simtime import TimeGrid
 from ..wire.frames import FrameReceiver
 from .links import OutLink
 
-__all__ = ["LocalFeed", "RemoteFeed", "Runner", "Unit"]
+__all__ = ["LAZY_S", "LocalFeed", "RemoteFeed", "Runner", "Unit"]
 
 _BURST_S = 0.001
 """A burst of steps ends after about this time, so that its rows are sent and messages are looked at."""
+
+LAZY_S = 0.05
+"""How long rows that nobody steps on may wait for more of them: each frame wakes a process that needs a core for it."""
 
 
 class RemoteFeed:
@@ -144,6 +147,7 @@ class Unit:
         self._point = 0
         self._burst = 1
         self._starved = False
+        self._lazy_flushed = 0.0
         self.hurry = False
 
     @property
@@ -163,13 +167,13 @@ class Unit:
             self._burst = min(2 * self._burst, 4096)
         elif elapsed > 2 * _BURST_S:
             self._burst = max(1, min(self._burst, steps) // 2)
+        lazy = started + elapsed - self._lazy_flushed > LAZY_S
+        if lazy:
+            self._lazy_flushed = started + elapsed
         for runner in self.runners:
             runner.step_seconds += elapsed
-            if elapsed >= _BURST_S:
-                runner.flush()
-                continue
-            if self._starved:
-                runner.flush(lazy=False)
+            if lazy or self._starved or elapsed >= _BURST_S:
+                runner.flush(lazy=lazy)
             runner.flush_full()
         return True
 
