@@ -6,6 +6,7 @@ Owns what these commands print; what they ask is `fmu_mesh.wire.client`.
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from collections.abc import Callable
 from itertools import islice
@@ -218,7 +219,9 @@ def _watch(arguments: argparse.Namespace, meshes: Meshes) -> int:
                 else:
                     print("  ".join(cell for cell in cells(reading) if cell), flush=True)
         except KeyboardInterrupt:
-            return Interrupted.exit_code
+            # At once: taking leave of others in order can take long, and they see that this process is gone.
+            sys.stdout.flush()
+            os._exit(Interrupted.exit_code)
     return 0
 
 
