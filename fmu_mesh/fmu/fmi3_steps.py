@@ -106,7 +106,7 @@ class Fmi3Steps:
         results = self._results
         time, largest, stuck, status = start, step_size, 0, None
         self._time = start
-        if not self._is_eventful:
+        if not (self._is_eventful or self.terminated):
             status = self._attempt(start, step_size)
             if status <= WARNING and not results.any[0]:  # the step was nothing but a step
                 self._time = end

@@ -13,6 +13,7 @@ import pytest
 from fmu_mesh.errors import StepFailed, TerminationRequested
 from fmu_mesh.fmu import FmuInstance, open_instance, read_description, stepped
 from fmu_mesh.fmu.extrapolation import LinearInputs
+from fmu_mesh.fmu.fmi3 import Fmi3Instance
 from fmu_mesh.fmu.substeps import DISCARD, SMALLEST, take_sub_steps
 from fmu_mesh.model.description import Kind
 from fmu_mesh.model.instance import LinearInput, SolverSettings, StepOptions
@@ -20,6 +21,7 @@ from fmu_mesh.model.ring import Layout, Ring
 from fmu_mesh.model.types import Value
 from fmu_mesh.simtime import TimeGrid
 from tests.fmus.event_fmus import Version
+from tests.fmus.helpers import NO_COMPILER, build_test_fmu
 
 EventFmu = Callable[..., Path]
 CO_SIMULATION: list[tuple[Version, Kind]] = [(2, "co_simulation"), (3, "co_simulation")]
@@ -343,3 +345,14 @@ def test_linear_inputs_are_part_of_the_state(version: Version, kind: Kind, event
         assert outputs(inner) == there
         instance.free_state(again)
         instance.free_state(state)
+
+
+@pytest.mark.skipif(NO_COMPILER is not None, reason=str(NO_COMPILER))
+def test_an_fmu_of_fmi_3_that_has_asked_to_end_is_not_stepped_again(tmp_path: Path) -> None:
+    with running(build_test_fmu("AllTypes3", tmp_path), tmp_path, "co_simulation") as instance:
+        assert isinstance(instance, Fmi3Instance)
+        instance.do_step(0)
+        instance._steps.terminated = True
+
+        with pytest.raises(TerminationRequested):
+            instance.do_step(1)
