@@ -533,18 +533,31 @@ def test_while_an_fmu_hangs_the_node_answers_and_its_end_is_bounded_and_clean(
     ros: Ros, tmp_path: Path, faulty: Path
 ) -> None:
     from lifecycle_msgs.srv import GetState  # noqa: PLC0415 only where ROS is installed
+    from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue  # noqa: PLC0415 as above
+    from rcl_interfaces.srv import SetParameters  # noqa: PLC0415 as above
 
     temporary = tmp_path / "temporary"
-    node = process(ros, temporary, fmu_path=faulty, step_size="0.01", hang_at="3.0")
+    node = process(ros, temporary, fmu_path=faulty, step_size="0.01")
     try:
         peer = ros.peer()
         subscription, messages = ros.collect(peer, type(float64(0.0)), "/lab/y")
         ros.matched(subscription)
-        client = peer.create_client(GetState, "/lab/own/get_state")
+        state = peer.create_client(GetState, "/lab/own/get_state")
+        parameters = peer.create_client(SetParameters, "/lab/own/set_parameters")
         ros.until(lambda: messages, "a first message")
-        ros.turn(3.5)  # by then it hangs
+        now = ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=0.0)
+        request = SetParameters.Request(parameters=[Parameter(name="hang_at", value=now)])
+        assert ros.called(parameters, request).results[0].successful
 
-        assert ros.called(client, GetState.Request()).current_state.label == "active"
+        def answers_and_nothing_else() -> bool:
+            """Whether the node answers again and again, for a second at least, and does not finish one step."""
+            before = len(messages)
+            for _ in range(100):
+                ros.turn(0.01)
+                assert ros.called(state, GetState.Request()).current_state.label == "active"
+            return len(messages) == before
+
+        ros.until(answers_and_nothing_else, "a step that hangs")
         node.send_signal(signal.SIGTERM)
         assert node.wait(DEADLINE_S) == 3
     finally:
