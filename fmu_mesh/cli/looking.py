@@ -9,6 +9,7 @@ import argparse
 import os
 import sys
 from collections.abc import Callable
+from functools import partial
 from itertools import islice
 from typing import Any
 
@@ -115,23 +116,28 @@ def _ls(arguments: argparse.Namespace, meshes: Meshes) -> int:
         clients = [meshes.one(arguments.name)]
     instance = clients[0].instance_in(arguments.name) if arguments.name is not None else None
     if arguments.json:
-        for client in clients:
+
+        def everything(client: MeshClient) -> dict[str, Any]:
             infos = _infos(client, instance) if instance is not None or arguments.long else ()
-            _print_json({"mesh": client.info(), "status": client.status(), "instances": infos})
+            return {"mesh": client.info(), "status": client.status(), "instances": infos}
+
+        for _, answer in meshes.answers(clients, everything):
+            _print_json(answer)
         return 0
     if instance is None:
-        statuses = [client.status() for client in clients]
+        answers = meshes.answers(clients, MeshClient.status)
+        clients = [client for client, _ in answers]
         rows = [
             [status.mesh, status.state, progress(status), seconds(status.time), ", ".join(client.endpoints)]
-            for client, status in zip(clients, statuses, strict=True)
+            for client, status in answers
         ]
         _print(table(rows, heading=["mesh", "state", "point", "time", "endpoint"]))
     if len(clients) == 1 and instance is None:
         print()
         _print(instances(_statuses(clients[0])))
     if instance is not None or arguments.long:
-        for client in clients:
-            for item in _infos(client, instance):
+        for client, infos in meshes.answers(clients, partial(_infos, instance=instance)):
+            for item in infos:
                 print(
                     f"\n{client.keys.instance(item.instance)}" if instance is None else client.keys.instance(instance)
                 )
@@ -151,8 +157,13 @@ def _statuses(client: MeshClient) -> list[InstanceStatus]:
 def _status(arguments: argparse.Namespace, meshes: Meshes) -> int:
     clients = [meshes.one(arguments.key)] if arguments.key is not None else meshes.all()
     instance = clients[0].instance_in(arguments.key) if arguments.key is not None else None
-    for number, client in enumerate(clients):
-        view = client.status() if instance is None else client.instance_status(instance)
+
+    def view_of(client: MeshClient) -> tuple[MeshStatus | InstanceStatus, list[InstanceStatus]]:
+        if instance is not None:
+            return client.instance_status(instance), []
+        return client.status(), [] if arguments.json else _statuses(client)
+
+    for number, (_, (view, statuses)) in enumerate(meshes.answers(clients, view_of)):
         if arguments.json:
             _print_json(view)
             continue
@@ -161,7 +172,7 @@ def _status(arguments: argparse.Namespace, meshes: Meshes) -> int:
         match view:
             case MeshStatus():
                 _print(mesh_status(view))
-                _print(["", *instances(_statuses(client))])
+                _print(["", *instances(statuses)])
             case InstanceStatus():
                 _print(instance_status(view))
     return 0

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from types import TracebackType
-from typing import NamedTuple, Self
+from typing import NamedTuple, Self, TypeVar
 
 import zenoh
 
@@ -22,6 +22,8 @@ from .runtime import meshes
 from .session import Wiring, close_session, open_session
 
 __all__ = ["Meshes"]
+
+Answer = TypeVar("Answer")
 
 _GRACE_S = 1.0
 
@@ -91,6 +93,26 @@ class Meshes:
         if not clients:
             raise self.silent[0]
         return clients
+
+    def answers(
+        self, clients: Sequence[MeshClient], question: Callable[[MeshClient], Answer]
+    ) -> list[tuple[MeshClient, Answer]]:
+        """What those of some meshes answer that do, at least one; the others join the `silent` ones.
+
+        Raises:
+            FmuMeshError: none of them answers.
+        """
+        answers: list[tuple[MeshClient, Answer]] = []
+        for client in clients:
+            try:
+                answers.append((client, question(client)))
+            except FmuMeshError as error:
+                if len(clients) == 1:
+                    raise
+                self.silent.append(error)
+        if not answers:
+            raise self.silent.pop()
+        return answers
 
     def one(self, reference: str | None) -> MeshClient:
         """The mesh that a reference (a key, a name, or nothing) means.

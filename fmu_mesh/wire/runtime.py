@@ -144,6 +144,8 @@ def leave_run_folder(folder: Path) -> None:
     elif note is not None and not is_alive(note.pid):
         remove_run_folder(folder)  # the launcher was killed
         return
+    elif note is None and folder.suffix[1:].isdigit() and is_alive(int(folder.suffix[1:])):
+        return  # a run is over before its launcher has come to write the note; it removes the folder, too
     for empty in (folder / "fmus", folder):
         try:
             empty.rmdir()

@@ -6,6 +6,7 @@ import re
 import signal
 from pathlib import Path
 
+import psutil
 import pytest
 
 from fmu_mesh.cli.main import main
@@ -108,6 +109,21 @@ def test_a_process_that_is_stopped_is_noticed_after_its_lease_and_does_not_stay(
     assert who in launched.message
     assert "its process does not answer any more" in launched.message
     assert_is_what_one_process_calculates(place, result)
+
+
+def test_a_run_that_is_over_before_its_launcher_looks_is_a_run_like_any_other(place: Place) -> None:
+    config = write_config(place.folder, stop_time=0.1)
+    launched = place.start("launch", config)
+    children = [launched.child(role) for role in ("master", "pendulum", "delay")]
+    launcher = psutil.Process(launched.pid)
+    launcher.suspend()
+    wait_until(lambda: all(child.status() == psutil.STATUS_ZOMBIE for child in children), "the end of the processes")
+
+    launcher.resume()
+
+    assert launched.wait() == 0, launched.errors
+    assert len(rows_of(config.with_suffix(".csv"))) == 101
+    place.assert_nothing_left()
 
 
 def test_a_killed_process_of_a_group_is_named_with_all_its_instances(place: Place) -> None:

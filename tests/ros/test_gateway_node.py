@@ -52,7 +52,7 @@ def test_a_feedback_loop_at_500_hz_gives_the_floats_of_one_process_while_ros_wat
         name="loop",
         instances=LOOP,
         connections=("plant.y -> controller.u", "controller.y -> plant.u"),
-        stop_time=2.0,
+        stop_time=2.1,
         simulation=simulation,
         ros=ROS,
     )
@@ -69,20 +69,23 @@ def test_a_feedback_loop_at_500_hz_gives_the_floats_of_one_process_while_ros_wat
     node.trigger_activate()
     ros.matched(watching, timing)
 
+    # It rests until everything has come: with the mesh ends what waits for a reader that is slow just then.
+    command(place, "step", "loop", "1000")
+    ros.until(lambda: messages and messages[-1].header.stamp.sec == 2, "the message of point 1000")
+    ros.until(lambda: clocks and clocks[-1].clock.sec == 2, "its time")
     command(place, "resume", "loop")
     ros.until(lambda: node._state_machine.current_state[1] == "inactive", "the end of the mesh")
-    ros.until(lambda: messages and messages[-1].header.stamp.sec == 2, "the message of the last point")
 
     assert launched.wait() == 0, launched.errors
     expected = rows_of(reference)
     assert rows_of(place.folder / "loop.csv") == expected
     # Point 0 may be over before somebody watches; from then on every point is there.
     points = [m.header.stamp.sec * 500 + m.header.stamp.nanosec // 2_000_000 for m in messages]
-    assert points in (list(range(1001)), list(range(1, 1001)))
-    assert [(m.twist.linear.x, m.twist.angular.z) for m in messages] == [row[1:3] for row in expected[points[0] :]]
+    up_to_the_rest = points[: points.index(1000) + 1]
+    assert up_to_the_rest in (list(range(1001)), list(range(1, 1001)))
+    assert [(m.twist.linear.x, m.twist.angular.z) for m in messages] == [expected[point][1:3] for point in points]
     times = [c.clock.sec * 1_000_000_000 + c.clock.nanosec for c in clocks]
     assert times == sorted(times)
-    assert times[-1] == 2_000_000_000
 
 
 def test_an_input_and_a_tunable_parameter_of_a_mesh_are_set_from_ros(ros: Ros, place: Place) -> None:
