@@ -30,14 +30,14 @@ def write(path: Path, times: list[float], reals: list[float]) -> None:
 
 
 def test_a_row_is_the_time_and_the_values_as_short_as_they_read_back(tmp_path: Path) -> None:
-    write(tmp_path / "a.csv", [0.0, 0.1, 1e-7, 1e22], [1.0, 0.1 + 0.2, -0.0, 5e-324])
+    write(tmp_path / "a.csv", [0.0, 0.1, 1e-7, 1e15], [1.0, 0.1 + 0.2, -0.0, 5e-324])
 
     assert (tmp_path / "a.csv").read_text().splitlines() == [
         "time,p.a,p.n,p.on,p.e",
         "0.0,1.0,0,false,10",
         "0.1,0.30000000000000004,1,true,11",
         "1e-7,-0.0,2,false,12",
-        "1e22,5e-324,3,true,13",
+        "1000000000000000.0,5e-324,3,true,13",
     ]
 
 
@@ -50,6 +50,24 @@ def test_numbers_that_json_does_not_have_are_written_as_python_reads_them(tmp_pa
         "1.0,-inf,2,false,12",
         "1.5,0.1,3,true,13",
     ]
+
+
+@pytest.mark.parametrize("others", [[], [("p.n", "Int32")]])
+def test_every_float_reads_back_with_the_same_bits_and_is_as_short_as_repr(
+    tmp_path: Path, others: list[tuple[str, VariableType]]
+) -> None:
+    bits = np.random.default_rng(1).integers(0, 2**64, size=(3, 5_000), dtype=np.uint64)
+    reals = bits.view(np.float64)[:, np.isfinite(bits.view(np.float64)).all(axis=0)]
+    times, a, b = np.hstack([reals, [[1e16], [1e22], [-1e-5]]])
+
+    with CsvFile(tmp_path / "a.csv", [("p.a", "Float64"), ("p.b", "Float64"), *others]) as file:
+        file.write(times, [a, b, *(np.zeros(len(times), np.int32) for _ in others)])
+
+    rows = [line.split(",") for line in (tmp_path / "a.csv").read_text().splitlines()[1:]]
+    read = np.array([[float(text) for text in row[:3]] for row in rows])
+    assert read.tobytes() == np.stack([times, a, b], axis=1).tobytes()
+    # Exponents may have a sign or not, and numbers below 1e-4 none at all.
+    assert all(len(text) <= len(repr(float(text))) + 2 for row in rows for text in row[:3])
 
 
 def test_a_name_with_a_comma_is_quoted(tmp_path: Path) -> None:
@@ -107,11 +125,11 @@ def test_text_is_quoted_and_binary_is_base64(tmp_path: Path) -> None:
     numbers = np.array([2**64 - 1, 0, 1], dtype=np.uint64)
 
     with CsvFile(tmp_path / "a.csv", columns) as file:
-        file.write(np.array([0.0, 1e22, math.inf]), [texts, data, numbers, numbers == 0])
+        file.write(np.array([0.0, 0.1, math.inf]), [texts, data, numbers, numbers == 0])
 
     with (tmp_path / "a.csv").open(newline="") as written:
         assert list(csv.reader(written))[1:] == [
             ["0.0", 'a "b", c', "", "18446744073709551615", "false"],
-            ["1e22", "two\nlines", "/wA=", "0", "true"],
+            ["0.1", "two\nlines", "/wA=", "0", "true"],
             ["inf", "[1]", "YWJj", "1", "false"],
         ]
