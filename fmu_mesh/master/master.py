@@ -205,14 +205,12 @@ class Master:
             if self._slowest >= self._grant:  # they had nothing to do until now: the wall clock held them
                 self._moved = now
             self._grant = grant
-            self._published = now
-            self._send(GRANT, grant)
-        else:
-            self._send_grant_as_sign_of_life()
+            self._members.grant(grant)
+        self._send_grant_as_sign_of_life()
         return min(pause, STATUS_S)
 
     def _send_grant_as_sign_of_life(self) -> None:
-        """The same grant again, so that nodes that wait for a slow FMU of another one know that the master lives."""
+        """The same grant to all, so that those who wait for a slow FMU of another one know that the master lives."""
         now = time.monotonic()
         if now - self._published >= _HEARTBEAT_S:
             self._published = now

@@ -15,7 +15,7 @@ from ..model.plan import RECORDER, Plan
 from ..wire.inbox import Inbox
 from ..wire.keys import Keys, batched
 from ..wire.membership import MASTER, Registration, Welcome
-from ..wire.messages import HEADER, encode_abort
+from ..wire.messages import GRANT, HEADER, encode_abort
 from ..wire.session import undeclare_all
 from ..wire.shared_memory import SharedOutlet
 
@@ -56,6 +56,7 @@ class Members:
             for key in keys.grants(self._nodes)
         ]
         self._senders: list[Callable[[bytes], None]] = [publisher.put for publisher in self._grants]
+        self._stepping = self._senders
 
     def register(self, query: zenoh.Query) -> None:
         """Take a registration, which is answered by `welcome`; refuse one that does not belong here."""
@@ -111,10 +112,13 @@ class Members:
         """
         shared = [node for node in self._nodes if node in self._outlets and self._registered[node][0].shared]
         self._senders = [self._outlets[node].put for node in shared]
+        self._stepping = [self._outlets[node].put for node in shared if node != RECORDER]
         rest = [node for node in self._nodes if node not in shared]
         if rest:
             publishers = zip(self._grants, batched(self._nodes), strict=True)
-            self._senders += [publisher.put for publisher, nodes in publishers if not set(nodes).isdisjoint(rest)]
+            others = [publisher.put for publisher, nodes in publishers if not set(nodes).isdisjoint(rest)]
+            self._senders += others
+            self._stepping += others
         offer = self._inbox.offer if len(self._outlets) == len(self._nodes) else None
         if offer is not None:
             self._inbox.share()
@@ -130,6 +134,12 @@ class Members:
         """Send a message of the master's to all nodes."""
         message = HEADER.pack(kind, 0, 0, point)
         for send in self._senders:
+            send(message)
+
+    def grant(self, point: int) -> None:
+        """Send a grant to those who step; the recorder takes what comes, and each message would wake it for nothing."""
+        message = HEADER.pack(GRANT, 0, 0, point)
+        for send in self._stepping:
             send(message)
 
     def abort(self, error: FmuMeshError) -> None:

@@ -25,7 +25,7 @@ from ..model.types import Value, VariableType, is_text
 
 __all__ = ["CsvFile"]
 
-_CHUNK_ROWS = 512
+_CHUNK_ROWS = 1024
 _COMMA, _NEWLINE = b",\n"
 
 
@@ -75,16 +75,15 @@ class CsvFile:
         self._file.close()
 
     def _format(self, columns: Sequence[NDArray[Any]]) -> bytes | memoryview:
-        if self._has_text or not all(np.isfinite(column).all() for column in columns):
-            rows = zip(*(column.tolist() for column in columns), strict=True)
-            return "".join(",".join(map(_text, row)) + "\n" for row in rows).encode()
         # JSON's numbers are shortest-round-trip, too, and orjson writes those of an array without a Python object each.
-        values: NDArray[np.float64] | list[Any]
         if self._is_float:
-            values = np.stack(columns, axis=1).ravel()
-        else:
-            values = list(chain.from_iterable(zip(*(column.tolist() for column in columns), strict=True)))
-        return _in_rows(orjson.dumps(values, option=orjson.OPT_SERIALIZE_NUMPY), len(columns))
+            values = np.stack(columns, axis=1)
+            if np.isfinite(values).all():
+                return _in_rows(orjson.dumps(values.ravel(), option=orjson.OPT_SERIALIZE_NUMPY), len(columns))
+        rows = zip(*(column.tolist() for column in columns), strict=True)
+        if self._has_text or not all(np.isfinite(column).all() for column in columns):
+            return "".join(",".join(map(_text, row)) + "\n" for row in rows).encode()
+        return _in_rows(orjson.dumps(list(chain.from_iterable(rows))), len(columns))
 
 
 def _in_rows(numbers: bytes, width: int) -> memoryview:

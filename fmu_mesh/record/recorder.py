@@ -60,7 +60,7 @@ class Recorder:
             link.index: _Source(FrameReceiver(link, "the recorder", plan.ring_rows)) for link in plan.links_in
         }
         by_name = {source.receiver.link.source: source for source in self._sources.values()}
-        self._columns = [(by_name[instance], variable) for instance, variable in plan.recorded]
+        self._columns = [by_name[instance].column(variable) for instance, variable in plan.recorded]
         self._file = open_file(
             Path(plan.result_file or ""),
             [(f"{i}.{v}", by_name[i].type_of(v)) for i, v in plan.recorded],
@@ -181,18 +181,18 @@ class Recorder:
             self._write_rows()
 
     def _write_rows(self) -> None:
-        end = self._complete() + 1
-        first = self._written
-        if end > first:
-            grid = self._plan.grid
-            points = np.arange(first, end)
-            columns = [source.column(variable, points) for source, variable in self._columns]
-            self._file.write(grid.times(first, end), columns)
+        last = self._complete() + 1
+        if last <= self._written:
+            return
+        while (first := self._written) < last:
+            end = min(last, first - first % self._plan.ring_rows + self._plan.ring_rows)  # rings are read in one piece
+            columns = [column(first, end) for column in self._columns]
+            self._file.write(self._plan.grid.times(first, end), columns)
             self._written = end
-            now = time.monotonic()
-            if now - self._flushed > _FLUSH_S:
-                self._flushed = now
-                self._file.flush()
+        now = time.monotonic()
+        if now - self._flushed > _FLUSH_S:
+            self._flushed = now
+            self._file.flush()
 
     def _drain(self) -> None:
         """Take the frames that have come but were not looked at; what they complete is written before the end."""
@@ -249,13 +249,21 @@ class _Source:
             return last_point
         return received * points - 1
 
-    def column(self, variable: str, points: NDArray[np.int64]) -> NDArray[Any]:
-        """The values of a variable at ``points``."""
-        ring = self.receiver.kept
-        slots = (points // self.receiver.link.step_points) & ring.mask
+    def column(self, variable: str) -> Callable[[int, int], NDArray[Any]]:
+        """What returns the values of a variable at the points first to end - 1, between which no ring begins anew."""
+        ring, step_points = self.receiver.kept, self.receiver.link.step_points
         place = ring.layout.place(variable)
-        values: NDArray[Any] = ring.parts[place.part][slots, place.first]
-        return values
+        values, mask = ring.parts[place.part][:, place.first], ring.mask
+
+        def each(first: int, end: int) -> NDArray[Any]:
+            start = first & mask
+            return values[start : start + end - first]
+
+        def held(first: int, end: int) -> NDArray[Any]:
+            column: NDArray[Any] = values[(np.arange(first, end) // step_points) & mask]
+            return column
+
+        return each if step_points == 1 else held
 
     def type_of(self, variable: str) -> VariableType:
         """The type of a variable."""
