@@ -30,7 +30,7 @@ from ..errors import (
     TerminationRequested,
     from_report,
 )
-from ..model.plan import Plan
+from ..model.plan import RECORDER, Plan
 from ..wire.inbox import Inbox
 from ..wire.keys import Keys
 from ..wire.membership import MASTER
@@ -40,7 +40,7 @@ from ..wire.shared_memory import SharedInbox, available
 from ..wire.values import json_encoding
 from ..wire.views import Command, CommandAnswer, MeshInfo, MeshState, MeshStatus
 from .members import Members, spoken
-from .pacing import Clock, Pacer
+from .pacing import Clock, Pacer, Reach
 from .profiling import CLOCK, PAUSE, GrantWatch
 from .serving import STATUS_S, Events, Server, mesh_info
 
@@ -90,6 +90,8 @@ class Master:
         self.watch: GrantWatch | None = None
         self.starts_paused = False
         self._pacer = Pacer(plan, config.simulation.real_time_factor)
+        self._reach = Reach(plan.window)
+        self._stepping = [number for number, node in enumerate(self._nodes) if node != RECORDER]
         self._clock = Clock()
         self._published = 0.0
         self._moved = time.monotonic()
@@ -193,6 +195,8 @@ class Master:
     def _publish_grant(self) -> float:
         """Publish the grant if it may grow; returns how long to wait for the next look, in s."""
         credit = min(map(operator.add, self._progress, self._windows))
+        ahead = min(self._progress[number] for number in self._stepping)
+        credit = min(credit, ahead + self._reach.points(ahead, time.monotonic()))
         grant = min(credit, self._last_point)
         if self._hold is not None:
             grant = min(grant, self._hold)

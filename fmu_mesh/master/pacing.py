@@ -1,13 +1,15 @@
-"""The wall clock of a run: how long it took, and how far it may be."""
+"""The wall clock of a run: how long it took, how far it may be, and how far ahead of the slowest."""
 
 from __future__ import annotations
 
 import math
 import time
 
-from ..model.plan import Plan
+from ..model.plan import STEADY_POINTS, STEADY_S, Plan
 
-__all__ = ["Clock", "Pacer"]
+__all__ = ["Clock", "Pacer", "Reach"]
+
+_SPEED_S = 0.01
 
 
 class Clock:
@@ -30,6 +32,31 @@ class Clock:
     def elapsed(self) -> float:
         """Seconds so far."""
         return self._before + (time.perf_counter() - self._since if self._since is not None else 0.0)
+
+
+class Reach:
+    """How many points the grant may be ahead of the slowest instance.
+
+    A pause holds at the grant. What of the window goes beyond 1024 points is used as far as it takes 50 ms, at the
+    speed of late.
+
+    Args:
+        window: the most, in points.
+    """
+
+    def __init__(self, window: int) -> None:
+        self._window = window
+        self._points = min(window, STEADY_POINTS)
+        self._slowest = 0
+        self._since = 0.0
+
+    def points(self, slowest: int, now: float) -> int:
+        """So many, when the slowest instance is at this point; ``now`` is monotonic, in s."""
+        if self._window > STEADY_POINTS and (elapsed := now - self._since) >= _SPEED_S:
+            wanted = (slowest - self._slowest) / elapsed * STEADY_S
+            self._points = min(self._window, max(STEADY_POINTS, int(wanted)))
+            self._slowest, self._since = slowest, now
+        return self._points
 
 
 class Pacer:

@@ -31,14 +31,21 @@ __all__ = ["RECORDER", "Feed", "InstancePlan", "Link", "NodePlan", "Plan", "make
 RECORDER = "@record"
 """Name of the recorder where node names stand; no instance can have it."""
 
-RECORDER_WINDOW = 4096
+RECORDER_WINDOW = 8192
 """How many points the recorder may be behind, at least."""
 
 LAZY_ROWS = 2048
 """Rows for the recorder that may wait in a node until a frame is worth sending."""
 
-AUTO_WINDOW_POINTS = 1024
+AUTO_WINDOW_POINTS = 4096
 AUTO_WINDOW_BYTES = 16 * 2**20
+AUTO_WINDOW_ROWS = 65536
+"""Of all instances together; each row is kept with the pointers to its values, too."""
+
+STEADY_POINTS = 1024
+"""So far the grant may be ahead at any speed; beyond that, it is ahead by what takes `STEADY_S` only."""
+
+STEADY_S = 0.05
 
 
 class Feed(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -275,14 +282,15 @@ def _algebraic_loop(loop: list[str], connections: tuple[Connection, ...], file: 
 def _window(system: System) -> int:
     """The window of the configuration; `auto` is as large as the memory for the rows allows.
 
-    A large window only costs memory: values do not depend on it, and what a node sends is flushed when a consumer could
-    be waiting for it.
+    A large window only costs memory: values do not depend on it, what a node sends is flushed when a consumer could
+    be waiting for it, and slow instances are granted a part of it only, so that a pause holds soon.
     """
     configured = system.config.simulation.window
     if configured != "auto":
         return configured
     widest = max(Layout.of(instance.description.variables).row_size for instance in system.instances.values())
-    return max(16, min(AUTO_WINDOW_POINTS, AUTO_WINDOW_BYTES // max(widest, 1)))
+    points = min(AUTO_WINDOW_POINTS, max(STEADY_POINTS, AUTO_WINDOW_ROWS // len(system.instances)))
+    return max(16, min(points, AUTO_WINDOW_BYTES // max(widest, 1)))
 
 
 def _nodes(plan: Plan) -> dict[str, NodePlan]:

@@ -9,7 +9,7 @@ import pytest
 
 from fmu_mesh.launch.preparing import prepare
 from fmu_mesh.master import pacing
-from fmu_mesh.master.pacing import Pacer
+from fmu_mesh.master.pacing import Pacer, Reach
 from tests.helpers import write_config
 
 STEP_SIZE = 0.5
@@ -93,3 +93,21 @@ def test_a_run_that_keeps_up_has_no_overruns(tmp_path: Path, wall: Wall) -> None
         reached, _ = paced.limit(1000, reached)
 
     assert (reached, paced.overruns) == (81, 0)
+
+
+@pytest.mark.parametrize(
+    ("points_per_s", "expected"), [(10.0, 1024), (20_000.0, 1024), (50_000.0, 2500), (1_000_000.0, 4096)]
+)
+def test_the_grant_reaches_as_far_as_50_ms_at_the_speed_of_late_or_1024_points(
+    points_per_s: float, expected: int
+) -> None:
+    reach = Reach(4096)
+    reach.points(0, 1000.0)
+
+    assert reach.points(round(points_per_s), 1001.0) == expected
+
+
+def test_a_small_window_is_always_used_as_a_whole() -> None:
+    reach = Reach(16)
+
+    assert [reach.points(point, 1000.0 + point) for point in range(5)] == [16] * 5

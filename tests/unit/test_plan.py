@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import pytest
 
 from fmu_mesh.errors import ConfigurationError
@@ -106,8 +108,15 @@ def test_rings_hold_what_can_be_under_way(window: int, slowest: int) -> None:
 def test_an_automatic_window_is_large_and_one_that_is_given_counts() -> None:
     system = Scenario(("a -> b",)).plan().system
 
-    assert make_plan(system).window == 1024
+    assert make_plan(system).window == 4096
     assert make_plan(system, window=3).window == 3
+
+
+def test_the_automatic_window_of_many_instances_is_smaller() -> None:
+    names = [f"i{number}" for number in range(50)]
+    system = Scenario(tuple(f"{a} -> {b}" for a, b in pairwise(names))).plan().system
+
+    assert make_plan(system).window == 65536 // 50
 
 
 @pytest.mark.parametrize("window", [1, 4, 5, 12, 13, 100, 1024])
