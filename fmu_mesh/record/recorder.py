@@ -181,11 +181,11 @@ class Recorder:
             self._write_rows()
 
     def _write_rows(self) -> None:
-        last = self._complete() + 1
-        if last <= self._written:
+        rows = self._complete() + 1
+        if rows <= self._written:
             return
-        while (first := self._written) < last:
-            end = min(last, first - first % self._plan.ring_rows + self._plan.ring_rows)  # rings are read in one piece
+        while (first := self._written) < rows:
+            end = min(rows, first - first % self._plan.ring_rows + self._plan.ring_rows)  # rings are read in one piece
             columns = [column(first, end) for column in self._columns]
             self._file.write(self._plan.grid.times(first, end), columns)
             self._written = end

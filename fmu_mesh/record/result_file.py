@@ -26,7 +26,7 @@ class ResultFile(Protocol):
     rows: int
 
     def write(self, times: NDArray[np.float64], columns: Sequence[NDArray[Any]]) -> None:
-        """Append one row per time; ``columns`` are arrays of the same length."""
+        """Append one row per time; ``columns`` are arrays of the same length, which hold during the call only."""
         ...
 
     def flush(self) -> None:
