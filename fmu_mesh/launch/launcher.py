@@ -76,6 +76,7 @@ class Launcher:
         self._heard = time.monotonic()
         self._quiet = False
         self._ending = False
+        self._signalled = False
         self._interrupted_at: float | None = None
         self._spawn_nodes: Callable[[], None] = lambda: None
 
@@ -198,9 +199,10 @@ class Launcher:
         self._on_output(name, line.decode(errors="replace").rstrip())
 
     def _take_exit(self, name: str, code: int) -> None:
+        if not self._signalled:  # afterwards it says no more what was wrong
+            self._how[name] = how_it_ended(code)
         if self._ending:
             return
-        self._how[name] = how_it_ended(code)
         if self._end is None and (code != 0 or name == _MASTER):
             self._lost.append((name, code, time.monotonic()))
         elif name == _GATEWAY:
@@ -243,6 +245,7 @@ class Launcher:
             if not running:
                 break
             if step is not None:
+                self._signalled = True
                 for process in running:
                     process.signal(step)
             deadline = time.monotonic() + (patience if step is None else grace_s)
