@@ -111,14 +111,12 @@ class Members:
             profile_entries: how many bursts and waits each node shall note for a profile; 0: nothing is measured.
         """
         shared = [node for node in self._nodes if node in self._outlets and self._registered[node][0].shared]
-        self._senders = [self._outlets[node].put for node in shared]
         self._stepping = [self._outlets[node].put for node in shared if node != RECORDER]
         rest = [node for node in self._nodes if node not in shared]
         if rest:
             publishers = zip(self._grants, batched(self._nodes), strict=True)
-            others = [publisher.put for publisher, nodes in publishers if not set(nodes).isdisjoint(rest)]
-            self._senders += others
-            self._stepping += others
+            self._stepping += [publisher.put for publisher, nodes in publishers if not set(nodes).isdisjoint(rest)]
+        self._senders = self._stepping + [self._outlets[node].put for node in shared if node == RECORDER]
         offer = self._inbox.offer if len(self._outlets) == len(self._nodes) else None
         if offer is not None:
             self._inbox.share()

@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 import time
 
-from ..model.plan import STEADY_POINTS, STEADY_S, Plan
+from ..model.plan import STEADY_POINTS, Plan
 
 __all__ = ["Clock", "Pacer", "Reach"]
 
+_STEADY_S = 0.05
 _SPEED_S = 0.01
 
 
@@ -53,7 +54,7 @@ class Reach:
     def points(self, slowest: int, now: float) -> int:
         """So many, when the slowest instance is at this point; ``now`` is monotonic, in s."""
         if self._window > STEADY_POINTS and (elapsed := now - self._since) >= _SPEED_S:
-            wanted = (slowest - self._slowest) / elapsed * STEADY_S
+            wanted = (slowest - self._slowest) / elapsed * _STEADY_S
             self._points = min(self._window, max(STEADY_POINTS, int(wanted)))
             self._slowest, self._since = slowest, now
         return self._points

@@ -43,9 +43,7 @@ AUTO_WINDOW_ROWS = 65536
 """Of all instances together; each row is kept with the pointers to its values, too."""
 
 STEADY_POINTS = 1024
-"""So far the grant may be ahead at any speed; beyond that, it is ahead by what takes `STEADY_S` only."""
-
-STEADY_S = 0.05
+"""So far the grant may be ahead at any speed; how far beyond that depends on it."""
 
 
 class Feed(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -107,8 +107,6 @@ class Meshes:
             try:
                 answers.append((client, question(client)))
             except FmuMeshError as error:
-                if len(clients) == 1:
-                    raise
                 self.silent.append(error)
         if not answers:
             raise self.silent.pop()

@@ -86,6 +86,7 @@ def test_a_feedback_loop_at_500_hz_gives_the_floats_of_one_process_while_ros_wat
     assert [(m.twist.linear.x, m.twist.angular.z) for m in messages] == [expected[point][1:3] for point in points]
     times = [c.clock.sec * 1_000_000_000 + c.clock.nanosec for c in clocks]
     assert times == sorted(times)
+    assert 2_000_000_000 in times
 
 
 def test_an_input_and_a_tunable_parameter_of_a_mesh_are_set_from_ros(ros: Ros, place: Place) -> None:
