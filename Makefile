@@ -52,6 +52,8 @@ clean: ## remove results, builds and caches, but not .venv
 $(VENV)/.installed-%: pyproject.toml $(VENV)/.created
 	@echo "Installing fmu-mesh[$*] into $(VENV) ..."
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[$*]'
+	@# Where PYTHONDONTWRITEBYTECODE is set, every process of a mesh would compile all modules on its own: 0.2 s each.
+	@$(BIN)/python -m compileall -q fmu_mesh
 	@touch $@
 
 # A name on PATH proves nothing (it may be a stand-in of a version manager), so each candidate has to run.

@@ -221,6 +221,16 @@ JOBS = (
         (Target("fmu_mesh, all outputs to a file", "fmu_mesh, nothing recorded", 1.3, 1.05, overhead=True),),
     ),
     Job(
+        "record_group",
+        "the cycle in one group: recording all outputs against recording none",
+        _CYCLE2,
+        (
+            Entry("fmu_mesh, all outputs to a file", OURS, 100_000, 40_000, {"group": "one", "record": "all"}),
+            Entry("fmu_mesh, nothing recorded", OURS, 100_000, 40_000, {"group": "one", "record": "none"}),
+        ),
+        (Target("fmu_mesh, all outputs to a file", "fmu_mesh, nothing recorded", 1.3, 1.05, overhead=True),),
+    ),
+    Job(
         "limits",
         "physical limits: one round trip of 16 bytes between two processes",
         None,
