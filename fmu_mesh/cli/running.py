@@ -11,7 +11,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from ..errors import ConfigurationError, FmuError, FmuMeshError
+from ..errors import ConfigurationError, FmuError, FmuMeshError, MeshLost
 from ..fmu import LogMessage
 from ..hosts import check_film, check_window
 from ..launch.events import End, Event, EventWriter, Ready
@@ -28,7 +28,7 @@ from ..wire.profile import MeshProfile
 from ..wire.router import run_router
 from ..wire.runtime import enter_run_folder, fmu_folder, leave_run_folder, remove_stale_folders, run_folder
 from ..wire.views import LogLine
-from .arguments import add_command, endpoint, number
+from .arguments import add_command, count, endpoint, number
 from .display import Display, say, stdout_as_stderr, summary
 from .plotting import check_plot, plot_results
 from .profiling import add_profile, show_profile
@@ -43,6 +43,13 @@ def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.Arg
     launch.add_argument("--local", action="store_true", help="run everything in this one process")
     _add_paused(launch)
     launch.add_argument("--plot", type=Path, metavar="FILE.png", help="plot the result when done")
+    launch.add_argument(
+        "--restarts",
+        type=count,
+        default=0,
+        metavar="N",
+        help="start again from the first point when a node or the master is lost, N times at most",
+    )
     launch.add_argument("--no-progress", action="store_true", help="no progress line")
     _add_showing(launch)
     add_profile(launch)
@@ -155,6 +162,9 @@ def _launch(arguments: argparse.Namespace) -> int:
         raise ConfigurationError(
             "--real-time-factor is kept by the master, and --local has none", hint="Leave one of them out."
         )
+    if arguments.restarts and (arguments.local or options.paused):
+        other = "--local" if arguments.local else "--paused"
+        raise ConfigurationError(f"--restarts and {other} do not go together", hint="Leave one of them out.")
     plan = prepare(arguments.config, options, say)
     if arguments.plot is not None:
         check_plot(arguments.plot, plan.system.result_file)
@@ -163,8 +173,7 @@ def _launch(arguments: argparse.Namespace) -> int:
         if arguments.local:
             point, seconds, rows = _run_local(plan, arguments.config, display, options.showing)
         else:
-            launcher = Launcher(plan, arguments.config, options, display.event, display.output)
-            end = run_launcher(launcher)
+            end = _run_processes(plan, arguments, options, display)
             point, seconds, rows, profile = end.status.point, end.seconds, end.rows, end.profile
     if profile is not None:
         show_profile(plan, profile, seconds, arguments.profile)
@@ -172,6 +181,20 @@ def _launch(arguments: argparse.Namespace) -> int:
         print(f"video: {arguments.video}")
     close(plan, point, seconds, rows, arguments.plot)
     return 0
+
+
+def _run_processes(plan: Plan, arguments: argparse.Namespace, options: Options, display: Display) -> End:
+    """Run the mesh, and again from its first point as often as `--restarts` allows if a process of it is lost."""
+    for restart in range(arguments.restarts + 1):
+        launcher = Launcher(plan, arguments.config, options, display.event, display.output, restarts=restart)
+        try:
+            return run_launcher(launcher)
+        except MeshLost as error:
+            if restart == arguments.restarts or type(error) is not MeshLost:
+                raise
+            error.hint = f"The run starts again from its first point (restart {restart + 1} of {arguments.restarts})."
+            say(str(error))
+    raise AssertionError
 
 
 def run_launcher(launcher: Launcher) -> End:

@@ -54,12 +54,21 @@ class Launcher:
         options: what the command line changed; handed on.
         on_event: called with every event of the master, on the thread that calls `run`.
         on_output: called with every line that a process writes, likewise.
+        restarts: how often the run was started before.
     """
 
-    def __init__(
-        self, plan: Plan, config_file: Path, options: Options, on_event: Callable[[Event], None], on_output: Output
+    def __init__(  # noqa: PLR0913 a run and whom it tells
+        self,
+        plan: Plan,
+        config_file: Path,
+        options: Options,
+        on_event: Callable[[Event], None],
+        on_output: Output,
+        *,
+        restarts: int = 0,
     ) -> None:
         self._plan = plan
+        self._restarts = restarts
         self._config_file = config_file
         self._options = options
         self._timeouts = plan.system.config.timeouts
@@ -134,7 +143,7 @@ class Launcher:
             if node == RECORDER:
                 continue
             plan_file = folder / f"{number}.json"
-            plan_file.write_bytes(msgspec.json.encode(plan))
+            plan_file.write_bytes(msgspec.json.encode(msgspec.structs.replace(plan, restarts=self._restarts)))
             shown = self._showing() if any(isinstance(i.hosted, MujocoConfig) for i in plan.instances) else []
             self._spawn(node, ["node", str(self._config_file), node, *common, *shown, "--plan", str(plan_file)], folder)
 
@@ -182,7 +191,7 @@ class Launcher:
             if event.status.state in _GOING_ON and ended is not None and self._heard - ended > _GATEWAY_S:
                 self._gateway_ended = None
                 self._lost.append((_GATEWAY, 0, ended))
-        elif isinstance(event, End):
+        elif isinstance(event, End) and not self._signalled:  # afterwards it only says that it was asked to end
             self._end = event
         self._on_event(event)
 

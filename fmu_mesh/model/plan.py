@@ -114,14 +114,13 @@ class NodePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         units: the instances in execution order; those of one inner tuple form a cycle within the node and step point by
             point, the others run as far ahead as their inputs and the grant allow.
         window: how many points this node may be behind the grant.
-        progress_stride: points after which the master is told; a quarter of the window, or every point where a single
-            step is as long as that.
+        progress_stride: points after which the master is told.
         ring_rows: rows of every ring; a power of two.
         loops: the algebraic loops at the start that instances of this node are part of.
         initialization: how they are iterated.
-        links_in: links that end here.
-        links_out: links that start here.
+        links_in, links_out: links that end here, and that start here.
         result_file: absolute path of the result CSV (for the recorder).
+        restarts: how often the run was started again.
         shared_memory: whether processes of one host exchange messages through shared memory.
     """
 
@@ -144,6 +143,7 @@ class NodePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     recorded: tuple[tuple[str, str], ...] = ()
     limits: LimitsConfig = LimitsConfig()
     shared_memory: bool = True
+    restarts: int = 0
 
     def instance(self, name: str) -> InstancePlan:
         """The plan of one of its instances."""

@@ -45,7 +45,8 @@ class Activity:
         """What `status` answers for an instance of this process."""
         runner = self.runners.get(name)
         if runner is None:
-            return InstanceStatus(name, self.state, self.state, 0, self._plan.grid.time(0), 0.0, 0.0)
+            start = self._plan.grid.time(0)
+            return InstanceStatus(name, self.state, self.state, 0, start, 0.0, 0.0, restarts=self._plan.restarts)
         return InstanceStatus(
             instance=name,
             state=self.state,
@@ -54,6 +55,7 @@ class Activity:
             time=self._plan.grid.time(runner.point),
             step_time=runner.step_seconds / runner.step if runner.step else 0.0,
             wait_time=self.waited_s,
+            restarts=self._plan.restarts,
             running_time=time.monotonic() - self._started if self._started is not None else 0.0,
         )
 
