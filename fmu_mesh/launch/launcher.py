@@ -191,8 +191,10 @@ class Launcher:
             if event.status.state in _GOING_ON and ended is not None and self._heard - ended > _GATEWAY_S:
                 self._gateway_ended = None
                 self._lost.append((_GATEWAY, 0, ended))
-        elif isinstance(event, End) and not self._signalled:  # afterwards it only says that it was asked to end
-            self._end = event
+        elif isinstance(event, End):
+            asked = event.error is not None and event.error.kind == Interrupted.__name__
+            if not (self._signalled and asked):  # it was this process that asked, and not why the run ends
+                self._end = event
         self._on_event(event)
 
     def _take_gateway_line(self, line: bytes) -> None:
