@@ -123,6 +123,20 @@ def _limit(label: str, transport: str, language: str, cores: str = "any") -> Ent
     return Entry(label, "ping_pong", 100_000, 30_000, options)
 
 
+def _recording(name: str, what: str, system: System, **options: str) -> Job:
+    recorded, plain = "fmu_mesh, all outputs to a file", "fmu_mesh, nothing recorded"
+    return Job(
+        name,
+        f"{what}: recording all outputs against recording none",
+        system,
+        (
+            Entry(recorded, OURS, 100_000, 40_000, {**options, "record": "all"}),
+            Entry(plain, OURS, 100_000, 40_000, {**options, "record": "none"}),
+        ),
+        (Target(recorded, plain, 1.3, 1.05, overhead=True),),
+    )
+
+
 JOBS = (
     Job(
         "pendulum",
@@ -210,26 +224,8 @@ JOBS = (
         ),
         (Target("fmu_mesh, chain of 8", "fmu_mesh, chain of 2", 1.5, 1.0, overhead=True),),
     ),
-    Job(
-        "record",
-        "pendulum -> delay: recording all outputs against recording none",
-        replace(_PENDULUM, step_size=0.001),
-        (
-            Entry("fmu_mesh, all outputs to a file", OURS, 100_000, 40_000, {"record": "all"}),
-            Entry("fmu_mesh, nothing recorded", OURS, 100_000, 40_000, {"record": "none"}),
-        ),
-        (Target("fmu_mesh, all outputs to a file", "fmu_mesh, nothing recorded", 1.3, 1.05, overhead=True),),
-    ),
-    Job(
-        "record_group",
-        "the cycle in one group: recording all outputs against recording none",
-        _CYCLE2,
-        (
-            Entry("fmu_mesh, all outputs to a file", OURS, 100_000, 40_000, {"group": "one", "record": "all"}),
-            Entry("fmu_mesh, nothing recorded", OURS, 100_000, 40_000, {"group": "one", "record": "none"}),
-        ),
-        (Target("fmu_mesh, all outputs to a file", "fmu_mesh, nothing recorded", 1.3, 1.05, overhead=True),),
-    ),
+    _recording("record", "pendulum -> delay", replace(_PENDULUM, step_size=0.001)),
+    _recording("record_group", "the cycle in one group", _CYCLE2, group="one"),
     Job(
         "limits",
         "physical limits: one round trip of 16 bytes between two processes",

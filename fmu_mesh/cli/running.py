@@ -185,16 +185,17 @@ def _launch(arguments: argparse.Namespace) -> int:
 
 def _run_processes(plan: Plan, arguments: argparse.Namespace, options: Options, display: Display) -> End:
     """Run the mesh, and again from its first point as often as `--restarts` allows if a process of it is lost."""
-    for restart in range(arguments.restarts + 1):
-        launcher = Launcher(plan, arguments.config, options, display.event, display.output, restarts=restart)
+    restarts = 0
+    while True:
+        launcher = Launcher(plan, arguments.config, options, display.event, display.output, restarts=restarts)
         try:
             return run_launcher(launcher)
         except MeshLost as error:
-            if restart == arguments.restarts or type(error) is not MeshLost:
+            if restarts == arguments.restarts or type(error) is not MeshLost:
                 raise
-            error.hint = f"The run starts again from its first point (restart {restart + 1} of {arguments.restarts})."
+            restarts += 1
+            error.hint = f"The run starts again from its first point (restart {restarts} of {arguments.restarts})."
             say(str(error))
-    raise AssertionError
 
 
 def run_launcher(launcher: Launcher) -> End:

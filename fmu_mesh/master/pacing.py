@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 import time
 
-from ..model.plan import STEADY_POINTS, Plan
+from ..model.plan import Plan
+from ..model.window import STEADY_POINTS
 
 __all__ = ["Clock", "Pacer", "Reach"]
 

@@ -25,25 +25,12 @@ from .step_options import linear_inputs
 from .system import Connection, System, SystemInstance
 from .types import PlainValue
 from .values import to_plain
+from .window import LAZY_ROWS, RECORDER_WINDOW, window_of
 
 __all__ = ["RECORDER", "Feed", "InstancePlan", "Link", "NodePlan", "Plan", "make_plan"]
 
 RECORDER = "@record"
 """Name of the recorder where node names stand; no instance can have it."""
-
-RECORDER_WINDOW = 8192
-"""How many points the recorder may be behind, at least."""
-
-LAZY_ROWS = 2048
-"""Rows for the recorder that may wait in a node until a frame is worth sending."""
-
-AUTO_WINDOW_POINTS = 4096
-AUTO_WINDOW_BYTES = 16 * 2**20
-AUTO_WINDOW_ROWS = 65536
-"""Of all instances together; each row is kept with the pointers to its values, too."""
-
-STEADY_POINTS = 1024
-"""So far the grant may be ahead at any speed; how far beyond that depends on it."""
 
 
 class Feed(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -114,11 +101,13 @@ class NodePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         units: the instances in execution order; those of one inner tuple form a cycle within the node and step point by
             point, the others run as far ahead as their inputs and the grant allow.
         window: how many points this node may be behind the grant.
-        progress_stride: points after which the master is told.
+        progress_stride: points after which the master is told; a quarter of the window, or every point where a single
+            step is as long as that.
         ring_rows: rows of every ring; a power of two.
         loops: the algebraic loops at the start that instances of this node are part of.
         initialization: how they are iterated.
-        links_in, links_out: links that end here, and that start here.
+        links_in: links that end here.
+        links_out: links that start here.
         result_file: absolute path of the result CSV (for the recorder).
         restarts: how often the run was started again.
         shared_memory: whether processes of one host exchange messages through shared memory.
@@ -207,7 +196,7 @@ def make_plan(system: System, *, window: int | None = None, file: str = "") -> P
     order = topological_order(system.instances, instant)
     cycles = tuple(tuple(part) for part in strongly_connected(system.instances, edges) if _is_cycle(part, edges))
     initialization = plan_initialization(system, connections)
-    points = window if window is not None else _window(system)
+    points = window if window is not None else window_of(system)
     plan = Plan(
         system=system,
         connections=connections,
@@ -275,20 +264,6 @@ def _algebraic_loop(loop: list[str], connections: tuple[Connection, ...], file: 
         found=f"every connection on the cycle {' -> '.join(walk)} has delay 0",
         expected="at least one connection with delay 1 (set `delay: 1`, or leave the delays to the algorithm)",
     )
-
-
-def _window(system: System) -> int:
-    """The window of the configuration; `auto` is as large as the memory for the rows allows.
-
-    A large window only costs memory: values do not depend on it, what a node sends is flushed when a consumer could
-    be waiting for it, and slow instances are granted a part of it only, so that a pause holds soon.
-    """
-    configured = system.config.simulation.window
-    if configured != "auto":
-        return configured
-    widest = max(Layout.of(instance.description.variables).row_size for instance in system.instances.values())
-    points = min(AUTO_WINDOW_POINTS, max(STEADY_POINTS, AUTO_WINDOW_ROWS // len(system.instances)))
-    return max(16, min(points, AUTO_WINDOW_BYTES // max(widest, 1)))
 
 
 def _nodes(plan: Plan) -> dict[str, NodePlan]:

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 from ..errors import FmuMeshError
-from ..model.plan import LAZY_ROWS, RECORDER, Link
+from ..model.plan import RECORDER, Link
 from ..model.ring import Layout, Ring
 from ..model.types import Value
+from ..model.window import LAZY_ROWS
 from ..wire.messages import FRAME, INITIAL
 from ..wire.rows import encode_frames, encode_rows
 

@@ -12,7 +12,7 @@ import psutil
 import pytest
 
 from fmu_mesh.cli.main import main
-from fmu_mesh.model.plan import AUTO_WINDOW_POINTS, LAZY_ROWS
+from fmu_mesh.model.window import AUTO_WINDOW_POINTS, LAZY_ROWS
 from tests.helpers import Launched, Place, on_a_busy_machine, row_count, rows_of, wait_until, write_config
 
 FAST = pytest.param({}, 2000, id="as fast as possible")
