@@ -250,6 +250,8 @@ class Launcher:
         """Wait for those that end by themselves, then ask, then kill."""
         self._ending = True
         patience = _KILL_S if self._end is not None else 0.1
+        if self._end is not None and self._end.error is None:  # the gateway has samples to carry to ROS
+            patience = self._timeouts.stop
         grace_s = _KILL_S if self._interrupted_at is None else 0.3
         for step in (None, signal.SIGTERM, signal.SIGKILL):
             running = [process for process in self._processes.values() if process.running]

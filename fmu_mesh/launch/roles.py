@@ -208,6 +208,7 @@ def run_master(
         emit(Ready(public))
         recorder, error = None, None
         master = Master(plan, session, _Emitter(emit), endpoints=public, config_file=str(config_file))
+        stack.callback(master.close)
         master.watch = GrantWatch() if options.profile else None
         master.starts_paused = options.paused
         for reason in early:
@@ -221,12 +222,17 @@ def run_master(
         except FmuMeshError as ended:
             error = ended
         rows = recorder.rows if recorder is not None else 0
-        report = error.report() if error is not None else None
-        ended_by = master.ended_by.report() if master.ended_by is not None and error is None else None
-        status, result_file = master.last_status(), plan.system.result_file
-        emit(End(status, master.seconds, rows, result_file, report, master.profile(), ended_by))
+        emit(_end_of(master, rows, plan.system.result_file, error))
         if error is not None:
             raise error
+        master.wait_for_followers()
+
+
+def _end_of(master: Master, rows: int, result_file: str | None, error: FmuMeshError | None) -> End:
+    """What is told of a run that is over."""
+    report = error.report() if error is not None else None
+    ended_by = master.ended_by.report() if master.ended_by is not None and error is None else None
+    return End(master.last_status(), master.seconds, rows, result_file, report, master.profile(), ended_by)
 
 
 @contextmanager

@@ -14,6 +14,7 @@ The master never sees a value. Its work per grant depends on the number of nodes
 
 from __future__ import annotations
 
+import logging
 import operator
 import time
 from collections.abc import Callable, Sequence
@@ -46,6 +47,8 @@ from .serving import STATUS_S, Events, Server, mesh_info
 
 __all__ = ["Master"]
 
+log = logging.getLogger(__name__)
+
 _HEARTBEAT_S = 0.5
 
 
@@ -62,7 +65,7 @@ class Master:
         watch: set it before `run` for a profile: then nodes measure themselves, and this sums up what holds the grant.
         ended_by: which FMU asked to end the simulation before its last point, if one did.
 
-    Call `run` once, from the main thread.
+    Call `run` once, from the main thread, then `wait_for_followers` if it went well, then `close`.
     """
 
     def __init__(
@@ -82,6 +85,7 @@ class Master:
         self._slowest = -1
         self._reports: dict[str, NodeReport] = {}
         self._failure: FmuMeshError | None = None
+        self._followers: set[str] = set()
         self.ended_by: TerminationRequested | None = None
         self._state: MeshState = "starting"
         self._grant = 0
@@ -139,7 +143,21 @@ class Master:
             self._clock.stop()
             self._publish_status(final=True)
             token.undeclare()
-            self._close()
+
+    def wait_for_followers(self) -> None:
+        """Stay, as the router, until those that need the last sample have it; their tokens tell, Zenoh does not."""
+        deadline = time.monotonic() + self._timeouts.stop
+        while self._followers and self._failure is None:
+            if (left := deadline - time.monotonic()) <= 0:
+                log.warning("a gateway did not take its last samples within %g s", self._timeouts.stop)
+                return
+            self._inbox.wait(left)
+
+    def close(self) -> None:
+        """Undeclare everything."""
+        self._server.close()
+        self._members.close()
+        self._inbox.close()
 
     @property
     def seconds(self) -> float:
@@ -282,7 +300,9 @@ class Master:
         server.show("status", self.last_status)
         server.show("plan", lambda: self._plan.nodes)
         server.serve(self._keys.mesh_key("command"), self._command)
-        server.watch(self._members.token_changed)
+        server.watch(self._keys.node_token("*"), self._members.token_changed)
+        server.watch(self._keys.follower("*"), self._follower_changed)
+        server.hand_on_logs()
 
     def _take_report(self, query: zenoh.Query) -> None:
         report = msgspec.json.decode(query.payload.to_bytes() if query.payload else b"", type=NodeReport)
@@ -311,6 +331,10 @@ class Master:
                 time=self._plan.grid.time(point),
             )
         )
+
+    def _follower_changed(self, sample: zenoh.Sample) -> None:
+        name = str(sample.key_expr)
+        (self._followers.add if sample.kind == zenoh.SampleKind.PUT else self._followers.discard)(name)
 
     def _command(self, query: zenoh.Query) -> None:
         """pause, resume, step N and stop; the grant is all that they move."""
@@ -366,8 +390,3 @@ class Master:
             error=failure,
             overruns=self._pacer.overruns,
         )
-
-    def _close(self) -> None:
-        self._server.close()
-        self._members.close()
-        self._inbox.close()

@@ -81,17 +81,20 @@ class Server:
 
         self.serve(key, reply)
 
-    def watch(self, token_changed: Callable[[zenoh.Sample], None]) -> None:
-        """From now on the log of all instances is handed on, and every change of a node's token."""
+    def watch(self, tokens: str, changed: Callable[[zenoh.Sample], None]) -> None:
+        """From now on ``changed`` gets every change of these liveliness tokens."""
         post = self._inbox.post
-        session = self._session
         self._entities.append(
-            session.liveliness().declare_subscriber(
-                self._keys.node_token("*"), lambda sample: post(lambda: token_changed(sample)), history=True
+            self._session.liveliness().declare_subscriber(
+                tokens, lambda sample: post(lambda: changed(sample)), history=True
             )
         )
+
+    def hand_on_logs(self) -> None:
+        """From now on the log of all instances is handed on."""
+        post = self._inbox.post
         self._entities.append(
-            session.declare_subscriber(f"{self._keys.root}/*/log", lambda sample: post(lambda: self._log(sample)))
+            self._session.declare_subscriber(f"{self._keys.root}/*/log", lambda sample: post(lambda: self._log(sample)))
         )
 
     def _log(self, sample: zenoh.Sample) -> None:

@@ -59,6 +59,7 @@ from .links import OutLink
 from .profiling import Profiler
 from .serving import Server
 from .stepping import LAZY_S, RemoteFeed, Runner, Unit
+from .streams import PRIORITY
 
 __all__ = ["Node"]
 
@@ -398,7 +399,8 @@ class Node:
         point = min((runner.point for runner in self._runners.values()), default=0)
         profile = self._profiler.profile() if self._profiler is not None and error is None else None
         report = NodeReport(self._plan.node, point, error.report() if error is not None else None, profile)
-        ask(self._session, self._keys.report, msgspec.json.encode(report), timeout_s, "the master")
+        # Behind the last samples: the master, who brings them to clients, goes when it has all reports.
+        ask(self._session, self._keys.report, msgspec.json.encode(report), timeout_s, "the master", priority=PRIORITY)
 
 
 class _Aborted(FmuMeshError):

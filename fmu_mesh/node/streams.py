@@ -20,9 +20,12 @@ from ..wire.session import matches, undeclare_all
 from ..wire.values import attachment, encode_value, json_encoding
 from .stepping import Runner
 
-__all__ = ["MAX_WAITING_ROWS", "Batch", "InstanceStreams", "kind_of"]
+__all__ = ["MAX_WAITING_ROWS", "PRIORITY", "Batch", "InstanceStreams", "kind_of"]
 
 MAX_WAITING_ROWS = 1 << 14
+
+PRIORITY = zenoh.Priority.DATA_LOW
+"""Frames and grants must not queue behind what is only looked at."""
 
 Batch = tuple["InstanceStreams", int, dict[str, NDArray[Any]]]
 """Streams, first own step, and the values by variable name."""
@@ -73,8 +76,7 @@ class InstanceStreams:
                 keys.variable(runner.name, kind, variable.name),
                 encoding=json_encoding,
                 congestion_control=zenoh.CongestionControl.DROP,
-                # Frames and grants must not queue behind what is only looked at.
-                priority=zenoh.Priority.DATA_LOW,
+                priority=PRIORITY,
                 allowed_destination=zenoh.Locality.REMOTE,
             )
             self._publishers[variable.name] = publisher

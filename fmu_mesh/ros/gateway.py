@@ -20,6 +20,7 @@ import zenoh
 from ..model.description import Value
 from ..simtime import TimeGrid
 from ..wire.keys import Keys
+from ..wire.readings import latecomers
 from ..wire.session import undeclare_all
 from ..wire.values import decode_stamp, encode_time, encode_value, json_encoding
 from .cdr import CdrError, Codec
@@ -71,7 +72,8 @@ class Gateway:
         self._events: queue.SimpleQueue[Event] = queue.SimpleQueue()
         self._left_out = 0
         self._ended = False
-        self._entities: list[zenoh.Subscriber[None]] = []
+        self._mesh_ended = False
+        self._entities: list[zenoh.Subscriber[None] | zenoh.LivelinessToken] = []
         self._publishers: dict[str, zenoh.Publisher] = {}
         self._watches: dict[str, _Watch] = {}
         self._clock: _Clock | None = None
@@ -98,11 +100,13 @@ class Gateway:
         self._entities.append(
             self._mesh.liveliness().declare_subscriber(self._keys.master, self._token_changed, history=True)
         )
+        token = self._keys.follower(str(self._mesh.zid()))
+        self._entities.append(self._mesh.liveliness().declare_token(token))
 
     def run(self) -> None:
-        """Carry until the mesh ends, or until `end` is called."""
+        """Carry until the mesh has ended and its last sample is carried, or until `end` is called."""
         due = time.monotonic() + _REPEAT_S
-        while not self._ended:
+        while not (self._ended or self._mesh_ended):
             now = time.monotonic()
             if now >= due:
                 due = now + _REPEAT_S
@@ -114,6 +118,11 @@ class Gateway:
             except queue.Empty:
                 continue
             event()
+        late = latecomers(self._events)
+        while not self._ended and self._watches and self._complete < self._grid.last_point:
+            if (late_event := next(late, None)) is None:
+                return
+            late_event()
 
     def end(self) -> None:
         """From any thread: let `run` return once everything that has come is carried."""
@@ -213,7 +222,12 @@ class Gateway:
 
     def _token_changed(self, sample: zenoh.Sample) -> None:
         if sample.kind == zenoh.SampleKind.DELETE:
+            self._events.put(self._end_mesh)
+        elif self._mesh_ended:  # it is another run, or this process was let go of: its samples are not all there
             self.end()
+
+    def _end_mesh(self) -> None:
+        self._mesh_ended = True
 
     def _end(self) -> None:
         self._ended = True

@@ -21,7 +21,7 @@ import zenoh
 from ..errors import ConfigurationError, DeadlineExceeded
 from ..model.findings import listed, nearest
 from .keys import Keys
-from .readings import Keeper, Reading, Target, reading_of
+from .readings import Keeper, Reading, Target, latecomers, reading_of
 from .session import matches
 from .values import json_encoding
 from .views import (
@@ -191,7 +191,7 @@ class MeshClient:
             there = threading.Event()
 
             def changed(sample: zenoh.Sample) -> None:
-                if sample.kind == zenoh.SampleKind.PUT:
+                if sample.kind == zenoh.SampleKind.PUT and not there.is_set():
                     there.set()
                 else:
                     arrived.put(None)
@@ -201,7 +201,7 @@ class MeshClient:
             for target in targets:
                 subscriber = self._session.declare_subscriber(target.key, Keeper(target, arrived).keep)
                 stack.callback(subscriber.undeclare)
-            yield iter(arrived.get, None) if there.wait(self._timeout_s) else iter(())
+            yield _to_the_last(arrived) if there.wait(self._timeout_s) else iter(())
 
     # --- names
 
@@ -321,6 +321,15 @@ def _not_understood(who: str, error: msgspec.DecodeError) -> ConfigurationError:
     return ConfigurationError(
         f"the answer of {who} is not understood: {error}.", hint="Is it another version of fmu_mesh?"
     )
+
+
+def _to_the_last(arrived: queue.SimpleQueue[Reading | None]) -> Iterator[Reading]:
+    """What arrives until the mesh has ended, which None says, and what comes behind that, unless it starts again."""
+    yield from iter(arrived.get, None)
+    for reading in latecomers(arrived):
+        if reading is None:
+            return
+        yield reading
 
 
 def _unknown(message: str, name: str, names: Sequence[str]) -> ConfigurationError:

@@ -64,6 +64,10 @@ class Keys(msgspec.Struct, frozen=True):
         """Liveliness token of a node as a process; internal."""
         return f"{self.root}/@sync/node/{node}"
 
+    def follower(self, name: str) -> str:
+        """Liveliness token of a reader that has not got its last sample yet: the master stays for it; internal."""
+        return f"{self.root}/@sync/follower/{name}"
+
     def hello(self, node: str) -> str:
         """Queryable of a node that answers as soon as its subscribers are declared."""
         return f"{self.root}/@sync/hello/{node}"

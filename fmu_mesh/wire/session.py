@@ -168,6 +168,7 @@ def ask(  # noqa: PLR0913, PLR0917  the parts of one question
     what: str,
     answer_s: float | None = None,
     over: Callable[[], bool] = lambda: False,
+    priority: zenoh.Priority = zenoh.Priority.DEFAULT,
 ) -> bytes:
     """Query ``key`` until somebody is there to answer, and return the answer's payload.
 
@@ -182,6 +183,7 @@ def ask(  # noqa: PLR0913, PLR0917  the parts of one question
         what: what is being waited for, for the error.
         answer_s: how long somebody who is there may take to answer, in s, if that is longer.
         over: whether the answer is not wanted any more.
+        priority: the query goes ahead of what has a lower one, and behind what was sent before with its own.
 
     Raises:
         DeadlineExceeded: nobody answered within ``deadline_s`` seconds.
@@ -189,7 +191,7 @@ def ask(  # noqa: PLR0913, PLR0917  the parts of one question
     """
     end = time.monotonic() + deadline_s
     changed = threading.Event()
-    with session.declare_querier(key, timeout=answer_s or deadline_s) as querier:
+    with session.declare_querier(key, timeout=answer_s or deadline_s, priority=priority) as querier:
         listener = querier.declare_matching_listener(lambda _status: changed.set())
         try:
             while (left := end - time.monotonic()) > 0:

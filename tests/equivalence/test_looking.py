@@ -26,7 +26,7 @@ import pytest
 import zenoh
 
 from fmu_mesh.cli.main import main
-from tests.helpers import DEADLINE_S, wait_until
+from tests.helpers import DEADLINE_S, Place, wait_until, write_config
 
 FMUS = Path(__file__).parents[2] / "fmus"
 ROOT = "fmu_mesh/looked_at"
@@ -383,6 +383,27 @@ def test_watch_ends_with_the_mesh_and_with_ctrl_c() -> None:
         assert [watcher.returncode for watcher in watchers] == [130, 0]
         assert "mesh 'looked_at' is told to end at point " in stopped.stdout
         assert mesh.end() == 130, mesh.lines
+
+
+def test_watch_shows_the_last_point_though_it_had_no_processor_at_the_end(place: Place) -> None:
+    mesh = place.start("launch", write_config(place.folder, stop_time=0.2), "--paused", "--no-progress")
+    mesh.wait_for_error_line("mesh 'pair' at")
+    watch = place.start("watch", "pendulum.a")
+
+    def seen() -> bool:
+        place.run("step", "pair", "1")  # refused as long as the mesh starts
+        return bool(watch.output)
+
+    wait_until(seen, "a sample")
+    watch.signal(signal.SIGSTOP)
+    assert place.run("resume", "pair").wait() == 0
+    assert mesh.wait() == 0
+
+    watch.signal(signal.SIGCONT)
+
+    assert watch.wait() == 0
+    points = [int(line.partition("(point ")[2].partition(",")[0]) for line in watch.output.splitlines()]
+    assert points == list(range(points[0], 201))
 
 
 # --- nothing but Zenoh

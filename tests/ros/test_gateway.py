@@ -7,13 +7,15 @@ import signal
 import socket
 import struct
 from collections.abc import Iterator
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
+import psutil
 import pytest
 import zenoh
 
-from tests.helpers import Place, rows_of, wait_until, write_config
+from tests.helpers import DEADLINE_S, Place, row_count, rows_of, wait_until, write_config
 from tests.ros.peers import free_port
 
 FLOAT = struct.Struct("<4xd")
@@ -38,6 +40,14 @@ class Ros:
     def ticks(self) -> list[float]:
         return [sec + nanosec / 1e9 for sec, nanosec in map(TIME.unpack, self.samples.get("clock", []))]
 
+    def assert_whole(self, rows: list[tuple[float, ...]]) -> None:
+        """Every row is here or still on its way; a clock that stood for a second told its time again."""
+        wait_until(lambda: len(self.floats("angle")) >= len(rows), "every sample")
+        wait_until(lambda: round(self.ticks()[-1], 9) == round(rows[-1][0], 9), "the last tick")
+        assert self.floats("angle") == [row[1] for row in rows]
+        ticks = [round(tick, 9) for tick in self.ticks()]
+        assert [tick for tick, _ in groupby(ticks)] == [round(row[0], 9) for row in rows]
+
 
 @pytest.fixture
 def ros() -> Iterator[Ros]:
@@ -56,6 +66,7 @@ def configured(
     *,
     factor: float,
     stop_time: float = 3.0,
+    timeouts: dict[str, float] | None = None,
     **more: Any,  # noqa: ANN401 keys of the section
 ) -> Path:
     return write_config(
@@ -65,6 +76,7 @@ def configured(
         connections=[],
         stop_time=stop_time,
         simulation={"step_size": 0.01, "real_time_factor": factor},
+        timeouts=timeouts or {},
         ros={
             "connect": [f"tcp/127.0.0.1:{ros.port}"],
             "topics": [{"topic": "/angle", "variable": "pendulum.a"}, {"topic": "/command", "variable": "gain.u"}],
@@ -83,8 +95,37 @@ def test_every_sample_from_the_first_point_to_the_last_arrives_and_the_clock_tel
     rows = rows_of(place.folder / "lab.csv")
     assert (mesh.wait(), mesh.errors.count("\n")) == (0, 1), mesh.errors
     assert len(rows) == 301
-    assert ros.floats("angle") == [row[1] for row in rows]
-    assert [round(tick, 9) for tick in ros.ticks()] == [round(row[0], 9) for row in rows]
+    ros.assert_whole(rows)
+    place.assert_nothing_left()
+
+
+def test_a_gateway_that_had_no_processor_at_the_end_still_carries_every_sample(place: Place, ros: Ros) -> None:
+    mesh = place.start("launch", configured(place, ros, factor=3), "--no-progress")
+    wait_until(lambda: len(ros.floats("angle")) > 100, "samples")
+    [gateway] = [process for process in place.processes() if "gateway" in process.cmdline()]
+    nodes = [mesh.child("pendulum"), mesh.child("gain")]
+    gateway.suspend()
+    wait_until(lambda: row_count(place.folder / "lab.csv") == 301, "the last point")
+    assert psutil.wait_procs(nodes, DEADLINE_S)[1] == []
+
+    gateway.resume()
+
+    assert mesh.wait() == 0, mesh.errors
+    ros.assert_whole(rows_of(place.folder / "lab.csv"))
+    place.assert_nothing_left()
+
+
+def test_a_gateway_that_never_comes_back_ends_with_the_mesh(place: Place, ros: Ros) -> None:
+    config = configured(place, ros, factor=3, timeouts={"stop": 1.0})
+    mesh = place.start("launch", config, "--no-progress")
+    wait_until(lambda: len(ros.floats("angle")) > 100, "samples")
+    [gateway] = [process for process in place.processes() if "gateway" in process.cmdline()]
+
+    gateway.suspend()
+
+    assert mesh.wait() == 0, mesh.errors
+    assert "a gateway did not take its last samples within 1 s" in mesh.errors
+    assert len(rows_of(place.folder / "lab.csv")) == 301
     place.assert_nothing_left()
 
 
