@@ -23,6 +23,7 @@ from ..simtime import TimeGrid
 from .buffers import Buffer, NumberBuffer, StringBuffer
 from .callbacks import FMI2_CALLBACKS, register, unregister
 from .calls import Function, Pointer, hot
+from .fused import SETTING, STATUS_BITS, STEPPING, Fused, fuse
 from .instance import STATUS_NAMES, WARNING, FmuInstance, Verb
 from .step_status import PENDING, RETRY, SMALLER_STEPS, StepStatus, discarded
 from .substeps import DISCARD, SMALLEST, take_sub_steps
@@ -121,41 +122,53 @@ class Fmi2Instance(Fmi2Values):
     def bind(self, inputs: Ring, outputs: Sequence[Ring], grid: TimeGrid, points: int, step: int = 0) -> None:
         """Let `do_step` work on these rings, ``points`` of ``grid`` each; write the current outputs as row ``step``."""
         super().bind(inputs, outputs, grid, points, step)
-        # One look-up for all that a step needs: it is a part of the time of a small FMU.
-        self._hot = (
-            self._self,
-            self._do_step,
-            self._input_mask,
-            self._output_mask,
-            [call[:4] for call in self._direct_setters],
-            [call[:4] for call in self._direct_getters],
-            bool(self._setters or self._getters),
-        )
+        is_plain = self._do_step is self._plain_do_step and not (self._setters or self._getters)
+        self._fused = self._fuse() if is_plain else None
+        self._hot = (self._fused.call if self._fused is not None else None, self._input_mask, self._output_mask)
 
     def do_step(self, step: int) -> None:
         """Set the inputs of row ``step``, advance to own step ``step + 1``, write the outputs to row ``step + 1``."""
-        component, do_step, input_mask, output_mask, setters, getters, has_buffers = self._hot
-        slot = step & input_mask
-        for function, references, count, rows in setters:
-            status = function(component, references, count, rows[slot])
+        fused, input_mask, output_mask = self._hot
+        if fused is None:
+            self._step_by_calls(step)
+            return
+        time = self._start_time + step * self._points * self._base_step_size  # `grid.time`, without a call
+        if outcome := fused(step & input_mask, time, (step + 1) & output_mask):
+            self._finish_fused(outcome, step)
+        self._step = step + 1
+
+    def _step_by_calls(self, step: int) -> None:
+        """`do_step` where something is between the rows and the FMU: a conversion, or a step that is retried."""
+        slot = step & self._input_mask
+        for setter, references, count, rows, _ in self._direct_setters:
+            status = setter(self._self, references, count, rows[slot])
             if status > WARNING:
                 raise self._failed(f"setting the inputs returned {STATUS_NAMES[status]}")
-        if has_buffers:
-            for set_row in self._setters:
-                set_row(slot)
-        time = self._start_time + step * self._points * self._base_step_size  # `grid.time`, without a call
-        status = do_step(component, time, self._step_size, 1)
+        for set_row in self._setters:
+            set_row(slot)
+        time = self._start_time + step * self._points * self._base_step_size
+        status = self._do_step(self._self, time, self._step_size, 1)
         if status > WARNING:
             self._finish(status)
         self._step = step + 1
-        slot = (step + 1) & output_mask
-        for function, references, count, rows in getters:
-            status = function(component, references, count, rows[slot])
-            if status > WARNING:
-                raise self._failed(f"reading the outputs returned {STATUS_NAMES[status]}")
-        if has_buffers:
-            for get_row in self._getters:
-                get_row(slot)
+        self._read_outputs((step + 1) & self._output_mask)
+
+    def _fuse(self) -> Fused | None:
+        moves, do_step = self._moves, self._fmu.dll.fmi2DoStep
+        return fuse(self._component, moves["Set"], do_step, self._step_size, moves["Get"])
+
+    def _finish_fused(self, outcome: int, step: int) -> None:
+        """What follows from a status above warning, as in `_step_by_calls`."""
+        stage, status = divmod(outcome, 1 << STATUS_BITS)
+        if stage == SETTING:
+            raise self._failed(f"setting the inputs returned {STATUS_NAMES[status]}")
+        if stage == STEPPING:
+            self._finish(status)
+            self._step = step + 1
+            self._read_outputs((step + 1) & self._output_mask)
+        else:
+            self._step = step + 1
+            raise self._failed(f"reading the outputs returned {STATUS_NAMES[status]}")
 
     def advance(self, time: float, step_size: float) -> None:
         """One step of ``step_size`` from ``time`` (both in s) without rings, for callers with their own time base."""
@@ -182,7 +195,8 @@ class Fmi2Instance(Fmi2Values):
 
     def _instantiate(self, folder: Path) -> None:
         super()._instantiate(folder)
-        self._do_step: Function = hot(self._fmu.dll.fmi2DoStep, _DO_STEP)
+        self._plain_do_step: Function = hot(self._fmu.dll.fmi2DoStep, _DO_STEP)
+        self._do_step = self._plain_do_step
         self._step_status = StepStatus(self._fmu.dll, self._component, "fmi2")
         if self._options.retry_discarded_steps:
             self._retrying = _Retrying(self._fmu, self._do_step, self._waited, self._asks_to_end, self._failed)

@@ -26,6 +26,7 @@ from ..simtime import TimeGrid
 from .archive import Terms
 from .buffers import Buffer
 from .calls import Function, Pointer, hot, memory, pointer
+from .fused import Move
 from .sources import extract
 from .state import KeepsFmuState, Standing
 
@@ -169,6 +170,7 @@ class FmuInstance(KeepsFmuState, ABC):
         self._input_mask = inputs.mask
         self._output_mask = outputs[0].mask
         self._keep = [inputs, *outputs]
+        self._moves: dict[Verb, list[Move]] = {"Set": [], "Get": []}
         self._direct_setters: list[DirectCall] = []
         self._direct_getters: list[DirectCall] = []
         self._setters: list[Callable[[int], None]] = []
@@ -273,8 +275,9 @@ class FmuInstance(KeepsFmuState, ABC):
         if self._is_direct(part):
             rows = [pointer(array.ctypes.data + slot * array.strides[0]) for slot in range(len(array))]
             calls = self._direct_setters if verb == "Set" else self._direct_getters
-            called = hot(function, self._direct_declaration)
-            calls.append((called, memory(_references(variables)), len(variables), rows, part.width))
+            called, references = hot(function, self._direct_declaration), _references(variables)
+            calls.append((called, memory(references), len(variables), rows, part.width))
+            self._moves[verb].append(Move(function, references, array.ctypes.data, array.strides[0]))
             return
         buffer = self._buffer(part.type, variables)
         names = [variable.name for variable in variables]

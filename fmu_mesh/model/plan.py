@@ -25,7 +25,7 @@ from .step_options import linear_inputs
 from .system import Connection, System, SystemInstance
 from .types import PlainValue
 from .values import to_plain
-from .window import LAZY_ROWS, RECORDER_WINDOW, window_of
+from .window import LAZY_ROWS, recorder_window, window_of
 
 __all__ = ["RECORDER", "Feed", "InstancePlan", "Link", "NodePlan", "Plan", "make_plan"]
 
@@ -309,8 +309,9 @@ def _node(
     links: tuple[Link, ...],
 ) -> NodePlan:
     config = plan.system.config
-    # Rows that nobody steps on may wait: they hold the nodes back only when there are many of them.
-    window = max(plan.window, RECORDER_WINDOW) if node == RECORDER else plan.window
+    window = plan.window
+    if node == RECORDER:
+        window = recorder_window(window, [link.layout.row_size for link in links if link.target_node == RECORDER])
     longest_step = max(instance.step_points for instance in plan.system.instances.values())
     return NodePlan(
         mesh=config.mesh,

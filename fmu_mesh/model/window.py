@@ -2,24 +2,43 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from .ring import Layout
 from .system import System
 
-__all__ = ["AUTO_WINDOW_POINTS", "LAZY_ROWS", "RECORDER_WINDOW", "STEADY_POINTS", "window_of"]
+__all__ = ["AUTO_WINDOW_POINTS", "FRAME_OVERHEAD", "LAZY_ROWS", "STEADY_POINTS", "recorder_window", "window_of"]
 
-RECORDER_WINDOW = 8192
-"""How many points the recorder may be behind, at least."""
+RECORDER_WINDOW = 32768
+"""How many points the recorder may be behind, where its memory for their rows allows: it rests while they gather."""
+
+_LEAST_RECORDER_WINDOW = 8192
+_RECORDER_BYTES = 16 * 2**20
+
+FRAME_OVERHEAD = 32
+"""What a message takes besides its rows, in bytes; it may hold a single one."""
 
 LAZY_ROWS = 2048
 """Rows for the recorder that may wait in a node until a frame is worth sending."""
 
-AUTO_WINDOW_POINTS = 4096
+AUTO_WINDOW_POINTS = 16384
 AUTO_WINDOW_BYTES = 16 * 2**20
 AUTO_WINDOW_ROWS = 65536
 """Of all instances together; each row is kept with the pointers to its values, too."""
 
 STEADY_POINTS = 1024
 """So far the grant may be ahead at any speed; how far beyond that depends on it."""
+
+
+def recorder_window(window: int, row_sizes: Sequence[int]) -> int:
+    """How many points the recorder may be behind: rows that nobody steps on hold nodes back only when there are many.
+
+    Args:
+        window: that of the mesh.
+        row_sizes: of all instances that are recorded, in bytes.
+    """
+    row_bytes = sum(row_sizes) + FRAME_OVERHEAD * len(row_sizes)
+    return max(window, _LEAST_RECORDER_WINDOW, min(RECORDER_WINDOW, _RECORDER_BYTES // max(row_bytes, 1)))
 
 
 def window_of(system: System) -> int:

@@ -42,6 +42,9 @@ _REST_S = 0.005
 somebody who steps, and to write many rows at once costs less."""
 
 _REST_ROWS = 256
+_LAST_ROWS = 8192
+"""More than come during a rest: it must not hold up the end of a run."""
+
 _TELL_S = 0.1
 _FLUSH_S = 0.2
 
@@ -172,9 +175,9 @@ class Recorder:
                 raise DeadlineExceeded("the recorder heard nothing from the master")
 
     def _rest(self) -> None:
-        """Let frames gather, if many rows have come since the last rest and more than a window of them is left."""
+        """Let frames gather, if many rows have come since the last rest and many are left."""
         written, last_point = self._written, self._plan.grid.last_point
-        if written - self._rested >= _REST_ROWS and last_point - written > self._plan.window:
+        if written - self._rested >= _REST_ROWS and last_point - written > _LAST_ROWS:
             self._rested = written
             self._leaving.wait(_REST_S)
 

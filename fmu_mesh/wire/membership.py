@@ -16,6 +16,7 @@ import zenoh
 
 from ..errors import FmuMeshError
 from ..model.plan import NodePlan
+from ..model.window import FRAME_OVERHEAD
 from .inbox import Inbox
 from .keys import Keys
 from .messages import decode_json
@@ -28,7 +29,6 @@ MASTER = "@mesh"
 """Name of the master where node names stand."""
 
 _SHARED = b"shared"
-_FRAME_OVERHEAD = 32
 
 
 class Hello(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -44,7 +44,7 @@ def shared_inbox(plan: NodePlan, *, spins: bool) -> SharedInbox | None:
         return None
     senders = {MASTER: 0}
     for link in plan.links_in:
-        own = plan.ring_rows * (link.layout.row_size + _FRAME_OVERHEAD)
+        own = plan.ring_rows * (link.layout.row_size + FRAME_OVERHEAD)
         senders[link.source_node] = senders.get(link.source_node, 0) + own
     return SharedInbox(senders, spins=spins)
 

@@ -1,0 +1,129 @@
+"""The calls of one step as one call: a function that is compiled when an instance is bound to its rings.
+
+The way from Python into C and back takes longer than a step of a small FMU, and is taken for every setter, for the step
+itself and for every getter. llvmlite makes one function of them, in some milliseconds and without a compiler on the
+user's machine; the addresses are constants in it. Where there is no llvmlite, `fuse` gives None.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import struct
+from collections.abc import Callable, Sequence
+from functools import cache
+from typing import Any, Final, NamedTuple
+
+from .calls import Function, hot
+
+__all__ = ["GETTING", "SETTING", "STATUS_BITS", "STEPPING", "Fused", "Move", "fuse"]
+
+SETTING: Final = 1
+STEPPING: Final = 2
+GETTING: Final = 3
+STATUS_BITS: Final = 24
+
+_DECLARATION: Final = "int (*)(size_t, double, size_t)"
+_WARNING: Final = 1
+_POINTER_BYTES: Final = 8
+
+
+class Fused(NamedTuple):
+    """A compiled function, and what owns its code."""
+
+    call: Function
+    engine: Any
+
+
+class Move(NamedTuple):
+    """A getter or setter of FMI 2.0 on the rows of a ring.
+
+    Attributes:
+        function: as ctypes has it; its arguments are component, references, their number, and a row.
+        references: the value references.
+        rows: address of row 0.
+        row_size: from one row to the next, in bytes.
+    """
+
+    function: Callable[..., int]
+    references: ctypes.Array[ctypes.c_uint]
+    rows: int
+    row_size: int
+
+
+def fuse(
+    component: int, setters: Sequence[Move], do_step: Callable[..., int], step_size: float, getters: Sequence[Move]
+) -> Fused | None:
+    """Compile ``(input row, time in s, output row)``: set the inputs, step by ``step_size`` (s), get the outputs.
+
+    The function returns 0. At the first status above warning it calls nothing more, and returns
+    ``stage << STATUS_BITS | status``. The references and the rings have to be kept alive for it. FMI 2.0, 4.2.1.
+    """
+    if _llvm() is None or struct.calcsize("P") != _POINTER_BYTES:
+        return None
+    calls: list[str] = []
+
+    def call(stage: int, function: Callable[..., int], arguments: str) -> None:
+        number = len(calls)
+        calls.append(
+            f"""
+  %status{number} = call i32 {_pointer(_address(function))}(ptr {_pointer(component)}, {arguments})
+  %above{number} = icmp sgt i32 %status{number}, {_WARNING}
+  br i1 %above{number}, label %end{number}, label %next{number}
+end{number}:
+  %low{number} = and i32 %status{number}, {(1 << STATUS_BITS) - 1}
+  %result{number} = or i32 %low{number}, {stage << STATUS_BITS}
+  ret i32 %result{number}
+next{number}:"""
+        )
+
+    def move(stage: int, moved: Move, row: str) -> None:
+        number = len(calls)
+        calls.append(
+            f"""
+  %offset{number} = mul i64 {row}, {moved.row_size}
+  %place{number} = add i64 %offset{number}, {moved.rows}
+  %row{number} = inttoptr i64 %place{number} to ptr"""
+        )
+        references = _pointer(ctypes.addressof(moved.references))
+        call(stage, moved.function, f"ptr {references}, i64 {len(moved.references)}, ptr %row{number}")
+
+    for setter in setters:
+        move(SETTING, setter, "%in")
+    call(STEPPING, do_step, f"double %time, double {_double(step_size)}, i32 1")
+    for getter in getters:
+        move(GETTING, getter, "%out")
+    return _compiled(f"define i32 @step(i64 %in, double %time, i64 %out) {{{''.join(calls)}\n  ret i32 0\n}}")
+
+
+def _address(function: Callable[..., int]) -> int:
+    return ctypes.cast(function, ctypes.c_void_p).value or 0  # type: ignore[arg-type]  # it is one of ctypes' own
+
+
+def _pointer(address: int) -> str:
+    return f"inttoptr (i64 {address} to ptr)"
+
+
+def _double(value: float) -> str:
+    """A double in LLVM's own notation, bit by bit."""
+    return f"0x{struct.unpack('<Q', struct.pack('<d', value))[0]:016X}"
+
+
+def _compiled(text: str) -> Fused:
+    llvm = _llvm()
+    machine = llvm.Target.from_default_triple().create_target_machine(opt=1)
+    engine = llvm.create_mcjit_compiler(llvm.parse_assembly(text), machine)
+    engine.finalize_object()
+    address = engine.get_function_address("step")
+    return Fused(hot(ctypes.CFUNCTYPE(ctypes.c_int)(address), _DECLARATION), engine)
+
+
+@cache
+def _llvm() -> Any:  # noqa: ANN401 llvmlite is untyped
+    """llvmlite, loaded when the first instance is bound: the other processes of a mesh do without it."""
+    try:
+        import llvmlite.binding as llvm  # noqa: PLC0415 as above
+    except ImportError:  # there is none for this platform
+        return None
+    llvm.initialize_native_target()
+    llvm.initialize_native_asmprinter()
+    return llvm
