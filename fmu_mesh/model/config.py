@@ -100,7 +100,7 @@ class SimulationConfig(Base, frozen=True, kw_only=True):
         Literal["auto"] | Annotated[int, Meta(ge=1)],
         Meta(
             description="How many points a node may run ahead of the slowest; 1 is strict lockstep; "
-            "auto: up to 4096, where the instances are fast."
+            "auto: up to 16384, where the instances are fast."
         ),
     ] = "auto"
     real_time_factor: Annotated[
