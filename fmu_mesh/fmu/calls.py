@@ -12,7 +12,7 @@ from typing import Any, TypeAlias
 
 from cffi import FFI
 
-__all__ = ["Function", "Pointer", "hot", "memory", "pointer"]
+__all__ = ["Function", "Pointer", "Rows", "hot", "memory", "pointer"]
 
 Pointer: TypeAlias = Any
 """A C pointer to anything."""
@@ -38,6 +38,25 @@ def hot(function: Function, declaration: str) -> Function:
 def pointer(address: int | None) -> Pointer:
     """An address as an argument of what `hot` returns."""
     return _ffi.cast("void *", address or 0)
+
+
+class Rows(dict[int, Pointer]):
+    """The rows of an array as arguments of what `hot` returns, by number; a pointer is made when it is first needed.
+
+    Args:
+        address: of row 0.
+        row_size: from one row to the next, in bytes.
+    """
+
+    def __init__(self, address: int, row_size: int) -> None:
+        super().__init__()
+        self.address = address
+        self.row_size = row_size
+
+    def __missing__(self, row: int) -> Pointer:
+        """The pointer to a row, made now."""
+        made = self[row] = pointer(self.address + row * self.row_size)
+        return made
 
 
 def memory(array: ctypes.Array[Any]) -> Pointer:

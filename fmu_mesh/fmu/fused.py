@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from functools import cache
 from typing import Any, Final, NamedTuple
 
-from .calls import Function, hot
+from .calls import Function, Rows, hot
 
 __all__ = ["GETTING", "SETTING", "STATUS_BITS", "STEPPING", "Fused", "Move", "fuse"]
 
@@ -40,14 +40,12 @@ class Move(NamedTuple):
     Attributes:
         function: as ctypes has it; its arguments are component, references, their number, and a row.
         references: the value references.
-        rows: address of row 0.
-        row_size: from one row to the next, in bytes.
+        rows: where they are.
     """
 
     function: Callable[..., int]
     references: ctypes.Array[ctypes.c_uint]
-    rows: int
-    row_size: int
+    rows: Rows
 
 
 def fuse(
@@ -80,8 +78,8 @@ next{number}:"""
         number = len(calls)
         calls.append(
             f"""
-  %offset{number} = mul i64 {row}, {moved.row_size}
-  %place{number} = add i64 %offset{number}, {moved.rows}
+  %offset{number} = mul i64 {row}, {moved.rows.row_size}
+  %place{number} = add i64 %offset{number}, {moved.rows.address}
   %row{number} = inttoptr i64 %place{number} to ptr"""
         )
         references = _pointer(ctypes.addressof(moved.references))

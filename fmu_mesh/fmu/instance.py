@@ -25,7 +25,7 @@ from ..model.values import to_value
 from ..simtime import TimeGrid
 from .archive import Terms
 from .buffers import Buffer
-from .calls import Function, Pointer, hot, memory, pointer
+from .calls import Function, Pointer, Rows, hot, memory, pointer
 from .fused import Move
 from .sources import extract
 from .state import KeepsFmuState, Standing
@@ -37,7 +37,7 @@ WARNING: Final = 1
 STATUS_NAMES: Final = ("ok", "warning", "discard", "error", "fatal", "pending")
 
 Verb = Literal["Get", "Set"]
-DirectCall = tuple[Function, Pointer, int, list[Pointer], int]
+DirectCall = tuple[Function, Pointer, int, Rows, int]
 """A function on ring memory: it, the value references and their number, each row, number of values."""
 
 
@@ -273,11 +273,11 @@ class FmuInstance(KeepsFmuState, ABC):
         variables = [self._variables[column.name] for column in part.columns]
         function = self._function(verb, part.type)
         if self._is_direct(part):
-            rows = [pointer(array.ctypes.data + slot * array.strides[0]) for slot in range(len(array))]
+            rows = Rows(array.ctypes.data, array.strides[0])
             calls = self._direct_setters if verb == "Set" else self._direct_getters
             called, references = hot(function, self._direct_declaration), _references(variables)
             calls.append((called, memory(references), len(variables), rows, part.width))
-            self._moves[verb].append(Move(function, references, array.ctypes.data, array.strides[0]))
+            self._moves[verb].append(Move(function, references, rows))
             return
         buffer = self._buffer(part.type, variables)
         names = [variable.name for variable in variables]

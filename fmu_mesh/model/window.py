@@ -24,7 +24,7 @@ LAZY_ROWS = 2048
 AUTO_WINDOW_POINTS = 16384
 AUTO_WINDOW_BYTES = 16 * 2**20
 AUTO_WINDOW_ROWS = 65536
-"""Of all instances together; each row is kept with the pointers to its values, too."""
+"""Of all instances together; where a step goes call by call, each row is kept with a pointer to it, too."""
 
 STEADY_POINTS = 1024
 """So far the grant may be ahead at any speed; how far beyond that depends on it."""

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 from fmu_mesh.fmu import fused, open_instance, read_description
+from fmu_mesh.fmu.calls import Rows
 from fmu_mesh.fmu.fused import GETTING, SETTING, STATUS_BITS, STEPPING, Fused, Move, fuse
 from fmu_mesh.model.ring import Layout, Ring
 from fmu_mesh.simtime import TimeGrid
@@ -49,7 +50,7 @@ class Recorded:
             return self._statuses.get(name, 0)
 
         self._keep.append(_MOVE(moved))
-        return Move(self._keep[-1], array, self.rows, ROW_SIZE)
+        return Move(self._keep[-1], array, Rows(self.rows, ROW_SIZE))
 
     def _stepped(self, component: int, time: float, step_size: float, no_set_state: int) -> int:
         self.calls.append(("step", component, time, step_size, no_set_state))
