@@ -9,6 +9,7 @@ import pytest
 from fmu_mesh.errors import ConfigurationError
 from fmu_mesh.model.plan import RECORDER, Plan, make_plan
 from fmu_mesh.model.ring import rows_for
+from fmu_mesh.model.window import recorder_window
 from tests.scenarios.scenario import Scenario
 
 
@@ -108,8 +109,23 @@ def test_rings_hold_what_can_be_under_way(window: int, slowest: int) -> None:
 def test_an_automatic_window_is_large_and_one_that_is_given_counts() -> None:
     system = Scenario(("a -> b",)).plan().system
 
-    assert make_plan(system).window == 4096
+    assert make_plan(system).window == 16384
     assert make_plan(system, window=3).window == 3
+
+
+@pytest.mark.parametrize(
+    ("window", "row_sizes", "expected"),
+    [
+        (16, [8, 24], 32768),
+        (40_000, [8], 40_000),
+        (16, [80_000], 8192),
+        (16, [8] * 40, 2**24 // (40 * (8 + 32))),
+    ],
+)
+def test_the_recorder_may_be_further_behind_where_its_rows_are_narrow(
+    window: int, row_sizes: list[int], expected: int
+) -> None:
+    assert recorder_window(window, row_sizes) == expected
 
 
 def test_the_automatic_window_of_many_instances_is_smaller() -> None:
