@@ -12,7 +12,7 @@ from typing import Any, TypeAlias
 
 from cffi import FFI
 
-__all__ = ["Function", "Pointer", "Rows", "hot", "memory", "pointer"]
+__all__ = ["DirectCall", "Function", "Pointer", "Rows", "address_of", "hot", "memory", "pointer"]
 
 Pointer: TypeAlias = Any
 """A C pointer to anything."""
@@ -57,6 +57,15 @@ class Rows(dict[int, Pointer]):
         """The pointer to a row, made now."""
         made = self[row] = pointer(self.address + row * self.row_size)
         return made
+
+
+DirectCall: TypeAlias = tuple[Function, Pointer, int, Rows, int]
+"""A function on ring memory: it, the value references and their number, each row, number of values."""
+
+
+def address_of(made: Function | Pointer) -> int:
+    """The address of what `hot`, `pointer` or `memory` made."""
+    return int(_ffi.cast("uintptr_t", made))  # type: ignore[arg-type]  # it is one of cffi's own
 
 
 def memory(array: ctypes.Array[Any]) -> Pointer:

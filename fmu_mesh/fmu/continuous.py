@@ -150,14 +150,6 @@ class ContinuousInstance(FmuInstance):
         loop.event(lambda: self._set_inputs(slot))
         loop.extrapolate = self._line(slot, time)
 
-    def _set_inputs(self, slot: int) -> None:
-        for function, references, count, rows, size in self._direct_setters:
-            status = self._call_direct(function, references, count, rows[slot], size)
-            if status > WARNING:
-                raise self._failed(f"setting the inputs returned {STATUS_NAMES[status]}")
-        for set_row in self._setters:
-            set_row(slot)
-
     def _line(self, slot: int, start: float) -> Callable[[float], None] | None:
         """What sets the linear inputs at a time within a step that starts at ``start`` (s); None if none changes."""
         slopes = {name: slope for name, slope in self._slopes.items() if slope != 0.0}

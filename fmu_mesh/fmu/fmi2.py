@@ -139,13 +139,7 @@ class Fmi2Instance(Fmi2Values):
 
     def _step_by_calls(self, step: int) -> None:
         """`do_step` where something is between the rows and the FMU: a conversion, or a step that is retried."""
-        slot = step & self._input_mask
-        for setter, references, count, rows, _ in self._direct_setters:
-            status = setter(self._self, references, count, rows[slot])
-            if status > WARNING:
-                raise self._failed(f"setting the inputs returned {STATUS_NAMES[status]}")
-        for set_row in self._setters:
-            set_row(slot)
+        self._set_inputs(step & self._input_mask)
         time = self._start_time + step * self._points * self._base_step_size
         status = self._do_step(self._self, time, self._step_size, 1)
         if status > WARNING:
@@ -154,8 +148,7 @@ class Fmi2Instance(Fmi2Values):
         self._read_outputs((step + 1) & self._output_mask)
 
     def _fuse(self) -> Fused | None:
-        moves, do_step = self._moves, self._fmu.dll.fmi2DoStep
-        return fuse(self._component, moves["Set"], do_step, self._step_size, moves["Get"])
+        return fuse(self._self, self._direct_setters, self._plain_do_step, self._step_size, self._direct_getters)
 
     def _finish_fused(self, outcome: int, step: int) -> None:
         """What follows from a status above warning, as in `_step_by_calls`."""

@@ -15,8 +15,9 @@ from ..errors import FmuError, TerminationRequested
 from ..model.ring import Part, Ring
 from ..model.types import Value
 from ..simtime import TimeGrid
+from .calls import DirectCall
 from .fmi3_steps import Fmi3Steps
-from .instance import STATUS_NAMES, WARNING, DirectCall, FmuInstance, Verb
+from .instance import STATUS_NAMES, WARNING, FmuInstance, Verb
 from .solver import SolverFailed
 from .state import Standing
 

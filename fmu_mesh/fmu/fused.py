@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import ctypes
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import cache
 from typing import Any, Final, NamedTuple
 
-from .calls import Function, Rows, hot
+from .calls import DirectCall, Function, Pointer, address_of, hot
+from .instance import WARNING
 
-__all__ = ["GETTING", "SETTING", "STATUS_BITS", "STEPPING", "Fused", "Move", "fuse"]
+__all__ = ["GETTING", "SETTING", "STATUS_BITS", "STEPPING", "Fused", "fuse"]
 
 SETTING: Final = 1
 STEPPING: Final = 2
@@ -23,7 +24,6 @@ GETTING: Final = 3
 STATUS_BITS: Final = 24
 
 _DECLARATION: Final = "int (*)(size_t, double, size_t)"
-_WARNING: Final = 1
 _POINTER_BYTES: Final = 8
 
 
@@ -34,22 +34,12 @@ class Fused(NamedTuple):
     engine: Any
 
 
-class Move(NamedTuple):
-    """A getter or setter of FMI 2.0 on the rows of a ring.
-
-    Attributes:
-        function: as ctypes has it; its arguments are component, references, their number, and a row.
-        references: the value references.
-        rows: where they are.
-    """
-
-    function: Callable[..., int]
-    references: ctypes.Array[ctypes.c_uint]
-    rows: Rows
-
-
 def fuse(
-    component: int, setters: Sequence[Move], do_step: Callable[..., int], step_size: float, getters: Sequence[Move]
+    component: Pointer,
+    setters: Sequence[DirectCall],
+    do_step: Function,
+    step_size: float,
+    getters: Sequence[DirectCall],
 ) -> Fused | None:
     """Compile ``(input row, time in s, output row)``: set the inputs, step by ``step_size`` (s), get the outputs.
 
@@ -60,12 +50,12 @@ def fuse(
         return None
     calls: list[str] = []
 
-    def call(stage: int, function: Callable[..., int], arguments: str) -> None:
+    def call(stage: int, function: Function, arguments: str) -> None:
         number = len(calls)
         calls.append(
             f"""
-  %status{number} = call i32 {_pointer(_address(function))}(ptr {_pointer(component)}, {arguments})
-  %above{number} = icmp sgt i32 %status{number}, {_WARNING}
+  %status{number} = call i32 {_pointer(function)}(ptr {_pointer(component)}, {arguments})
+  %above{number} = icmp sgt i32 %status{number}, {WARNING}
   br i1 %above{number}, label %end{number}, label %next{number}
 end{number}:
   %low{number} = and i32 %status{number}, {(1 << STATUS_BITS) - 1}
@@ -74,16 +64,16 @@ end{number}:
 next{number}:"""
         )
 
-    def move(stage: int, moved: Move, row: str) -> None:
+    def move(stage: int, moved: DirectCall, row: str) -> None:
+        function, references, count, rows, _ = moved
         number = len(calls)
         calls.append(
             f"""
-  %offset{number} = mul i64 {row}, {moved.rows.row_size}
-  %place{number} = add i64 %offset{number}, {moved.rows.address}
+  %offset{number} = mul i64 {row}, {rows.row_size}
+  %place{number} = add i64 %offset{number}, {rows.address}
   %row{number} = inttoptr i64 %place{number} to ptr"""
         )
-        references = _pointer(ctypes.addressof(moved.references))
-        call(stage, moved.function, f"ptr {references}, i64 {len(moved.references)}, ptr %row{number}")
+        call(stage, function, f"ptr {_pointer(references)}, i64 {count}, ptr %row{number}")
 
     for setter in setters:
         move(SETTING, setter, "%in")
@@ -93,12 +83,8 @@ next{number}:"""
     return _compiled(f"define i32 @step(i64 %in, double %time, i64 %out) {{{''.join(calls)}\n  ret i32 0\n}}")
 
 
-def _address(function: Callable[..., int]) -> int:
-    return ctypes.cast(function, ctypes.c_void_p).value or 0  # type: ignore[arg-type]  # it is one of ctypes' own
-
-
-def _pointer(address: int) -> str:
-    return f"inttoptr (i64 {address} to ptr)"
+def _pointer(made: Function | Pointer) -> str:
+    return f"inttoptr (i64 {address_of(made)} to ptr)"
 
 
 def _double(value: float) -> str:

@@ -25,8 +25,7 @@ from ..model.values import to_value
 from ..simtime import TimeGrid
 from .archive import Terms
 from .buffers import Buffer
-from .calls import Function, Pointer, Rows, hot, memory, pointer
-from .fused import Move
+from .calls import DirectCall, Function, Pointer, Rows, hot, memory, pointer
 from .sources import extract
 from .state import KeepsFmuState, Standing
 
@@ -37,8 +36,6 @@ WARNING: Final = 1
 STATUS_NAMES: Final = ("ok", "warning", "discard", "error", "fatal", "pending")
 
 Verb = Literal["Get", "Set"]
-DirectCall = tuple[Function, Pointer, int, Rows, int]
-"""A function on ring memory: it, the value references and their number, each row, number of values."""
 
 
 class LogMessage(msgspec.Struct, frozen=True):
@@ -170,7 +167,6 @@ class FmuInstance(KeepsFmuState, ABC):
         self._input_mask = inputs.mask
         self._output_mask = outputs[0].mask
         self._keep = [inputs, *outputs]
-        self._moves: dict[Verb, list[Move]] = {"Set": [], "Get": []}
         self._direct_setters: list[DirectCall] = []
         self._direct_getters: list[DirectCall] = []
         self._setters: list[Callable[[int], None]] = []
@@ -275,9 +271,8 @@ class FmuInstance(KeepsFmuState, ABC):
         if self._is_direct(part):
             rows = Rows(array.ctypes.data, array.strides[0])
             calls = self._direct_setters if verb == "Set" else self._direct_getters
-            called, references = hot(function, self._direct_declaration), _references(variables)
-            calls.append((called, memory(references), len(variables), rows, part.width))
-            self._moves[verb].append(Move(function, references, rows))
+            called = hot(function, self._direct_declaration)
+            calls.append((called, memory(_references(variables)), len(variables), rows, part.width))
             return
         buffer = self._buffer(part.type, variables)
         names = [variable.name for variable in variables]
@@ -297,6 +292,14 @@ class FmuInstance(KeepsFmuState, ABC):
             self._setters.append(set_row)
         else:
             self._getters.append(get_row)
+
+    def _set_inputs(self, slot: int) -> None:
+        for function, references, count, rows, size in self._direct_setters:
+            status = self._call_direct(function, references, count, rows[slot], size)
+            if status > WARNING:
+                raise self._failed(f"setting the inputs returned {STATUS_NAMES[status]}")
+        for set_row in self._setters:
+            set_row(slot)
 
     def _read_outputs(self, slot: int) -> None:
         for function, references, count, rows, size in self._direct_getters:

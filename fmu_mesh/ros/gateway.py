@@ -119,9 +119,7 @@ class Gateway:
                 continue
             event()
         late = latecomers(self._events)
-        while not self._ended and self._watches and self._complete < self._grid.last_point:
-            if (late_event := next(late, None)) is None:
-                return
+        while not self._is_over() and (late_event := next(late, None)) is not None:
             late_event()
 
     def end(self) -> None:
@@ -225,6 +223,10 @@ class Gateway:
             self._events.put(self._end_mesh)
         elif self._mesh_ended:  # it is another run, or this process was let go of: its samples are not all there
             self.end()
+
+    def _is_over(self) -> bool:
+        """Whether nothing is left to be carried."""
+        return self._ended or not self._watches or self._complete >= self._grid.last_point
 
     def _end_mesh(self) -> None:
         self._mesh_ended = True

@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 
 from fmu_mesh.fmu import fused, open_instance, read_description
-from fmu_mesh.fmu.calls import Rows
-from fmu_mesh.fmu.fused import GETTING, SETTING, STATUS_BITS, STEPPING, Fused, Move, fuse
+from fmu_mesh.fmu.calls import DirectCall, Rows, hot, memory, pointer
+from fmu_mesh.fmu.fused import GETTING, SETTING, STATUS_BITS, STEPPING, Fused, fuse
 from fmu_mesh.model.ring import Layout, Ring
 from fmu_mesh.simtime import TimeGrid
 from tests.fmus.helpers import FMUS
@@ -34,14 +34,15 @@ class Recorded:
         self._keep: list[Any] = []
         self._setters = [self._move("set_real", 3, 1), self._move("set_integer", 5)]
         self._getters = [self._move("get_real", 7, 8, 9)]
-        self._step = _STEP(self._stepped)
+        self._keep.append(_STEP(self._stepped))
+        self._step = hot(self._keep[-1], "int (*)(void *, double, double, int)")
 
     def fuse(self) -> Fused:
-        one = fuse(COMPONENT, self._setters, self._step, 0.1, self._getters)
+        one = fuse(pointer(COMPONENT), self._setters, self._step, 0.1, self._getters)
         assert one is not None
         return one
 
-    def _move(self, name: str, *references: int) -> Move:
+    def _move(self, name: str, *references: int) -> DirectCall:
         array = (ctypes.c_uint * len(references))(*references)
 
         def moved(component: int, values: int, count: int, row: int) -> int:
@@ -50,7 +51,8 @@ class Recorded:
             return self._statuses.get(name, 0)
 
         self._keep.append(_MOVE(moved))
-        return Move(self._keep[-1], array, Rows(self.rows, ROW_SIZE))
+        called = hot(self._keep[-1], "int (*)(void *, void *, size_t, void *)")
+        return called, memory(array), len(references), Rows(self.rows, ROW_SIZE), len(references)
 
     def _stepped(self, component: int, time: float, step_size: float, no_set_state: int) -> int:
         self.calls.append(("step", component, time, step_size, no_set_state))
