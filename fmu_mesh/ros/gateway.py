@@ -219,10 +219,7 @@ class Gateway:
             log.warning("%d samples were left out: the mesh is faster than ROS can be told", count)
 
     def _token_changed(self, sample: zenoh.Sample) -> None:
-        if sample.kind == zenoh.SampleKind.DELETE:
-            self._events.put(self._end_mesh)
-        elif self._mesh_ended:  # it is another run, or this process was let go of: its samples are not all there
-            self.end()
+        self._events.put(self._end_mesh if sample.kind == zenoh.SampleKind.DELETE else self._meet_mesh)
 
     def _is_over(self) -> bool:
         """Whether nothing is left to be carried."""
@@ -230,6 +227,10 @@ class Gateway:
 
     def _end_mesh(self) -> None:
         self._mesh_ended = True
+
+    def _meet_mesh(self) -> None:
+        """If it had gone, it is another run, or this process was let go of: its samples are not all there."""
+        self._ended = self._ended or self._mesh_ended
 
     def _end(self) -> None:
         self._ended = True
