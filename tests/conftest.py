@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,9 @@ from tests.helpers import Place
 # How long an example takes says more about the machine than about the code; a failure must be the same everywhere.
 settings.register_profile("fmu_mesh", deadline=None, derandomize=True, print_blob=True)
 settings.load_profile("fmu_mesh")
+
+# A script that starts the tests in the background has Ctrl-C ignored, and what tests start inherits that.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.hookimpl(wrapper=True)

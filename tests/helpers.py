@@ -14,7 +14,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Any, Self, TypeVar
@@ -198,11 +198,7 @@ class Place:
     def left(self) -> list[str]:
         """In words what is there: processes, and files, folders and sockets of runs."""
         found = [f"process {process.pid}: {' '.join(_command(process))}" for process in self.processes()]
-        for folder in (self._runtime, self._temporary):
-            # Unlike `Path.rglob`, this bears with folders that are removed while it looks.
-            for parent, folders, files in os.walk(folder):
-                found += [str(Path(parent, name)) for name in sorted(folders + files)]
-        return found
+        return [*found, *(str(path) for folder in (self._runtime, self._temporary) for path in _within(folder))]
 
     def assert_nothing_left(self, within_s: float = 0.0) -> None:
         """Nothing may be left, ``within_s`` seconds from now."""
@@ -218,7 +214,17 @@ class Place:
 
     def extracted(self) -> list[Path]:
         """The folders of extracted FMUs."""
-        return [path.parent for path in self.folder.rglob("modelDescription.xml")]
+        return [path.parent for path in _within(self.folder) if path.name == "modelDescription.xml"]
+
+    def sockets(self) -> list[Path]:
+        """The sockets of processes that listen for others."""
+        return [path for path in _within(self.folder) if path.suffix == ".sock"]
+
+
+def _within(folder: Path) -> Iterator[Path]:
+    """All that is in a folder; unlike `Path.rglob`, this bears with folders that are removed while it looks."""
+    for parent, folders, files in os.walk(folder):
+        yield from (Path(parent, name) for name in sorted(folders + files))
 
 
 class Launched:

@@ -17,7 +17,7 @@ def start(place: Place, config: Path, role: str, *options: str) -> Launched:
 
 def wait_until_there(place: Place, count: int) -> None:
     """Wait until so many processes listen for others."""
-    wait_until(lambda: len(list(place.folder.rglob("*.sock"))) == count, f"{count} processes that listen")
+    wait_until(lambda: len(place.sockets()) == count, f"{count} processes that listen")
 
 
 @pytest.mark.parametrize(

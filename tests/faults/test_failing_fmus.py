@@ -16,7 +16,15 @@ from tests.fmus.helpers import find_fmu
 from tests.helpers import Place, rows_of, wait_until, write_config
 
 
-def with_faulty(place: Place, faulty: Path, start_values: Mapping[str, float | bool], **timeouts: float) -> Path:
+def with_faulty(
+    place: Place,
+    faulty: Path,
+    start_values: Mapping[str, float | bool],
+    *,
+    simulation: Mapping[str, float] | None = None,
+    timeouts: Mapping[str, float] | None = None,
+    zenoh: Mapping[str, bool] | None = None,
+) -> Path:
     """A pendulum that feeds the FMU with faults for two seconds in steps of 1 ms."""
     return write_config(
         place.folder,
@@ -26,7 +34,9 @@ def with_faulty(place: Place, faulty: Path, start_values: Mapping[str, float | b
         },
         connections=["pendulum.a -> faulty.u"],
         stop_time=2.0,
-        timeouts=timeouts,
+        simulation=simulation or {},
+        timeouts=timeouts or {},
+        zenoh=zenoh or {},
     )
 
 
@@ -57,9 +67,43 @@ def test_a_failed_step_is_told_with_instance_point_time_and_the_message_of_the_f
     )
     assert f"faulty at point 1000: {says.partition('.')[0]}" in launched.errors  # as it came, too
     assert "Traceback" not in launched.errors
-    # In one process all is there; of several, one may not have sent its last rows when it hears of the failure.
-    assert len(rows) == 1001 if options else len(rows) <= 1001
+    assert [row[0] for row in rows] == [point * 0.001 for point in range(1001)]
+    place.assert_nothing_left()
+
+
+@pytest.mark.parametrize("simulation", [{}, {"window": 1}, {"real_time_factor": 1}], ids=["auto", "lockstep", "paced"])
+@pytest.mark.parametrize("zenoh", [{}, {"shared_memory": False}], ids=["shared", "zenoh"])
+def test_when_an_fmu_fails_all_rows_before_are_kept(
+    place: Place, faulty: Path, simulation: dict[str, float], zenoh: dict[str, bool]
+) -> None:
+    """The other node hears of it, and has rows that it had not sent yet: nobody steps on them."""
+    config = with_faulty(place, faulty, {"fail_at": 0.5}, simulation=simulation, zenoh=zenoh)
+
+    launched = place.run("launch", config)
+
+    assert launched.wait() == 3
+    assert [row[0] for row in rows_of(config.with_suffix(".csv"))] == [point * 0.001 for point in range(501)]
+    place.assert_nothing_left()
+
+
+def test_nobody_waits_long_for_the_last_rows_of_a_node_whose_fmu_does_not_return(place: Place, faulty: Path) -> None:
+    config = write_config(
+        place.folder,
+        instances={
+            "stuck": {"fmu": str(faulty), "start_values": {"hang_at": 0.2}},
+            "failing": {"fmu": str(faulty), "start_values": {"fail_at": 0.5}},
+        },
+        connections=[],
+        stop_time=2.0,
+    )
+
+    launched = place.run("launch", config)
+
+    assert launched.wait() == 3
+    assert launched.message.startswith("fmu-mesh: instance failing, point 500, t = 0.5 s: ")
+    rows = rows_of(config.with_suffix(".csv"))
     assert [row[0] for row in rows] == [point * 0.001 for point in range(len(rows))]
+    assert 1 <= len(rows) <= 201
     place.assert_nothing_left()
 
 
@@ -108,7 +152,7 @@ def test_an_fmu_that_aborts_takes_only_its_own_process_with_it(place: Place, fau
 
 
 def test_an_fmu_that_does_not_return_meets_the_deadline_of_a_step(place: Place, faulty: Path) -> None:
-    config = with_faulty(place, faulty, {"hang_at": 1.0}, step=1.0)
+    config = with_faulty(place, faulty, {"hang_at": 1.0}, timeouts={"step": 1.0})
 
     launched = place.run("launch", config)
 
@@ -117,6 +161,7 @@ def test_an_fmu_that_does_not_return_meets_the_deadline_of_a_step(place: Place, 
         "fmu-mesh: instance faulty, point 1000, t = 1 s: the FMU has not returned for 1."
     )
     assert "`timeouts.step`" in launched.message
+    assert len(rows_of(config.with_suffix(".csv"))) == 1001
     place.assert_nothing_left()
 
 
