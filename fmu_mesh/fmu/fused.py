@@ -10,9 +10,9 @@ from __future__ import annotations
 import ctypes
 import struct
 from collections.abc import Sequence
-from functools import cache
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
+from ..compiled import Compiled, compile_function
 from .calls import DirectCall, Function, Pointer, address_of, hot
 from .instance import WARNING
 
@@ -24,14 +24,13 @@ GETTING: Final = 3
 STATUS_BITS: Final = 24
 
 _DECLARATION: Final = "int (*)(size_t, double, size_t)"
-_POINTER_BYTES: Final = 8
 
 
 class Fused(NamedTuple):
-    """A compiled function, and what owns its code."""
+    """A compiled function as it is called, and where it is."""
 
     call: Function
-    engine: Any
+    code: Compiled
 
 
 def fuse(
@@ -46,8 +45,6 @@ def fuse(
     The function returns 0. At the first status above warning it calls nothing more, and returns
     ``stage << STATUS_BITS | status``. The references and the rings have to be kept alive for it. FMI 2.0, 4.2.1.
     """
-    if _llvm() is None or struct.calcsize("P") != _POINTER_BYTES:
-        return None
     calls: list[str] = []
 
     def call(stage: int, function: Function, arguments: str) -> None:
@@ -80,7 +77,10 @@ next{number}:"""
     call(STEPPING, do_step, f"double %time, double {_double(step_size)}, i32 1")
     for getter in getters:
         move(GETTING, getter, "%out")
-    return _compiled(f"define i32 @step(i64 %in, double %time, i64 %out) {{{''.join(calls)}\n  ret i32 0\n}}")
+    text = f"define i32 @step(i64 %in, double %time, i64 %out) {{{''.join(calls)}\n  ret i32 0\n}}"
+    if (step := compile_function("step", text)) is None:
+        return None
+    return Fused(hot(ctypes.CFUNCTYPE(ctypes.c_int)(step.address), _DECLARATION), step)
 
 
 def _pointer(made: Function | Pointer) -> str:
@@ -90,24 +90,3 @@ def _pointer(made: Function | Pointer) -> str:
 def _double(value: float) -> str:
     """A double in LLVM's own notation, bit by bit."""
     return f"0x{struct.unpack('<Q', struct.pack('<d', value))[0]:016X}"
-
-
-def _compiled(text: str) -> Fused:
-    llvm = _llvm()
-    machine = llvm.Target.from_default_triple().create_target_machine(opt=1)
-    engine = llvm.create_mcjit_compiler(llvm.parse_assembly(text), machine)
-    engine.finalize_object()
-    address = engine.get_function_address("step")
-    return Fused(hot(ctypes.CFUNCTYPE(ctypes.c_int)(address), _DECLARATION), engine)
-
-
-@cache
-def _llvm() -> Any:  # noqa: ANN401 llvmlite is untyped
-    """llvmlite, loaded when the first instance is bound: the other processes of a mesh do without it."""
-    try:
-        import llvmlite.binding as llvm  # noqa: PLC0415 as above
-    except ImportError:  # there is none for this platform
-        return None
-    llvm.initialize_native_target()
-    llvm.initialize_native_asmprinter()
-    return llvm

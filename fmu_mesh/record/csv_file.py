@@ -22,11 +22,12 @@ from numpy.typing import NDArray
 
 from ..files import open_alone
 from ..model.types import Value, VariableType, is_text
+from .lines import in_lines, prepare
 
 __all__ = ["CsvFile"]
 
-_CHUNK_ROWS = 1024
-_COMMA, _NEWLINE = b",\n"
+_CHUNK_NUMBERS = 4096
+"""What is formatted at once: more would not stay in the cache, and its memory would come from the system each time."""
 
 
 class CsvFile:
@@ -45,6 +46,9 @@ class CsvFile:
         self.rows = 0
         self._has_text = any(is_text(type_) for _, type_ in columns)
         self._is_float = all(type_ == "Float64" for _, type_ in columns)
+        self._chunk_rows = max(1, _CHUNK_NUMBERS // (1 + len(columns)))
+        if not self._has_text:
+            prepare()
         self._file = open_alone(path)
         header = io.StringIO()
         csv.writer(header, lineterminator="\n").writerow(["time", *(name for name, _ in columns)])
@@ -60,8 +64,8 @@ class CsvFile:
 
     def write(self, times: NDArray[np.float64], columns: Sequence[NDArray[Any]]) -> None:
         """Append one row per time; ``columns`` are arrays of the same length, of their types' dtypes."""
-        for first in range(0, len(times), _CHUNK_ROWS):
-            part = slice(first, first + _CHUNK_ROWS)
+        for first in range(0, len(times), self._chunk_rows):
+            part = slice(first, first + self._chunk_rows)
             chunk = [times[part], *(column[part] for column in columns)]
             self._file.write(self._format(chunk))
         self.rows += len(times)
@@ -79,20 +83,11 @@ class CsvFile:
         if self._is_float:
             values = np.stack(columns, axis=1)
             if np.isfinite(values).all():
-                return _in_rows(orjson.dumps(values.ravel(), option=orjson.OPT_SERIALIZE_NUMPY), len(columns))
+                return in_lines(orjson.dumps(values.ravel(), option=orjson.OPT_SERIALIZE_NUMPY), len(columns))
         rows = zip(*(column.tolist() for column in columns), strict=True)
         if self._has_text or not all(np.isfinite(column).all() for column in columns):
             return "".join(",".join(map(_text, row)) + "\n" for row in rows).encode()
-        return _in_rows(orjson.dumps(list(chain.from_iterable(rows))), len(columns))
-
-
-def _in_rows(numbers: bytes, width: int) -> memoryview:
-    """A JSON array of numbers as lines with ``width`` of them each."""
-    text = bytearray(numbers)
-    characters = np.frombuffer(text, dtype=np.uint8)
-    characters[np.flatnonzero(characters == _COMMA)[width - 1 :: width]] = _NEWLINE
-    characters[-1] = _NEWLINE
-    return memoryview(text)[1:]
+        return in_lines(orjson.dumps(list(chain.from_iterable(rows))), len(columns))
 
 
 def _text(value: Value) -> str:

@@ -9,7 +9,8 @@ from typing import Any
 
 import pytest
 
-from fmu_mesh.fmu import fused, open_instance, read_description
+from fmu_mesh import compiled
+from fmu_mesh.fmu import open_instance, read_description
 from fmu_mesh.fmu.calls import DirectCall, Rows, hot, memory, pointer
 from fmu_mesh.fmu.fused import GETTING, SETTING, STATUS_BITS, STEPPING, Fused, fuse
 from fmu_mesh.model.ring import Layout, Ring
@@ -98,7 +99,7 @@ def test_the_first_status_above_warning_ends_the_step_and_is_told_with_its_stage
 @pytest.mark.parametrize("model", ["TransportDelay", "DampedPendulum", "Integrator", "Gain"])
 def test_the_rows_are_those_of_a_step_call_by_call(model: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     together = rows_of_steps(model, tmp_path)
-    monkeypatch.setattr(fused, "_llvm", lambda: None)
+    monkeypatch.setattr(compiled, "_llvm", lambda: None)
 
     assert rows_of_steps(model, tmp_path) == together
     assert len(set(together)) > 100
