@@ -12,6 +12,7 @@ __all__ = ["Clock", "Pacer", "Reach"]
 
 _STEADY_S = 0.05
 _SPEED_S = 0.01
+_TICK_S = 1e-6
 
 
 class Clock:
@@ -53,9 +54,13 @@ class Reach:
         self._since = 0.0
 
     def points(self, slowest: int, now: float) -> int:
-        """So many, when the slowest instance is at this point; ``now`` is monotonic, in s."""
-        if self._window > STEADY_POINTS and (elapsed := now - self._since) >= _SPEED_S:
-            wanted = (slowest - self._slowest) / elapsed * _STEADY_S
+        """So many, when the slowest instance is at this point; ``now`` is monotonic, in s.
+
+        The speed is measured every 10 ms, and as soon as all of the last answer was used: at the start it is not known.
+        """
+        gone, elapsed = slowest - self._slowest, now - self._since
+        if self._window > STEADY_POINTS and (elapsed >= _SPEED_S or gone >= self._points):
+            wanted = gone * _STEADY_S / max(elapsed, _TICK_S)
             self._points = min(self._window, max(STEADY_POINTS, int(wanted)))
             self._slowest, self._since = slowest, now
         return self._points

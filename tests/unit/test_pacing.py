@@ -107,6 +107,16 @@ def test_the_grant_reaches_as_far_as_50_ms_at_the_speed_of_late_or_1024_points(
     assert reach.points(round(points_per_s), 1001.0) == expected
 
 
+def test_a_fast_start_is_not_held_up_until_the_speed_is_measured_the_next_time() -> None:
+    reach = Reach(4096)
+
+    assert reach.points(0, 1000.0) == 1024
+    assert reach.points(1023, 1000.001) == 1024
+    assert reach.points(1024, 1000.001) == 4096
+    assert reach.points(1024 + 4096, 1000.001) == 4096  # a clock that has not moved
+    assert reach.points(1024 + 4096, 1000.012) == 1024
+
+
 def test_a_small_window_is_always_used_as_a_whole() -> None:
     reach = Reach(16)
 
