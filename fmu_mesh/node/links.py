@@ -9,13 +9,13 @@ from ..model.plan import RECORDER, Link
 from ..model.ring import Layout, Ring
 from ..model.types import Value
 from ..model.window import LAZY_ROWS
-from ..wire.messages import FRAME, INITIAL
+from ..wire.messages import FRAME, HEADER, INITIAL, LAST
 from ..wire.rows import encode_frames, encode_rows
 
 __all__ = ["OutLink"]
 
 _FRAME_BYTES = 32 * 1024
-_FRAME_POINTS = 256
+_FRAME_POINTS = 1024
 
 
 class OutLink:
@@ -60,6 +60,11 @@ class OutLink:
                 self.put(message)
             first += cut
         self.sent = end
+
+    def send_last(self, end: int) -> None:
+        """The run ends early: send what is left up to own step ``end - 1``, and that there is no more."""
+        self.flush(end)
+        self.put(HEADER.pack(LAST, self.link.index, 0, end))
 
     def send_initial(self, tag: int, values: Mapping[str, Value]) -> None:
         """Send the values of one level of Initialization Mode, which ``tag`` tells; other columns are zero."""

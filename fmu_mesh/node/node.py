@@ -17,6 +17,7 @@ served by `fmu_mesh.node.serving` from snapshots.
 from __future__ import annotations
 
 import logging
+import sys
 import time
 from collections.abc import Callable
 
@@ -68,6 +69,7 @@ log = logging.getLogger(__name__)
 _LOOK_S = 0.5
 _TELL_S = 0.1
 _LAST_WORD_S = 0.3
+_ALONE_S = 60.0
 _NO_MASTER_S = 1.0
 """How long a failure waits for a master that was never seen."""
 
@@ -144,7 +146,10 @@ class Node:
                 del tokens
         except FmuMeshError as error:
             located = self._located(error)
-            self.failure_is_known = isinstance(error, _Aborted) or self._report_failure(located)
+            aborted = isinstance(error, _Aborted)
+            if aborted or not self._master_is_gone:  # its token may be gone before its last word comes
+                self._send_last_rows()
+            self.failure_is_known = aborted or self._report_failure(located)
             raise located from error
         finally:
             if watcher is not None:
@@ -159,6 +164,9 @@ class Node:
 
     def report_hang(self, error: FmuError) -> bool:
         """From a watching thread, while an FMU does not return: tell the master; whether it knows now."""
+        if not self._master_is_gone:
+            sys.setswitchinterval(_ALONE_S)  # should the FMU return now, the main thread waits until the rows are sent
+            self._send_last_rows()
         return self.server.report_hang(error, self._patience_s())
 
     # --- before the first point
@@ -373,12 +381,18 @@ class Node:
             error.time = self._plan.grid.time(runner.point)
         return error
 
+    def _send_last_rows(self) -> None:
+        """The run ends early: whoever failed, what this node has for the recorder is sent, and that it is all."""
+        running = self._activity.state == "running"
+        try:
+            for runner in self._runners.values():
+                runner.send_last(runner.step + 1 if running else 0)
+        except FmuMeshError as unreachable:
+            log.info("last_rows_not_sent", extra={"error": str(unreachable)})
+
     def _report_failure(self, error: FmuMeshError) -> bool:
         """Tell the master, unless it is the one that is gone; whether it knows now."""
         self._activity.advancing = None
-        if self._activity.state == "running":
-            for runner in self._runners.values():
-                runner.flush()
         self._activity.state = "failed"
         if self._master_is_gone:
             return True

@@ -123,6 +123,12 @@ class Runner:
             if lazy or not link.lazy:
                 link.flush(end)
 
+    def send_last(self, end: int) -> None:
+        """The run ends early: send the recorder the rows before own step ``end`` that it lacks, and that it is all."""
+        for link in self.out_links:
+            if link.lazy:
+                link.send_last(end)
+
     def flush_full(self) -> None:
         """Send the rows of those links whose frame is full."""
         end = self.step + 1

@@ -26,10 +26,11 @@ from ..wire.frames import FrameReceiver
 from ..wire.inbox import Inbox, Message
 from ..wire.keys import Keys
 from ..wire.membership import MASTER, Membership, shared_inbox
-from ..wire.messages import ABORT, FINISH, FRAME, HEADER, PROGRESS, NodeReport, decode_abort
+from ..wire.messages import ABORT, FINISH, FRAME, HEADER, LAST, PROGRESS, NodeReport, decode_abort
 from ..wire.session import ask
 from .csv_file import CsvFile
 from .result_file import OpenResult
+from .turns import Turns
 
 __all__ = ["Recorder", "unwritable"]
 
@@ -41,9 +42,10 @@ _REST_S = 0.005
 """How long frames may gather while rows come by the thousand: each frame that wakes the recorder takes a processor from
 somebody who steps, and to write many rows at once costs less."""
 
+_LEAST_REST_S = 0.0005
 _REST_ROWS = 256
-_LAST_ROWS = 8192
-"""More than come during a rest: it must not hold up the end of a run."""
+_LAST_S = 0.5
+"""How long the nodes may take to send their last rows when a run ends early."""
 
 _TELL_S = 0.1
 _FLUSH_S = 0.2
@@ -67,7 +69,7 @@ class Recorder:
         self._sources = {
             link.index: _Source(FrameReceiver(link, "the recorder", plan.ring_rows)) for link in plan.links_in
         }
-        by_name = {source.receiver.link.source: source for source in self._sources.values()}
+        by_name = {source.name: source for source in self._sources.values()}
         self._columns = [by_name[instance].column(variable) for instance, variable in plan.recorded]
         self._file = open_file(
             Path(plan.result_file or ""),
@@ -75,6 +77,7 @@ class Recorder:
         )
         self._written = 0
         self._rested = 0
+        self._rested_at = 0.0
         self._leaving = threading.Event()
         self._progress_sent = -1
         self._progress_told_at = 0.0
@@ -88,6 +91,7 @@ class Recorder:
         self._inbox = Inbox(session, self._keys.inbox(RECORDER), self._keys.wake(RECORDER), capacity, shared)
         self._membership = Membership(plan, session, self._keys, self._inbox)
         self._put_progress: Callable[[bytes], None]
+        self._turns: Turns
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
 
     @property
@@ -152,12 +156,14 @@ class Recorder:
             raise _Ended(error) from error
 
     def _meet(self) -> None:
-        self._number = self._membership.join().number
+        welcome = self._membership.join()
+        self._number = welcome.number
+        self._turns = Turns(len({link.source_node for link in self._plan.links_in}.intersection(welcome.shared)))
         self._put_progress = self._membership.sender(MASTER, self._keys.progress())
 
     def _record(self) -> None:
         """Take what comes, write rows when they are many or nothing more is there, and tell the progress."""
-        heard = time.monotonic()
+        heard = self._rested_at = time.monotonic()
         while not self._finished:
             message = self._inbox.poll()
             if message is None:
@@ -175,21 +181,33 @@ class Recorder:
                 raise DeadlineExceeded("the recorder heard nothing from the master")
 
     def _rest(self) -> None:
-        """Let frames gather, if many rows have come since the last rest and many are left."""
-        written, last_point = self._written, self._plan.grid.last_point
-        if written - self._rested >= _REST_ROWS and last_point - written > _LAST_ROWS:
-            self._rested = written
-            self._leaving.wait(_REST_S)
+        """Let frames gather, if many rows have come since the last rest.
+
+        At most for a quarter of the time that the run still takes at the speed of late: its end waits for nobody.
+        """
+        written, now = self._written, time.monotonic()
+        came = written - self._rested
+        if came < _REST_ROWS:
+            return
+        left_s = (self._plan.grid.last_point - written) * (now - self._rested_at) / came
+        rest_s = min(_REST_S, left_s / 4)
+        if rest_s >= _LEAST_REST_S:
+            self._rested, self._rested_at = written, now
+            self._turns.next()
+            self._leaving.wait(rest_s)
 
     def _take(self, message: Message) -> None:
         kind, number, count, point, data = message
         if kind == FRAME:
             self._sources[number].receiver.take(point, count, data)
+        elif kind == LAST:
+            self._sources[number].ended = True
         elif kind == FINISH:
             self._finished = True
         elif kind == ABORT:
-            self._drain()
-            raise _Ended(from_report(decode_abort(data)))
+            cause = from_report(decode_abort(data))
+            self._take_last_rows(cause)
+            raise _Ended(cause)
 
     def _complete(self) -> int:
         """The last point whose row is complete, or -1."""
@@ -213,11 +231,31 @@ class Recorder:
             self._flushed = now
             self._file.flush()
 
-    def _drain(self) -> None:
-        """Take the frames that have come but were not looked at; what they complete is written before the end."""
-        while (message := self._inbox.poll()) is not None:
-            if message[0] == FRAME:
+    def _take_last_rows(self, cause: FmuMeshError) -> None:
+        """Take the frames that are still to come when a run ends early; what they complete is written at the end.
+
+        Who is alive says when it has sent its last rows; who is lost has.
+        """
+        if isinstance(cause, MeshLost):
+            lost = (cause.instance or "").split(", ")
+            for source in self._sources.values():
+                source.ended = source.ended or source.name in lost
+        deadline = time.monotonic() + _LAST_S
+        while True:
+            message = self._inbox.poll()
+            if message is None:
+                left = deadline - time.monotonic()
+                if left <= 0 or not self._rows_are_missing():
+                    return
+                message = self._inbox.wait(left)
+            if message is not None and message[0] in (FRAME, LAST):
                 self._take(message)
+
+    def _rows_are_missing(self) -> bool:
+        """Whether rows are still to come that those of the sources that have ended make complete."""
+        last_point, sources = self._plan.grid.last_point, self._sources.values()
+        end = min((source.covered(last_point) for source in sources if source.ended), default=last_point)
+        return any(not source.ended and source.covered(last_point) < end for source in sources)
 
     def _tell_progress(self) -> None:
         """Tell the master how far the rows are complete, if the grant can hang on it or somebody may want to see it."""
@@ -256,10 +294,12 @@ class _Ended(FmuMeshError):
 
 
 class _Source:
-    """Rows of one instance that wait for those of the others."""
+    """Rows of one instance that wait for those of the others; ``ended`` if there will be no more of them."""
 
     def __init__(self, receiver: FrameReceiver) -> None:
         self.receiver = receiver
+        self.name = receiver.link.source
+        self.ended = False
 
     def covered(self, last_point: int) -> int:
         """The last point for which the value is known; it holds until the next own point."""

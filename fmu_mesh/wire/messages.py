@@ -1,8 +1,9 @@
 """The messages of the synchronization, as bytes.
 
 Every message starts with 16 bytes, little endian: kind (u8), one spare byte, link or node number (u16), count (u32),
-point (i64). A frame follows with its rows (`fmu_mesh.wire.rows`). Abort follows with an `ErrorReport` as JSON. Every
-decoder checks sizes before it touches anything.
+point (i64). A frame follows with its rows (`fmu_mesh.wire.rows`). Abort follows with an `ErrorReport` as JSON. Last
+tells that a link brings no more rows, because the run has ended early. Every decoder checks sizes before it touches
+anything.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ __all__ = [
     "GRANT",
     "HEADER",
     "INITIAL",
+    "LAST",
     "MAX_MESSAGE_SIZE",
     "PROGRESS",
     "WAKE",
@@ -39,6 +41,7 @@ PROGRESS: Final = 4
 FINISH: Final = 5
 ABORT: Final = 6
 WAKE: Final = 7
+LAST: Final = 8
 
 MAX_MESSAGE_SIZE: Final = 64 * 2**20
 
