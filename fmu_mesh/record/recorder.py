@@ -179,6 +179,8 @@ class Recorder:
                     self._tell_progress()
             elif time.monotonic() - heard > self._plan.timeouts.step:
                 raise DeadlineExceeded("the recorder heard nothing from the master")
+        while self._leaving.is_set() and (message := self._inbox.poll()) is not None:
+            self._take(message)  # what came before the end, above all the reason for it
 
     def _rest(self) -> None:
         """Let frames gather, if many rows have come since the last rest.
@@ -268,8 +270,14 @@ class Recorder:
             self._put_progress(HEADER.pack(PROGRESS, self._number, 0, complete))
 
     def _report(self, error: FmuMeshError | None) -> None:
+        """Tell the master how recording ended; one that leaves takes no reports any more, and waits for this end."""
         report = NodeReport(RECORDER, max(self._written - 1, 0), error.report() if error is not None else None)
-        ask(self._session, self._keys.report, msgspec.json.encode(report), self._plan.timeouts.stop, "the master")
+        patience_s, left = self._plan.timeouts.stop, self._leaving.is_set
+        try:
+            ask(self._session, self._keys.report, msgspec.json.encode(report), patience_s, "the master", over=left)
+        except MeshLost:
+            if not left():
+                raise
 
     def _try_to_report(self, error: FmuMeshError) -> None:
         try:

@@ -1,0 +1,120 @@
+"""The recorder's end: it waits for nobody who does not listen any more."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import ExitStack, suppress
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+import zenoh
+
+from fmu_mesh.errors import MeshLost
+from fmu_mesh.model.plan import RECORDER, NodePlan
+from fmu_mesh.model.ring import Ring
+from fmu_mesh.record import recorder as module
+from fmu_mesh.record.recorder import Recorder
+from fmu_mesh.wire.keys import Keys
+from fmu_mesh.wire.membership import Welcome
+from fmu_mesh.wire.messages import FINISH, FRAME, HEADER, encode_abort
+from fmu_mesh.wire.rows import encode_rows
+from fmu_mesh.wire.session import Wiring, close_session, open_session
+from tests.helpers import DEADLINE_S
+from tests.scenarios.scenario import Scenario
+
+POINTS = 1_000_000
+ROWS = 1024
+
+
+class Mesh:
+    """A node and a master who listens, but does not answer reports."""
+
+    def __init__(self, session: zenoh.Session, folder: Path) -> None:
+        plan = Scenario(("a -> b",), points=POINTS).plan(groups={"a": "n", "b": "n"}, record=True, window=ROWS)
+        self.plan: NodePlan = msgspec.structs.replace(
+            plan.nodes[RECORDER],
+            result_file=str(folder / "result.csv"),
+            shared_memory=False,
+            timeouts=msgspec.structs.replace(plan.system.config.timeouts, stop=DEADLINE_S),
+        )
+        self.session = session
+        self.reported = threading.Event()
+        self._keys = Keys(self.plan.key_prefix, self.plan.mesh)
+        self._reports: list[zenoh.Query] = []
+        self._entities: list[Any] = [
+            session.declare_queryable(self._keys.hello("n"), lambda query: query.reply(query.key_expr, b"")),
+            session.declare_queryable(self._keys.register, self._register),
+            session.declare_queryable(self._keys.report, self._take_report),
+        ]
+
+    def put(self, message: bytes) -> None:
+        self.session.put(self._keys.frames("any", RECORDER), message, congestion_control=zenoh.CongestionControl.BLOCK)
+
+    def put_rows(self) -> None:
+        for link in self.plan.links_in:
+            self.put(encode_rows(FRAME, link.index, 0, Ring(link.layout, ROWS).parts))
+
+    def close(self) -> None:
+        for entity in self._entities:
+            entity.undeclare()
+
+    def _register(self, query: zenoh.Query) -> None:
+        query.reply(query.key_expr, msgspec.json.encode(Welcome(0)))
+
+    def _take_report(self, query: zenoh.Query) -> None:
+        self._reports.append(query)
+        self.reported.set()
+
+
+@pytest.fixture
+def mesh(tmp_path: Path) -> Iterator[Mesh]:
+    with ExitStack() as stack:
+        session = open_session(Wiring())
+        stack.callback(close_session, session)
+        mesh = Mesh(session, tmp_path)
+        stack.callback(mesh.close)
+        yield mesh
+
+
+def assert_has_ended(recorder: Recorder) -> None:
+    assert "recorder" not in {thread.name for thread in threading.enumerate()}
+    assert len(Path(recorder._file.path).read_text().splitlines()) == 1 + ROWS
+
+
+def test_a_recorder_at_rest_ends_with_a_run_that_fails_and_writes_what_has_come(
+    mesh: Mesh, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rests = threading.Event()
+
+    class Turns:
+        def __init__(self, _nodes: int) -> None:
+            pass
+
+        def next(self) -> None:
+            rests.set()
+
+    monkeypatch.setattr(module, "Turns", Turns)
+    monkeypatch.setattr(module, "_REST_S", DEADLINE_S)
+
+    with suppress(MeshLost), Recorder(mesh.plan, mesh.session) as recorder:
+        mesh.put_rows()
+        assert rests.wait(DEADLINE_S)
+        error = MeshLost("node 'n' was lost", instance="a, b")
+        mesh.put(encode_abort(error.report()))
+        raise error
+
+    assert_has_ended(recorder)
+    assert not mesh.reported.is_set()
+
+
+def test_a_recorder_that_reports_ends_with_a_master_that_takes_no_reports_any_more(mesh: Mesh) -> None:
+    with suppress(MeshLost), Recorder(mesh.plan, mesh.session) as recorder:
+        mesh.put_rows()
+        mesh.put(HEADER.pack(FINISH, 0, 0, 0))
+        assert mesh.reported.wait(DEADLINE_S)
+        raise MeshLost("node 'n' was lost")
+
+    assert_has_ended(recorder)
