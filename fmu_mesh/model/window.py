@@ -7,7 +7,15 @@ from collections.abc import Sequence
 from .ring import Layout
 from .system import System
 
-__all__ = ["AUTO_WINDOW_POINTS", "FRAME_OVERHEAD", "LAZY_ROWS", "STEADY_POINTS", "recorder_window", "window_of"]
+__all__ = [
+    "AUTO_WINDOW_POINTS",
+    "FRAME_OVERHEAD",
+    "LAZY_ROWS",
+    "STEADY_POINTS",
+    "lazy_frame_rows",
+    "recorder_window",
+    "window_of",
+]
 
 RECORDER_WINDOW = 32768
 """How many points the recorder may be behind, where its memory for their rows allows: it rests while they gather."""
@@ -19,7 +27,9 @@ FRAME_OVERHEAD = 32
 """What a message takes besides its rows, in bytes; it may hold a single one."""
 
 LAZY_ROWS = 2048
-"""Rows for the recorder that may wait in a node until a frame is worth sending."""
+"""Rows that a ring holds at least, so that half of them may wait for the recorder where the window is small."""
+
+_LAZY_FRAME_ROWS = 4096
 
 AUTO_WINDOW_POINTS = 16384
 AUTO_WINDOW_BYTES = 16 * 2**20
@@ -39,6 +49,11 @@ def recorder_window(window: int, row_sizes: Sequence[int]) -> int:
     """
     row_bytes = sum(row_sizes) + FRAME_OVERHEAD * len(row_sizes)
     return max(window, _LEAST_RECORDER_WINDOW, min(RECORDER_WINDOW, _RECORDER_BYTES // max(row_bytes, 1)))
+
+
+def lazy_frame_rows(window: int) -> int:
+    """How many rows may wait in a node until a frame for the recorder is worth sending, for a window of the mesh."""
+    return min(_LAZY_FRAME_ROWS, max(LAZY_ROWS // 2, window // 4))
 
 
 def window_of(system: System) -> int:

@@ -8,7 +8,7 @@ from ..errors import FmuMeshError
 from ..model.plan import RECORDER, Link
 from ..model.ring import Layout, Ring
 from ..model.types import Value
-from ..model.window import LAZY_ROWS
+from ..model.window import lazy_frame_rows
 from ..wire.messages import FRAME, HEADER, INITIAL, LAST
 from ..wire.rows import encode_frames, encode_rows
 
@@ -16,6 +16,7 @@ __all__ = ["OutLink"]
 
 _FRAME_BYTES = 32 * 1024
 _FRAME_POINTS = 1024
+_LAZY_FRAME_BYTES = 128 * 1024
 
 
 class OutLink:
@@ -31,9 +32,12 @@ class OutLink:
         self.link = link
         self.sent = 0
         self.lazy = link.target_node == RECORDER
-        # A quarter of the window, so that the consumer has work while the credit for more is on its way.
-        rows = LAZY_ROWS // 2 if self.lazy else min(_FRAME_POINTS, max(1, window // (4 * link.step_points)))
-        self.capacity = max(1, min(rows, _FRAME_BYTES // max(link.layout.row_size, 1)))
+        if self.lazy:
+            rows, size = lazy_frame_rows(window), _LAZY_FRAME_BYTES
+        else:
+            # A quarter of the window, so that the consumer has work while the credit for more is on its way.
+            rows, size = min(_FRAME_POINTS, max(1, window // (4 * link.step_points))), _FRAME_BYTES
+        self.capacity = max(1, min(rows, size // max(link.layout.row_size, 1)))
         self._outputs = outputs
         self.put = put
         self._picks = _picks(outputs.layout, link.layout)

@@ -40,6 +40,9 @@ _SPACES: Final = 64
 _DATA: Final = 128
 _MIN_SIZE: Final = 64 * 1024
 _MAX_SIZE: Final = 16 * 2**20
+_AT_ONCE_SIZE: Final = 16 * 2**20
+"""Up to this size all pages are made when the memory is: the first one to write into a page would wait for it."""
+
 _LENGTH: Final = struct.Struct("<I")
 _MORE: Final = 1 << 31
 """Set in a length where the message goes on in the next record: it was too long for one."""
@@ -98,7 +101,8 @@ class _Memory:
     """A mapping and its address; it stays as long as something refers to it."""
 
     def __init__(self, descriptor: int, size: int) -> None:
-        self.map = mmap.mmap(descriptor, size)
+        populate = getattr(mmap, "MAP_POPULATE", 0) if size <= _AT_ONCE_SIZE else 0
+        self.map = mmap.mmap(descriptor, size, mmap.MAP_SHARED | populate)
         self.view = memoryview(self.map)
         self.address = ctypes.addressof(ctypes.c_char.from_buffer(self.map))
 

@@ -12,7 +12,7 @@ import psutil
 import pytest
 
 from fmu_mesh.cli.main import main
-from fmu_mesh.model.window import AUTO_WINDOW_POINTS, LAZY_ROWS
+from fmu_mesh.model.window import AUTO_WINDOW_POINTS, lazy_frame_rows
 from tests.helpers import Launched, Place, on_a_busy_machine, row_count, rows_of, wait_until, write_config
 
 FAST = pytest.param({}, 2000, id="as fast as possible")
@@ -67,7 +67,7 @@ def test_a_killed_process_ends_the_run_within_two_seconds_and_the_rows_before_ar
     assert "its process was ended by SIGKILL" in message
     assert f"({kept} rows) is in '{result}'" in message
     # The other node may be a window behind, and up to a frame of its rows for the recorder ends with it.
-    assert kept - 1 <= point_in(message) <= kept - 1 + AUTO_WINDOW_POINTS + LAZY_ROWS // 2
+    assert kept - 1 <= point_in(message) <= kept - 1 + AUTO_WINDOW_POINTS + lazy_frame_rows(AUTO_WINDOW_POINTS)
     assert_is_what_one_process_calculates(place, result)
 
 
