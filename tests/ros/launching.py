@@ -232,6 +232,7 @@ class Launch:
 
         for node in filter(change.lifecycle_node_matcher, self._nodes):
             self._ros.matched(self._subscriptions[node])
+            self._ros.known_to(node.path, self._peer)
             request = Service.Request()
             request.transition.id = change.transition_id
             answer = self._ros.called(self._peer.create_client(Service, f"{node.path}/change_state"), request)

@@ -119,6 +119,19 @@ class Ros:
         for end in ends:
             self.until(partial(_matches, end), f"somebody else on '{end.topic_name}'")
 
+    def known_to(self, node: str, peer: Any) -> None:  # noqa: ANN401 types of rclpy
+        """Wait until the node of another process knows the subscriptions of ``peer``: from then on they miss nothing.
+
+        `matched` cannot tell: it sees that this side has heard of the other one, and a subscription that the publisher
+        has not heard of is sent nothing. DDS announces what a process reads in the order of its making, so a node that
+        answers a client has heard of all that was made before.
+        """
+        from rcl_interfaces.srv import GetParameters  # noqa: PLC0415 only where ROS is installed
+
+        client = peer.create_client(GetParameters, f"{node}/get_parameters")
+        self.called(client, GetParameters.Request())
+        peer.destroy_client(client)
+
     def called(self, client: Any, request: Any) -> Any:  # noqa: ANN401 types of rclpy
         """The answer of a service."""
         self.until(client.service_is_ready, f"the service {client.srv_name}")
