@@ -1,6 +1,19 @@
-"""`python -m fmu_mesh`: the same as the command `fmu-mesh`."""
+"""The command `fmu-mesh`, and `python -m fmu_mesh`: Ctrl-C has its exit code even while the command is being loaded."""
 
-from .cli.main import main
+import sys
+
+
+def main() -> int:
+    """Load the command, which takes half a second, and run it; returns the exit code."""
+    try:
+        from .cli.main import main as command  # noqa: PLC0415 an interrupt must find us here
+    except KeyboardInterrupt:
+        from .errors import Interrupted  # noqa: PLC0415 as above
+
+        print("fmu-mesh: interrupted", file=sys.stderr)
+        return Interrupted.exit_code
+    return command()
+
 
 if __name__ == "__main__":
     raise SystemExit(main())

@@ -3,15 +3,31 @@
 from __future__ import annotations
 
 import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import psutil
 import pytest
 
-from tests.helpers import Place, on_a_busy_machine, row_count, rows_of, wait_until, write_config
+from tests.helpers import DEADLINE_S, Place, on_a_busy_machine, row_count, rows_of, wait_until, write_config
 
 FAR_S = 10_000.0
 SIGNALS = [signal.SIGINT, signal.SIGTERM]
+
+
+_INTERRUPTED_WHILE_LOADING = """
+import os, runpy, signal, sys
+
+class Finder:
+    def find_spec(self, name, path=None, target=None):
+        if name == "fmu_mesh.cli.running":
+            os.kill(os.getpid(), signal.SIGINT)
+
+sys.meta_path.insert(0, Finder())
+sys.argv = ["fmu-mesh", "--version"]
+runpy.run_module("fmu_mesh", run_name="__main__")
+"""
 
 
 def is_pending(pid: int, number: signal.Signals) -> bool:
@@ -53,6 +69,14 @@ def test_a_signal_ends_the_run_within_two_seconds_with_a_readable_partial_result
     rows = rows_of(result)
     assert f"({len(rows)} rows) is in '{result}'" in launched.message
     assert f"point {len(rows) - 1}, t = " in launched.message
+
+
+def test_ctrl_c_while_the_command_is_being_loaded_is_told_like_any_other() -> None:
+    program = [sys.executable, "-c", _INTERRUPTED_WHILE_LOADING]
+
+    done = subprocess.run(program, capture_output=True, text=True, check=False, timeout=DEADLINE_S)
+
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "fmu-mesh: interrupted\n")
 
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="looks into /proc")
