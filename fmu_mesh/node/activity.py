@@ -5,15 +5,18 @@ The main thread only writes a few attributes; the server's thread looks at them 
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Mapping
 
-from ..errors import StepFailed
+from ..errors import FmuMeshError, StepFailed
 from ..model.plan import NodePlan
 from ..wire.views import InstanceStatus
 from .stepping import Runner, Unit
 
 __all__ = ["Activity"]
+
+log = logging.getLogger(__name__)
 
 
 class Activity:
@@ -60,16 +63,21 @@ class Activity:
         )
 
     def look_at_steps(self, now: float) -> StepFailed | None:
-        """End a burst of steps that takes long; the error of a step that has not returned in its time, if there is one.
+        """Look at the step that is under way; the error of one that has not returned in its time.
 
-        Other calls of an FMU are watched by `fmu_mesh.fmu.guard.CallWatch`.
+        The burst that it belongs to is ended, and what came before it is sent if it takes longer than from one look to
+        the next: others may wait for that, and it shall not be lost with this process. Other calls of an FMU are
+        watched by `fmu_mesh.fmu.guard.CallWatch`.
         """
         if (unit := self.advancing) is None or self.state != "running":
             self._under_way = None
             return None
         runner = unit.current
         under_way_s = now - self._since(runner, now)
-        unit.hurry = True
+        if under_way_s > 0.0:
+            unit.meanwhile(self._send)
+        else:
+            unit.hurry()
         if under_way_s <= self._plan.timeouts.step:
             return None
         return StepFailed(
@@ -79,6 +87,13 @@ class Activity:
             time=self._plan.grid.time(runner.point),
             hint="If it needs that long, raise `timeouts.step` in the configuration.",
         )
+
+    def _send(self) -> None:
+        try:
+            for runner in self.runners.values():
+                runner.flush()
+        except FmuMeshError as unreachable:  # the main thread will meet it, too
+            log.info("rows_not_sent", extra={"error": str(unreachable)})
 
     def _in_words(self, runner: Runner) -> str:
         if self.state != "running":

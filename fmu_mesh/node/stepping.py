@@ -6,7 +6,8 @@ ahead as its inputs and the grant allow, or a cycle of runners, which go point b
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from threading import Lock
 from time import perf_counter
 
 from ..fmu.guard import DEFAULT_MODE, floating_point_changed, restore_floating_point
@@ -140,9 +141,8 @@ class Runner:
 class Unit:
     """Runners that are stepped together, in the order of the plan.
 
-    Attributes:
-        hurry: set it on another thread, and the burst that is under way ends after the current step. How long a burst
-            takes is known from those before it only, and an FMU may become slow from one step to the next.
+    How long a burst takes is known from those before it only, and an FMU may become slow from one step to the next:
+    another thread may then end the burst (`hurry`) and do what cannot wait (`meanwhile`).
     """
 
     def __init__(self, runners: Sequence[Runner]) -> None:
@@ -154,18 +154,44 @@ class Unit:
         self._burst = 1
         self._starved = False
         self._lazy_flushed = 0.0
-        self.hurry = False
+        self._stepping = False
+        self._hurry = False
+        self._returning = Lock()
 
     @property
     def current(self) -> Runner:
         """The runner whose step is under way while this is advanced."""
         return min(self.runners, key=lambda runner: (runner.step + 1) * runner.plan.step_points)
 
+    def hurry(self) -> None:
+        """From another thread: end the burst that is under way after the current step."""
+        self._hurry = True
+
+    def meanwhile(self, action: Callable[[], None]) -> None:
+        """From another thread: call ``action`` if a burst is under way; for that time it alone uses links and inbox.
+
+        The thread that steps sets `_stepping` before it looks at `_hurry`, and this one the other way round: one of the
+        two sees the other, and the one that steps waits at the end of its burst until ``action`` is over.
+        """
+        with self._returning:
+            self._hurry = True
+            if self._stepping:
+                action()
+
     def advance(self, grant: int) -> bool:
         """Step as far as inputs and ``grant`` allow, for one burst at most; whether anything was stepped."""
-        self.hurry = False
         started = perf_counter()
-        steps = self._advance_single(self._single, grant) if self._single is not None else self._advance_cycle(grant)
+        self._stepping = True
+        try:
+            if self._single is not None:
+                steps = self._advance_single(self._single, grant)
+            else:
+                steps = self._advance_cycle(grant)
+        finally:
+            self._stepping = False
+            if self._hurry:
+                with self._returning:
+                    self._hurry = False
         if not steps:
             return False
         elapsed = perf_counter() - started
@@ -200,7 +226,7 @@ class Unit:
             if one + half_ulp - quarter_ulp != one or not tiny + tiny:  # as `floating_point_changed`, without a call
                 restore_floating_point()
             runner.step = step + 1
-            if self.hurry:
+            if self._hurry:
                 break
         self._starved = runner.step == limit
         return runner.step - first
@@ -228,7 +254,7 @@ class Unit:
                 if one + half_ulp - quarter_ulp != one or not tiny + tiny:  # as in `_advance_single`
                     restore_floating_point()
                 runner.step = point + 1
-            if self.hurry:
+            if self._hurry:
                 return point + 1
         return max(first, end)
 
@@ -246,7 +272,7 @@ class Unit:
                 if floating_point_changed():
                     restore_floating_point()
                 runner.step = step + 1
-            if self.hurry:
+            if self._hurry:
                 return point + 1
         return max(first, end)
 

@@ -86,6 +86,7 @@ class Recorder:
         # At the end the main thread writes what is left, and on a slow disk the thread may still be at it.
         self._writing = threading.Lock()
         self._flushed = time.monotonic()
+        self._flushed_rows = 0
         capacity = (plan.window + 8) * len(plan.links_in) + 1024
         shared = shared_inbox(plan, spins=False)  # nobody waits for it, but others need the processor
         self._inbox = Inbox(session, self._keys.inbox(RECORDER), self._keys.wake(RECORDER), capacity, shared)
@@ -218,6 +219,10 @@ class Recorder:
     def _write_complete_rows(self) -> None:
         with self._writing:
             self._write_rows()
+            now = time.monotonic()
+            if self._file.rows > self._flushed_rows and now - self._flushed > _FLUSH_S:
+                self._flushed_rows, self._flushed = self._file.rows, now
+                self._file.flush()
 
     def _write_rows(self) -> None:
         rows = self._complete() + 1
@@ -228,10 +233,6 @@ class Recorder:
             columns = [column(first, end) for column in self._columns]
             self._file.write(self._plan.grid.times(first, end), columns)
             self._written = end
-        now = time.monotonic()
-        if now - self._flushed > _FLUSH_S:
-            self._flushed = now
-            self._file.flush()
 
     def _take_last_rows(self, cause: FmuMeshError) -> None:
         """Take the frames that are still to come when a run ends early; what they complete is written at the end.

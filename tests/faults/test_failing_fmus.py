@@ -13,7 +13,7 @@ import zenoh
 
 from fmu_mesh.fmu.step_status import RETRY
 from tests.fmus.helpers import find_fmu
-from tests.helpers import Place, rows_of, wait_until, write_config
+from tests.helpers import Place, row_count, rows_of, wait_until, write_config
 
 
 def with_faulty(
@@ -83,6 +83,27 @@ def test_when_an_fmu_fails_all_rows_before_are_kept(
 
     assert launched.wait() == 3
     assert [row[0] for row in rows_of(config.with_suffix(".csv"))] == [point * 0.001 for point in range(501)]
+    place.assert_nothing_left()
+
+
+@pytest.mark.parametrize("zenoh", [{}, {"shared_memory": False}], ids=["shared", "zenoh"])
+def test_a_node_that_is_killed_in_a_long_step_has_sent_everything_before_it(
+    place: Place, faulty: Path, zenoh: dict[str, bool]
+) -> None:
+    config = write_config(
+        place.folder,
+        instances={"slow": {"fmu": str(faulty), "start_values": {"hang_at": 0.2}}, "gain": {"fmu": "Gain"}},
+        connections=["slow.y -> gain.u"],
+        stop_time=2.0,
+        zenoh=zenoh,
+    )
+    launched = place.start("launch", config)
+    wait_until(lambda: row_count(config.with_suffix(".csv")) == 201, "all rows, while the step is under way")
+
+    launched.child("slow").kill()
+
+    assert launched.wait() == 4
+    assert [row[0] for row in rows_of(config.with_suffix(".csv"))] == [point * 0.001 for point in range(201)]
     place.assert_nothing_left()
 
 

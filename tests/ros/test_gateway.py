@@ -15,7 +15,7 @@ import psutil
 import pytest
 import zenoh
 
-from tests.helpers import DEADLINE_S, Place, row_count, rows_of, wait_until, write_config
+from tests.helpers import DEADLINE_S, Launched, Place, row_count, rows_of, wait_until, write_config
 from tests.ros.peers import free_port
 
 FLOAT = struct.Struct("<4xd")
@@ -82,6 +82,16 @@ def configured(
     )
 
 
+def resting(place: Place, ros: Ros, config: Path) -> tuple[Launched, psutil.Process]:
+    """A mesh that rests at point 150 until it is resumed, and its gateway, which has carried the samples up to then."""
+    mesh = place.start("launch", config, "--no-progress", "--paused")
+    place.note()
+    wait_until(lambda: place.run("step", "lab", "150").wait() == 0, "a mesh that is not starting any more")
+    wait_until(lambda: len(ros.floats("angle")) == 151, "samples")
+    [gateway] = [process for process in place.processes() if "gateway" in process.cmdline()]
+    return mesh, gateway
+
+
 def test_every_sample_from_the_first_point_to_the_last_arrives_and_the_clock_tells_every_point(
     place: Place, ros: Ros
 ) -> None:
@@ -99,11 +109,10 @@ def test_every_sample_from_the_first_point_to_the_last_arrives_and_the_clock_tel
 
 
 def test_a_gateway_that_had_no_processor_at_the_end_still_carries_every_sample(place: Place, ros: Ros) -> None:
-    mesh = place.start("launch", configured(place, ros, factor=3), "--no-progress")
-    wait_until(lambda: len(ros.floats("angle")) > 100, "samples")
-    [gateway] = [process for process in place.processes() if "gateway" in process.cmdline()]
+    mesh, gateway = resting(place, ros, configured(place, ros, factor=3))
     nodes = [mesh.child("pendulum"), mesh.child("gain")]
     gateway.suspend()
+    assert place.run("resume", "lab").wait() == 0
     wait_until(lambda: row_count(place.folder / "lab.csv") == 301, "the last point")
     assert psutil.wait_procs(nodes, DEADLINE_S)[1] == []
 
@@ -119,12 +128,10 @@ def test_a_gateway_that_had_no_processor_at_the_end_still_carries_every_sample(p
 
 
 def test_a_gateway_that_never_comes_back_ends_with_the_mesh(place: Place, ros: Ros) -> None:
-    config = configured(place, ros, factor=3, timeouts={"stop": 1.0})
-    mesh = place.start("launch", config, "--no-progress")
-    wait_until(lambda: len(ros.floats("angle")) > 100, "samples")
-    [gateway] = [process for process in place.processes() if "gateway" in process.cmdline()]
+    mesh, gateway = resting(place, ros, configured(place, ros, factor=3, timeouts={"stop": 1.0}))
 
     gateway.suspend()
+    assert place.run("resume", "lab").wait() == 0
 
     assert mesh.wait() == 0, mesh.errors
     assert "a gateway did not take its last samples within 1 s" in mesh.errors
