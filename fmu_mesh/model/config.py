@@ -209,7 +209,7 @@ class RecordConfig(Base, frozen=True, kw_only=True):
 
     file: Annotated[
         str | None,
-        Meta(description="CSV file, relative to this file; {mesh} is the name of the mesh; null: no recording."),
+        Meta(description="CSV, or a bag if it ends in .mcap, relative to this file; {mesh}: the mesh; null: none."),
     ] = "results/{mesh}.csv"
     variables: Annotated[
         list[str] | None,

@@ -36,6 +36,11 @@ __all__ = ["Connection", "System", "SystemInstance", "build"]
 
 _RESERVED_NAME = "mesh"
 
+_OTHER_FORMATS = frozenset(
+    (".arrow", ".bag", ".db3", ".feather", ".h5", ".hdf5", ".json", ".mat", ".npz", ".ods", ".parquet", ".xls", ".xlsx")
+)
+"""Endings of other formats: a CSV under such a name would not open in what the name asks for."""
+
 
 class SystemInstance(msgspec.Struct, frozen=True):
     """One instance of the system.
@@ -276,6 +281,10 @@ def _result_file(loaded: LoadedConfig, findings: Findings) -> str | None:
     path = loaded.resolve(text.replace("{mesh}", loaded.config.mesh))
     if path.is_dir():
         findings.add("record.file", f"the folder '{text}'", "a file, or null to record nothing")
+    elif path.suffix.lower() in _OTHER_FORMATS:
+        findings.add(
+            "record.file", f"'{text}', a format that is not written", "a name ending in .csv, or .mcap for a bag"
+        )
     return str(path)
 
 

@@ -501,6 +501,18 @@ def test_a_folder_is_no_result_file(tmp_path: Path) -> None:
     assert found == f"7: record.file: the folder '{tmp_path}'; expected a file, or null to record nothing"
 
 
+@pytest.mark.parametrize("name", ["result.xlsx", "result.H5", "result.json"])
+def test_a_format_that_is_not_written_is_refused(name: str) -> None:
+    assert findings_of(text(rest=f"record: {{file: {name}}}")) == [
+        f"7: record.file: '{name}', a format that is not written; expected a name ending in .csv, or .mcap for a bag"
+    ]
+
+
+@pytest.mark.parametrize("name", ["result.csv", "result.txt", "result", "result.mcap", "result.2"])
+def test_other_names_of_result_files_are_taken(name: str) -> None:
+    assert built(text(rest=f"record: {{file: {name}}}")).result_file == f"/models/configs/{name}"
+
+
 def test_a_client_needs_a_router() -> None:
     assert findings_of(text(rest="zenoh: {mode: client}")) == [
         "7: zenoh.mode: client without a router; expected an endpoint in zenoh.connect"
