@@ -197,6 +197,8 @@ class Master:
         patience_s = 3 * self._timeouts.step * self._most_instances
         while self._slowest < self._last_point and not self._stop_asked:
             self._turn(self._publish_grant())
+            if self._hold is not None and self._slowest >= self._hold:
+                self._clock.stop()
             silent_s = time.monotonic() - self._moved
             if silent_s > patience_s and self._slowest < self._grant and self._hold is None:
                 raise DeadlineExceeded(
@@ -351,14 +353,13 @@ class Master:
         match command.command:
             case "pause":
                 self._state, self._hold = "paused", self._grant
-                self._clock.stop()
             case "resume":
                 self._state, self._hold = "running", None
                 self._clock.start()
                 self._pacer.start(self._slowest)
             case "step":
                 self._state, self._hold = "paused", max(self._hold or 0, self._grant) + max(1, command.points)
-                self._clock.stop()
+                self._clock.start()
                 self._pacer.start(self._slowest)
             case "stop":
                 self._stop_asked = True

@@ -16,7 +16,7 @@ _TICK_S = 1e-6
 
 
 class Clock:
-    """Wall-clock time since the first point, pauses left out."""
+    """Wall-clock time since the first point; where the mesh rests it is held."""
 
     def __init__(self) -> None:
         self._before = 0.0

@@ -385,6 +385,21 @@ def test_watch_ends_with_the_mesh_and_with_ctrl_c() -> None:
         assert mesh.end() == 130, mesh.lines
 
 
+def test_the_speed_counts_what_was_stepped_by_hand_with_its_time_and_no_rest(place: Place) -> None:
+    simulation = {"step_size": 0.01, "real_time_factor": 2.0}
+    config = write_config(place.folder, stop_time=1.0, simulation=simulation)
+    mesh = place.start("launch", config, "--paused", "--no-progress")
+    mesh.wait_for_error_line("mesh 'pair' at")
+    wait_until(lambda: place.run("step", "pair", "50").wait() == 0, "a mesh that has started")
+    wait_until(lambda: "50 of 100" in place.run("status").output, "point 50")
+    assert place.run("resume", "pair").wait() == 0
+
+    assert mesh.wait() == 0
+
+    # Each start of the clock grants its first point at once: 98 points in 0.49 s are the fastest.
+    assert float(mesh.output.rpartition("real-time factor ")[2]) <= 100 / 98 * 2.0 + 0.01
+
+
 def test_watch_shows_the_last_point_though_it_had_no_processor_at_the_end(place: Place) -> None:
     mesh = place.start("launch", write_config(place.folder, stop_time=0.2), "--paused", "--no-progress")
     mesh.wait_for_error_line("mesh 'pair' at")
