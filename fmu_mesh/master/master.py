@@ -86,6 +86,7 @@ class Master:
         self._reports: dict[str, NodeReport] = {}
         self._failure: FmuMeshError | None = None
         self._followers: set[str] = set()
+        self._lost_followers: set[str] = set()
         self.ended_by: TerminationRequested | None = None
         self._state: MeshState = "starting"
         self._grant = 0
@@ -146,6 +147,8 @@ class Master:
 
     def wait_for_followers(self) -> None:
         """Stay, as the router, until those that need the last sample have it; their tokens tell, Zenoh does not."""
+        if self._lost_followers:
+            log.warning("a gateway was gone before the last point; ROS has nothing of what came after it")
         deadline = time.monotonic() + self._timeouts.stop
         while self._followers and self._failure is None:
             if (left := deadline - time.monotonic()) <= 0:
@@ -336,7 +339,13 @@ class Master:
 
     def _follower_changed(self, sample: zenoh.Sample) -> None:
         name = str(sample.key_expr)
-        (self._followers.add if sample.kind == zenoh.SampleKind.PUT else self._followers.discard)(name)
+        if sample.kind == zenoh.SampleKind.PUT:
+            self._followers.add(name)
+            self._lost_followers.discard(name)
+        else:
+            self._followers.discard(name)
+            if self._state in ("running", "paused"):
+                self._lost_followers.add(name)
 
     def _command(self, query: zenoh.Query) -> None:
         """pause, resume, step N and stop; the grant is all that they move."""

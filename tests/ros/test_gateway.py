@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import signal
 import socket
 import struct
@@ -82,14 +83,24 @@ def configured(
     )
 
 
-def resting(place: Place, ros: Ros, config: Path) -> tuple[Launched, psutil.Process]:
-    """A mesh that rests at point 150 until it is resumed, and its gateway, which has carried the samples up to then."""
+@contextlib.contextmanager
+def resting(place: Place, ros: Ros, config: Path) -> Iterator[tuple[Launched, psutil.Process, zenoh.Session]]:
+    """A mesh that rests at point 150, its gateway, which has carried everything so far, and a session in the mesh."""
     mesh = place.start("launch", config, "--no-progress", "--paused")
-    place.note()
-    wait_until(lambda: place.run("step", "lab", "150").wait() == 0, "a mesh that is not starting any more")
-    wait_until(lambda: len(ros.floats("angle")) == 151, "samples")
-    [gateway] = [process for process in place.processes() if "gateway" in process.cmdline()]
-    return mesh, gateway
+    settings = zenoh.Config()
+    settings.insert_json5("mode", '"client"')
+    settings.insert_json5("connect/endpoints", json.dumps(place.note().endpoints))
+    with zenoh.open(settings) as session:
+        wait_until(lambda: commanded(session, "step", 150), "a mesh that has started")
+        wait_until(lambda: len(ros.floats("angle")) == 151, "samples")
+        [gateway] = [process for process in place.processes() if "gateway" in process.cmdline()]
+        yield mesh, gateway, session
+
+
+def commanded(session: zenoh.Session, command: str, points: int = 0) -> bool:
+    """Whether the mesh does what it is told; at once, where the command line takes half a second."""
+    payload = json.dumps({"command": command, "points": points})
+    return any(reply.ok is not None for reply in session.get("fmu_mesh/lab/mesh/command", payload=payload))
 
 
 def test_every_sample_from_the_first_point_to_the_last_arrives_and_the_clock_tells_every_point(
@@ -109,16 +120,16 @@ def test_every_sample_from_the_first_point_to_the_last_arrives_and_the_clock_tel
 
 
 def test_a_gateway_that_had_no_processor_at_the_end_still_carries_every_sample(place: Place, ros: Ros) -> None:
-    mesh, gateway = resting(place, ros, configured(place, ros, factor=3))
-    nodes = [mesh.child("pendulum"), mesh.child("gain")]
-    gateway.suspend()
-    assert place.run("resume", "lab").wait() == 0
-    wait_until(lambda: row_count(place.folder / "lab.csv") == 301, "the last point")
-    assert psutil.wait_procs(nodes, DEADLINE_S)[1] == []
+    with resting(place, ros, configured(place, ros, factor=3)) as (mesh, gateway, session):
+        nodes = [mesh.child("pendulum"), mesh.child("gain")]
+        gateway.suspend()
+        assert commanded(session, "resume")
+        wait_until(lambda: row_count(place.folder / "lab.csv") == 301, "the last point")
+        assert psutil.wait_procs(nodes, DEADLINE_S)[1] == []
 
-    gateway.resume()
+        gateway.resume()
 
-    assert mesh.wait() == 0, mesh.errors
+        assert mesh.wait() == 0, mesh.errors
     rows = rows_of(place.folder / "lab.csv")
     ros.wait_for(rows)
     assert ros.floats("angle") == [row[1] for row in rows]
@@ -127,14 +138,28 @@ def test_a_gateway_that_had_no_processor_at_the_end_still_carries_every_sample(p
     place.assert_nothing_left()
 
 
-def test_a_gateway_that_never_comes_back_ends_with_the_mesh(place: Place, ros: Ros) -> None:
-    mesh, gateway = resting(place, ros, configured(place, ros, factor=3, timeouts={"stop": 1.0}))
+@pytest.mark.parametrize(
+    ("away", "says"),
+    [
+        (False, "a gateway did not take its last samples within 1 s"),
+        (True, "a gateway was gone before the last point; ROS has nothing of what came after it"),
+    ],
+    ids=["at the end", "for longer than Zenoh's lease"],
+)
+def test_a_gateway_that_never_comes_back_ends_with_the_mesh_and_is_told(
+    place: Place, ros: Ros, *, away: bool, says: str
+) -> None:
+    config = configured(place, ros, factor=3, timeouts={"stop": 1.0})
+    with resting(place, ros, config) as (mesh, gateway, session):
+        gateway.suspend()
+        if away:
+            key = "fmu_mesh/lab/@sync/follower/*"
+            wait_until(lambda: not list(session.liveliness().get(key, timeout=1.0)), "the end of its lease")
+        assert commanded(session, "resume")
 
-    gateway.suspend()
-    assert place.run("resume", "lab").wait() == 0
+        assert mesh.wait() == 0, mesh.errors
 
-    assert mesh.wait() == 0, mesh.errors
-    assert "a gateway did not take its last samples within 1 s" in mesh.errors
+    assert says in mesh.errors
     assert len(rows_of(place.folder / "lab.csv")) == 301
     place.assert_nothing_left()
 
