@@ -134,7 +134,7 @@ def test_a_step_that_is_pending_for_ever_ends_at_the_deadline_of_the_step(
     place: Place, tmp_path: Path, name: str, options: tuple[str, ...]
 ) -> None:
     instances = {"pump": {"fmu": str(find_fmu(name, tmp_path)), "start_values": {"polls": -1}}}
-    config = write_config(place.folder, instances=instances, connections=[], timeouts={"step": 1.0})
+    config = write_config(place.folder, instances=instances, connections=[], timeouts={"step": 2.0})
 
     launched = place.run("launch", config, *options)
 
@@ -173,14 +173,12 @@ def test_an_fmu_that_aborts_takes_only_its_own_process_with_it(place: Place, fau
 
 
 def test_an_fmu_that_does_not_return_meets_the_deadline_of_a_step(place: Place, faulty: Path) -> None:
-    config = with_faulty(place, faulty, {"hang_at": 1.0}, timeouts={"step": 1.0})
+    config = with_faulty(place, faulty, {"hang_at": 1.0}, timeouts={"step": 2.0})
 
     launched = place.run("launch", config)
 
     assert launched.wait() == 3
-    assert launched.message.startswith(
-        "fmu-mesh: instance faulty, point 1000, t = 1 s: the FMU has not returned for 1."
-    )
+    assert launched.message.startswith("fmu-mesh: instance faulty, point 1000, t = 1 s: the FMU has not returned for ")
     assert "`timeouts.step`" in launched.message
     assert len(rows_of(config.with_suffix(".csv"))) == 1001
     place.assert_nothing_left()

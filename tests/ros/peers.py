@@ -79,9 +79,12 @@ class Peer:
     ) -> None:
         command = [sys.executable, str(FOLDER / script)] if isinstance(script, str) else [str(script)]
         texts = [own if isinstance(own, str) else json.dumps(own) for own in arguments]
+        variables = dict(environment if environment is not None else ros_environment())
+        # Without a buffer, Python loses the rest of a long line if the process is stopped while it writes it.
+        variables.pop("PYTHONUNBUFFERED", None)
         self._popen = subprocess.Popen(
             [*command, *texts],
-            env=environment if environment is not None else ros_environment(),
+            env=variables,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
