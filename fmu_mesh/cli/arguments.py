@@ -11,13 +11,14 @@ import math
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from ..errors import ConfigurationError, LoadFailed
+from ..model.config import MAX_WINDOW
 from ..model.config_base import ENDPOINT_PATTERN
 from ..model.findings import nearest_file
 
-__all__ = ["add_command", "count", "endpoint", "no_fmu", "number", "positive_seconds"]
+__all__ = ["add_command", "add_window", "count", "endpoint", "no_fmu", "number", "positive_seconds"]
 
 Parsers = Sequence[argparse.ArgumentParser]
 
@@ -29,6 +30,12 @@ def add_command(
     description = f"{text[0].upper()}{text[1:]}."
     parser: argparse.ArgumentParser = commands.add_parser(name, parents=parents, help=text, description=description)
     return parser
+
+
+def add_window(parser: argparse.ArgumentParser) -> None:
+    """The option `--window`."""
+    text = "how many points a node may run ahead; 1 is lockstep; auto: where instances are fast, many"
+    parser.add_argument("--window", type=_window, metavar="N", help=text)
 
 
 def number(text: str) -> float:
@@ -74,6 +81,18 @@ def no_fmu(path: Path, error: LoadFailed) -> ConfigurationError:
     elif path.suffix in (".yaml", ".yml"):
         hint = f"A configuration is run by `fmu-mesh launch {path}`."
     return ConfigurationError(error.message, hint=hint)
+
+
+def _window(text: str) -> int | Literal["auto"]:
+    if text == "auto":
+        return "auto"
+    try:
+        value = int(text)
+    except ValueError:
+        value = 0
+    if not 1 <= value <= MAX_WINDOW:
+        raise argparse.ArgumentTypeError(f"'{text}' is no window: auto, or from 1 to {MAX_WINDOW} points")
+    return value
 
 
 def _read(text: str) -> float:

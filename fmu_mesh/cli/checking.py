@@ -15,7 +15,7 @@ from ..model.initialization import Loop
 from ..model.plan import Plan
 from ..model.schema import schema_text
 from ..model.system import Connection, SystemInstance
-from .arguments import add_command
+from .arguments import add_command, add_window
 from .display import say
 from .tables import pairs, table
 
@@ -28,7 +28,7 @@ def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.Arg
     """Add the commands of this module."""
     check = add_command(commands, "check", "check a configuration and show its plan; run nothing", [common])
     check.add_argument("config", type=Path, metavar="CONFIG", help="the configuration file")
-    check.add_argument("--window", type=int, metavar="N", help="how many points a node may run ahead; 1 is lockstep")
+    add_window(check)
     check.add_argument(
         "--set", action="append", default=[], metavar="INSTANCE.VARIABLE=VALUE", help="another start value; repeatable"
     )

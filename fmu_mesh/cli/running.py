@@ -28,7 +28,7 @@ from ..wire.profile import MeshProfile
 from ..wire.router import run_router
 from ..wire.runtime import enter_run_folder, fmu_folder, leave_run_folder, remove_stale_folders, run_folder
 from ..wire.views import LogLine
-from .arguments import add_command, count, endpoint, number
+from .arguments import add_command, add_window, count, endpoint, number
 from .display import Display, say, stdout_as_stderr, summary
 from .plotting import check_plot, plot_results
 from .profiling import add_profile, show_profile
@@ -92,7 +92,7 @@ def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.Arg
 
 def _add_config(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("config", type=Path, metavar="CONFIG", help="the configuration file")
-    parser.add_argument("--window", type=int, metavar="N", help="how many points a node may run ahead; 1 is lockstep")
+    add_window(parser)
     parser.add_argument(
         "--set", action="append", default=[], metavar="INSTANCE.VARIABLE=VALUE", help="another start value; repeatable"
     )

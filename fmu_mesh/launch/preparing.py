@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
+from typing import Literal
 
 import msgspec
 from msgspec.structs import replace
 
-from ..errors import ConfigurationError, Finding, LoadFailed
+from ..errors import Finding, LoadFailed
 from ..fmu import Terms
 from ..model.config import AnyInstanceConfig, GazeboClassicConfig, InstanceConfig, MujocoConfig, PidConfig, ZenohConfig
 from ..model.description import ModelDescription
@@ -28,7 +29,7 @@ class Options(msgspec.Struct, frozen=True):
 
     Attributes:
         start_values: `instance.variable=value` each.
-        window: in points.
+        window: in points, or `auto`, instead of the configured one.
         real_time_factor: simulated over wall-clock time instead of the configured one; 0 for as fast as possible.
         output: the result file instead of the configured one.
         connect: Zenoh endpoints instead of the configured ones.
@@ -38,7 +39,7 @@ class Options(msgspec.Struct, frozen=True):
     """
 
     start_values: tuple[str, ...] = ()
-    window: int | None = None
+    window: int | Literal["auto"] | None = None
     real_time_factor: float | None = None
     output: Path | None = None
     connect: tuple[str, ...] = ()
@@ -81,7 +82,7 @@ def planned(
     system = build(loaded, descriptions, tuple(findings))
     check_results(loaded, system)
     check_showing(system, options.showing)
-    return make_plan(system, window=options.window, file=str(loaded.file))
+    return make_plan(system, file=str(loaded.file))
 
 
 def zenoh_section(loaded: LoadedConfig, options: Options) -> ZenohConfig:
@@ -91,9 +92,9 @@ def zenoh_section(loaded: LoadedConfig, options: Options) -> ZenohConfig:
 
 
 def _with_options(loaded: LoadedConfig, options: Options) -> LoadedConfig:
-    if options.window is not None and options.window < 1:
-        raise ConfigurationError(f"--window {options.window}: a window has at least 1 point")
     config = replace(loaded.config, zenoh=zenoh_section(loaded, options))
+    if options.window is not None:
+        config = replace(config, simulation=replace(config.simulation, window=options.window))
     if (factor := options.real_time_factor) is not None:
         config = replace(config, simulation=replace(config.simulation, real_time_factor=factor))
         overrides = {"simulation.real_time_factor": f"--real-time-factor {factor:g}"}

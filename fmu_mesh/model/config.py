@@ -43,6 +43,7 @@ __all__ = [
     "ENDPOINT_PATTERN",
     "KEY_PREFIX_PATTERN",
     "KIND",
+    "MAX_WINDOW",
     "NAME_PATTERN",
     "SHA256_PATTERN",
     "ActuatorConfig",
@@ -68,6 +69,9 @@ __all__ = [
     "TimeoutsConfig",
     "ZenohConfig",
 ]
+
+MAX_WINDOW = 1_000_000
+"""In points; rings hold as many rows."""
 
 
 class SimulationConfig(Base, frozen=True, kw_only=True):
@@ -97,7 +101,7 @@ class SimulationConfig(Base, frozen=True, kw_only=True):
         ),
     ] = "gauss_seidel"
     window: Annotated[
-        Literal["auto"] | Annotated[int, Meta(ge=1)],
+        Literal["auto"] | Annotated[int, Meta(ge=1, le=MAX_WINDOW)],
         Meta(
             description="How many points a node may run ahead of the slowest; 1 is strict lockstep; "
             "auto: up to 16384, where the instances are fast."

@@ -218,7 +218,6 @@ def test_a_missing_file_is_told_with_the_nearest_that_there_is(
         ("--set=pendulun.l=2", "Did you mean 'pendulum'?"),
         ("--set=pendulum.ll=2", "--set pendulum.ll=2"),
         ("--set=pendulum.l", "instance.variable=value"),
-        ("--window=0", "--window 0"),
     ],
 )
 def test_a_wrong_option_is_told_as_it_was_written(
@@ -277,6 +276,8 @@ def test_the_wrong_thing_for_a_command_is_told_with_the_right_one(
     [
         (["get", "--connect", "localhost", "pendulum.a"], "'localhost' is no Zenoh endpoint such as tcp/"),
         (["launch", "mesh.yaml", "--connect", "tcp/localhost"], "'tcp/localhost' is no Zenoh endpoint such as tcp/"),
+        (["launch", "mesh.yaml", "--window", "0"], "'0' is no window: auto, or from 1 to 1000000 points"),
+        (["check", "mesh.yaml", "--window", "9999999"], "'9999999' is no window: auto, or from 1 to 1000000 points"),
         (["step", "pair", "some"], "'some' is not a whole number of 1 or more"),
         (["top", "--interval", "often"], "'often' is no number"),
         (["run", "Gain.fmu", "--step-size", "small"], "'small' is no number"),

@@ -144,12 +144,12 @@ STRUCTURE = [
     ),
     pytest.param(
         changed("1e-3", "1e-3, window: 0"),
-        "mesh.yaml:2: simulation.window: 0; expected auto or a whole number >= 1",
+        "mesh.yaml:2: simulation.window: 0; expected auto or a whole number >= 1 and <= 1e+06",
         id="a number out of range",
     ),
     pytest.param(
         changed("1e-3", "1e-3, window: 2.0"),
-        "mesh.yaml:2: simulation.window: 2.0; expected auto or a whole number >= 1",
+        "mesh.yaml:2: simulation.window: 2.0; expected auto or a whole number >= 1 and <= 1e+06",
         id="a float for a whole number",
     ),
     pytest.param(

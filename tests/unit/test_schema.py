@@ -61,6 +61,7 @@ def test_both_forms_of_a_connection_keep_the_schema() -> None:
         ("step_size: 0.1", "step_size: 0"),
         ("stop_time: 1", "stop_time: '1'"),
         ("stop_time: 1", "stop_time: 1, window: 0"),
+        ("stop_time: 1", "stop_time: 1, window: 1000001"),
         ("stop_time: 1", "stop_time: 1, real_time_factor: -1"),
         ("stop_time: 1", "stop_time: 1, algorithm: gauss"),
         ("{fmu: b.fmu, step_size: null}", "b.fmu"),
