@@ -23,7 +23,7 @@ from ..simtime import TimeGrid
 from .buffers import Buffer, NumberBuffer, StringBuffer
 from .callbacks import FMI2_CALLBACKS, register, unregister
 from .calls import Function, Pointer, hot
-from .fused import SETTING, STATUS_BITS, STEPPING, Fused, fuse
+from .fused import DOING, GETTING, STATUS_BITS, STEPPING, Fused, fmi2_step, fuse
 from .instance import STATUS_NAMES, WARNING, FmuInstance, Verb
 from .step_status import PENDING, RETRY, SMALLER_STEPS, StepStatus, discarded
 from .substeps import DISCARD, SMALLEST, take_sub_steps
@@ -148,20 +148,20 @@ class Fmi2Instance(Fmi2Values):
         self._read_outputs((step + 1) & self._output_mask)
 
     def _fuse(self) -> Fused | None:
-        return fuse(self._self, self._direct_setters, self._plain_do_step, self._step_size, self._direct_getters)
+        step = fmi2_step(self._plain_do_step, self._step_size)
+        return fuse(self._self, self._direct_setters, step, self._direct_getters)
 
     def _finish_fused(self, outcome: int, step: int) -> None:
         """What follows from a status above warning, as in `_step_by_calls`."""
         stage, status = divmod(outcome, 1 << STATUS_BITS)
-        if stage == SETTING:
-            raise self._failed(f"setting the inputs returned {STATUS_NAMES[status]}")
         if stage == STEPPING:
             self._finish(status)
             self._step = step + 1
             self._read_outputs((step + 1) & self._output_mask)
-        else:
+            return
+        if stage == GETTING:
             self._step = step + 1
-            raise self._failed(f"reading the outputs returned {STATUS_NAMES[status]}")
+        raise self._failed(f"{DOING[stage]} returned {STATUS_NAMES[status]}")
 
     def advance(self, time: float, step_size: float) -> None:
         """One step of ``step_size`` from ``time`` (both in s) without rings, for callers with their own time base."""

@@ -17,6 +17,7 @@ from ..model.types import Value
 from ..simtime import TimeGrid
 from .calls import DirectCall
 from .fmi3_steps import Fmi3Steps
+from .fused import DOING, GETTING, STATUS_BITS, STEPPING, Fused, fuse
 from .instance import STATUS_NAMES, WARNING, FmuInstance, Verb
 from .solver import SolverFailed
 from .state import Standing
@@ -38,40 +39,52 @@ class SteppedInEvents(FmuInstance):
         self._discrete_direct: list[DirectCall] = []
         self._discrete_setters: list[Callable[[int], None]] = []
         super().bind(inputs, outputs, grid, points, step)
+        self._fused = self._fuse() if not (self._setters or self._getters) else None
+        fused = self._fused.call if self._fused is not None else None
+        self._hot = (fused, self._steps, self._input_mask, self._output_mask)
 
     def do_step(self, step: int) -> None:
         """Set the inputs of row ``step``, advance to own step ``step + 1``, write the outputs to row ``step + 1``."""
-        component, slot = self._self, step & self._input_mask
+        fused, steps, input_mask, output_mask = self._hot
         if self._discrete:
-            self._set_discrete(slot)
-        for function, references, count, rows, size in self._direct_setters:
-            status = function(component, references, count, rows[slot], size)
-            if status > WARNING:
-                raise self._failed(f"setting the inputs returned {STATUS_NAMES[status]}")
-        for set_row in self._setters:
-            set_row(slot)
+            self._set_discrete(step & input_mask)
+        start = self._start_time + step * self._points * self._base_step_size
         end = self._start_time + (step + 1) * self._points * self._base_step_size
-        self._go_on(self._start_time + step * self._points * self._base_step_size, self._step_size, end)
+        if fused is not None and steps.quiet_until > end:
+            if outcome := fused(step & input_mask, start, (step + 1) & output_mask):
+                self._finish_fused(outcome, step, start, end)
+            else:
+                steps.time = end
+            self._step = step + 1
+            return
+        self._set_inputs(step & input_mask)
+        self._go_on(lambda: steps.step(start, self._step_size, end))
         self._step = step + 1
-        slot = (step + 1) & self._output_mask
-        for function, references, count, rows, size in self._direct_getters:
-            status = function(component, references, count, rows[slot], size)
-            if status > WARNING:
-                raise self._failed(f"reading the outputs returned {STATUS_NAMES[status]}")
-        for get_row in self._getters:
-            get_row(slot)
+        self._read_outputs((step + 1) & output_mask)
+
+    def _fuse(self) -> Fused | None:
+        step = self._steps.fused(self._step_size)
+        return fuse(self._self, self._direct_setters, step, self._direct_getters, sized=True)
+
+    def _finish_fused(self, outcome: int, step: int, start: float, end: float) -> None:
+        """What follows where the step was more than a step, or a status is above warning."""
+        stage, status = divmod(outcome, 1 << STATUS_BITS)
+        if stage == STEPPING:
+            self._go_on(lambda: self._steps.finish(status, start, self._step_size, end))
+            self._step = step + 1
+            self._read_outputs((step + 1) & self._output_mask)
+            return
+        if stage == GETTING:
+            self._steps.time, self._step = end, step + 1
+        raise self._failed(f"{DOING[stage]} returned {STATUS_NAMES[status]}")
 
     def advance(self, time: float, step_size: float) -> None:
         """One step of ``step_size`` from ``time`` (both in s) without rings, for callers with their own time base."""
         self._check_live()
-        self._go_on(time, step_size, time + step_size)
+        self._go_on(lambda: self._steps.step(time, step_size, time + step_size))
 
-    def _go_on(self, time: float, step_size: float, end: float) -> None:
-        try:
-            done = self._steps.step(time, step_size, end)
-        except (FMICallException, SolverFailed) as error:
-            raise self._failure(error) from error
-        if not done:
+    def _go_on(self, step: Callable[[], bool]) -> None:
+        if not self._stepped(step):
             raise TerminationRequested("the FMU asked to end the simulation", instance=self.name)
 
     def set_values(self, values: Mapping[str, Value]) -> None:

@@ -23,6 +23,7 @@ from fmpy.fmi1 import FMICallException
 from ..model.description import ModelDescription
 from .calls import hot, pointer
 from .clocks import Clocks
+from .fused import Step, fmi3_step
 from .solver import SolverFailed, resolvable
 from .substeps import DISCARD, SMALLEST
 
@@ -45,9 +46,11 @@ class Fmi3Steps:
     Attributes:
         terminated: whether the FMU has asked to end the simulation; no step may be taken then.
         clocks: its clocks.
+        time: where the FMU is in s.
+        quiet_until: up to this time in s, a step is one call of fmi3DoStep, unless that says otherwise.
 
     Call sequence: `start` in Initialization Mode, `exit_initialization` after it, then `step`, and `event` wherever
-    values are set in event mode.
+    values are set in event mode. Instead of `step`, who calls fmi3DoStep (`fuse`) goes on with `finish` where needed.
 
     Raises:
         FMICallException: by every method: the FMU did not return OK.
@@ -62,16 +65,16 @@ class Fmi3Steps:
         self._has_event_mode = description.has_event_mode
         self._varies = description.can_handle_variable_step_size
         self._do_step = hot(fmu.dll.fmi3DoStep, _DO_STEP)
-        self._is_eventful = self._has_event_mode or bool(self.clocks)
         self._results = _Results()
         self._pointers = [pointer(address) for address in self._results.addresses]
-        self._time = 0.0
+        self.time = 0.0
         self._next_event = math.inf
         self._event_time = -math.inf
+        self._look_ahead()
 
     def start(self, time: float) -> None:
         """In Initialization Mode at ``time`` (s)."""
-        self._time = time
+        self.time = time
         if self.clocks:
             self.clocks.start(time)
 
@@ -79,6 +82,7 @@ class Fmi3Steps:
         """After Initialization Mode: the first events, then step mode."""
         if self._has_event_mode:
             self._update()
+            self._look_ahead()
 
     @property
     def place(self) -> tuple[float | None, float | None]:
@@ -91,6 +95,7 @@ class Fmi3Steps:
         self.terminated = False
         self._next_event = math.inf if next_event is None else next_event
         self._event_time = -math.inf if event_time is None else event_time
+        self._look_ahead()
 
     def event(self, set_values: Callable[[], None]) -> None:
         """Set values in event mode, or between two steps if there is none."""
@@ -100,17 +105,27 @@ class Fmi3Steps:
         self._fmu.enterEventMode()
         set_values()
         self._update()
+        self._look_ahead()
+
+    def fused(self, step_size: float) -> Step:
+        """fmi3DoStep by ``step_size`` (s) as a part of one compiled call."""
+        return fmi3_step(self._do_step, step_size, self._pointers, self._results.addresses[0])
 
     def step(self, start: float, step_size: float, end: float) -> bool:
         """Go on from ``start`` by ``step_size`` to ``end`` (s); False if the FMU asked to end the simulation before."""
-        results = self._results
-        time, largest, stuck, status = start, step_size, 0, None
-        self._time = start
-        if not (self._is_eventful or self.terminated):
+        status = None
+        if self.quiet_until > end:
             status = self._attempt(start, step_size)
-            if status <= WARNING and not results.any[0]:  # the step was nothing but a step
-                self._time = end
+            if status <= WARNING and not self._results.any[0]:  # the step was nothing but a step
+                self.time = end
                 return True
+        return self.finish(status, start, step_size, end)
+
+    def finish(self, status: int | None, start: float, step_size: float, end: float) -> bool:
+        """As `step`, where fmi3DoStep from ``start`` by ``step_size`` (s) has returned ``status`` already, if any."""
+        results = self._results
+        time, largest, stuck = start, step_size, 0
+        self.time = start
         while not self.terminated and resolvable(time, end):
             if self._is_due(time):
                 self._handle_event()
@@ -127,11 +142,15 @@ class Fmi3Steps:
             stuck = 0 if time > before else stuck + 1
             if stuck > MOST_RETURNS:
                 raise SolverFailed(f"fmi3DoStep returned early {MOST_RETURNS} times at t = {time:.12g} s")
-            self._time = time
+            self.time = time
             self.terminated = results.terminate
             if not self.terminated and (results.event_needed or self._is_due(time)):
                 self._handle_event()
+        self._look_ahead()
         return not resolvable(time, end)
+
+    def _look_ahead(self) -> None:
+        self.quiet_until = -math.inf if self.terminated or self.clocks else self._next_event
 
     def _attempt(self, time: float, size: float) -> int:
         self._results.any[0] = 0
@@ -164,8 +183,8 @@ class Fmi3Steps:
 
     def _update(self) -> None:
         """Event mode at the current time, and back to step mode."""
-        self._event_time = self._time
-        self.clocks.set_due(self._time)
+        self._event_time = self.time
+        self.clocks.set_due(self.time)
         for _ in range(MOST_RETURNS):
             again, self.terminated, _nominals, _states, defined, next_event = self._fmu.updateDiscreteStates()
             self.clocks.read()
@@ -174,9 +193,9 @@ class Fmi3Steps:
             if not again:
                 break
         else:
-            raise SolverFailed(f"the discrete states at t = {self._time:.12g} s need more than {MOST_RETURNS} updates")
+            raise SolverFailed(f"the discrete states at t = {self.time:.12g} s need more than {MOST_RETURNS} updates")
         self._next_event = next_event if defined else math.inf
-        self.clocks.update_intervals(self._time)
+        self.clocks.update_intervals(self.time)
         self._fmu.enterStepMode()
 
 

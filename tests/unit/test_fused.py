@@ -12,16 +12,23 @@ import pytest
 from fmu_mesh import compiled
 from fmu_mesh.fmu import open_instance, read_description
 from fmu_mesh.fmu.calls import DirectCall, Rows, hot, memory, pointer
-from fmu_mesh.fmu.fused import GETTING, SETTING, STATUS_BITS, STEPPING, Fused, fuse
+from fmu_mesh.fmu.fused import GETTING, SETTING, STATUS_BITS, STEPPING, Fused, fmi2_step, fmi3_step, fuse
 from fmu_mesh.model.ring import Layout, Ring
+from fmu_mesh.model.types import VariableType
 from fmu_mesh.simtime import TimeGrid
-from tests.fmus.helpers import FMUS
+from tests.fmus.helpers import find_fmu
 
 COMPONENT = 4711
 ROW_SIZE = 16
 
 _MOVE = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_size_t, ctypes.c_void_p)
 _STEP = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_double, ctypes.c_double, ctypes.c_int)
+_MOVE_3 = ctypes.CFUNCTYPE(
+    ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_size_t, ctypes.c_void_p, ctypes.c_size_t
+)
+_STEP_3 = ctypes.CFUNCTYPE(
+    ctypes.c_int, ctypes.c_void_p, ctypes.c_double, ctypes.c_double, ctypes.c_bool, *[ctypes.c_void_p] * 4
+)
 
 
 class Recorded:
@@ -39,7 +46,7 @@ class Recorded:
         self._step = hot(self._keep[-1], "int (*)(void *, double, double, int)")
 
     def fuse(self) -> Fused:
-        one = fuse(pointer(COMPONENT), self._setters, self._step, 0.1, self._getters)
+        one = fuse(pointer(COMPONENT), self._setters, fmi2_step(self._step, 0.1), self._getters)
         assert one is not None
         return one
 
@@ -96,27 +103,101 @@ def test_the_first_status_above_warning_ends_the_step_and_is_told_with_its_stage
     assert recorded.calls == ALL[:calls]
 
 
-@pytest.mark.parametrize("model", ["TransportDelay", "DampedPendulum", "Integrator", "Gain"])
-def test_the_rows_are_those_of_a_step_call_by_call(model: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    together = rows_of_steps(model, tmp_path)
+class Recorded3:
+    """As `Recorded`, with the functions of FMI 3.0, which take the number of values, and where a step sets flags."""
+
+    def __init__(self) -> None:
+        self.calls: list[tuple[Any, ...]] = []
+        self.flag: int | None = None
+        self._memory = (ctypes.c_double * 64)()
+        self._flags = (ctypes.c_uint8 * 4)()
+        first = ctypes.addressof(self._flags)
+        self.addresses = (first, first + 1, first + 2, ctypes.addressof(self._memory))
+        self._keep = [_MOVE_3(self._moved), _STEP_3(self._stepped)]
+        moved = hot(self._keep[0], "int (*)(void *, void *, size_t, void *, size_t)")
+        stepped = hot(self._keep[1], "int (*)(void *, double, double, _Bool, void *, void *, void *, void *)")
+        self._references = (ctypes.c_uint * 2)(6, 5)
+        rows = Rows(ctypes.addressof(self._memory), ROW_SIZE)
+        moves = [(moved, memory(self._references), 2, rows, 9)]
+        step = fmi3_step(stepped, 0.1, [pointer(address) for address in self.addresses], first)
+        one = fuse(pointer(COMPONENT), moves, step, moves, sized=True)
+        assert one is not None
+        self.one = one
+
+    def _moved(self, component: int, values: int, count: int, row: int, size: int) -> int:
+        taken = tuple(ctypes.cast(values, ctypes.POINTER(ctypes.c_uint))[:count])
+        self.calls.append((component, taken, (row - ctypes.addressof(self._memory)) // ROW_SIZE, size))
+        return 0
+
+    def _stepped(self, component: int, time: float, step_size: float, no_set_state: bool, *results: int) -> int:  # noqa: FBT001 as in C
+        self.calls.append((component, time, step_size, no_set_state, results, bytes(self._flags)))
+        if self.flag is not None:
+            self._flags[self.flag] = 1
+        return 0
+
+
+@pytest.mark.parametrize("flag", [None, 0, 1, 2])
+def test_a_step_of_fmi_3_ends_where_the_fmu_says_more_than_its_status(flag: int | None) -> None:
+    recorded = Recorded3()
+    recorded.flag = flag
+    moved = (COMPONENT, (6, 5))
+    step = (COMPONENT, 0.3, 0.1, True, recorded.addresses, bytes(4))
+    all_calls = [(*moved, 4, 9), step, (*moved, 6, 9)]
+
+    for _ in range(2):  # the flags of the first step are no longer there in the second
+        outcome = recorded.one.call(4, 0.3, 6)
+
+        assert divmod(outcome, 1 << STATUS_BITS) == ((0, 0) if flag is None else (STEPPING, 0))
+        assert recorded.calls == all_calls[: 3 if flag is None else 2]
+        recorded.calls.clear()
+
+
+MODELS: list[tuple[str, dict[str, float]]] = [
+    ("TransportDelay", {}),
+    ("DampedPendulum", {}),
+    ("Integrator", {}),
+    ("Gain", {}),
+    ("AllTypes3", {}),
+    (
+        "Events3",
+        {"interval": 0.3125, "announced": 1.0},
+    ),  # it says when the next event comes: what is before it is a plain step
+    ("Events3", {"interval": 0.3125, "announced": 0.0}),  # it returns early from a plain step
+]
+
+
+@pytest.mark.parametrize(("model", "start_values"), MODELS)
+def test_the_rows_are_those_of_a_step_call_by_call(
+    model: str, start_values: dict[str, float], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    together, is_one_call = rows_of_steps(model, start_values, tmp_path)
     monkeypatch.setattr(compiled, "_llvm", lambda: None)
 
-    assert rows_of_steps(model, tmp_path) == together
-    assert len(set(together)) > 100
+    assert rows_of_steps(model, start_values, tmp_path) == (together, False)
+    assert is_one_call
+    assert len(set(together)) > 50
 
 
-def rows_of_steps(model: str, folder: Path) -> list[tuple[float, ...]]:
-    path = FMUS / f"{model}.fmu"
+def rows_of_steps(
+    model: str, start_values: dict[str, float], folder: Path
+) -> tuple[list[tuple[tuple[float, ...], ...]], bool]:
+    """All numbers that an FMU puts out in 200 steps, and whether a step was one call."""
+    path = find_fmu(model, folder)
     description = read_description(path)
     with closing(open_instance(path, "it", description, folder)) as instance:
-        instance.enter_initialization(0.0, 100.0, {})
+        instance.enter_initialization(0.0, 100.0, start_values)
         instance.exit_initialization()
-        inputs, outputs = (Ring(Layout.of(description.with_causality(kind)), 64) for kind in ("input", "output"))
-        instance.bind(inputs, (outputs,), TimeGrid(0.0, 0.1, 1000), 1)
+        numbers = ([v for v in description.with_causality(kind) if is_number(v.type)] for kind in ("input", "output"))
+        inputs, outputs = (Ring(Layout.of(variables), 64) for variables in numbers)
+        instance.bind(inputs, (outputs,), TimeGrid(0.0, 0.125, 1000), 1)
         rows = []
         for step in range(200):
             for part in inputs.parts:
-                part[step & inputs.mask] = 0.37 * step
+                part[step & inputs.mask] = 0.37 * (step // 3)
             instance.do_step(step)
-            rows.append(tuple(outputs.parts[0][(step + 1) & outputs.mask].tolist()))
-        return rows
+            rows.append(tuple(tuple(part[(step + 1) & outputs.mask].tolist()) for part in outputs.parts))
+        return rows, vars(instance)["_fused"] is not None
+
+
+def is_number(type_: VariableType) -> bool:
+    return type_.startswith(("Float", "Int", "UInt"))
