@@ -46,9 +46,10 @@ class SteppedInEvents(FmuInstance):
     def do_step(self, step: int) -> None:
         """Set the inputs of row ``step``, advance to own step ``step + 1``, write the outputs to row ``step + 1``."""
         fused, steps, input_mask, output_mask = self._hot
-        if self._discrete:
-            self._set_discrete(step & input_mask)
         start = self._start_time + step * self._points * self._base_step_size
+        if self._discrete:
+            steps.time = start  # after a state was set, it is still where the FMU was before
+            self._set_discrete(step & input_mask)
         end = self._start_time + (step + 1) * self._points * self._base_step_size
         if fused is not None and steps.quiet_until > end:
             if outcome := fused(step & input_mask, start, (step + 1) & output_mask):

@@ -316,6 +316,26 @@ def test_clocks_and_linear_inputs_go_on_from_a_state_too(kind: Kind, event_fmu: 
         stairs.free_state(state)
 
 
+@pytest.mark.skipif(NO_COMPILER is not None, reason=str(NO_COMPILER))
+def test_an_event_that_follows_from_an_input_after_a_state_was_set_has_its_own_time(
+    event_fmu: EventFmu, tmp_path: Path
+) -> None:
+    with running(event_fmu("Stairs", 3), tmp_path, "co_simulation", increment=1) as stairs:
+        inputs: Ring = vars(stairs)["_keep"][0]
+        stairs.do_step(0)
+        state = stairs.get_state()
+        outputs_after(stairs, range(1, 20))
+        stairs.set_state(state)
+        inputs.put(1, "increment", 2)
+
+        stairs.do_step(1)
+
+        after = stairs.get_state()
+        assert (state.standing.time, after.standing.time) == (0.0, 0.25)
+        stairs.free_state(state)
+        stairs.free_state(after)
+
+
 @pytest.mark.parametrize(("version", "kind"), [(2, "co_simulation"), (2, "model_exchange"), (3, "model_exchange")])
 def test_linear_inputs_are_part_of_the_state(version: Version, kind: Kind, event_fmu: EventFmu, tmp_path: Path) -> None:
     options = StepOptions(linear_inputs=(LinearInput("u", 1),))
