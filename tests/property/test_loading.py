@@ -12,7 +12,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from fmu_mesh.errors import ConfigurationError, Finding
-from fmu_mesh.model.config import Config, ConnectionConfig, InstanceConfig, SimulationConfig
+from fmu_mesh.model.config import MAX_WINDOW, Config, ConnectionConfig, InstanceConfig, SimulationConfig
 from fmu_mesh.model.description import ModelDescription, Variable
 from fmu_mesh.model.findings import locate, nearest
 from fmu_mesh.model.loading import LoadedConfig, _examine, parse
@@ -70,7 +70,7 @@ SIMULATIONS = st.builds(
     stop_time=FINITE,
     step_size=FINITE,
     algorithm=st.sampled_from(["jacobi", "gauss_seidel"]),
-    window=st.just("auto") | st.integers(1, 2**31),
+    window=st.just("auto") | st.integers(1, MAX_WINDOW),
     real_time_factor=FINITE,
 )
 INSTANCES = st.dictionaries(
