@@ -48,7 +48,6 @@ class SteppedInEvents(FmuInstance):
         fused, steps, input_mask, output_mask = self._hot
         start = self._start_time + step * self._points * self._base_step_size
         if self._discrete:
-            steps.time = start  # after a state was set, it is still where the FMU was before
             self._set_discrete(step & input_mask)
         end = self._start_time + (step + 1) * self._points * self._base_step_size
         if fused is not None and steps.quiet_until > end:
@@ -98,13 +97,14 @@ class SteppedInEvents(FmuInstance):
             self._stepped(lambda: self._steps.event(lambda: set_values(values)))
 
     def _standing(self) -> Standing:
-        next_event, event_time = self._steps.place
-        return Standing(self._step, event_time, next_event, self._discrete_row, self._steps.clocks.place)
+        steps = self._steps
+        next_event, event_time = steps.place
+        return Standing(self._step, steps.time, next_event, self._discrete_row, steps.clocks.place, event_time)
 
     def _stand(self, standing: Standing) -> None:
         super()._stand(standing)
         self._discrete_row = standing.row
-        self._steps.resume(standing.next_event, standing.time)
+        self._steps.resume(standing.time or 0.0, standing.next_event, standing.last_event)
         self._steps.clocks.resume(standing.ticks)
 
     def _prepare(self, verb: Verb, part: Part, array: Any) -> None:  # noqa: ANN401 an array of any dtype

@@ -90,9 +90,10 @@ class Fmi3Steps:
         next_event, event_time = (t if math.isfinite(t) else None for t in (self._next_event, self._event_time))
         return next_event, event_time
 
-    def resume(self, next_event: float | None, event_time: float | None) -> None:
-        """Go on where `place` was."""
+    def resume(self, time: float, next_event: float | None, event_time: float | None) -> None:
+        """Go on at ``time`` (s), where `place` was."""
         self.terminated = False
+        self.time = time
         self._next_event = math.inf if next_event is None else next_event
         self._event_time = -math.inf if event_time is None else event_time
         self._look_ahead()

@@ -29,6 +29,7 @@ class Standing(msgspec.Struct, frozen=True):
         next_event: that of its next time event; None if there is none.
         row: the inputs that it was given in its last event mode.
         ticks: where its clocks are; see `Clocks.place`.
+        last_event: the time of its last event mode in s, where the steps go by it; None if there was none.
     """
 
     step: int
@@ -36,6 +37,7 @@ class Standing(msgspec.Struct, frozen=True):
     next_event: float | None = None
     row: tuple[bytes | list[str], ...] = ()
     ticks: tuple[float | None, ...] = ()
+    last_event: float | None = None
 
 
 class FmuState:

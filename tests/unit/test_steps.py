@@ -317,8 +317,9 @@ def test_clocks_and_linear_inputs_go_on_from_a_state_too(kind: Kind, event_fmu: 
 
 
 @pytest.mark.skipif(NO_COMPILER is not None, reason=str(NO_COMPILER))
-def test_an_event_that_follows_from_an_input_after_a_state_was_set_has_its_own_time(
-    event_fmu: EventFmu, tmp_path: Path
+@pytest.mark.parametrize("causality", ["input", "parameter"])
+def test_an_event_that_follows_from_a_value_after_a_state_was_set_has_its_own_time(
+    causality: str, event_fmu: EventFmu, tmp_path: Path
 ) -> None:
     with running(event_fmu("Stairs", 3), tmp_path, "co_simulation", increment=1) as stairs:
         inputs: Ring = vars(stairs)["_keep"][0]
@@ -326,12 +327,15 @@ def test_an_event_that_follows_from_an_input_after_a_state_was_set_has_its_own_t
         state = stairs.get_state()
         outputs_after(stairs, range(1, 20))
         stairs.set_state(state)
-        inputs.put(1, "increment", 2)
+        if causality == "input":
+            inputs.put(1, "increment", 2)
+        else:
+            stairs.set_values({"end": 1000})
 
         stairs.do_step(1)
 
         after = stairs.get_state()
-        assert (state.standing.time, after.standing.time) == (0.0, 0.25)
+        assert (state.standing.last_event, after.standing.last_event) == (0.0, 0.25)
         stairs.free_state(state)
         stairs.free_state(after)
 
