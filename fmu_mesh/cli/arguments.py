@@ -56,10 +56,7 @@ def positive_seconds(text: str) -> float:
 
 def count(text: str) -> int:
     """A whole number of 1 or more."""
-    try:
-        value = int(text)
-    except ValueError:
-        value = 0
+    value = _whole(text)
     if value < 1:
         raise argparse.ArgumentTypeError(f"'{text}' is not a whole number of 1 or more")
     return value
@@ -86,13 +83,18 @@ def no_fmu(path: Path, error: LoadFailed) -> ConfigurationError:
 def _window(text: str) -> int | Literal["auto"]:
     if text == "auto":
         return "auto"
-    try:
-        value = int(text)
-    except ValueError:
-        value = 0
+    value = _whole(text)
     if not 1 <= value <= MAX_WINDOW:
         raise argparse.ArgumentTypeError(f"'{text}' is no window: auto, or from 1 to {MAX_WINDOW} points")
     return value
+
+
+def _whole(text: str) -> int:
+    """A whole number; 0 for what is none, which no option here takes."""
+    try:
+        return int(text)
+    except ValueError:
+        return 0
 
 
 def _read(text: str) -> float:

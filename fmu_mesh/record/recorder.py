@@ -219,9 +219,9 @@ class Recorder:
     def _write_complete_rows(self) -> None:
         with self._writing:
             self._write_rows()
-            now = time.monotonic()
-            if self._file.rows > self._flushed_rows and now - self._flushed > _FLUSH_S:
-                self._flushed_rows, self._flushed = self._file.rows, now
+            rows = self._file.rows
+            if rows > self._flushed_rows and (now := time.monotonic()) - self._flushed > _FLUSH_S:
+                self._flushed_rows, self._flushed = rows, now
                 self._file.flush()
 
     def _write_rows(self) -> None:
