@@ -6,6 +6,7 @@ Nothing here waits by the clock: every wait is for a condition, and has a deadli
 from __future__ import annotations
 
 import csv
+import json
 import os
 import shutil
 import signal
@@ -22,6 +23,7 @@ from typing import IO, Any, Self, TypeVar
 import msgspec
 import psutil
 import yaml
+import zenoh
 
 from fmu_mesh.wire.runtime import MeshNote
 
@@ -183,6 +185,14 @@ class Place:
         """The note of the one mesh that runs here, as soon as it is there."""
         [file] = wait_until(lambda: list(self._runtime.glob("*/mesh.json")), "the note of a running mesh")
         return msgspec.json.decode(file.read_bytes(), type=MeshNote)
+
+    def session(self) -> zenoh.Session:
+        """A session as any program would open it, in the one mesh that runs here, as soon as it is there."""
+        config = zenoh.Config()
+        config.insert_json5("mode", '"client"')
+        config.insert_json5("scouting/multicast/enabled", "false")
+        config.insert_json5("connect/endpoints", json.dumps(self.note().endpoints))
+        return zenoh.open(config)
 
     def processes(self) -> list[psutil.Process]:
         """All processes that run here, children of children included: they inherit the environment of this place."""

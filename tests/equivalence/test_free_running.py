@@ -12,14 +12,6 @@ import zenoh
 from tests.helpers import DEADLINE_S, FMUS, Place, rows_of, wait_until, write_config
 
 
-def session_to(place: Place) -> zenoh.Session:
-    config = zenoh.Config()
-    config.insert_json5("mode", '"client"')
-    config.insert_json5("scouting/multicast/enabled", "false")
-    config.insert_json5("connect/endpoints", json.dumps(list(place.note().endpoints)))
-    return zenoh.open(config)
-
-
 def ask(session: zenoh.Session, key: str, value: object, attachment: str | None = None) -> Any:  # noqa: ANN401 JSON
     """The answer to a query with a value, as soon as it is not refused: first the FMU has to be loaded and to run."""
 
@@ -37,7 +29,7 @@ def test_inputs_follow_their_time_stamps_and_the_run_ends_at_its_stop_time(place
         "--real-time-factor", "100", "--stop-time", "400", "--output", output, "--no-progress",
     )  # fmt: skip
     root = "fmu_mesh/amplifier/amplifier"
-    with session_to(place) as session:
+    with place.session() as session:
         ask(session, "fmu_mesh/amplifier/mesh/command", {"command": "pause"})
         for time, value in ((300.0, 1.0), (302.0, 5.0), (303.0, 5.0), (301.0, 3.0)):
             answer = ask(session, f"{root}/in/u", value, json.dumps({"time": time}))
@@ -71,7 +63,7 @@ def test_an_input_of_a_mesh_holds_from_its_time_on_however_far_the_other_instanc
         connections=[],
     )
     process = place.start("launch", config, "--paused", "--window", window, "--no-progress")
-    with session_to(place) as session:
+    with place.session() as session:
         for time, value in ((0.5, 3.0), (0.25, 2.0), (0.9, 4.0)):
             answer = ask(session, "fmu_mesh/pair/free/in/u", value, json.dumps({"time": time}))
             assert answer["time"] == time

@@ -87,10 +87,7 @@ def configured(
 def resting(place: Place, ros: Ros, config: Path) -> Iterator[tuple[Launched, psutil.Process, zenoh.Session]]:
     """A mesh that rests at point 150, its gateway, which has carried everything so far, and a session in the mesh."""
     mesh = place.start("launch", config, "--no-progress", "--paused")
-    settings = zenoh.Config()
-    settings.insert_json5("mode", '"client"')
-    settings.insert_json5("connect/endpoints", json.dumps(place.note().endpoints))
-    with zenoh.open(settings) as session:
+    with place.session() as session:
         wait_until(lambda: commanded(session, "step", 150), "a mesh that has started")
         wait_until(lambda: len(ros.floats("angle")) == 151, "samples")
         [gateway] = [process for process in place.processes() if "gateway" in process.cmdline()]

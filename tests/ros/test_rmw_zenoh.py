@@ -106,7 +106,9 @@ def test_numbers_text_and_stamped_messages_flow_both_ways(met: Met, implementati
     values, texts, states = received["/value"], received["/text"], received["/state"][:COUNT]
     assert set(values) <= {0.1 * number for number in range(next(sent) + 1)}
     assert values == sorted(values)
+    assert len(set(values)) > COUNT // 10
     assert set(texts) <= {"", *(f"text {number}" for number in range(next(sent)))}
+    assert len(set(texts)) > COUNT // 10
     first = round((states[0][2] + states[0][3] * 1e-9) / 0.01)
     assert [(own[0], own[1], f"{own[2]}.{own[3]:09d}", own[4]) for own in states] == [
         (row[1], row[2], f"{row[0]:.9f}", "base") for row in rows[first : first + COUNT]
