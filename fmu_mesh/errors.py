@@ -11,7 +11,9 @@ FmuMeshError                     1   an internal error
 │   └── StepFailed                   fmi2DoStep, or a get or set at a point, failed
 ├── MeshLost                     4   a node, the master or the recorder is gone or silent
 │   ├── DeadlineExceeded             a wait met its deadline
-│   └── FrameGap                     a point is missing, or came twice with other values
+│   ├── FrameGap                     a point is missing, or came twice with other values
+│   └── ProtocolBroken               a registered peer sent what the protocol forbids, such as a grant beyond the window
+├── MessageRefused               1   what came over the wire is not understood; it is counted, and the run goes on
 ├── Interrupted                130   a person or the parent process asked to end
 └── TerminationRequested         0   an FMU asked to end the simulation: an orderly end, no failure
 ```
@@ -40,6 +42,8 @@ __all__ = [
     "LoadFailed",
     "LoopNotConverged",
     "MeshLost",
+    "MessageRefused",
+    "ProtocolBroken",
     "StepFailed",
     "TerminationRequested",
 ]
@@ -203,6 +207,14 @@ class FrameGap(MeshLost):
     """A point is missing from a sequence of frames, or came twice with other values."""
 
 
+class ProtocolBroken(MeshLost):
+    """A registered peer sent what the protocol forbids (design, invariant 7); names both ends."""
+
+
+class MessageRefused(FmuMeshError):
+    """What came over the wire is malformed, or comes from nobody who may send it. Ends no run."""
+
+
 class Interrupted(FmuMeshError):
     """A person, or the parent process, asked to end."""
 
@@ -229,6 +241,7 @@ _BY_KIND: dict[str, type[FmuMeshError]] = {
         MeshLost,
         DeadlineExceeded,
         FrameGap,
+        ProtocolBroken,
         Interrupted,
         TerminationRequested,
     )

@@ -77,7 +77,8 @@ def run_gateway(config_file: Path, options: Options, emit: Callable[[Event], Non
         keys = Keys(loaded.config.zenoh.key_prefix, loaded.config.mesh)
         profiles = stack.enter_context(open_profiles(section, ros, types, ros_plan))
         stack.enter_context(parameter_services(ros_plan, types, mesh, keys, profiles))
-        gateway = Gateway(ros_plan, types, mesh, keys, plan.grid, profiles)
+        patience_s = loaded.config.timeouts.start
+        gateway = Gateway(ros_plan, types, mesh, keys, plan.grid, profiles, patience_s)
         stack.callback(gateway.close)
         gateway.open()
         emit(Ready((*section.connect, *section.listen)))

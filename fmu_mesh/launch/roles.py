@@ -36,7 +36,7 @@ from ..wire.runtime import (
     tidy_run_folder,
     write_note,
 )
-from ..wire.session import close_session, open_session, own_endpoints
+from ..wire.session import RouterLink, close_session, open_session, own_endpoints
 from ..wire.views import LogLine, MeshStatus
 from .events import End, Event, Log, Ready, Status
 from .opening import open_instance, stepped
@@ -76,17 +76,18 @@ def run_node(
         plan_file.unlink()
     else:
         plan = _node_plan(prepare(config_file, options), name)
-    _NodeProcess(config_file, plan, options, run_folder(plan.mesh, run)).run(child=child)
+    _NodeProcess(config_file, plan, options, run_folder(plan.mesh, run), _launch(run)).run(child=child)
 
 
 class _NodeProcess:
     """A node with all that it takes from its host: a session, a folder, FMUs, and an answer to signals."""
 
-    def __init__(self, config_file: Path, plan: NodePlan, options: Options, folder: Path) -> None:
+    def __init__(self, config_file: Path, plan: NodePlan, options: Options, folder: Path, launch: str | None) -> None:
         self._config_file = config_file
         self._plan = plan
         self._zenoh = zenoh_section(load(config_file), options)
         self._folder = folder
+        self._launch = launch
         self._options = options
         self._instances: list[Instance] = []
         self._guarded: list[Guarded] = []
@@ -108,7 +109,8 @@ class _NodeProcess:
             stack.callback(close_session, session)
             self._watch = stack.enter_context(closing(CallWatch(self._take_hang)))
             stack.callback(self._close_instances)
-            self._node = node = Node(self._plan, session, self._open)
+            router = RouterLink(session, self._zenoh.connect)
+            self._node = node = Node(self._plan, session, self._open, router=router, launch=self._launch)
             node.server.on_hang = self._take_hang
             if self._interrupted is not None:
                 node.interrupt(self._interrupted)
@@ -197,25 +199,34 @@ def run_master(
         tidy_run_folder(folder)
         _refuse_second(folder, MASTER, f"the master of mesh '{config.mesh}'")
         enter_run_folder(folder, MASTER)
+        recorder = error = None
         with _told(plan, emit):
             session = open_session(wiring(config.zenoh, config_file, folder, MASTER, ()))
-        stack.callback(close_session, session)
-        endpoints = own_endpoints(session) if config.zenoh.mode == "peer" else tuple(config.zenoh.connect)
-        public = tuple(endpoint for endpoint in endpoints if not endpoint.startswith("unixsock-stream/"))
-        note = MeshNote(config.mesh, config.zenoh.key_prefix, public, os.getpid(), str(config_file))
+            stack.callback(close_session, session)
+            endpoints = own_endpoints(session) if config.zenoh.mode == "peer" else tuple(config.zenoh.connect)
+            public = tuple(endpoint for endpoint in endpoints if not endpoint.startswith("unixsock-stream/"))
+            master = Master(
+                plan,
+                session,
+                _Emitter(emit),
+                endpoints=public,
+                config_file=str(config_file),
+                router=RouterLink(session, config.zenoh.connect),
+                launch=_launch(run),
+            )
+            stack.callback(master.close)
+            master.claim()
         if not child:
-            write_note(folder, note)
+            write_note(folder, MeshNote(config.mesh, config.zenoh.key_prefix, public, os.getpid(), str(config_file)))
         emit(Ready(public))
-        recorder, error = None, None
-        master = Master(plan, session, _Emitter(emit), endpoints=public, config_file=str(config_file))
-        stack.callback(master.close)
         master.watch = GrantWatch() if options.profile else None
         master.starts_paused = options.paused
         for reason in early:
             master.interrupt(reason)
         try:
             if RECORDER in plan.nodes:
-                with Recorder(plan.nodes[RECORDER], session, result_opener(config_file, plan.system)) as recorder:
+                opener = result_opener(config_file, plan.system)
+                with Recorder(plan.nodes[RECORDER], session, opener, launch=_launch(run)) as recorder:
                     master.run()
             else:
                 master.run()
@@ -226,6 +237,11 @@ def run_master(
         if error is not None:
             raise error
         master.wait_for_followers()
+
+
+def _launch(run: str) -> str | None:
+    """Which launch a process belongs to, for those that meet it on a router; None if it was started by hand."""
+    return f"{socket.gethostname()}.{run}" if run != BY_HAND else None
 
 
 def _end_of(master: Master, rows: int, result_file: str | None, error: FmuMeshError | None) -> End:

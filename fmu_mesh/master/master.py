@@ -23,20 +23,25 @@ import msgspec
 import zenoh
 
 from ..errors import (
+    ConfigurationError,
     DeadlineExceeded,
     ErrorReport,
     FmuMeshError,
     Interrupted,
     MeshLost,
+    MessageRefused,
+    ProtocolBroken,
     TerminationRequested,
     from_report,
 )
 from ..model.plan import RECORDER, Plan
 from ..wire.inbox import Inbox
-from ..wire.keys import Keys
+from ..wire.keys import Keys, RunKeys
 from ..wire.membership import MASTER
-from ..wire.messages import FINISH, GRANT, PROGRESS, NodeReport
+from ..wire.messages import FINISH, GRANT, PROGRESS, NodeReport, decode_json
 from ..wire.profile import TIME_LINE_ENTRIES, MeshProfile
+from ..wire.refusals import payload_of
+from ..wire.session import RouterLink, tokens
 from ..wire.shared_memory import SharedInbox, available
 from ..wire.values import json_encoding
 from ..wire.views import Command, CommandAnswer, MeshInfo, MeshState, MeshStatus
@@ -50,6 +55,8 @@ __all__ = ["Master"]
 log = logging.getLogger(__name__)
 
 _HEARTBEAT_S = 0.5
+_LEAST_HEARTBEAT_S = 0.01
+_GOING_ON = ("starting", "initializing", "running", "paused")
 
 
 class Master:
@@ -60,16 +67,26 @@ class Master:
         session: the session of this process; stays the caller's.
         endpoints: where tools can reach this process, for `mesh/info`.
         config_file: name of the configuration file, for `mesh/info`.
+        router: the link to the router that connects the nodes, if there is one.
+        launch: the launcher that started this process; None where it was started by hand.
 
     Attributes:
         watch: set it before `run` for a profile: then nodes measure themselves, and this sums up what holds the grant.
         ended_by: which FMU asked to end the simulation before its last point, if one did.
 
-    Call `run` once, from the main thread, then `wait_for_followers` if it went well, then `close`.
+    Call `claim`, then `run` once, from the main thread, then `wait_for_followers` if it went well, then `close`.
     """
 
-    def __init__(
-        self, plan: Plan, session: zenoh.Session, events: Events, *, endpoints: Sequence[str], config_file: str
+    def __init__(  # noqa: PLR0913  one run and what it is reached by
+        self,
+        plan: Plan,
+        session: zenoh.Session,
+        events: Events,
+        *,
+        endpoints: Sequence[str],
+        config_file: str,
+        router: RouterLink | None = None,
+        launch: str | None = None,
     ) -> None:
         config = plan.system.config
         self._plan = plan
@@ -77,8 +94,14 @@ class Master:
         self._endpoints = tuple(endpoints)
         self._config_file = config_file
         self._timeouts = config.timeouts
+        self._heartbeat_s = max(_LEAST_HEARTBEAT_S, min(_HEARTBEAT_S, config.timeouts.step / 4))
         self._keys = Keys(config.zenoh.key_prefix, config.mesh)
+        self._run_keys = RunKeys.new(self._keys)
+        self._router = router or RouterLink(session)
         self._nodes = list(plan.nodes)
+        self._numbers = {node: number for number, node in enumerate(self._nodes)}
+        # A slower instance tells the point up to which its outputs hold: its next own step less one.
+        self._most_ahead = 2 * max(item.step_points for item in plan.system.instances.values()) - 2
         self._windows = [plan.nodes[node].window for node in self._nodes]
         self._most_instances = max(len(node.instances) for node in plan.nodes.values())
         self._progress = [-1] * len(self._nodes)
@@ -101,18 +124,31 @@ class Master:
         self._published = 0.0
         self._moved = time.monotonic()
         shares = config.zenoh.shared_memory and available()
-        self._inbox = Inbox(
-            session,
-            self._keys.inbox(MASTER),
-            self._keys.wake(MASTER),
-            (plan.window + 64) * len(self._nodes) + 1024,
-            # It is looked at closely only where nodes wait for every single grant.
-            SharedInbox(dict.fromkeys(self._nodes, 0), spins=plan.window == 1) if shares else None,
-        )
-        self._members = Members(plan, session, self._keys, self._inbox, self._lose)
+        # It is looked at closely only where nodes wait for every single grant.
+        self._inbox = Inbox(SharedInbox(dict.fromkeys(self._nodes, 0), spins=plan.window == 1) if shares else None)
+        senders = {self._run_keys.progress(node): node for node in self._nodes}
+        capacity = (plan.window + 64) * len(self._nodes) + 1024
+        self._inbox.open(session, self._run_keys, MASTER, senders, capacity)
+        self._members = Members(plan, session, self._run_keys, self._inbox, self._lose, launch)
         self._send = self._members.send
-        self._server = Server(session, self._keys, self._inbox, events, self.last_status)
+        self._server = Server(session, self._keys, self._inbox, events, self.last_status, plan.system.instances)
         self._publish_status = self._server.publish_status
+
+    def claim(self) -> None:
+        """Be the master of this mesh, which is to be done before anything else of it can be seen.
+
+        Raises:
+            ConfigurationError: another process is, there where this session connects to; it notices nothing.
+        """
+        self._router.wait()
+        self._token = self._session.liveliness().declare_token(self._run_keys.master)
+        others = [key for key in tokens(self._session, self._keys.run("*").master) if key != self._run_keys.master]
+        if others:
+            self._token.undeclare()
+            raise ConfigurationError(
+                f"mesh '{self._keys.mesh}' runs already where this one connects to",
+                hint="Stop it first, or give this mesh another name or another `zenoh.key_prefix`.",
+            )
 
     def run(self) -> None:
         """Run the mesh to its last point.
@@ -144,6 +180,7 @@ class Master:
             self._clock.stop()
             self._publish_status(final=True)
             token.undeclare()
+            self._token.undeclare()
 
     def wait_for_followers(self) -> None:
         """Stay, as the router, until those that need the last sample have it; their tokens tell, Zenoh does not."""
@@ -234,12 +271,12 @@ class Master:
             self._grant = grant
             self._members.grant(grant)
         self._send_grant_as_sign_of_life()
-        return min(pause, STATUS_S)
+        return min(pause, STATUS_S, self._heartbeat_s)
 
     def _send_grant_as_sign_of_life(self) -> None:
         """The same grant to all, so that those who wait for a slow FMU of another one know that the master lives."""
         now = time.monotonic()
-        if now - self._published >= _HEARTBEAT_S:
+        if now - self._published >= self._heartbeat_s:
             self._published = now
             self._send(GRANT, self._grant)
 
@@ -269,7 +306,7 @@ class Master:
                 raise DeadlineExceeded(f"{what} {spoken(*missing)} within {timeout_s:g} s")
             if self._state == "initializing":
                 self._send_grant_as_sign_of_life()
-            self._turn(0.1)
+            self._turn(min(0.1, self._heartbeat_s))
 
     def _turn(self, timeout_s: float) -> None:
         """Take what arrived, at least one message if one comes within ``timeout_s`` seconds.
@@ -279,10 +316,7 @@ class Master:
         """
         message, moved = self._inbox.wait(timeout_s), False
         while message is not None:
-            kind, number, _, point, _ = message
-            if kind == PROGRESS and number < len(self._progress) and point > self._progress[number]:
-                self._progress[number] = point
-                moved = True
+            moved = self._take_progress(*message) or moved
             message = self._inbox.poll()
         if moved:  # whoever it was: the slowest may be the last of a row of slow ones
             self._slowest = min(self._progress)
@@ -291,6 +325,20 @@ class Master:
         if self._failure is not None:
             raise self._failure
 
+    def _take_progress(self, node: str, kind: int, _link: int, _count: int, point: int, _data: bytes) -> bool:
+        """A message of a node; whether the node has moved."""
+        if kind != PROGRESS:
+            self._inbox.refusals.add(spoken(node), f"a message of kind {kind} is nothing that the master takes")
+            return False
+        if not self._may_be_at(node, point):
+            self._fail(self._broken(node, f"is at point {point}"))
+            return False
+        number = self._numbers[node]
+        if point <= self._progress[number]:
+            return False
+        self._progress[number] = point
+        return True
+
     def _fail(self, error: FmuMeshError) -> None:
         if self._failure is None:
             self._failure = error
@@ -298,40 +346,67 @@ class Master:
     # --- what arrives; all of it on the main thread
 
     def _declare(self) -> None:
-        server = self._server
+        server, keys = self._server, self._run_keys
         server.serve(self._keys.register, self._members.register)
-        server.serve(self._keys.report, self._take_report)
+        server.serve(keys.ready("*"), self._members.ready)
+        server.serve(keys.report("*"), self._take_report)
         server.show("info", self._info)
         server.show("status", self.last_status)
         server.show("plan", lambda: self._plan.nodes)
         server.serve(self._keys.mesh_key("command"), self._command)
-        server.watch(self._keys.node_token("*"), self._members.token_changed)
-        server.watch(self._keys.follower("*"), self._follower_changed)
+        server.watch(keys.node("*"), self._members.token_changed)
+        server.watch(keys.follower("*"), self._follower_changed)
         server.hand_on_logs()
 
     def _take_report(self, query: zenoh.Query) -> None:
-        report = msgspec.json.decode(query.payload.to_bytes() if query.payload else b"", type=NodeReport)
+        node = RunKeys.node_in(str(query.key_expr))
+        report = decode_json(payload_of(query, self._run_keys.report(node)), NodeReport)
+        if report.node != node or not self._members.is_admitted(node):
+            raise MessageRefused("it is from no node that has registered")
         error = from_report(report.error) if report.error is not None else None
         if isinstance(error, TerminationRequested):
             # Its node goes on with its other instances, and says so once more at the end.
-            if error.point is not None and error.point < self._last_point:
+            if error.point is None or not self._may_be_at(node, error.point):
+                self._fail(self._broken(node, f"has an FMU that ends the simulation at point {error.point}"))
+            elif error.point < self._last_point:
                 self.ended_by = error
+        elif error is None and self._state in _GOING_ON:
+            self._fail(self._broken(node, f"has ended at point {report.point}"))
         else:
-            self._reports[report.node] = report
+            self._reports[node] = report
             if error is not None:
                 self._fail(error)
         query.reply(query.key_expr, b"")
         query.drop()
 
+    def _may_be_at(self, node: str, point: int) -> bool:
+        """Whether a node can have come there with what it was granted."""
+        ended = self.ended_by is not None and node != RECORDER
+        most = self._plan.grid.last_point if ended else self._grant + self._most_ahead
+        return -1 <= point <= most
+
+    def _broken(self, node: str, what: str) -> ProtocolBroken:
+        return ProtocolBroken(
+            f"{spoken(node)} says that it {what}, and the master has granted point {self._grant}",
+            instance=self._instances_of(node),
+            hint="Does somebody else send in its name?",
+        )
+
+    def _instances_of(self, node: str) -> str | None:
+        return ", ".join(item.name for item in self._plan.nodes[node].instances) or None
+
     def _lose(self, node: str) -> None:
         """The process of a node is gone; whoever has reported may go."""
         if node in self._reports:
             return
-        point = max(self._progress[self._nodes.index(node)], 0)
+        point = max(self._progress[self._numbers[node]], 0)
+        loss = self._router.loss()
         self._fail(
             MeshLost(
-                f"{spoken(node)} was lost: its process does not answer any more",
-                instance=", ".join(item.name for item in self._plan.nodes[node].instances) or None,
+                f"{loss}, and {spoken(node)} with it"
+                if loss is not None
+                else f"{spoken(node)} was lost: its process does not answer any more",
+                instance=self._instances_of(node),
                 point=point,
                 time=self._plan.grid.time(point),
             )
@@ -349,12 +424,10 @@ class Master:
 
     def _command(self, query: zenoh.Query) -> None:
         """pause, resume, step N and stop; the grant is all that they move."""
-        try:
-            command = msgspec.json.decode(query.payload.to_bytes() if query.payload else b"", type=Command)
-        except msgspec.DecodeError as error:
-            query.reply_err(f"not a command: {error}")
-            query.drop()
+        if query.payload is None and str(query.key_expr) != self._keys.mesh_key("command"):
+            query.drop()  # somebody looks at all keys
             return
+        command = decode_json(payload_of(query, self._keys.mesh_key("command")), Command)
         if self._state not in ("running", "paused"):
             query.reply_err(f"the mesh is {self._state}; there is nothing to {command.command}")
             query.drop()
@@ -380,7 +453,7 @@ class Master:
     # --- views
 
     def _info(self) -> MeshInfo:
-        return mesh_info(self._plan, self._config_file, self._endpoints, self._members.shared)
+        return mesh_info(self._plan, self._run_keys.run, self._config_file, self._endpoints, self._members.shared)
 
     def last_status(self) -> MeshStatus:
         """The state of the run right now."""
@@ -399,4 +472,5 @@ class Master:
             progress={node: max(progress, 0) for node, progress in zip(self._nodes, self._progress, strict=True)},
             error=failure,
             overruns=self._pacer.overruns,
+            refused=self._inbox.refusals.count,
         )

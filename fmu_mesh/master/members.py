@@ -5,21 +5,25 @@ Owns the master's end of `fmu_mesh.wire.membership`. Knows nothing of points and
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 
 import msgspec
 import zenoh
 
-from ..errors import DeadlineExceeded, FmuMeshError
+from ..errors import DeadlineExceeded, FmuMeshError, MessageRefused
 from ..model.plan import RECORDER, Plan
 from ..wire.inbox import Inbox
-from ..wire.keys import Keys, batched
-from ..wire.membership import MASTER, Registration, Welcome
-from ..wire.messages import GRANT, HEADER, encode_abort
-from ..wire.session import undeclare_all
+from ..wire.keys import Keys, RunKeys, batched
+from ..wire.membership import MASTER, Admission, Ready, Registration, Welcome
+from ..wire.messages import GRANT, HEADER, decode_json, encode_abort
+from ..wire.refusals import payload_of
+from ..wire.session import tokens, undeclare_all
 from ..wire.shared_memory import SharedOutlet
 
 __all__ = ["Members", "spoken"]
+
+log = logging.getLogger(__name__)
 
 
 class Members:
@@ -28,29 +32,44 @@ class Members:
     Args:
         plan: the plan of the whole mesh.
         session: the session of this process; stays the caller's.
+        keys: those of the run.
         inbox: the inbox of the master.
         on_lost: called with the name of a node whose process is gone.
+        launch: the launcher that started this process; None where it was started by hand.
 
     Attributes:
         shared: who gets all messages through shared memory: names of nodes, `@mesh` for the master.
 
-    Call sequence: `register` and `token_changed` with what arrives; `welcome` once all are `complete`; from then on
-    `send`. `abort` may come at any time, `close` at the end.
+    Call sequence: `register`, `ready` and `token_changed` with what arrives; `welcome` once all are `complete`; from
+    then on `send`. `abort` may come at any time, `close` at the end.
     """
 
-    def __init__(
-        self, plan: Plan, session: zenoh.Session, keys: Keys, inbox: Inbox, on_lost: Callable[[str], None]
+    def __init__(  # noqa: PLR0913, PLR0917  the run and what it is reached by
+        self,
+        plan: Plan,
+        session: zenoh.Session,
+        keys: RunKeys,
+        inbox: Inbox,
+        on_lost: Callable[[str], None],
+        launch: str | None = None,
     ) -> None:
         self._plan = plan
+        self._session = session
+        self._keys = keys
         self._timeouts = plan.system.config.timeouts
         self._nodes = list(plan.nodes)
         self._inbox = inbox
         self._on_lost = on_lost
-        self._registered: dict[str, tuple[Registration, zenoh.Query]] = {}
+        self._launch = launch
+        self._admitted: dict[str, Registration] = {}
+        self._refused: list[str] = []
+        self._ready: dict[str, tuple[Ready, zenoh.Query]] = {}
+        self._welcomed = False
         self._outlets: dict[str, SharedOutlet] = {}
         self.shared: tuple[str, ...] = ()
-        self._present: set[str] = set()
-        self._welcomed = False
+        self._grant_keys = {
+            node: key for key, part in zip(keys.grants(self._nodes), batched(self._nodes), strict=True) for node in part
+        }
         self._grants = [
             session.declare_publisher(key, congestion_control=zenoh.CongestionControl.BLOCK, express=True)
             for key in keys.grants(self._nodes)
@@ -59,50 +78,80 @@ class Members:
         self._stepping = self._senders
 
     def register(self, query: zenoh.Query) -> None:
-        """Take a registration, which is answered by `welcome`; refuse one that does not belong here."""
-        registration = msgspec.json.decode(query.payload.to_bytes() if query.payload else b"", type=Registration)
-        if registration.node not in self._plan.nodes:
-            query.reply_err(f"this mesh has no node '{registration.node}'")
-        elif registration.digest != self._plan.digest:
-            where = f"process {registration.pid} on {registration.host}"
-            query.reply_err(
-                f"node '{registration.node}' ({where}) has another configuration, or other FMUs, than the master"
-            )
-        elif registration.node in self._registered or self._welcomed:
-            query.reply_err(f"node '{registration.node}' is there already; two processes run it")
-        else:
-            outlet = SharedOutlet.open(
-                registration.offer, MASTER, spoken(registration.node), self._inbox.stash, self._timeouts.step
-            )
-            if outlet is not None and self._inbox.offer is not None:
-                self._outlets[registration.node] = outlet
-            self._registered[registration.node] = (registration, query)
-            return
+        """Admit a node, or refuse one that does not belong here: nobody but itself notices.
+
+        Raises:
+            MessageRefused: it is no registration.
+        """
+        config = self._plan.system.config
+        key = Keys(config.zenoh.key_prefix, config.mesh).register
+        registration = decode_json(payload_of(query, key), Registration)
+        if registration.launch == self._launch:
+            reason = self._reason_against(registration)
+            if reason is None:
+                self._admitted[registration.node] = registration
+                admission = Admission(self._keys.run, self._grant_keys[registration.node])
+                query.reply(key, msgspec.json.encode(admission))
+            else:
+                self._refused.append(reason)
+                log.info("node_refused", extra={"reason": reason})
+                query.reply_err(reason)
+        # What another launch has started gets no answer: it is for its own master to tell it.
         query.drop()
 
+    def _reason_against(self, registration: Registration) -> str | None:
+        node, where = registration.node, f"process {registration.pid} on {registration.host}"
+        if node not in self._plan.nodes:
+            return f"this mesh has no node '{node}'"
+        if registration.digest != self._plan.digest:
+            return f"node '{node}' ({where}) has another configuration, or other FMUs, than the master"
+        # Who asks again, because no answer came, is the same.
+        if self._admitted.get(node, registration) != registration:
+            return f"node '{node}' is there already; two processes run it"
+        return None
+
+    def is_admitted(self, node: str) -> bool:
+        """Whether this is a node of the run."""
+        return node in self._admitted
+
+    def ready(self, query: zenoh.Query) -> None:
+        """Take that a node is ready, which is answered by `welcome`.
+
+        Raises:
+            MessageRefused: it is none, or not of a node of this run.
+        """
+        node = RunKeys.node_in(str(query.key_expr))
+        data = payload_of(query, self._keys.ready(node))
+        if node not in self._admitted or node in self._ready:
+            raise MessageRefused("it is from no node that has registered")
+        ready = decode_json(data, Ready)
+        outlet = SharedOutlet.open(ready.offer, MASTER, spoken(node), self._inbox.stash, self._timeouts.step)
+        if outlet is not None and self._inbox.offer is not None:
+            self._outlets[node] = outlet
+        self._ready[node] = (ready, query)
+
     def token_changed(self, sample: zenoh.Sample) -> None:
-        """Take the liveliness token of a node: it is there, or it is gone."""
-        node = str(sample.key_expr).rsplit("/", 1)[1]
-        if sample.kind == zenoh.SampleKind.PUT:
-            self._present.add(node)
-        elif node in self._plan.nodes:
+        """Take a liveliness token of a node that is gone, if it really is."""
+        node = RunKeys.node_in(str(sample.key_expr))
+        gone = sample.kind == zenoh.SampleKind.DELETE and node in self._admitted
+        if gone and not tokens(self._session, self._keys.node(node)):
             self._on_lost(node)
 
     @property
     def complete(self) -> bool:
-        """Whether every node has registered and waits for its welcome."""
-        return len(self._registered) >= len(self._nodes)
+        """Whether every node is ready and waits for its welcome."""
+        return len(self._ready) >= len(self._nodes)
 
     def absence(self) -> DeadlineExceeded:
-        """The error that names who has not registered."""
-        missing = [node for node in self._nodes if node not in self._registered]
+        """The error that names who is not ready."""
+        missing = [node for node in self._nodes if node not in self._ready]
         if len(missing) > 1:  # the recorder only waits for the others
             missing = [node for node in missing if node != RECORDER]
-        there = [node for node in missing if node in self._present]
-        return DeadlineExceeded(
-            f"not ready within {self._timeouts.start:g} s: {spoken(*missing)}",
-            hint=f"Started, but not ready: {', '.join(there)}." if there else "None of them was started.",
-        )
+        there = [node for node in missing if node in self._admitted]
+        hint = f"Started, but not ready: {', '.join(there)}." if there else "None of them was started."
+        if self._refused:
+            hint += f" Refused: {self._refused[-1]}."
+        return DeadlineExceeded(f"not ready within {self._timeouts.start:g} s: {spoken(*missing)}", hint=hint)
 
     def welcome(self, profile_entries: int) -> None:
         """Answer all nodes, and tell them who is reached through shared memory: the master is if all nodes are.
@@ -110,7 +159,7 @@ class Members:
         Args:
             profile_entries: how many bursts and waits each node shall note for a profile; 0: nothing is measured.
         """
-        shared = [node for node in self._nodes if node in self._outlets and self._registered[node][0].shared]
+        shared = [node for node in self._nodes if node in self._outlets and self._ready[node][0].shared]
         self._stepping = [self._outlets[node].put for node in shared if node != RECORDER]
         rest = [node for node in self._nodes if node not in shared]
         if rest:
@@ -123,9 +172,8 @@ class Members:
             shared.append(MASTER)
         self.shared = tuple(shared)
         self._welcomed = True
-        for number, node in enumerate(self._nodes):
-            _, query = self._registered.pop(node)
-            query.reply(query.key_expr, msgspec.json.encode(Welcome(number, profile_entries, self.shared, offer)))
+        for _, query in self._ready.values():
+            query.reply(query.key_expr, msgspec.json.encode(Welcome(profile_entries, self.shared, offer)))
             query.drop()
 
     def send(self, kind: int, point: int) -> None:
@@ -144,10 +192,10 @@ class Members:
         """Tell the nodes why the run ends, and give them the time to end by themselves."""
         for send in self._senders:
             send(encode_abort(error.report()))
-        for _, query in self._registered.values():  # nodes that still wait to be let in
-            query.reply_err(str(error))
-            query.drop()
-        self._registered.clear()
+        if not self._welcomed:
+            for _, query in self._ready.values():  # they still wait to be let in
+                query.reply_err(str(error))
+                query.drop()
 
     def close(self) -> None:
         """Undeclare what was sent on."""

@@ -5,30 +5,31 @@ Everything that arrives, on foreign threads, is posted to the main thread.
 
 from __future__ import annotations
 
-import logging
 import os
 import socket
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import Literal, Protocol
 
 import msgspec
 import zenoh
 
 from .. import __version__
+from ..errors import MessageRefused
 from ..model.plan import Plan
 from ..wire.inbox import Inbox
 from ..wire.keys import Keys
+from ..wire.messages import decode_json
 from ..wire.session import matches, undeclare_all
 from ..wire.values import json_encoding
 from ..wire.views import LogLine, MeshInfo, MeshStatus
 
 __all__ = ["STATUS_S", "Events", "Server", "mesh_info"]
 
-log = logging.getLogger(__name__)
-
 STATUS_S = 0.1
 """How often the status is published."""
+
+_MOST_LOG_BYTES = 1 << 20
 
 
 class Events(Protocol):
@@ -50,16 +51,24 @@ class Server:
         session: the session of this process; stays the caller's.
         inbox: the inbox of the master.
         status: the state of the run right now.
+        instances: the names of all instances.
     """
 
-    def __init__(
-        self, session: zenoh.Session, keys: Keys, inbox: Inbox, events: Events, status: Callable[[], MeshStatus]
+    def __init__(  # noqa: PLR0913, PLR0917  the run and whom it tells
+        self,
+        session: zenoh.Session,
+        keys: Keys,
+        inbox: Inbox,
+        events: Events,
+        status: Callable[[], MeshStatus],
+        instances: Collection[str],
     ) -> None:
         self._session = session
         self._keys = keys
         self._inbox = inbox
         self._events = events
         self._status = status
+        self._instances = frozenset(instances)
         self._status_published = 0.0
         self._entities: list[zenoh.Queryable[None] | zenoh.Subscriber[None]] = []
         self._status_publisher = session.declare_publisher(
@@ -67,9 +76,14 @@ class Server:
         )
 
     def serve(self, key: str, answer: Callable[[zenoh.Query], None]) -> None:
-        """From now on ``answer`` gets the queries of a key."""
-        post = self._inbox.post
-        self._entities.append(self._session.declare_queryable(key, lambda query: post(lambda: answer(query))))
+        """From now on ``answer`` gets the queries of a key; what it refuses is answered with the reason."""
+        post, guard = self._inbox.post, self._inbox.refusals.guard
+
+        def take(query: zenoh.Query) -> None:
+            with guard(str(query.key_expr), query):
+                answer(query)
+
+        self._entities.append(self._session.declare_queryable(key, lambda query: post(lambda: take(query))))
 
     def show(self, what: Literal["info", "status", "plan"], view: Callable[[], object]) -> None:
         """From now on a key of the mesh is answered with a view."""
@@ -98,10 +112,12 @@ class Server:
         )
 
     def _log(self, sample: zenoh.Sample) -> None:
-        try:
-            self._events.log(msgspec.json.decode(sample.payload.to_bytes(), type=LogLine))
-        except msgspec.DecodeError as error:
-            log.warning("log_line_not_understood", extra={"key": str(sample.key_expr), "error": str(error)})
+        key = str(sample.key_expr)
+        with self._inbox.refusals.guard(key):
+            line = decode_json(sample.payload.to_bytes(), LogLine, _MOST_LOG_BYTES)
+            if key != f"{self._keys.instance(line.instance)}/log" or line.instance not in self._instances:
+                raise MessageRefused("it is not the log of an instance of this mesh")
+            self._events.log(line)
 
     def publish_status(self, *, final: bool = False) -> None:
         """Publish the status if it is time to."""
@@ -119,11 +135,12 @@ class Server:
         undeclare_all(self._entities, [self._status_publisher])
 
 
-def mesh_info(plan: Plan, config_file: str, endpoints: Sequence[str], shared: Sequence[str]) -> MeshInfo:
+def mesh_info(plan: Plan, run: str, config_file: str, endpoints: Sequence[str], shared: Sequence[str]) -> MeshInfo:
     """What `mesh/info` answers.
 
     Args:
         plan: the plan of the whole mesh.
+        run: the run's id.
         config_file: name of the configuration file.
         endpoints: where tools can reach this process.
         shared: who gets all messages through shared memory.
@@ -133,6 +150,7 @@ def mesh_info(plan: Plan, config_file: str, endpoints: Sequence[str], shared: Se
     return MeshInfo(
         mesh=config.mesh,
         version=__version__,
+        run=run,
         config=config_file,
         start_time=grid.start_time,
         stop_time=grid.stop_time,

@@ -11,6 +11,7 @@ from collections.abc import Mapping
 
 from ..errors import FmuMeshError, StepFailed
 from ..model.plan import NodePlan
+from ..wire.refusals import Refusals
 from ..wire.views import InstanceStatus
 from .stepping import Runner, Unit
 
@@ -28,14 +29,19 @@ class Activity:
         waited_s: how long it has waited since the first point.
         advancing: the unit that the main thread steps, if it does.
         runners: the instances, once all are loaded.
+
+    Args:
+        plan: the node's plan.
+        refusals: what its process did not take.
     """
 
-    def __init__(self, plan: NodePlan) -> None:
+    def __init__(self, plan: NodePlan, refusals: Refusals) -> None:
         self.state = "starting"
         self.waiting = False
         self.waited_s = 0.0
         self.runners: Mapping[str, Runner] = {}
         self._plan = plan
+        self._refusals = refusals
         self._started: float | None = None
         self.advancing: Unit | None = None
         self._under_way: tuple[str, int, float] | None = None
@@ -49,16 +55,29 @@ class Activity:
         runner = self.runners.get(name)
         if runner is None:
             start = self._plan.grid.time(0)
-            return InstanceStatus(name, self.state, self.state, 0, start, 0.0, 0.0, restarts=self._plan.restarts)
+            return InstanceStatus(
+                name,
+                self.state,
+                self.state,
+                0,
+                start,
+                0.0,
+                0.0,
+                restarts=self._plan.restarts,
+                refused=self._refusals.count,
+            )
+        step = runner.step  # the main thread goes on meanwhile: what is told belongs to one point
+        point = step * runner.plan.step_points
         return InstanceStatus(
             instance=name,
             state=self.state,
             activity=self._in_words(runner),
-            point=runner.point,
-            time=self._plan.grid.time(runner.point),
-            step_time=runner.step_seconds / runner.step if runner.step else 0.0,
+            point=point,
+            time=self._plan.grid.time(point),
+            step_time=runner.step_seconds / step if step else 0.0,
             wait_time=self.waited_s,
             restarts=self._plan.restarts,
+            refused=self._refusals.count,
             running_time=time.monotonic() - self._started if self._started is not None else 0.0,
         )
 

@@ -29,6 +29,7 @@ from .streams import kind_of
 __all__ = ["Answers", "Job"]
 
 _ANSWER_S = 2.0
+_LOOKS = 3
 
 Job = Callable[[], None]
 
@@ -86,8 +87,10 @@ class Answers:
             query.reply_err(f"'{name}' has no values now: {self._activity.state}")
             query.drop()
             return
-        known, unknown = self._split(runner, wanted)
-        self._reply_values(runner, query, known, runner.step)
+        known, step = self._from_rows(runner, wanted)
+        self._reply_values(runner, query, known, step)
+        answered = {key for key, _ in known}
+        unknown = [(key, variable) for key, variable in wanted if key not in answered]
         if unknown:
             self._read_at_next_point(runner, query, unknown)
         else:
@@ -116,13 +119,20 @@ class Answers:
                     matching.append((key, variable))
         return matching
 
-    def _split(
-        self, runner: Runner, wanted: list[tuple[str, Variable]]
-    ) -> tuple[list[tuple[str, Value]], list[tuple[str, Variable]]]:
-        """Values that the rings hold, and variables that only the FMU knows."""
-        names = {*runner.outputs.layout.names}
-        known = [(key, runner.outputs.value(runner.step, v.name)) for key, v in wanted if v.name in names]
-        return known, [(key, v) for key, v in wanted if v.name not in names]
+    def _from_rows(self, runner: Runner, wanted: list[tuple[str, Variable]]) -> tuple[list[tuple[str, Value]], int]:
+        """Values that the rows of the newest own step hold, and that step; what only the FMU knows is left out.
+
+        The main thread steps meanwhile. It may come round to this row, which then holds values of a later step: what
+        was read is thrown away, and read again; after a few times it is left to the main thread.
+        """
+        ring = runner.outputs
+        names = {*ring.layout.names}
+        for _ in range(_LOOKS):
+            step = runner.step
+            values = [(key, ring.value(step, v.name)) for key, v in wanted if v.name in names]
+            if runner.step + 1 - step < ring.rows:
+                return values, step
+        return [], runner.step
 
     def _reply_values(self, runner: Runner, query: zenoh.Query, values: list[tuple[str, Value]], step: int) -> None:
         point = step * runner.plan.step_points

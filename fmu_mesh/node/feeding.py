@@ -5,7 +5,8 @@ Makes the feeds once, from the plan; using them is `fmu_mesh.node.stepping`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from functools import partial
 
 from ..model.plan import NodePlan
 from ..model.transfer import Transfer
@@ -19,7 +20,9 @@ def connect_feeds(plan: NodePlan, runners: Mapping[str, Runner]) -> dict[int, tu
     """Give all runners their feeds; returns who receives the frames of each link, by its index, and what they feed."""
     remote: dict[int, tuple[FrameReceiver, list[RemoteFeed]]] = {}
     for link in plan.links_in:
-        remote[link.index] = (FrameReceiver(link, f"node '{plan.node}'", plan.ring_rows), [])
+        fed: list[RemoteFeed] = []
+        fits = partial(_fit, fed)
+        remote[link.index] = (FrameReceiver(link, f"node '{plan.node}'", plan.ring_rows, fits), fed)
     receivers = {
         receiver.link.source: (receiver, feeds) for receiver, feeds in remote.values() if not receiver.link.initial_only
     }
@@ -42,6 +45,11 @@ def connect_feeds(plan: NodePlan, runners: Mapping[str, Runner]) -> dict[int, tu
                 transfer = Transfer(
                     feed, link.layout, runner.inputs, source_points=link.step_points, target_points=points
                 )
-                feeds.append(RemoteFeed(receiver, transfer))
+                feeds.append(RemoteFeed(receiver, runner, transfer))
                 runner.remote_feeds.append(feeds[-1])
     return remote
+
+
+def _fit(feeds: Sequence[RemoteFeed], end: int) -> bool:
+    """Whether the source's rows before own step ``end`` overwrite no input that was not used yet."""
+    return all(feed.transfer.ready(end) - feed.target.step <= feed.target.inputs.rows for feed in feeds)

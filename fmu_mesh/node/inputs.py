@@ -16,7 +16,7 @@ from ..model.ring import Ring
 from ..model.trajectory import Trajectory
 from ..model.types import is_float
 from ..model.wrapping import AroundInstance
-from ..simtime import TimeGrid
+from ..simtime import ENDLESS, TimeGrid
 from ..wire.values import ValueRefused
 from .stepping import Runner
 
@@ -74,13 +74,16 @@ class TimedInputs(AroundInstance[Instance]):
         """A value of an input from ``time`` (s; None: now) on; returns the own step that is the first to use it.
 
         Raises:
-            ValueRefused: too many values wait for their time.
+            ValueRefused: too many values wait for their time, or this one is too late.
         """
         if self._grid is None:
             self._early.append((name, value, time))
             return 0
         now = self._time(self._step)
         when = now if time is None else time
+        steps = (when - self._resolution(when) - self._grid.start_time) / (self._points * self._grid.step_size)
+        if steps > ENDLESS:
+            raise ValueRefused(f"the time {when:g} s is later than any run ends")
         if name not in self._trajectories:
             variable = self.description.variable(name)
             linear = self._linear and variable is not None and is_float(variable.type)
@@ -91,9 +94,7 @@ class TimedInputs(AroundInstance[Instance]):
         if len(self._trajectories[name]) >= _WAITING:
             raise ValueRefused(f"{_WAITING} values of '{name}' wait for their time already")
         self._trajectories[name].add(when, value)
-        step_size = self._points * self._grid.step_size
-        first = math.ceil((when - self._resolution(when) - self._grid.start_time) / step_size)
-        return max(self._step, first)
+        return math.ceil(max(steps, self._step))
 
     def _time(self, step: int) -> float:
         assert self._grid is not None
@@ -112,7 +113,7 @@ def set_input(runner: Runner, name: str, value: Value, time: float | None) -> in
 
     Raises:
         FmuError: the FMU refused it.
-        ValueRefused: too many values wait for their time.
+        ValueRefused: too many values wait for their time, or this one is too late.
     """
     variable = runner.instance.description.variable(name)
     is_input = variable is not None and variable.causality == "input"

@@ -30,6 +30,8 @@ from ..errors import (
     FmuMeshError,
     Interrupted,
     MeshLost,
+    MessageRefused,
+    ProtocolBroken,
     StepFailed,
     TerminationRequested,
     from_report,
@@ -38,7 +40,6 @@ from ..model.instance import Instance
 from ..model.plan import NodePlan
 from ..wire.frames import FrameReceiver
 from ..wire.inbox import Inbox, Message
-from ..wire.keys import Keys
 from ..wire.membership import MASTER, Membership, shared_inbox
 from ..wire.messages import (
     ABORT,
@@ -51,7 +52,7 @@ from ..wire.messages import (
     NodeReport,
     decode_abort,
 )
-from ..wire.session import ask
+from ..wire.session import RouterLink, ask
 from .activity import Activity
 from .feeding import connect_feeds
 from .initialization import Initialization
@@ -73,6 +74,8 @@ _ALONE_S = 60.0
 _NO_MASTER_S = 1.0
 """How long a failure waits for a master that was never seen."""
 
+_NO_FEEDS: tuple[None, list[RemoteFeed]] = (None, [])
+
 
 class Node:
     """One node of a mesh.
@@ -81,6 +84,8 @@ class Node:
         plan: what it has to do.
         session: the session of this process; stays the caller's.
         open_instance: opens an instance of the plan by name; instances stay the caller's, too.
+        router: the link to the router that connects this node to the others, if there is one.
+        launch: the launcher that started this process; None where it was started by hand.
 
     Attributes:
         failure_is_known: whether somebody else knows what ended the run: the master, or who sees that it is gone.
@@ -88,16 +93,23 @@ class Node:
     Call `run` once, from the main thread.
     """
 
-    def __init__(self, plan: NodePlan, session: zenoh.Session, open_instance: Callable[[str], Instance]) -> None:
+    def __init__(
+        self,
+        plan: NodePlan,
+        session: zenoh.Session,
+        open_instance: Callable[[str], Instance],
+        *,
+        router: RouterLink | None = None,
+        launch: str | None = None,
+    ) -> None:
         self._plan = plan
         self._session = session
         self._open_instance = open_instance
-        self._keys = Keys(plan.key_prefix, plan.mesh)
+        self._router = router or RouterLink(session)
         self._grant = 0
         self._finished = False
         self.failure_is_known = False
         self._master_is_gone = False
-        self._master_was_there = False
         self._heard = time.monotonic()
         self._lazy_flushed = 0.0
         self._lazy_pending = False
@@ -108,18 +120,15 @@ class Node:
         self._units: list[Unit] = []
         self._remote: dict[int, tuple[FrameReceiver, list[RemoteFeed]]] = {}
         self._initialization = Initialization(plan, self._wait_for_initial_value)
-        capacity = sum(plan.window + 8 for _ in plan.links_in) + 4096
-        shared = shared_inbox(plan, spins=True)
-        self._inbox = Inbox(session, self._keys.inbox(plan.node), self._keys.wake(plan.node), capacity, shared)
-        self._membership = Membership(plan, session, self._keys, self._inbox)
-        self._progress_number = 0
+        self._inbox = Inbox(shared_inbox(plan, spins=True))
+        self._membership = Membership(plan, session, self._inbox, launch)
         self._profiler: Profiler | None = None
         # The calls that a profile measures; without one they are what they seem.
         self._poll = self._inbox.poll
         self._take = self._sort_in
         self._put_progress: Callable[[bytes], None]
-        self._activity = Activity(plan)
-        self.server = Server(plan, session, self._keys, self._inbox, self._activity)
+        self._activity = Activity(plan, self._inbox.refusals)
+        self.server = Server(plan, session, self._inbox, self._activity, self._report)
 
     def run(self) -> None:
         """Load, initialize and step to the last point, then report to the master.
@@ -127,23 +136,17 @@ class Node:
         Raises:
             FmuMeshError: what ended the run early; the master knows of it already if it could be reached.
         """
-        watcher: zenoh.Subscriber[None] | None = None
         try:
-            with self._session.declare_queryable(self._keys.hello(self._plan.node), self._membership.answer_hello):
-                tokens = [self._session.liveliness().declare_token(key) for key in self._token_keys()]
-                watcher = self._session.liveliness().declare_subscriber(
-                    self._keys.master, self._master_token_changed, history=True
-                )
-                self._load()
-                self._meet()
-                self._connect()
-                self._initialize()
-                self._step_to_the_end()
-                self.server.close()  # the last samples, while the master is there to bring them to clients
-                for runner in self._runners.values():
-                    runner.instance.close()  # before the report, so that what fails in it can be told
-                self._report(None, self._plan.timeouts.stop)
-                del tokens
+            self._membership.register(self.server.open, self._master_token_went)
+            self._load()
+            self._meet()
+            self._connect()
+            self._initialize()
+            self._step_to_the_end()
+            self.server.close()  # the last samples, while the master is there to bring them to clients
+            for runner in self._runners.values():
+                runner.instance.close()  # before the report, so that what fails in it can be told
+            self._tell_end(None, self._plan.timeouts.stop)
         except FmuMeshError as error:
             located = self._located(error)
             aborted = isinstance(error, _Aborted)
@@ -152,8 +155,6 @@ class Node:
             self.failure_is_known = aborted or self._report_failure(located)
             raise located from error
         finally:
-            if watcher is not None:
-                watcher.undeclare()
             self.server.close()
             self._membership.close()
             self._inbox.close()
@@ -171,10 +172,6 @@ class Node:
 
     # --- before the first point
 
-    def _token_keys(self) -> list[str]:
-        names = [self._keys.instance(instance.name) for instance in self._plan.instances]
-        return [self._keys.node_token(self._plan.node), *names]
-
     def _load(self) -> None:
         """Instantiate the FMUs and wire rings, feeds and links together."""
         plan = self._plan
@@ -186,19 +183,19 @@ class Node:
             self._runners[item.name] = Runner(item, instance, plan.grid, plan.ring_rows)
         self._remote = connect_feeds(plan, self._runners)
         self._units = [Unit([self._runners[name] for name in names]) for names in plan.units]
-        self.server.serve(self._runners)
 
     def _meet(self) -> None:
         """Join the mesh: from now on all others are there."""
         self._activity.state = "waiting for the mesh"
         try:
+            self._membership.keys(self._plan.timeouts.start)
+            self.server.serve(self._runners)
             welcome = self._membership.join()
         except MeshLost as error:
             if not self._membership.given_up:
                 raise
-            self._master_is_gone = True
-            raise MeshLost("the master is gone", hint="See the messages of its process.") from error
-        self._progress_number = welcome.number
+            raise self._without_master() from error
+        self._router.look()
         self._heard = time.monotonic()
         if welcome.profile:
             self._profiler = Profiler(self._plan.node, welcome.profile, self._plan.window)
@@ -206,13 +203,14 @@ class Node:
     def _connect(self) -> None:
         """Make what sends to the other nodes and to the master."""
         plan, membership = self._plan, self._membership
+        keys = membership.keys(plan.timeouts.start)
         for link in plan.links_out:
             runner = self._runners[link.source]
-            put = membership.sender(link.target_node, self._keys.frames(link.source, link.target_node))
+            put = membership.sender(link.target_node, keys.frames(link.source, link.target_node))
             out_links = self._initialization.out_links if link.initial_only else runner.out_links
             out_links.append(OutLink(link, runner.outputs, put, plan.window))
         self._poll = self._inbox.poll
-        self._put_progress = membership.sender(MASTER, self._keys.progress())
+        self._put_progress = membership.sender(MASTER, keys.progress(plan.node))
         if self._profiler is not None:
             self._measure(self._profiler)
 
@@ -278,7 +276,7 @@ class Node:
             runner.last_step = runner.step
             runner.flush()
         asked.point, asked.time = point, self._plan.grid.time(point)
-        self._report(asked, self._plan.timeouts.stop)
+        self._tell_end(asked, self._plan.timeouts.stop)
 
     def _flush_before_waiting(self) -> None:
         """Send what a consumer could be waiting for; what is only recorded at least every 50 ms, and at the end."""
@@ -309,25 +307,50 @@ class Node:
             raise DeadlineExceeded(text, hint="Is its process stopped, or its host gone?")
 
     def _sort_in(self, message: Message) -> None:
-        """One message into the rings, or a new grant."""
-        kind, number, count, point, data = message
+        """One message into the rings, or a new grant; one that is neither is refused."""
+        sender = message[0]
+        try:
+            if sender == MASTER:
+                self._take_from_master(message)
+            else:
+                self._take_from_node(message)
+        except MessageRefused as refused:
+            self._inbox.refusals.add(sender, refused.message)
+
+    def _take_from_node(self, message: Message) -> None:
+        sender, kind, number, count, point, data = message
+        receiver, feeds = self._remote.get(number, _NO_FEEDS)
+        if receiver is None or receiver.link.source_node != sender:
+            raise MessageRefused(f"there is no link {number} from it to this node")
         if kind == FRAME:
-            receiver, feeds = self._remote[number]
             new = receiver.take(point, count, data)
             if new is not None:
                 first, rows = new
                 for feed in feeds:
                     feed.transfer.from_rows(first, rows)
                     feed.ready = feed.transfer.ready(receiver.received)
-        elif kind == GRANT:
+        elif kind == INITIAL:
+            self._initialization.take(receiver.link, point, data)
+        else:
+            raise MessageRefused(f"a message of kind {kind} is nothing that a node sends")
+
+    def _take_from_master(self, message: Message) -> None:
+        _, kind, _, _, point, data = message
+        if kind == GRANT:
+            most = self._progress_sent + self._plan.window
+            if point > most:
+                raise ProtocolBroken(
+                    f"the master grants point {point} to node '{self._plan.node}', which may be granted {most} at most",
+                    hint="Does somebody else send in its name?",
+                )
             self._heard = time.monotonic()
             self._grant = max(self._grant, min(point, self._plan.grid.last_point))
-        elif kind == INITIAL:
-            self._initialization.take(self._remote[number][0].link, point, data)
         elif kind == FINISH:
             self._finished = True
         elif kind == ABORT:
             raise _Aborted(from_report(decode_abort(data)))
+        else:
+            raise MessageRefused(f"a message of kind {kind} is nothing that the master sends")
 
     def _covered(self) -> int:
         return min(runner.covered for runner in self._runners.values())
@@ -346,15 +369,13 @@ class Node:
         if due or covered >= self._grant:
             self._progress_sent = covered
             self._progress_told_at = now
-            self._put_progress(HEADER.pack(PROGRESS, self._progress_number, 0, covered))
+            self._put_progress(HEADER.pack(PROGRESS, 0, 0, covered))
 
     # --- the end
 
-    def _master_token_changed(self, sample: zenoh.Sample) -> None:
-        if sample.kind == zenoh.SampleKind.PUT:
-            self._master_was_there = True
-        elif not self._finished:
-            self._membership.give_up()
+    def _master_token_went(self) -> None:
+        """On a foreign thread: the master's token is gone, or that of somebody who pretends to be the master."""
+        if not self._finished:
             self._inbox.post(self._end_without_master)
 
     def _end_without_master(self) -> None:
@@ -363,13 +384,23 @@ class Node:
         Raises:
             FmuMeshError: why the master ended the run, or that it is gone.
         """
-        self._master_is_gone = True
+        if not self._membership.master_is_gone:
+            return
+        error = self._without_master()
         deadline = time.monotonic() + _LAST_WORD_S
         while not self._finished and (left := deadline - time.monotonic()) > 0:
             if (message := self._inbox.wait(left)) is not None:
                 self._take(message)
         if not self._finished:
-            raise MeshLost("the master is gone", hint="See the messages of its process.")
+            raise error
+
+    def _without_master(self) -> MeshLost:
+        """What to say, and from now on to assume, where the master does not answer any more."""
+        self._master_is_gone = True
+        loss = self._router.loss()
+        if loss is not None:
+            return MeshLost(f"{loss}, and the master with it")
+        return MeshLost("the master is gone", hint="See the messages of its process.")
 
     def _located(self, error: FmuMeshError) -> FmuMeshError:
         """The error with the point and time of its instance."""
@@ -398,23 +429,44 @@ class Node:
             return True
         self.server.say_everything()
         try:
-            self._report(error, self._patience_s())
+            self._tell_end(self._as_others_see(error), self._patience_s())
         except FmuMeshError as unreachable:
             log.info("failure_not_reported", extra={"error": str(unreachable)})
             return False
         return True
 
+    def _as_others_see(self, error: FmuMeshError) -> FmuMeshError:
+        """Whoever ends this process means this process: for the others it is lost."""
+        if not isinstance(error, Interrupted):
+            return error
+        point = min((runner.point for runner in self._runners.values()), default=0)
+        return MeshLost(
+            f"node '{self._plan.node}' was lost: its process was told to end ({error.message})",
+            instance=", ".join(item.name for item in self._plan.instances),
+            point=point,
+            time=self._plan.grid.time(point),
+        )
+
     def _patience_s(self) -> float:
         """How long a failure waits for the master to take it."""
         stop_s = self._plan.timeouts.stop
-        return stop_s if self._master_was_there else min(stop_s, _NO_MASTER_S)
+        return stop_s if self._membership.is_admitted else min(stop_s, _NO_MASTER_S)
 
-    def _report(self, error: FmuMeshError | None, timeout_s: float) -> None:
+    def _tell_end(self, error: FmuMeshError | None, timeout_s: float) -> None:
         point = min((runner.point for runner in self._runners.values()), default=0)
         profile = self._profiler.profile() if self._profiler is not None and error is None else None
         report = NodeReport(self._plan.node, point, error.report() if error is not None else None, profile)
         # Behind the last samples: the master, who brings them to clients, goes when it has all reports.
-        ask(self._session, self._keys.report, msgspec.json.encode(report), timeout_s, "the master", priority=PRIORITY)
+        self._report(report, timeout_s, PRIORITY)
+
+    def _report(self, report: NodeReport, timeout_s: float, priority: zenoh.Priority = zenoh.Priority.DEFAULT) -> None:
+        """From any thread: tell the master how this node has ended.
+
+        Raises:
+            MeshLost: the master does not take it within ``timeout_s`` seconds, or this node is none of its own.
+        """
+        key = self._membership.keys(timeout_s).report(self._plan.node)
+        ask(self._session, key, msgspec.json.encode(report), timeout_s, "the master", priority=priority)
 
 
 class _Aborted(FmuMeshError):

@@ -22,7 +22,7 @@ from ..model.plan import NodePlan
 from ..wire.inbox import Inbox
 from ..wire.keys import Keys
 from ..wire.messages import NodeReport
-from ..wire.session import ask, matches, undeclare_all
+from ..wire.session import matches, undeclare_all
 from ..wire.values import json_encoding
 from ..wire.views import LogLine
 from .activity import Activity
@@ -38,6 +38,8 @@ _TICK_S = 0.25
 _LAST_ROWS_S = 1.0
 _LAST_WORDS_S = 0.5
 _STREAM_SHARE = 4.0
+_EARLY_LINES = 1000
+"""How many log messages are kept until this node belongs to a mesh."""
 
 
 class Server:
@@ -48,27 +50,39 @@ class Server:
         session: the session of this process; stays the caller's.
         inbox: the inbox of the node.
         activity: what the node is doing.
+        report: tells the master how the node has ended, within so many seconds.
     """
 
-    def __init__(self, plan: NodePlan, session: zenoh.Session, keys: Keys, inbox: Inbox, activity: Activity) -> None:
+    def __init__(
+        self,
+        plan: NodePlan,
+        session: zenoh.Session,
+        inbox: Inbox,
+        activity: Activity,
+        report: Callable[[NodeReport, float], None],
+    ) -> None:
         self.on_hang: Callable[[FmuError], None] = lambda _error: None
         self._plan = plan
         self._session = session
-        self._keys = keys
+        self._report = report
+        self._keys = Keys(plan.key_prefix, plan.mesh)
         self._inbox = inbox
         self._activity = activity
         self._streams: list[InstanceStreams] = []
         self._waiting_rows = 0
         self._jobs: queue.SimpleQueue[Job | None] = queue.SimpleQueue()
         self._answers = Answers(plan, inbox, activity, self._jobs.put, self._publish_log)
-        self._entities: list[zenoh.Queryable[None] | zenoh.Subscriber[None]] = []
+        self._entities: list[zenoh.Queryable[None] | zenoh.Subscriber[None] | zenoh.LivelinessToken] = []
         self._status_publishers: dict[str, zenoh.Publisher] = {}
         self._log_publishers: dict[str, zenoh.Publisher] = {}
-        for instance in plan.instances:
-            self._declare_early(instance.name)
+        self._early_lines: list[LogLine] = []
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="server", daemon=True)
         self._thread.start()
+
+    def open(self) -> None:
+        """From any thread, when the node belongs to the mesh: from now on it is seen, even while FMUs are loaded."""
+        self._jobs.put(self._declare)
 
     # --- called by the main thread
 
@@ -127,10 +141,8 @@ class Server:
             else:
                 if job is None:
                     return
-                try:
+                with self._inbox.refusals.guard("a query or a value"):
                     job()
-                except zenoh.ZError as error:  # the peer that asked is gone
-                    log.info("answer_not_sent", extra={"error": str(error)})
             now = time.monotonic()
             if now - published >= _TICK_S:
                 published = now
@@ -152,10 +164,11 @@ class Server:
         """From a watching thread: tell the master that an FMU does not return; whether it knows now."""
         runner = self._activity.runners.get(error.instance or "")
         if runner is not None and self._activity.state != "initializing":
-            error.point, error.time = runner.point, self._plan.grid.time(runner.point)
+            error.point = point = runner.point
+            error.time = self._plan.grid.time(point)
         report = NodeReport(self._plan.node, error.point or 0, error.report())
         try:
-            ask(self._session, self._keys.report, msgspec.json.encode(report), deadline_s, "the master")
+            self._report(report, deadline_s)
         except FmuMeshError as unreachable:
             log.warning("hang_not_reported", extra={"error": str(unreachable)})
             return False
@@ -163,9 +176,15 @@ class Server:
 
     # --- queries
 
-    def _declare_early(self, name: str) -> None:
-        """What can be asked from the start, even before the FMU is loaded."""
+    def _declare(self) -> None:
+        for instance in self._plan.instances:
+            self._declare_instance(instance.name)
+        for line in self._early_lines:
+            self._publish_log(line)
+
+    def _declare_instance(self, name: str) -> None:
         root = self._keys.instance(name)
+        self._entities.append(self._session.liveliness().declare_token(root))
         self._entities.append(self._session.declare_queryable(f"{root}/**", partial(self._query_arrived, name)))
         # A log message is not lost; the status is told again.
         for what, publishers, congestion_control in (
@@ -177,7 +196,11 @@ class Server:
             )
 
     def _query_arrived(self, name: str, query: zenoh.Query) -> None:
-        self._jobs.put(partial(self._answers.answer, name, query))
+        def answer() -> None:
+            with self._inbox.refusals.guard(str(query.key_expr), query):
+                self._answers.answer(name, query)
+
+        self._jobs.put(answer)
 
     # --- publishing
 
@@ -204,4 +227,8 @@ class Server:
             self._closing.wait(_STREAM_SHARE * (time.monotonic() - started))
 
     def _publish_log(self, line: LogLine) -> None:
-        self._log_publishers[line.instance].put(msgspec.json.encode(line))
+        publisher = self._log_publishers.get(line.instance)
+        if publisher is not None:
+            publisher.put(msgspec.json.encode(line))
+        elif len(self._early_lines) < _EARLY_LINES:
+            self._early_lines.append(line)

@@ -30,10 +30,11 @@ LAZY_S = 0.05
 
 
 class RemoteFeed:
-    """A feed from another node; `FrameReceiver` and `Transfer` of the frames that bring it."""
+    """A feed from another node: the receiver of the frames that bring it, and the instance that uses it."""
 
-    def __init__(self, receiver: FrameReceiver, transfer: Transfer) -> None:
+    def __init__(self, receiver: FrameReceiver, target: Runner, transfer: Transfer) -> None:
         self.receiver = receiver
+        self.target = target
         self.transfer = transfer
         self.ready = 0
 

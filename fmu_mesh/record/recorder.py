@@ -10,6 +10,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -19,14 +20,24 @@ import numpy as np
 import zenoh
 from numpy.typing import NDArray
 
-from ..errors import ConfigurationError, DeadlineExceeded, FmuMeshError, MeshLost, from_report
+from ..errors import ConfigurationError, DeadlineExceeded, FmuMeshError, MeshLost, MessageRefused, from_report
 from ..model.description import VariableType
-from ..model.plan import RECORDER, NodePlan
+from ..model.plan import RECORDER, Link, NodePlan
 from ..wire.frames import FrameReceiver
 from ..wire.inbox import Inbox, Message
-from ..wire.keys import Keys
 from ..wire.membership import MASTER, Membership, shared_inbox
-from ..wire.messages import ABORT, FINISH, FRAME, HEADER, LAST, PROGRESS, NodeReport, decode_abort
+from ..wire.messages import (
+    ABORT,
+    FINISH,
+    FRAME,
+    GRANT,
+    HEADER,
+    INITIAL,
+    LAST,
+    PROGRESS,
+    NodeReport,
+    decode_abort,
+)
 from ..wire.session import ask
 from .csv_file import CsvFile
 from .result_file import OpenResult
@@ -62,12 +73,14 @@ class Recorder:
     Use it as a context manager: the thread runs inside, and the file is complete up to the last complete row outside.
     """
 
-    def __init__(self, plan: NodePlan, session: zenoh.Session, open_file: OpenResult = CsvFile) -> None:
+    def __init__(
+        self, plan: NodePlan, session: zenoh.Session, open_file: OpenResult = CsvFile, *, launch: str | None = None
+    ) -> None:
         self._plan = plan
         self._session = session
-        self._keys = Keys(plan.key_prefix, plan.mesh)
         self._sources = {
-            link.index: _Source(FrameReceiver(link, "the recorder", plan.ring_rows)) for link in plan.links_in
+            link.index: _Source(FrameReceiver(link, "the recorder", plan.ring_rows, partial(self._fits, link)))
+            for link in plan.links_in
         }
         by_name = {source.name: source for source in self._sources.values()}
         self._columns = [by_name[instance].column(variable) for instance, variable in plan.recorded]
@@ -81,16 +94,13 @@ class Recorder:
         self._leaving = threading.Event()
         self._progress_sent = -1
         self._progress_told_at = 0.0
-        self._number = 0
         self._finished = False
         # At the end the main thread writes what is left, and on a slow disk the thread may still be at it.
         self._writing = threading.Lock()
         self._flushed = time.monotonic()
         self._flushed_rows = 0
-        capacity = (plan.window + 8) * len(plan.links_in) + 1024
-        shared = shared_inbox(plan, spins=False)  # nobody waits for it, but others need the processor
-        self._inbox = Inbox(session, self._keys.inbox(RECORDER), self._keys.wake(RECORDER), capacity, shared)
-        self._membership = Membership(plan, session, self._keys, self._inbox)
+        self._inbox = Inbox(shared_inbox(plan, spins=False))  # nobody waits for it, but others need the processor
+        self._membership = Membership(plan, session, self._inbox, launch)
         self._put_progress: Callable[[bytes], None]
         self._turns: Turns
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
@@ -133,10 +143,10 @@ class Recorder:
 
     def _run(self) -> None:
         try:
-            with self._session.liveliness().declare_token(self._keys.node_token(RECORDER)):
-                self._meet_in_time()
-                self._record()
-                self._report(None)
+            self._membership.register()
+            self._meet_in_time()
+            self._record()
+            self._report(None)
         except _Ended:
             log.info("recording_ended_early", extra={"rows": self._written})
         except OSError as error:
@@ -158,9 +168,9 @@ class Recorder:
 
     def _meet(self) -> None:
         welcome = self._membership.join()
-        self._number = welcome.number
         self._turns = Turns(len({link.source_node for link in self._plan.links_in}.intersection(welcome.shared)))
-        self._put_progress = self._membership.sender(MASTER, self._keys.progress())
+        progress = self._membership.keys(self._plan.timeouts.start).progress(RECORDER)
+        self._put_progress = self._membership.sender(MASTER, progress)
 
     def _record(self) -> None:
         """Take what comes, write rows when they are many or nothing more is there, and tell the progress."""
@@ -200,17 +210,41 @@ class Recorder:
             self._leaving.wait(rest_s)
 
     def _take(self, message: Message) -> None:
-        kind, number, count, point, data = message
+        sender = message[0]
+        try:
+            if sender == MASTER:
+                self._take_from_master(message)
+            else:
+                self._take_from_node(message)
+        except MessageRefused as refused:
+            self._inbox.refusals.add(sender, refused.message)
+
+    def _take_from_node(self, message: Message) -> None:
+        sender, kind, number, count, point, data = message
+        source = self._sources.get(number)
+        if source is None or source.receiver.link.source_node != sender:
+            raise MessageRefused(f"there is no link {number} from it to the recorder")
         if kind == FRAME:
-            self._sources[number].receiver.take(point, count, data)
+            source.receiver.take(point, count, data)
         elif kind == LAST:
-            self._sources[number].ended = True
-        elif kind == FINISH:
+            source.ended = True
+        elif kind != INITIAL:
+            raise MessageRefused(f"a message of kind {kind} is nothing that a node sends")
+
+    def _take_from_master(self, message: Message) -> None:
+        _, kind, _, _, _, data = message
+        if kind == FINISH:
             self._finished = True
         elif kind == ABORT:
             cause = from_report(decode_abort(data))
             self._take_last_rows(cause)
             raise _Ended(cause)
+        elif kind != GRANT:
+            raise MessageRefused(f"a message of kind {kind} is nothing that the master sends")
+
+    def _fits(self, link: Link, end: int) -> bool:
+        """Whether rows of a source before its own step ``end`` overwrite none that is not written yet."""
+        return end - self._written // link.step_points <= self._plan.ring_rows
 
     def _complete(self) -> int:
         """The last point whose row is complete, or -1."""
@@ -251,7 +285,7 @@ class Recorder:
                 if left <= 0 or not self._rows_are_missing():
                     return
                 message = self._inbox.wait(left)
-            if message is not None and message[0] in (FRAME, LAST):
+            if message is not None and message[1] in (FRAME, LAST):
                 self._take(message)
 
     def _rows_are_missing(self) -> bool:
@@ -268,14 +302,15 @@ class Recorder:
         if complete > self._progress_sent and (due or complete == self._plan.grid.last_point):
             self._progress_sent = complete
             self._progress_told_at = now
-            self._put_progress(HEADER.pack(PROGRESS, self._number, 0, complete))
+            self._put_progress(HEADER.pack(PROGRESS, 0, 0, complete))
 
     def _report(self, error: FmuMeshError | None) -> None:
         """Tell the master how recording ended; one that leaves takes no reports any more, and waits for this end."""
         report = NodeReport(RECORDER, max(self._written - 1, 0), error.report() if error is not None else None)
         patience_s, left = self._plan.timeouts.stop, self._leaving.is_set
         try:
-            ask(self._session, self._keys.report, msgspec.json.encode(report), patience_s, "the master", over=left)
+            key = self._membership.keys(patience_s).report(RECORDER)
+            ask(self._session, key, msgspec.json.encode(report), patience_s, "the master", over=left)
         except MeshLost:
             if not left():
                 raise

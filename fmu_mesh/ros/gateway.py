@@ -14,15 +14,17 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-import msgspec
 import zenoh
 
-from ..model.description import Value
+from ..errors import MeshLost, MessageRefused
 from ..simtime import TimeGrid
 from ..wire.keys import Keys
+from ..wire.messages import decode_json
 from ..wire.readings import latecomers
-from ..wire.session import undeclare_all
+from ..wire.refusals import Refusals
+from ..wire.session import ask, undeclare_all
 from ..wire.values import decode_stamp, encode_time, encode_value, json_encoding
+from ..wire.views import MeshInfo
 from .cdr import CdrError, Codec
 from .messages import Assembler, Disassembler
 from .profile import Profile, Put
@@ -50,6 +52,7 @@ class Gateway:
         keys: the keys of the mesh.
         grid: the communication points of the run.
         profiles: the profile of every topic, by name, that of the clock first; they stay the caller's.
+        patience_s: how long `open` waits for the master, in s.
 
     Call `open`, then `run`, then `close`.
     """
@@ -62,6 +65,7 @@ class Gateway:
         keys: Keys,
         grid: TimeGrid,
         profiles: dict[str, Profile],
+        patience_s: float = 60.0,
     ) -> None:
         self._plan = plan
         self._types = types
@@ -69,6 +73,9 @@ class Gateway:
         self._keys = keys
         self._grid = grid
         self._profiles = profiles
+        self._patience_s = patience_s
+        self._refusals = Refusals()
+        self._leaving = False
         self._events: queue.SimpleQueue[Event] = queue.SimpleQueue()
         self._left_out = 0
         self._ended = False
@@ -82,7 +89,11 @@ class Gateway:
         self._now = -1
 
     def open(self) -> None:
-        """Declare everything; from now on nothing is missed."""
+        """Declare everything; from now on nothing is missed.
+
+        Raises:
+            MeshLost: the master does not answer.
+        """
         for topic in self._plan.topics:
             if topic.direction == "out":
                 self._open_output(topic)
@@ -96,12 +107,11 @@ class Gateway:
                 profile.publish(_clock_topic(self._plan)), self._types, self._plan.clock_points, self._grid
             )
         for key, watch in self._watches.items():
-            self._entities.append(self._mesh.declare_subscriber(key, partial(self._value_arrived, watch)))
+            self._entities.append(self._mesh.declare_subscriber(key, partial(self._value_arrived, key, watch)))
         self._entities.append(
             self._mesh.liveliness().declare_subscriber(self._keys.master, self._token_changed, history=True)
         )
-        token = self._keys.follower(str(self._mesh.zid()))
-        self._entities.append(self._mesh.liveliness().declare_token(token))
+        self._follow()
 
     def run(self) -> None:
         """Carry until the mesh has ended and its last sample is carried, or until `end` is called."""
@@ -117,19 +127,37 @@ class Gateway:
                 event = self._events.get(timeout=due - now if due > now else 0)
             except queue.Empty:
                 continue
-            event()
+            self._handle(event)
         late = latecomers(self._events)
         while not self._is_over() and (late_event := next(late, None)) is not None:
-            late_event()
+            self._handle(late_event)
 
     def end(self) -> None:
         """From any thread: let `run` return once everything that has come is carried."""
+        self._leaving = True
         self._events.put(self._end)
 
     def close(self) -> None:
         """Undeclare what belongs to the mesh."""
         self._tell_left_out()
         undeclare_all(self._entities, self._publishers.values())
+
+    def _handle(self, event: Callable[[], None]) -> None:
+        with self._refusals.guard("a topic or a variable"):
+            event()
+
+    def _follow(self) -> None:
+        """Let the master, which may be a moment late, stay at the end until the last sample has come here."""
+        key = self._keys.mesh_key("info")
+        try:
+            answer = ask(self._mesh, key, None, self._patience_s, "the master", over=lambda: self._leaving)
+        except MeshLost:
+            if not self._leaving:
+                raise
+            return
+        run = self._keys.run(decode_json(answer, MeshInfo).run)
+        token = self._mesh.liveliness().declare_token(run.follower(str(self._mesh.zid())))
+        self._entities.append(token)
 
     # --- from the mesh to ROS
 
@@ -142,18 +170,19 @@ class Gateway:
         key = self._keys.variable(port.instance, port.kind, port.variable.name)
         return self._watches.setdefault(key, _Watch(f"{port.instance}.{port.variable.name}", port.step_points))
 
-    def _value_arrived(self, watch: _Watch, sample: zenoh.Sample) -> None:
-        if sample.attachment is not None:  # otherwise it is what somebody puts on the key of an input
+    def _value_arrived(self, key: str, watch: _Watch, sample: zenoh.Sample) -> None:
+        # Without an attachment it is what somebody puts on the key of an input.
+        if sample.attachment is not None and str(sample.key_expr) == key:
             self._post(partial(self._take_value, watch, sample.payload.to_bytes(), sample.attachment.to_bytes()))
 
     def _take_value(self, watch: _Watch, data: bytes, attachment: bytes) -> None:
         try:
             stamp = decode_stamp(attachment)
-        except msgspec.DecodeError:  # likewise: it says from when on it holds, and no point
+        except MessageRefused:  # likewise: it says from when on it holds, and no point
             return
         try:
-            value: Value = msgspec.json.decode(data)
-        except msgspec.DecodeError as error:
+            value: Any = decode_json(data, object)
+        except MessageRefused as error:
             watch.complain(f"a value that is not understood: {error}")
             return
         for output, port in watch.outputs:

@@ -26,7 +26,7 @@ from .mapping import message_types, resolve
 from .node_parameters import RosNode
 from .peer import message_class, ros_module
 from .playing import grid_of
-from .profile import DEPTH, Put, Take
+from .profile import DEPTH, Profile, Put, Take
 from .seen import descriptions_of
 from .topics import RosPlan, Topic
 from .types import MessageTypes
@@ -118,11 +118,11 @@ class GatewayNode:
         client, plan, types = self._client, self._plan, self._types
         if client is None or plan is None or types is None:
             raise ConfigurationError("the gateway has no mesh yet.", hint="Configure it first.")
-        profile = RclpyProfile(self._node)
+        profile: Profile = RclpyProfile(self._node)
         names = {topic.profile for topic in plan.topics} or {"ros2dds"}
-        gateway = Gateway(
-            plan, types, client.session, client.keys, grid_of(client.info()), dict.fromkeys(sorted(names), profile)
-        )
+        profiles = dict.fromkeys(map(str, sorted(names)), profile)
+        grid = grid_of(client.info())
+        gateway = Gateway(plan, types, client.session, client.keys, grid, profiles, _TIMEOUT_S)
         self._gateway = gateway
         gateway.open()
         self._thread = threading.Thread(target=gateway.run, name="gateway", daemon=True)

@@ -13,12 +13,12 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-import msgspec
 import zenoh
 
 from ..errors import FmuMeshError
 from ..model.description import Value, Variable
 from ..wire.keys import Keys
+from ..wire.messages import decode_json
 from ..wire.session import ask
 from ..wire.values import encode_value
 from .cdr import Codec, Message
@@ -148,10 +148,9 @@ class ParameterServices:
         key = self._keys.variable(parameter.instance, "param", parameter.variable.name)
         payload = encode_value(value) if value is not None else None
         try:
-            answer = ask(self._mesh, key, payload, _ANSWER_S, f"'{parameter.name}'")
+            return decode_json(ask(self._mesh, key, payload, _ANSWER_S, f"'{parameter.name}'"), object), ""
         except FmuMeshError as error:
             return None, error.message
-        return msgspec.json.decode(answer), ""
 
 
 def _kind(variable: Variable) -> int:

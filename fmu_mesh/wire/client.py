@@ -18,9 +18,10 @@ from typing import Any, TypeVar
 import msgspec
 import zenoh
 
-from ..errors import ConfigurationError, DeadlineExceeded
+from ..errors import ConfigurationError, DeadlineExceeded, MessageRefused
 from ..model.findings import listed, nearest
 from .keys import Keys
+from .messages import decode_json
 from .readings import Keeper, Reading, Target, latecomers, reading_of
 from .session import matches
 from .values import json_encoding
@@ -91,9 +92,9 @@ class MeshClient:
         mesh = answers.pop(self.keys.mesh_key("status"), None)
         status = self.status() if mesh is None else None  # nothing is known of the mesh yet, or it is gone
         try:
-            status = status or msgspec.json.decode(mesh or b"", type=MeshStatus)
-            views = [msgspec.json.decode(data, type=InstanceStatus) for data in answers.values()]
-        except msgspec.DecodeError as error:
+            status = status or decode_json(mesh or b"", MeshStatus)
+            views = [decode_json(data, InstanceStatus) for data in answers.values()]
+        except MessageRefused as error:
             raise _not_understood(f"mesh '{self.keys.mesh}'", error) from error
         return status, {view.instance: view for view in views}
 
@@ -244,8 +245,8 @@ class MeshClient:
     def _view(self, key: str, kind: type[View], who: str, payload: bytes | None = None) -> View:
         data = self._ask(key, who, payload)[0].payload.to_bytes()
         try:
-            return msgspec.json.decode(data, type=kind)
-        except msgspec.DecodeError as error:
+            return decode_json(data, kind)
+        except MessageRefused as error:
             raise _not_understood(who, error) from error
 
     def _ask(self, key: str, who: str, payload: bytes | None = None) -> list[zenoh.Sample]:
@@ -317,7 +318,7 @@ def _fits(pattern: str, name: str) -> bool:
     return re.fullmatch(".*".join(map(re.escape, pattern.split("*"))), name) is not None
 
 
-def _not_understood(who: str, error: msgspec.DecodeError) -> ConfigurationError:
+def _not_understood(who: str, error: MessageRefused) -> ConfigurationError:
     return ConfigurationError(
         f"the answer of {who} is not understood: {error}.", hint="Is it another version of fmu_mesh?"
     )

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 from numpy.typing import NDArray
 
-from ..errors import FmuMeshError, FrameGap
+from ..errors import FrameGap, MessageRefused, ProtocolBroken
 from ..model.plan import Link
 from ..model.ring import Ring, Rows
 from ..model.types import Value
@@ -22,14 +23,16 @@ class FrameReceiver:
         link: the link.
         target: who receives, for errors.
         keep: how many rows are kept, a power of two: at least the window, so that a frame always fits.
+        fits: whether rows up to this own step of the source, itself not included, overwrite none that is still needed.
 
     Attributes:
         kept: the newest rows.
         received: own steps of the source whose rows are here; the next row must be this one.
     """
 
-    def __init__(self, link: Link, target: str, keep: int) -> None:
+    def __init__(self, link: Link, target: str, keep: int, fits: Callable[[int], bool] = lambda _end: True) -> None:
         self.link = link
+        self._fits = fits
         self.received = 0
         self._target = target
         self._parts = link.layout.parts
@@ -42,13 +45,22 @@ class FrameReceiver:
             The own step of the first new row and the rows, or None if all of them came before.
 
         Raises:
+            MessageRefused: it is no frame of this link.
             FrameGap: rows are missing before it, or a row came twice with other values.
-            FmuMeshError: it is no frame of this link, or larger than any.
+            ProtocolBroken: it holds more rows than were granted.
         """
         rows = decode_rows(data, count, self._parts)
-        if count > self.kept.rows:
-            text = f"a frame of '{self.link.source}' holds {count} points where {self.kept.rows} are the most"
-            raise FmuMeshError(text, instance=self.link.source, point=first * self.link.step_points)
+        if first < 0:
+            raise MessageRefused(f"a frame from point {first} on holds none of the run")
+        if count > self.kept.rows or (first <= self.received < first + count and not self._fits(first + count)):
+            last = (first + count - 1) * self.link.step_points
+            raise ProtocolBroken(
+                f"'{self.link.source}' sends its values up to point {last} to {self._target}, which has no room for "
+                "them: more than was granted",
+                instance=self.link.source,
+                point=first * self.link.step_points,
+                hint="Does somebody else send in its name?",
+            )
         if first > self.received:
             missing, last = self.received * self.link.step_points, first * self.link.step_points - 1
             text = f"points {missing} to {last} of '{self.link.source}' never reached {self._target}"
@@ -95,7 +107,11 @@ def _bits(array: NDArray[Any], row: int) -> bytes | list[str | bytes]:
 
 
 def initial_values(link: Link, level: int, data: bytes) -> dict[str, Value]:
-    """The values in an INITIAL message that became known at ``level``."""
+    """The values in an INITIAL message that became known at ``level``.
+
+    Raises:
+        MessageRefused: it is none of this link.
+    """
     row = Ring(link.layout, 1)
     for part, new in zip(row.parts, decode_rows(data, 1, link.layout.parts), strict=True):
         part[:] = new

@@ -10,33 +10,37 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from types import TracebackType
 from typing import Final, Protocol, Self
 
 import zenoh
 from zenoh.handlers import FifoChannel
 
+from .keys import RunKeys
 from .messages import HEADER, WAKE
-from .shared_memory import Offer, SharedInbox
+from .refusals import Refusals
+from .shared_memory import Arrived, Offer, SharedInbox
 
 __all__ = ["Inbox", "Message"]
 
-Message = tuple[int, int, int, int, bytes]
-"""Kind, link or node, count, point, and the whole message."""
+Message = tuple[str, int, int, int, int, bytes]
+"""Sender, kind, link, count, point, and the whole message."""
 
 _WAKE: Final = HEADER.pack(WAKE, 0, 0, 0)
 _TIMER_PERIOD_S: Final = 0.05
+_NOBODY: Final = ""
+"""The sender of what is no message: a wake-up, or what was refused."""
 
 
 class _Source(Protocol):
     """Where messages come from."""
 
-    def take(self) -> bytes | None:
+    def take(self) -> Arrived | None:
         """The next message if one is there."""
         ...
 
-    def take_within(self, timeout_s: float) -> bytes | None:
+    def take_within(self, timeout_s: float) -> Arrived | None:
         """The next message; None after ``timeout_s`` seconds or a `wake`."""
         ...
 
@@ -50,27 +54,23 @@ class _Source(Protocol):
 
 
 class Inbox:
-    """Receives what is sent to one process.
+    """Receives what is sent to one process; until it is opened nothing can be, and only posted actions are run.
 
     Args:
-        session: the session of this process.
-        key: key expression to subscribe to; see `Keys.inbox`.
-        wake_key: a key of this node that only this process publishes on.
-        capacity: messages that fit; at least as many as the senders have credit for.
         shared: shared memory that `share` changes over to; None where nothing is shared.
 
     Attributes:
         offer: where senders on this host find the shared memory; None where nothing is shared.
+        refusals: what was not taken.
     """
 
-    def __init__(
-        self, session: zenoh.Session, key: str, wake_key: str, capacity: int, shared: SharedInbox | None = None
-    ) -> None:
+    def __init__(self, shared: SharedInbox | None = None) -> None:
         self._posted: deque[Callable[[], None]] = deque()
-        self._source: _Source = _ZenohSource(session, key, wake_key, capacity)
+        self._source: _Source = _Unopened()
         self._take = self._source.take
         self._shared = shared
         self.offer: Offer | None = shared.offer if shared is not None else None
+        self.refusals = Refusals()
 
     def __enter__(self) -> Self:
         return self
@@ -79,6 +79,20 @@ class Inbox:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+    def open(self, session: zenoh.Session, keys: RunKeys, name: str, senders: Mapping[str, str], capacity: int) -> None:
+        """From now on the process ``name`` receives what is sent through Zenoh.
+
+        Args:
+            session: the session of this process.
+            keys: those of the run.
+            name: of the node, or of the master.
+            senders: who may send to it, by the key that they send on; what comes by any other key is refused.
+            capacity: messages that fit; at least as many as the senders have credit for.
+        """
+        self._source = _ZenohSource(session, keys, name, senders, capacity, self.refusals)
+        self._take = self._source.take
+        self._source.wake()  # for what was posted meanwhile
 
     def share(self) -> None:
         """From now on everything comes through shared memory; call it before the first message."""
@@ -101,23 +115,29 @@ class Inbox:
         """The next message if one is there; runs posted actions on the way."""
         if self._posted:
             self._run_posted()
-        while (data := self._take()) is not None:
-            kind, number, count, point = HEADER.unpack_from(data)
-            if kind != WAKE:
-                return kind, number, count, point, data
+        while (arrived := self._take()) is not None:
+            if (message := self._decoded(*arrived)) is not None:
+                return message
         return None
 
     def wait(self, timeout_s: float) -> Message | None:
         """The next message, or None after ``timeout_s`` seconds or when posted actions were run."""
         if self._run_posted():
             return None
-        data = self._source.take_within(timeout_s)
-        if data is not None:
-            kind, number, count, point = HEADER.unpack_from(data)
-            if kind != WAKE:
-                return kind, number, count, point, data
+        arrived = self._source.take_within(timeout_s)
+        if arrived is not None and (message := self._decoded(*arrived)) is not None:
+            return message
         self._run_posted()
         return None
+
+    def _decoded(self, sender: str, data: bytes) -> Message | None:
+        if sender == _NOBODY:
+            return None
+        if len(data) < HEADER.size:
+            self.refusals.add(sender, f"a message of {len(data)} bytes is too short")
+            return None
+        kind, number, count, point = HEADER.unpack_from(data)
+        return sender, kind, number, count, point, data
 
     def close(self) -> None:
         """Stop receiving."""
@@ -129,15 +149,48 @@ class Inbox:
         """Run what was posted; whether there was anything."""
         found = bool(self._posted)
         while self._posted:
-            self._posted.popleft()()
+            with self.refusals.guard("a query or a setting"):
+                self._posted.popleft()()
         return found
+
+
+class _Unopened:
+    """Nobody can send anything yet; a wait ends by its time or a wake-up."""
+
+    def __init__(self) -> None:
+        self._woken = threading.Event()
+
+    def take(self) -> Arrived | None:
+        return None
+
+    def take_within(self, timeout_s: float) -> Arrived | None:
+        self._woken.wait(timeout_s)
+        self._woken.clear()
+        return None
+
+    def wake(self) -> None:
+        self._woken.set()
+
+    def close(self) -> None:
+        return
 
 
 class _ZenohSource:
     """A Zenoh subscriber with a FIFO channel; a timer thread ends its waits."""
 
-    def __init__(self, session: zenoh.Session, key: str, wake_key: str, capacity: int) -> None:
-        self._subscriber = session.declare_subscriber(key, FifoChannel(capacity))
+    def __init__(  # noqa: PLR0913, PLR0917  as `Inbox.open`
+        self,
+        session: zenoh.Session,
+        keys: RunKeys,
+        name: str,
+        senders: Mapping[str, str],
+        capacity: int,
+        refusals: Refusals,
+    ) -> None:
+        wake_key = keys.wake(name)
+        self._senders = {**senders, wake_key: _NOBODY}
+        self._refusals = refusals
+        self._subscriber = session.declare_subscriber(keys.inbox(name), FifoChannel(capacity))
         self._recv = self._subscriber.handler.recv
         self._try_recv = self._subscriber.handler.try_recv
         self._waker = session.declare_publisher(wake_key, allowed_destination=zenoh.Locality.SESSION_LOCAL)
@@ -147,18 +200,26 @@ class _ZenohSource:
         self._timer = threading.Thread(target=self._run_timer, name="inbox-timer", daemon=True)
         self._timer.start()
 
-    def take(self) -> bytes | None:
+    def take(self) -> Arrived | None:
         sample = self._try_recv()
-        return None if sample is None else sample.payload.to_bytes()
+        return None if sample is None else self._from_somebody(sample)
 
-    def take_within(self, timeout_s: float) -> bytes | None:
+    def take_within(self, timeout_s: float) -> Arrived | None:
         self._deadline = time.monotonic() + timeout_s
         if timeout_s < _TIMER_PERIOD_S:
             with self._condition:
                 self._condition.notify()
         sample = self._recv()
         self._deadline = float("inf")
-        return sample.payload.to_bytes()
+        return self._from_somebody(sample)
+
+    def _from_somebody(self, sample: zenoh.Sample) -> Arrived:
+        key = str(sample.key_expr)
+        sender = self._senders.get(key)
+        if sender is None:
+            self._refusals.add(key, "nobody of this run sends on this key")
+            return _NOBODY, b""
+        return sender, sample.payload.to_bytes()
 
     def wake(self) -> None:
         with self._condition:

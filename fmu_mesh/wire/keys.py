@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import re
+import secrets
 from collections.abc import Iterable
 from typing import Literal
 
 import msgspec
 
-__all__ = ["Keys", "VariableKind", "batched", "escape", "unescape"]
+__all__ = ["RUN_ID_BYTES", "Keys", "RunKeys", "VariableKind", "batched", "escape", "unescape"]
 
 VariableKind = Literal["out", "in", "param", "local"]
 
 _UNSAFE = re.compile(r"[/*$?#%]|^@|[\x00-\x20\x7f]")
 _ESCAPED = re.compile(r"%([0-9A-F]{2})")
 _GRANT_CHUNKS = 16
+
+RUN_ID_BYTES = 8
+"""A run's id is written as hexadecimal digits, so it never begins with `@`, whose chunk matches no wildcard."""
 
 
 def escape(name: str) -> str:
@@ -28,7 +32,7 @@ def unescape(chunk: str) -> str:
 
 
 class Keys(msgspec.Struct, frozen=True):
-    """The keys of one mesh.
+    """The public keys of one mesh, and where its internal ones begin.
 
     Attributes:
         prefix: first part of every key, `fmu_mesh` by default.
@@ -60,47 +64,91 @@ class Keys(msgspec.Struct, frozen=True):
         """Liveliness token of the master."""
         return f"{self.root}/mesh"
 
-    def node_token(self, node: str) -> str:
-        """Liveliness token of a node as a process; internal."""
-        return f"{self.root}/@sync/node/{node}"
-
-    def follower(self, name: str) -> str:
-        """Liveliness token of a reader that has not got its last sample yet: the master stays for it; internal."""
-        return f"{self.root}/@sync/follower/{name}"
-
-    def hello(self, node: str) -> str:
-        """Queryable of a node that answers as soon as its subscribers are declared."""
-        return f"{self.root}/@sync/hello/{node}"
-
     @property
     def register(self) -> str:
-        """Queryable of the master where nodes register; answered when all are there."""
+        """Queryable of the master where nodes register and learn the run's id."""
         return f"{self.root}/@sync/register"
 
+    def run(self, run: str) -> RunKeys:
+        """The internal keys of one run."""
+        return RunKeys(self.root, run)
+
+
+class RunKeys(msgspec.Struct, frozen=True):
+    """The internal keys of one run of a mesh. They carry its id, so that two runs never take each other's messages.
+
+    Attributes:
+        root: what every key of the mesh starts with.
+        run: the run's id, or `*` for any.
+    """
+
+    root: str
+    run: str
+
+    @classmethod
+    def new(cls, keys: Keys) -> RunKeys:
+        """The keys of a new run, whose id is random."""
+        return keys.run(secrets.token_hex(RUN_ID_BYTES))
+
     @property
-    def report(self) -> str:
+    def base(self) -> str:
+        """What every internal key of the run starts with."""
+        return f"{self.root}/@sync/{self.run}"
+
+    @property
+    def master(self) -> str:
+        """Liveliness token of the master of this run."""
+        return f"{self.base}/master"
+
+    @staticmethod
+    def node_in(key: str) -> str:
+        """The node whose token, readiness or report has this key."""
+        return key.rpartition("/of=")[2]
+
+    def node(self, node: str) -> str:
+        """Liveliness token of a node as a process."""
+        return f"{self.base}/node/{_of(node)}"
+
+    def follower(self, name: str) -> str:
+        """Liveliness token of a reader that has not got its last sample yet: the master stays for it."""
+        return f"{self.base}/follower/{name}"
+
+    def hello(self, node: str) -> str:
+        """Queryable of a node that tells whether it can reach the shared memory of whoever asks."""
+        return f"{self.base}/hello/{_of(node)}"
+
+    def ready(self, node: str) -> str:
+        """Queryable of the master where a node says that its links work; answered when all have said so."""
+        return f"{self.base}/ready/{_of(node)}"
+
+    def report(self, node: str) -> str:
         """Queryable of the master that takes the end or the failure of a node."""
-        return f"{self.root}/@sync/report"
+        return f"{self.base}/report/{_of(node)}"
 
     def inbox(self, node: str) -> str:
         """Key expression that a node subscribes to for everything sent to it."""
-        return f"{self.root}/@sync/**/to={node}/**"
+        return f"{self.base}/**/to={node}/**"
 
     def frames(self, source: str, target_node: str) -> str:
         """Frames of one instance for one node."""
-        return f"{self.root}/@sync/frame/{source}/to={target_node}"
+        return f"{self.base}/frame/{source}/to={target_node}"
 
-    def progress(self) -> str:
-        """Progress of the nodes, for the master."""
-        return f"{self.root}/@sync/progress/to=@mesh"
+    def progress(self, node: str) -> str:
+        """Progress of a node, for the master."""
+        return f"{self.base}/progress/{_of(node)}/to=@mesh"
 
     def wake(self, node: str) -> str:
         """A node's own key to wake itself up; never leaves the process."""
-        return f"{self.root}/@sync/wake/to={node}"
+        return f"{self.base}/wake/to={node}"
 
     def grants(self, nodes: Iterable[str]) -> list[str]:
         """Keys on which one put each reaches up to 16 nodes."""
-        return [f"{self.root}/@sync/grant/" + "/".join(f"to={node}" for node in part) for part in batched(nodes)]
+        return [f"{self.base}/grant/" + "/".join(f"to={node}" for node in part) for part in batched(nodes)]
+
+
+def _of(node: str) -> str:
+    """The chunk of a node, or of all; a name may begin with `@`, and such a chunk would match no wildcard."""
+    return node if node == "*" else f"of={node}"
 
 
 def batched(nodes: Iterable[str]) -> list[list[str]]:

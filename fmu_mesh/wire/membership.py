@@ -1,40 +1,103 @@
 """How a node or the recorder joins a mesh, and by which way its messages reach each of the others.
 
-Joining proves that all links work: a source that says hello has the subscription of who asked, and the master answers a
-registration when all are there. On the way everybody learns who can be reached through shared memory.
+In three steps, each a query that is answered:
+
+* **register** with the master, which admits the node and tells it the run's id, or refuses it. Nothing else is declared
+  before, so that a process that does not belong to the run leaves no trace in it.
+* **hello** to every node that sends frames to this one: a source that answers has the subscription of who asked. On the
+  way it tells whether it reaches the shared memory of who asked.
+* **ready** to the master, which answers when all nodes are.
 """
 
 from __future__ import annotations
 
 import os
 import socket
+import threading
 from collections.abc import Callable
 from contextlib import ExitStack
+from typing import Annotated, TypeVar
 
 import msgspec
 import zenoh
 
-from ..errors import FmuMeshError
+from ..errors import DeadlineExceeded, FmuMeshError, MeshLost, MessageRefused
 from ..model.plan import NodePlan
 from ..model.window import FRAME_OVERHEAD
 from .inbox import Inbox
-from .keys import Keys
+from .keys import RUN_ID_BYTES, Keys, RunKeys
 from .messages import decode_json
-from .session import ask
+from .refusals import payload_of
+from .session import ask, tokens
 from .shared_memory import Offer, SharedInbox, SharedOutlet, available
 
-__all__ = ["MASTER", "Membership", "Registration", "Welcome", "shared_inbox"]
+__all__ = ["MASTER", "Admission", "Membership", "Ready", "Registration", "Welcome", "shared_inbox"]
 
 MASTER = "@mesh"
 """Name of the master where node names stand."""
 
+T = TypeVar("T")
+
 _SHARED = b"shared"
+_GRACE_S = 1.0
+
+
+class Registration(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Who wants to be a node of the mesh.
+
+    Attributes:
+        launch: the launcher that started it; None for one that was started by hand.
+    """
+
+    node: str
+    digest: str
+    pid: int
+    host: str
+    launch: str | None = None
+
+
+class Admission(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The master's answer to a registration.
+
+    Attributes:
+        run: the id of the run.
+        grants: the key that the master sends to this node on.
+    """
+
+    run: Annotated[str, msgspec.Meta(pattern=f"^[0-9a-f]{{{2 * RUN_ID_BYTES}}}$")]
+    grants: str
 
 
 class Hello(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What a node tells its sources: who it is, and where its shared memory is."""
 
     node: str
+    offer: Offer | None = None
+
+
+class Ready(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What a node says about itself when its links work.
+
+    Attributes:
+        offer: its shared memory.
+        shared: whether all its sources can reach that.
+    """
+
+    offer: Offer | None = None
+    shared: bool = False
+
+
+class Welcome(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The master's answer to those that are ready, when all nodes are.
+
+    Attributes:
+        profile: how many bursts and waits the node shall note for a profile; 0: nothing is measured.
+        shared: who gets all messages through shared memory: names of nodes, `@mesh` for the master.
+        offer: the shared memory of the master, if it is among them.
+    """
+
+    profile: int = 0
+    shared: tuple[str, ...] = ()
     offer: Offer | None = None
 
 
@@ -49,75 +112,89 @@ def shared_inbox(plan: NodePlan, *, spins: bool) -> SharedInbox | None:
     return SharedInbox(senders, spins=spins)
 
 
-class Registration(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a node says about itself when it is ready for Initialization Mode.
-
-    Attributes:
-        offer: its shared memory.
-        shared: whether all its sources can reach that.
-    """
-
-    node: str
-    digest: str
-    pid: int
-    host: str
-    offer: Offer | None = None
-    shared: bool = False
-
-
-class Welcome(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The master's answer to a registration, when all nodes are there.
-
-    Attributes:
-        number: what the node writes into its progress.
-        profile: how many bursts and waits it shall note for a profile; 0: nothing is measured.
-        shared: who gets all messages through shared memory: names of nodes, `@mesh` for the master.
-        offer: the shared memory of the master, if it is among them.
-    """
-
-    number: int
-    profile: int = 0
-    shared: tuple[str, ...] = ()
-    offer: Offer | None = None
-
-
 class Membership:
     """One participant's part in the mesh.
 
     Args:
         plan: what the participant has to do.
         session: the session of this process; stays the caller's.
-        inbox: its inbox, made with `shared_inbox`.
+        inbox: its inbox, made with `shared_inbox`; opened by `join`.
+        launch: the launcher that started this process; None where it was started by hand.
 
     Attributes:
         given_up: whether `give_up` was called.
 
-    Call sequence: `join` once, then `sender` for everything that is sent to, and `close` at the end.
+    Call sequence: `register`, then `join` once, then `sender` for everything that is sent to, and `close` at the end.
     """
 
-    def __init__(self, plan: NodePlan, session: zenoh.Session, keys: Keys, inbox: Inbox) -> None:
+    def __init__(self, plan: NodePlan, session: zenoh.Session, inbox: Inbox, launch: str | None = None) -> None:
         self._plan = plan
         self._session = session
-        self._keys = keys
         self._inbox = inbox
+        self._launch = launch
+        self._keys: RunKeys | None = None
+        self._admission: Admission | None = None
+        self._refusal: FmuMeshError | None = None
+        self._answered = threading.Event()
         self._outlets: dict[str, SharedOutlet] = {}
         self._shared: frozenset[str] = frozenset()
         self._stack = ExitStack()
+        self._master_went = False
         self.given_up = False
+
+    def register(
+        self, on_admitted: Callable[[], None] = lambda: None, on_master_gone: Callable[[], None] = lambda: None
+    ) -> None:
+        """Begin to register, on a thread of its own: an FMU may be loaded meanwhile.
+
+        Args:
+            on_admitted: called when the master has admitted this node, on that thread.
+            on_master_gone: called when the master's liveliness token goes, on a foreign thread; look whether it is so.
+        """
+
+        def run() -> None:
+            try:
+                self._enter(on_master_gone)
+                on_admitted()
+            except FmuMeshError as error:
+                self._refusal = error
+            except zenoh.ZError as error:  # the session is closed meanwhile
+                self._refusal = MeshLost(f"this process cannot join the mesh: {error}")
+            finally:
+                self._answered.set()
+
+        threading.Thread(target=run, name="register", daemon=True).start()
 
     def give_up(self) -> None:
         """From any thread: let `join` end with an error, because there is nothing to join any more."""
         self.given_up = True
 
-    def answer_hello(self, query: zenoh.Query) -> None:
-        """On a foreign thread: a target asks; tell it whether its shared memory can be reached from here."""
-        hello = decode_json(query.payload.to_bytes() if query.payload else b"", Hello)
-        outlet = self._outlet(hello.offer, hello.node, f"node '{hello.node}'")
-        query.reply(query.key_expr, _SHARED if outlet is not None else b"")
-        query.drop()
+    def keys(self, patience_s: float) -> RunKeys:
+        """The keys of the run, once the master has admitted this node.
+
+        Raises:
+            DeadlineExceeded: it has not within ``patience_s`` seconds.
+            MeshLost: it has refused to; the message says why.
+        """
+        if not self._answered.wait(patience_s):
+            raise DeadlineExceeded(f"nobody answered for the master within {patience_s:g} s")
+        if self._refusal is not None:
+            raise self._refusal
+        assert self._keys is not None
+        return self._keys
+
+    @property
+    def is_admitted(self) -> bool:
+        """Whether the master has admitted this node."""
+        return self._answered.is_set() and self._refusal is None
+
+    @property
+    def master_is_gone(self) -> bool:
+        """Whether the master's token is gone; may ask, so it is no question for a callback of Zenoh."""
+        return self._keys is not None and not tokens(self._session, self._keys.master)
 
     def join(self) -> Welcome:
-        """Wait until the links with all other nodes work in both directions, then register with the master.
+        """Wait until the links with all other nodes work in both directions, then tell the master.
 
         Raises:
             DeadlineExceeded: somebody was not there in time.
@@ -125,26 +202,29 @@ class Membership:
         """
         plan, inbox = self._plan, self._inbox
         deadline_s = plan.timeouts.start
+        keys = self.keys(deadline_s + _GRACE_S)
+        assert self._admission is not None
+        senders = {keys.frames(link.source, plan.node): link.source_node for link in plan.links_in}
+        capacity = sum(plan.window + 8 for _ in plan.links_in) + 4096
+        inbox.open(self._session, keys, plan.node, {**senders, self._admission.grants: MASTER}, capacity)
         hello = msgspec.json.encode(Hello(plan.node, inbox.offer))
         shared = inbox.offer is not None
         for node in dict.fromkeys(link.source_node for link in plan.links_in):
-            key, who = self._keys.hello(node), f"node '{node}'"
-            answer = ask(self._session, key, hello, deadline_s, who, over=lambda: self.given_up)
+            answer = ask(
+                self._session, keys.hello(node), hello, deadline_s, f"node '{node}'", over=self._has_nothing_to_join
+            )
             shared = shared and answer == _SHARED
-        registration = Registration(
-            plan.node, plan.digest, os.getpid(), socket.gethostname(), offer=inbox.offer, shared=shared
-        )
-        payload = msgspec.json.encode(registration)
+        ready = msgspec.json.encode(Ready(inbox.offer, shared))
         answer = ask(
             self._session,
-            self._keys.register,
-            payload,
+            keys.ready(plan.node),
+            ready,
             deadline_s,
             "the master",
             2 * deadline_s,
-            over=lambda: self.given_up,
+            over=self._has_nothing_to_join,
         )
-        welcome = decode_json(answer, Welcome)
+        welcome = _understood(answer, Welcome)
         self._shared = frozenset(welcome.shared)
         if welcome.offer is not None and self._outlet(welcome.offer, MASTER, "the master") is None:
             raise FmuMeshError(
@@ -164,11 +244,71 @@ class Membership:
         return publisher.put
 
     def close(self) -> None:
-        """Undeclare what `sender` declared."""
+        """Undeclare what this has declared."""
+        self.given_up = True
         self._stack.close()
+
+    def _enter(self, on_master_gone: Callable[[], None]) -> None:
+        """Register, and be there: from now on others may say hello, and the master sees when this process is lost."""
+        plan, stack = self._plan, self._stack
+        registration = Registration(plan.node, plan.digest, os.getpid(), socket.gethostname(), self._launch)
+        public = Keys(plan.key_prefix, plan.mesh)
+        payload = msgspec.json.encode(registration)
+        answer = ask(
+            self._session,
+            public.register,
+            payload,
+            plan.timeouts.start,
+            "the master",
+            answer_s=plan.timeouts.start,
+            over=lambda: self.given_up,
+        )
+        self._admission = _understood(answer, Admission)
+        self._keys = keys = public.run(self._admission.run)
+
+        def master_changed(sample: zenoh.Sample) -> None:
+            if sample.kind == zenoh.SampleKind.DELETE:
+                self._master_went = True
+                on_master_gone()
+
+        watcher = self._session.liveliness().declare_subscriber(keys.master, master_changed, history=True)
+        stack.callback(watcher.undeclare)
+        hello = self._session.declare_queryable(keys.hello(plan.node), self._answer_hello)
+        stack.callback(hello.undeclare)
+        stack.callback(self._session.liveliness().declare_token(keys.node(plan.node)).undeclare)
+
+    def _answer_hello(self, query: zenoh.Query) -> None:
+        """On a foreign thread: a target asks; tell it whether its shared memory can be reached from here."""
+        assert self._keys is not None
+        with self._inbox.refusals.guard(str(query.key_expr), query):
+            hello = decode_json(payload_of(query, self._keys.hello(self._plan.node)), Hello)
+            if hello.node not in {link.target_node for link in self._plan.links_out}:
+                raise MessageRefused("it is from no node that this one sends to")
+            outlet = self._outlet(hello.offer, hello.node, f"node '{hello.node}'")
+            query.reply(query.key_expr, _SHARED if outlet is not None else b"")
+            query.drop()
+
+    def _has_nothing_to_join(self) -> bool:
+        if self._master_went and not self.given_up:
+            self._master_went = False
+            self.given_up = self.master_is_gone
+        return self.given_up
 
     def _outlet(self, offer: Offer | None, target: str, spoken: str) -> SharedOutlet | None:
         outlet = SharedOutlet.open(offer, self._plan.node, spoken, self._inbox.stash, self._plan.timeouts.step)
         if outlet is not None:
             self._outlets[target] = outlet
         return outlet
+
+
+def _understood(answer: bytes, kind: type[T]) -> T:
+    """The master's answer.
+
+    Raises:
+        MeshLost: it is none of this version.
+    """
+    try:
+        return decode_json(answer, kind)
+    except MessageRefused as error:
+        hint = "Do all processes run the same version of fmu_mesh?"
+        raise MeshLost(f"the master's answer is not understood: {error}", hint=hint) from error

@@ -1,9 +1,9 @@
 """The messages of the synchronization, as bytes.
 
-Every message starts with 16 bytes, little endian: kind (u8), one spare byte, link or node number (u16), count (u32),
-point (i64). A frame follows with its rows (`fmu_mesh.wire.rows`). Abort follows with an `ErrorReport` as JSON. Last
-tells that a link brings no more rows, because the run has ended early. Every decoder checks sizes before it touches
-anything.
+Every message starts with 24 bytes, little endian: kind (u8), three spare bytes, number of the link (u32), count (u32),
+four spare bytes, point (i64). A frame follows with its rows (`fmu_mesh.wire.rows`). Abort follows with an `ErrorReport`
+as JSON. Last tells that a link brings no more rows, because the run has ended early. Every decoder checks sizes before
+it touches anything, and raises nothing but `MessageRefused`.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Final, TypeVar
 
 import msgspec
 
-from ..errors import ErrorReport
+from ..errors import ErrorReport, MessageRefused
 from .profile import NodeProfile
 
 __all__ = [
@@ -33,7 +33,7 @@ __all__ = [
     "encode_abort",
 ]
 
-HEADER: Final = struct.Struct("<BxHIq")
+HEADER: Final = struct.Struct("<BxxxIIxxxxq")
 FRAME: Final = 1
 INITIAL: Final = 2
 GRANT: Final = 3
@@ -66,18 +66,21 @@ def decode_abort(data: bytes) -> ErrorReport:
     """The error that ended the mesh.
 
     Raises:
-        msgspec.DecodeError: it is not an `ErrorReport`.
+        MessageRefused: it is not an `ErrorReport`.
     """
     return decode_json(data[HEADER.size :], ErrorReport)
 
 
-def decode_json(data: bytes, type_: type[T]) -> T:
-    """JSON that came over the wire.
+def decode_json(data: bytes, type_: type[T], most: int = MAX_MESSAGE_SIZE) -> T:
+    """JSON of at most ``most`` bytes that came over the wire.
 
     Raises:
-        msgspec.DecodeError: it is not JSON of that type.
+        MessageRefused: it is not JSON of that type, or larger.
     """
+    if len(data) > most:
+        raise MessageRefused(f"it has {len(data)} bytes, and {most} are the most")
     try:
         return msgspec.json.decode(data, type=type_)
-    except (RecursionError, UnicodeDecodeError) as error:  # msgspec lets them through
-        raise msgspec.DecodeError(str(error)) from error
+    # msgspec lets what Python itself raises through, such as UnicodeDecodeError.
+    except (msgspec.MsgspecError, ValueError, OverflowError, RecursionError) as error:
+        raise MessageRefused(str(error)) from error

@@ -172,8 +172,9 @@ class Meshes:
         opening = self._open(self._endpoints, "nobody answered")
         for reply in opening.session().liveliness().get("**/mesh", timeout=self._timeout_s):
             if reply.ok is not None:
-                prefix, mesh, _ = str(reply.ok.key_expr).rsplit("/", 2)
-                self._found.append(_Found(Keys(prefix, mesh), self._endpoints, opening))
+                *prefix, mesh, _ = str(reply.ok.key_expr).split("/")
+                if prefix:  # otherwise it is a token of something else
+                    self._found.append(_Found(Keys("/".join(prefix), mesh), self._endpoints, opening))
 
     def _open(self, endpoints: Sequence[str], else_: str) -> _Opening:
         self._openings.append(_Opening(endpoints, else_, self._timeout_s))

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import queue
 from collections.abc import Iterator
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import msgspec
 import zenoh
 
+from ..errors import MessageRefused
 from ..model.description import PlainValue
+from .messages import decode_json
 from .values import decode_stamp
 from .views import VariableView
 
@@ -48,8 +50,8 @@ def reading_of(target: Target, sample: zenoh.Sample) -> Reading | None:
         return None
     try:
         stamp = decode_stamp(sample.attachment.to_bytes())
-        value: PlainValue = msgspec.json.decode(sample.payload.to_bytes())
-    except msgspec.DecodeError:
+        value: Any = decode_json(sample.payload.to_bytes(), object)
+    except MessageRefused:
         return None
     view = target.variable
     return Reading(target.key, target.instance, view.name, value, stamp.point, stamp.time, view.unit)
@@ -67,7 +69,9 @@ class Keeper:
 
     def keep(self, sample: zenoh.Sample) -> None:
         """The subscriber's callback."""
-        if self._arrived.qsize() < _WAITING_SAMPLES and (reading := reading_of(self._target, sample)) is not None:
+        if str(sample.key_expr) != self._target.key or self._arrived.qsize() >= _WAITING_SAMPLES:
+            return
+        if (reading := reading_of(self._target, sample)) is not None:
             self._arrived.put(reading)
 
 

@@ -14,7 +14,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FmuMeshError
+from ..errors import FmuMeshError, MessageRefused
 from ..model.ring import Part, Rows
 from ..model.types import DTYPES, VariableType, is_text
 from .messages import HEADER, MAX_MESSAGE_SIZE
@@ -57,7 +57,7 @@ def decode_rows(data: bytes, count: int, parts: Sequence[Part]) -> Rows:
     """The ``count`` rows of a FRAME or INITIAL message, read-only where they are numbers.
 
     Raises:
-        FmuMeshError: it does not hold just these rows.
+        MessageRefused: it does not hold just these rows.
     """
     if len(data) > MAX_MESSAGE_SIZE:
         raise _refused(data, count, f"{MAX_MESSAGE_SIZE} are the most")
@@ -73,7 +73,7 @@ def decode_rows(data: bytes, count: int, parts: Sequence[Part]) -> Rows:
                 raise _refused(data, count, f"at least {place + size * dtype.itemsize} are expected")
             values = np.frombuffer(data, dtype, size, place)
             if type_ == "Boolean" and size and values.view(np.uint8).max() > 1:
-                raise FmuMeshError("a frame has a Boolean that is neither true nor false", hint=_HINT)
+                raise MessageRefused("a frame has a Boolean that is neither true nor false", hint=_HINT)
             place += size * dtype.itemsize
         rows.append(values.reshape(count, width))
     if place != len(data):
@@ -104,11 +104,11 @@ def _decode_texts(
             try:
                 value = data[begin:end].decode()
             except UnicodeDecodeError as error:
-                raise FmuMeshError(f"a frame has a String that is no UTF-8 ({error.reason})", hint=_HINT) from error
+                raise MessageRefused(f"a frame has a String that is no UTF-8 ({error.reason})", hint=_HINT) from error
         values[index] = value
         begin = end
     return values, begin
 
 
-def _refused(data: bytes, count: int, expected: str) -> FmuMeshError:
-    return FmuMeshError(f"a frame of {count} points has {len(data)} bytes where {expected}", hint=_HINT)
+def _refused(data: bytes, count: int, expected: str) -> MessageRefused:
+    return MessageRefused(f"a frame of {count} points has {len(data)} bytes where {expected}", hint=_HINT)

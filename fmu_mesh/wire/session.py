@@ -20,7 +20,17 @@ from zenoh.handlers import Callback
 
 from ..errors import ConfigurationError, DeadlineExceeded, MeshLost
 
-__all__ = ["Wiring", "ask", "close_session", "matches", "open_session", "own_endpoints", "undeclare_all"]
+__all__ = [
+    "RouterLink",
+    "Wiring",
+    "ask",
+    "close_session",
+    "matches",
+    "open_session",
+    "own_endpoints",
+    "tokens",
+    "undeclare_all",
+]
 
 LEASE_MS = 4_000
 """A stopped (not dead) process is noticed after this time; a dead one within milliseconds."""
@@ -43,6 +53,8 @@ _CANNOT_LISTEN = (
 
 _CLOSE_S = 1.0
 _LOOK_S = 0.05
+_TOKENS_S = 2.0
+_LINK_S = 1.0
 
 
 class Wiring(msgspec.Struct, frozen=True):
@@ -148,6 +160,48 @@ def matches(entity: zenoh.Publisher | zenoh.Querier) -> bool:
     """Whether anybody is there for what this publisher or querier sends."""
     # The stub says bool, but it is an object that is always true (zenoh-python 1.10).
     return bool(entity.matching_status.matching)  # type: ignore[attr-defined]  # the stub is wrong
+
+
+def tokens(session: zenoh.Session, key: str) -> list[str]:
+    """The keys of the liveliness tokens that match ``key``; for a thread that may wait, and no callback of Zenoh.
+
+    A subscriber is told that a token is gone although another session still holds one with this key; this is the truth.
+    """
+    replies = session.liveliness().get(key, timeout=_TOKENS_S)
+    return [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
+
+
+class RouterLink:
+    """Whether a process still reaches the router through which it reaches the others.
+
+    Args:
+        session: the session of this process.
+        endpoints: where it connects to; none if all that it needs is on this host.
+    """
+
+    def __init__(self, session: zenoh.Session, endpoints: Iterable[str] = ()) -> None:
+        self._session = session
+        self._endpoints = tuple(endpoints)
+        self._had_router = False
+
+    def wait(self) -> None:
+        """Give the link a moment to come up: a session in peer mode is open before it is."""
+        end = time.monotonic() + _LINK_S
+        never = threading.Event()
+        while self._endpoints and not self.look() and time.monotonic() < end:
+            never.wait(_LOOK_S)
+
+    def look(self) -> bool:
+        """Whether there is a router; from the first time on, it counts as lost where there is none."""
+        there = bool(self._endpoints) and any(True for _ in self._session.info.routers_zid())
+        self._had_router = self._had_router or there
+        return there
+
+    def loss(self) -> str | None:
+        """In words that the router is gone; None where it is there, or there was none."""
+        if not self._had_router or self.look():
+            return None
+        return f"the link to the router at {', '.join(self._endpoints)} was lost"
 
 
 class _Declared(Protocol):

@@ -29,9 +29,13 @@ from ..errors import DeadlineExceeded, FmuMeshError
 from .messages import ABORT, MAX_MESSAGE_SIZE
 from .runtime import is_alive
 
-__all__ = ["Offer", "SharedInbox", "SharedOutlet", "available"]
+__all__ = ["Arrived", "Offer", "SharedInbox", "SharedOutlet", "available"]
+
+Arrived = tuple[str, bytes]
+"""Who sent a message, and the message."""
 
 _NAME: Final = "fmu_mesh"
+_ABORT: Final = bytes((ABORT,))
 _TOKEN_SIZE: Final = 16
 _DOORBELL: Final = 64
 _CHANNELS: Final = 128
@@ -142,21 +146,21 @@ class SharedInbox:
         self._doorbell = memory.semaphore(_DOORBELL)
         for offset in (_DOORBELL, *(start + part for start, _ in channels.values() for part in (_ITEMS, _SPACES))):
             init(memory.semaphore(offset), 1, 0)
-        self._channels = [_Incoming(memory, *place) for place in channels.values()]
-        self._arrived: deque[bytes] = deque()
+        self._channels = [_Incoming(memory, sender, *place) for sender, place in channels.items()]
+        self._arrived: deque[Arrived] = deque()
         self._post = post
         self.offer = Offer(os.getpid(), self._descriptor, token.hex(), end, channels)
         self._woken = False
         self._spins = spins and not _ONE_CORE
         self._patience = 0
 
-    def take(self) -> bytes | None:
+    def take(self) -> Arrived | None:
         """The next message if one is there."""
         if not self._arrived and self._trywait(self._doorbell) == 0:
             self._collect()
         return self._arrived.popleft() if self._arrived else None
 
-    def take_within(self, timeout_s: float) -> bytes | None:
+    def take_within(self, timeout_s: float) -> Arrived | None:
         """The next message; None after ``timeout_s`` seconds or a `wake`."""
         arrived = self._arrived
         if arrived:
@@ -181,7 +185,7 @@ class SharedInbox:
             self._collect()
             # What was taken here must not be slept over later.
             self._post(self._doorbell)
-        return any(message[0] == ABORT for message in self._arrived)
+        return any(message[:1] == _ABORT for _, message in self._arrived)
 
     def wake(self) -> None:
         """From any thread: let `take_within` come back."""
@@ -225,10 +229,11 @@ class SharedInbox:
 class _Incoming:
     """The reader of one buffer."""
 
-    def __init__(self, memory: _Memory, offset: int, size: int) -> None:
+    def __init__(self, memory: _Memory, sender: str, offset: int, size: int) -> None:
         assert _SEMAPHORES is not None
         _, self._post, self._trywait, _ = _SEMAPHORES
         self._memory = memory
+        self._sender = sender
         self._items = memory.semaphore(offset + _ITEMS)
         self._spaces = memory.semaphore(offset + _SPACES)
         self._data = memory.view[offset + _DATA : offset + _DATA + size]
@@ -236,7 +241,7 @@ class _Incoming:
         self._read = 0
         self._parts: list[bytes] = []
 
-    def collect(self, arrived: deque[bytes]) -> None:
+    def collect(self, arrived: deque[Arrived]) -> None:
         """Append all messages that are written."""
         trywait, items, size, data = self._trywait, self._items, self._size, self._data
         while trywait(items) == 0:
@@ -255,7 +260,7 @@ class _Incoming:
                     continue
                 message = b"".join(self._parts)
                 self._parts.clear()
-            arrived.append(message)
+            arrived.append((self._sender, message))
 
 
 class SharedOutlet:

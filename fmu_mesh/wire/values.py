@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
 import zenoh
 
+from ..errors import MessageRefused
 from ..model.description import Value, Variable
 from ..model.values import MAX_TEXT_SIZE, ValueRefused, to_plain, to_value
+from ..simtime import ENDLESS
 from .messages import decode_json
 
 __all__ = [
@@ -32,7 +34,7 @@ json_encoding = zenoh.Encoding.APPLICATION_JSON
 class Stamp(msgspec.Struct, frozen=True):
     """The communication point of a value and its time in s."""
 
-    point: int
+    point: Annotated[int, msgspec.Meta(ge=0, le=ENDLESS)]
     time: float
 
 
@@ -45,7 +47,7 @@ def decode_stamp(data: bytes) -> Stamp:
     """The point and time in an attachment.
 
     Raises:
-        msgspec.DecodeError: it is none of ours.
+        MessageRefused: it is none of ours.
     """
     return decode_json(data, Stamp)
 
@@ -58,7 +60,7 @@ def decode_time(data: bytes) -> float:
     """
     try:
         time = decode_json(data, _Moment).time
-    except msgspec.DecodeError as error:
+    except MessageRefused as error:
         raise ValueRefused(f'its attachment has no time, such as {{"time": 1.5}} in s ({error})') from error
     if not math.isfinite(time):
         raise ValueRefused(f"the time {time} in its attachment is not finite")
@@ -89,7 +91,7 @@ def decode_value(data: bytes, variable: Variable) -> Value:
         raise ValueRefused(f"{len(data)} bytes are too many for a value")
     try:
         value: Any = decode_json(data, object)
-    except msgspec.DecodeError as error:
+    except MessageRefused as error:
         raise ValueRefused(f"it is no JSON value ({error})") from error
     try:
         return to_value(value, variable)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 import msgspec
 
 from ..errors import ErrorReport
 from ..model.description import Clock, DefaultExperiment, PlainValue
+from ..simtime import ENDLESS
 
 __all__ = [
     "Command",
@@ -82,6 +83,7 @@ class InstanceStatus(msgspec.Struct, frozen=True):
         step_time: mean wall-clock time of a step in s.
         wait_time: wall-clock time spent waiting since the first point in s.
         running_time: wall-clock time since the first point in s.
+        refused: messages that its process did not take: malformed ones, and those of nobody who may send them.
     """
 
     instance: str
@@ -94,6 +96,7 @@ class InstanceStatus(msgspec.Struct, frozen=True):
     overruns: int = 0
     restarts: int = 0
     running_time: float = 0.0
+    refused: int = 0
 
 
 class LogLine(msgspec.Struct, frozen=True):
@@ -118,12 +121,14 @@ class MeshInfo(msgspec.Struct, frozen=True):
     """Answer of `…/mesh/info`.
 
     Attributes:
+        run: the id of the run, which all its internal keys carry.
         shared_memory: nodes that get their messages through shared memory, and `@mesh` if the master does; all others
             get them through Zenoh. Known when all are there.
     """
 
     mesh: str
     version: str
+    run: str
     config: str
     start_time: float
     stop_time: float | None
@@ -149,6 +154,7 @@ class MeshStatus(msgspec.Struct, frozen=True):
         real_time_factor: simulated over wall-clock time since the first point.
         overruns: points of the wall clock that were given up, because the run was too far behind it.
         progress: last point of every node.
+        refused: messages that the master did not take: malformed ones, and those of nobody who may send them.
     """
 
     mesh: str
@@ -161,13 +167,14 @@ class MeshStatus(msgspec.Struct, frozen=True):
     progress: dict[str, int]
     error: ErrorReport | None = None
     overruns: int = 0
+    refused: int = 0
 
 
 class Command(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What `…/mesh/command` takes; ``points`` belongs to step."""
 
     command: Literal["pause", "resume", "step", "stop"]
-    points: int = 1
+    points: Annotated[int, msgspec.Meta(le=ENDLESS)] = 1
 
 
 class CommandAnswer(msgspec.Struct, frozen=True):

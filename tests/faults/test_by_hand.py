@@ -101,7 +101,7 @@ def test_a_second_process_for_a_node_is_refused_and_the_first_goes_on(place: Pla
 
 
 def test_a_node_with_another_configuration_is_refused_with_the_reason(place: Place) -> None:
-    config = write_config(place.folder, timeouts={"start": 60.0})
+    config = write_config(place.folder)
     master = start(place, config, "master")
     place.note()
 
@@ -110,7 +110,20 @@ def test_a_node_with_another_configuration_is_refused_with_the_reason(place: Pla
     assert other.wait() == 4
     assert "node 'pendulum'" in other.message
     assert "has another configuration, or other FMUs, than the master" in other.message
+    nodes = [start(place, config, name) for name in ("pendulum", "delay")]  # the master has only refused that one
+    assert [launched.wait() for launched in (master, *nodes)] == [0, 0, 0]
+    place.assert_nothing_left()
+
+
+def test_a_master_that_waits_in_vain_says_whom_it_has_refused(place: Place) -> None:
+    config = write_config(place.folder, timeouts={"start": 3.0})
+    master = start(place, config, "master")
+    place.note()
+
+    place.run("node", config, "pendulum", "--set", "pendulum.l=2")
+
     assert master.wait() == 4
+    assert "Refused: node 'pendulum' (process " in master.message
     assert "has another configuration, or other FMUs, than the master" in master.message
     place.assert_nothing_left()
 

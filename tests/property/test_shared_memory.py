@@ -52,8 +52,8 @@ def test_messages_of_any_sizes_come_in_the_order_of_their_sender(plan: list[tupl
         if message is None:
             assert not any(sent.values())
         else:
-            sender = chr(message[0])
-            assert message == sent[sender].popleft()
+            sender, data = message
+            assert data == sent[sender].popleft()
 
     for number, (sender, size, takes) in enumerate(plan):
         message = sender.encode() + number.to_bytes(4, "little") * (size // 4)
@@ -73,7 +73,7 @@ def test_a_message_larger_than_the_buffer_arrives_whole() -> None:
     message = os.urandom(10 * SIZE + 5)
     sender = in_background(lambda: outlet_to(inbox).put(message))
 
-    assert inbox.take_within(10.0) == message
+    assert inbox.take_within(10.0) == ("a", message)
     sender.join(10.0)
     assert not sender.is_alive()
 
@@ -97,7 +97,7 @@ def test_two_that_send_to_each_other_more_than_fits_do_not_wait_for_each_other()
     received = [first.take(), second.take()]
     while None in received and time.monotonic() < deadline:
         received = [old or inbox.take_within(0.01) for old, inbox in zip(received, (first, second), strict=True)]
-    assert received == [message, message]
+    assert received == [("b", message), ("a", message)]
 
 
 def test_a_receiver_that_takes_nothing_is_an_error_with_its_name() -> None:
@@ -116,7 +116,7 @@ def test_a_sender_that_finds_no_room_gives_up_when_the_run_is_over() -> None:
     for _ in range(100):
         outlet.put(bytes(SIZE // 8))
 
-    assert own.take_within(1.0) == bytes([ABORT]) + bytes(15)  # and the abort is still there to be read
+    assert own.take_within(1.0) == ("@mesh", bytes([ABORT]) + bytes(15))  # and the abort is still there to be read
 
 
 def test_a_wake_ends_a_wait_and_a_wait_ends_by_itself() -> None:
@@ -148,8 +148,8 @@ print(msgspec.json.encode(inbox.offer).decode(), flush=True)
 count = int(sys.argv[1])
 total = 0
 for number in range(count):
-    message = inbox.take_within(30.0)
-    assert message is not None and int.from_bytes(message[:8], "little") == number, number
+    sender, message = inbox.take_within(30.0)
+    assert sender == "a" and int.from_bytes(message[:8], "little") == number, number
     total += len(message)
 print(total, flush=True)
 sys.stdin.read()

@@ -150,7 +150,7 @@ def test_a_gateway_that_never_comes_back_ends_with_the_mesh_and_is_told(
     with resting(place, ros, config) as (mesh, gateway, session):
         gateway.suspend()
         if away:
-            key = "fmu_mesh/lab/@sync/follower/*"
+            key = "fmu_mesh/lab/@sync/*/follower/*"
             wait_until(lambda: not list(session.liveliness().get(key, timeout=1.0)), "the end of its lease")
         assert commanded(session, "resume")
 

@@ -21,11 +21,14 @@ from fmu_mesh.model.instance import Instance
 from fmu_mesh.model.plan import RECORDER, NodePlan, Plan
 from fmu_mesh.node.node import Node
 from fmu_mesh.wire.frames import FrameReceiver
+from fmu_mesh.wire.keys import RunKeys
+from fmu_mesh.wire.membership import Membership, Welcome
 from fmu_mesh.wire.messages import FINISH, FRAME, GRANT, HEADER, PROGRESS, WAKE
 
 __all__ = ["SimulatedMesh"]
 
 _MASTER = "@mesh"
+RUN = RunKeys("fmu_mesh/scenario", "0123456789abcdef")
 _WAKE = HEADER.pack(WAKE, 0, 0, 0)
 _TURN_S = 30.0
 """A node that does not come back to the scheduler within this time hangs in a loop of its own."""
@@ -131,11 +134,11 @@ class SimulatedMesh:
         data = self._links[key].popleft()
         target = key.rpartition("to=")[2]
         if target == _MASTER:
-            self._take_progress(data)
+            self._take_progress(key.rpartition("of=")[2].partition("/")[0], data)
         elif target == RECORDER:
             self._record(data)
         else:
-            self._processes[target].inbox.append(data)
+            self._processes[target].inbox.append((_internal(key), data))
 
     def _resume(self, process: _Process) -> None:
         process.turn.release()
@@ -151,14 +154,15 @@ class SimulatedMesh:
             where = dict(zip(self._nodes, self._progress, strict=True))
             raise AssertionError(f"a deadlock: {waiting} wait for ever; grant {self._grant}, progress {where}")
         for process in self._processes.values():
-            process.inbox.append(_WAKE)
+            process.inbox.append((RUN.wake(process.name), _WAKE))
 
     # --- master and recorder
 
-    def _take_progress(self, data: bytes) -> None:
+    def _take_progress(self, node: str, data: bytes) -> None:
         """The credit rule: nobody runs more than its window ahead of the slowest."""
-        kind, number, _, point = HEADER.unpack_from(data)
+        kind, _, _, point = HEADER.unpack_from(data)
         assert kind == PROGRESS
+        number = self._nodes.index(node)
         self._progress[number] = max(self._progress[number], point)
         last = self._plan.grid.last_point
         if min(self._progress) < 0:
@@ -173,7 +177,7 @@ class SimulatedMesh:
 
     def _tell(self, kind: int, point: int) -> None:
         for node in self._processes:
-            self.send(f"grant/to={node}", HEADER.pack(kind, 0, 0, point))
+            self.send(RUN.grants([node])[0], HEADER.pack(kind, 0, 0, point))
 
     def _record(self, data: bytes) -> None:
         kind, number, count, first = HEADER.unpack_from(data)
@@ -185,11 +189,10 @@ class SimulatedMesh:
         last = self._plan.grid.last_point
         covered = [r.received * r.link.step_points for r in self._receivers.values()]
         complete = min(last if points > last else points - 1 for points in covered)
-        number = self._nodes.index(RECORDER)
         stride = self._plan.nodes[RECORDER].progress_stride
         if self._told < 0 <= complete or complete >= self._told + stride or complete == last > self._told:
             self._told = complete
-            self.send(f"progress/{RECORDER}/to={_MASTER}", HEADER.pack(PROGRESS, number, 0, complete))
+            self.send(RUN.progress(RECORDER), HEADER.pack(PROGRESS, 0, 0, complete))
 
 
 class _Process:
@@ -201,7 +204,7 @@ class _Process:
         self.name = plan.node
         self.mesh = mesh
         self.number = number
-        self.inbox: deque[bytes] = deque()
+        self.inbox: deque[tuple[str, bytes]] = deque()
         self.turn = threading.Semaphore(0)
         self.thread = threading.Thread(target=self._live, name=f"node {plan.node}", daemon=True)
         self.over = False
@@ -215,7 +218,7 @@ class _Process:
         """Whether it does not wait for a message, or one is there."""
         return not self._waiting or bool(self.inbox)
 
-    def receive(self) -> bytes:
+    def receive(self) -> tuple[str, bytes]:
         """The next message; lets the others go on until one is there."""
         self._waiting = True
         self._give_up()
@@ -224,7 +227,7 @@ class _Process:
         self._waiting = False
         return self.inbox.popleft()
 
-    def poll(self) -> bytes | None:
+    def poll(self) -> tuple[str, bytes] | None:
         """The next message if one is there, after the others had a chance to send one."""
         self._give_up()
         return self.inbox.popleft() if self.inbox else None
@@ -258,13 +261,32 @@ class _SimulatedNode(Node):
 
     def __init__(self, process: _Process, plan: NodePlan, open_instance: Callable[[str], Instance]) -> None:
         super().__init__(plan, cast("zenoh.Session", _Session(process)), open_instance)
-        self._progress_number = process.number
-
-    def _meet(self) -> None:
-        return
+        self._membership = _SimulatedMembership(plan, self._session, self._inbox)
 
     def _report(self, *_: object, **__: object) -> None:
         return
+
+
+class _SimulatedMembership(Membership):
+    """Everybody is there, and is reached through the wire of this module."""
+
+    def register(self, *_: object) -> None:
+        return
+
+    def keys(self, _patience_s: float) -> RunKeys:
+        return RUN
+
+    def join(self) -> Welcome:
+        plan = self._plan
+        senders = {RUN.frames(link.source, plan.node): link.source_node for link in plan.links_in}
+        senders[RUN.grants([plan.node])[0]] = _MASTER
+        self._inbox.open(self._session, RUN, plan.node, senders, 1)
+        return Welcome()
+
+
+def _internal(key: str) -> str:
+    """The key of a message without the name of the node that has put it."""
+    return key[key.index(RUN.root) :]
 
 
 class _Entity:
@@ -327,7 +349,7 @@ class _Publisher(_Entity):
         if data[0] != WAKE:
             self._process.mesh.send(f"{self._process.name}/{self._key}", data)
         elif threading.current_thread() is self._process.thread:
-            self._process.inbox.append(data)  # of timeouts, the scheduler decides
+            self._process.inbox.append((self._key, data))  # of timeouts, the scheduler decides
 
 
 class _Handler:
@@ -337,17 +359,18 @@ class _Handler:
         self._process = process
 
     def recv(self) -> _Sample:
-        return _Sample(self._process.receive())
+        return _Sample(*self._process.receive())
 
     def try_recv(self) -> _Sample | None:
-        data = self._process.poll()
-        return None if data is None else _Sample(data)
+        arrived = self._process.poll()
+        return None if arrived is None else _Sample(*arrived)
 
 
 class _Sample:
     """A sample, and its payload."""
 
-    def __init__(self, data: bytes) -> None:
+    def __init__(self, key: str, data: bytes) -> None:
+        self.key_expr = key
         self._data = data
 
     @property

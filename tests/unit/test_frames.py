@@ -32,7 +32,7 @@ def test_a_frame_says_which_rows_of_which_link_it_holds() -> None:
     _, _, message = frame(5, (1.0, 2.0, 3), (4.0, 5.0, 6))
 
     assert HEADER.unpack_from(message) == (FRAME, 3, 2, 5)
-    assert len(message) == 16 + 2 * (8 + 8 + 4)
+    assert len(message) == HEADER.size + 2 * (8 + 8 + 4)
 
 
 def test_rows_are_taken_in_order(receiver: FrameReceiver) -> None:
@@ -100,16 +100,18 @@ def test_rows_that_are_no_longer_kept_cannot_be_compared(receiver: FrameReceiver
 
 
 def test_a_frame_larger_than_any_window_is_refused(receiver: FrameReceiver) -> None:
-    with pytest.raises(FmuMeshError, match="a frame of 'source' holds 5 points where 4 are the most"):
+    with pytest.raises(
+        FmuMeshError, match="'source' sends its values up to point 8 to node 'right', which has no room for them"
+    ):
         receiver.take(*frame(0, *[(0.0, 0.0, 0)] * 5))
 
 
 def test_a_frame_of_another_size_is_refused(receiver: FrameReceiver) -> None:
     first, count, message = frame(0, (1.0, 2.0, 3))
 
-    for wrong in (message[:-1], message + b"\0", message[:16]):
+    for wrong in (message[:-1], message + b"\0", message[: HEADER.size]):
         with pytest.raises(
-            FmuMeshError, match=rf"a frame of 1 points has {len(wrong)} bytes where .*\b(36|32) are expected"
+            FmuMeshError, match=rf"a frame of 1 points has {len(wrong)} bytes where .*\b(44|40) are expected"
         ):
             receiver.take(first, count, wrong)
 

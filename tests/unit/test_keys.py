@@ -5,9 +5,10 @@ from __future__ import annotations
 import pytest
 import zenoh
 
-from fmu_mesh.wire.keys import Keys, escape, unescape
+from fmu_mesh.wire.keys import Keys, RunKeys, escape, unescape
 
 KEYS = Keys("fmu_mesh", "pair")
+RUN = KEYS.run("0123456789abcdef")
 
 
 @pytest.mark.parametrize(
@@ -40,34 +41,53 @@ def test_public_keys_are_those_of_the_key_space() -> None:
 
 
 def test_one_subscription_gets_what_is_for_a_node_and_nothing_else() -> None:
-    inbox = zenoh.KeyExpr(KEYS.inbox("delay"))
+    inbox = zenoh.KeyExpr(RUN.inbox("delay"))
 
     def gets(key: str) -> bool:
         return inbox.intersects(zenoh.KeyExpr(key))
 
-    assert gets(KEYS.frames("pendulum", "delay"))
-    assert gets(KEYS.wake("delay"))
-    assert not gets(KEYS.frames("pendulum", "delay2"))
-    assert not gets(KEYS.frames("delay", "pendulum"))
-    assert not gets(KEYS.progress())
-    assert not gets(Keys("fmu_mesh", "other").frames("pendulum", "delay"))
+    assert gets(RUN.frames("pendulum", "delay"))
+    assert gets(RUN.wake("delay"))
+    assert not gets(RUN.frames("pendulum", "delay2"))
+    assert not gets(RUN.frames("delay", "pendulum"))
+    assert not gets(RUN.progress("delay"))
+    assert not gets(Keys("fmu_mesh", "other").run(RUN.run).frames("pendulum", "delay"))
+
+
+def test_nothing_of_one_run_reaches_another_one_of_the_same_mesh() -> None:
+    first, second = RunKeys.new(KEYS), RunKeys.new(KEYS)
+
+    assert first.run != second.run
+    assert not zenoh.KeyExpr(first.inbox("delay")).intersects(zenoh.KeyExpr(second.frames("pendulum", "delay")))
+    assert not zenoh.KeyExpr(first.report("*")).intersects(zenoh.KeyExpr(second.report("delay")))
+    assert not zenoh.KeyExpr(first.node("*")).intersects(zenoh.KeyExpr(second.node("delay")))
+    assert not zenoh.KeyExpr(f"{first.base}/**").intersects(zenoh.KeyExpr(KEYS.register))
+
+
+@pytest.mark.parametrize("node", ["delay", "@record"])
+def test_the_master_is_asked_by_every_node_and_by_the_recorder(node: str) -> None:
+    for key in (RUN.node, RUN.ready, RUN.report):
+        assert zenoh.KeyExpr(key("*")).intersects(zenoh.KeyExpr(key(node)))
+        assert RunKeys.node_in(key(node)) == node
+    assert zenoh.KeyExpr(RUN.inbox("@mesh")).intersects(zenoh.KeyExpr(RUN.progress(node)))
 
 
 @pytest.mark.parametrize(("nodes", "keys"), [(1, 1), (16, 1), (17, 2), (100, 7)])
 def test_every_node_gets_each_grant_once(nodes: int, keys: int) -> None:
     names = [f"n{number}" for number in range(nodes)]
 
-    grants = KEYS.grants(names)
+    grants = RUN.grants(names)
 
     assert len(grants) == keys
     for name in names:
-        inbox = zenoh.KeyExpr(KEYS.inbox(name))
+        inbox = zenoh.KeyExpr(RUN.inbox(name))
         assert sum(inbox.intersects(zenoh.KeyExpr(key)) for key in grants) == 1
 
 
 def test_a_subscriber_of_everything_does_not_get_what_is_internal() -> None:
     everything = zenoh.KeyExpr("fmu_mesh/**")
 
-    for key in (KEYS.frames("a", "b"), KEYS.progress(), KEYS.register, KEYS.report, *KEYS.grants(["a"])):
+    internal = (RUN.frames("a", "b"), RUN.progress("a"), RUN.report("a"), RUN.master, *RUN.grants(["a"]))
+    for key in (KEYS.register, *internal):
         assert not everything.intersects(zenoh.KeyExpr(key))
     assert everything.intersects(zenoh.KeyExpr(KEYS.variable("a", "out", "@y/**")))

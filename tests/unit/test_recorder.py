@@ -17,8 +17,8 @@ from fmu_mesh.model.plan import RECORDER, NodePlan
 from fmu_mesh.model.ring import Ring
 from fmu_mesh.record import recorder as module
 from fmu_mesh.record.recorder import Recorder
-from fmu_mesh.wire.keys import Keys
-from fmu_mesh.wire.membership import Welcome
+from fmu_mesh.wire.keys import Keys, RunKeys
+from fmu_mesh.wire.membership import Admission, Welcome
 from fmu_mesh.wire.messages import FINISH, FRAME, HEADER, encode_abort
 from fmu_mesh.wire.rows import encode_rows
 from fmu_mesh.wire.session import Wiring, close_session, open_session
@@ -42,27 +42,41 @@ class Mesh:
         )
         self.session = session
         self.reported = threading.Event()
-        self._keys = Keys(self.plan.key_prefix, self.plan.mesh)
+        self._welcomed = threading.Event()
+        public = Keys(self.plan.key_prefix, self.plan.mesh)
+        self._keys = RunKeys.new(public)
         self._reports: list[zenoh.Query] = []
         self._entities: list[Any] = [
             session.declare_queryable(self._keys.hello("n"), lambda query: query.reply(query.key_expr, b"")),
-            session.declare_queryable(self._keys.register, self._register),
-            session.declare_queryable(self._keys.report, self._take_report),
+            session.declare_queryable(public.register, self._register),
+            session.declare_queryable(self._keys.ready(RECORDER), self._take_ready),
+            session.declare_queryable(self._keys.report(RECORDER), self._take_report),
         ]
 
     def put(self, message: bytes) -> None:
-        self.session.put(self._keys.frames("any", RECORDER), message, congestion_control=zenoh.CongestionControl.BLOCK)
+        """What the master sends."""
+        self._put(self._keys.grants([RECORDER])[0], message)
 
     def put_rows(self) -> None:
+        """What the node sends, as soon as the recorder is in the mesh."""
+        assert self._welcomed.wait(DEADLINE_S)
         for link in self.plan.links_in:
-            self.put(encode_rows(FRAME, link.index, 0, Ring(link.layout, ROWS).parts))
+            rows = encode_rows(FRAME, link.index, 0, Ring(link.layout, ROWS).parts)
+            self._put(self._keys.frames(link.source, RECORDER), rows)
+
+    def _put(self, key: str, message: bytes) -> None:
+        self.session.put(key, message, congestion_control=zenoh.CongestionControl.BLOCK)
 
     def close(self) -> None:
         for entity in self._entities:
             entity.undeclare()
 
     def _register(self, query: zenoh.Query) -> None:
-        query.reply(query.key_expr, msgspec.json.encode(Welcome(0)))
+        query.reply(query.key_expr, msgspec.json.encode(Admission(self._keys.run, self._keys.grants([RECORDER])[0])))
+
+    def _take_ready(self, query: zenoh.Query) -> None:
+        query.reply(query.key_expr, msgspec.json.encode(Welcome()))
+        self._welcomed.set()
 
     def _take_report(self, query: zenoh.Query) -> None:
         self._reports.append(query)

@@ -7,6 +7,7 @@ import math
 import msgspec
 import pytest
 
+from fmu_mesh.errors import MessageRefused
 from fmu_mesh.model.description import Value, Variable, VariableType
 from fmu_mesh.wire.values import (
     MAX_VALUE_SIZE,
@@ -133,5 +134,5 @@ def test_an_attachment_holds_point_and_time() -> None:
 
 @pytest.mark.parametrize("data", [b"", b"{}", b'{"point":"a","time":0.0}', b'{"point":1}', b"\xff", b"[" * 100_000])
 def test_another_attachment_is_refused(data: bytes) -> None:
-    with pytest.raises(msgspec.DecodeError):
+    with pytest.raises(MessageRefused):
         decode_stamp(data)

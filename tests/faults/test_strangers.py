@@ -1,0 +1,284 @@
+"""What a program that belongs to no node sends: it changes no number and ends no run (design, invariant 7).
+
+The stranger is a plain Zenoh client of the same user. What it cannot be kept from without access control is a message
+that is right in every respect; what a registered peer may not send ends the run with the names of both ends.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import msgspec
+import pytest
+import zenoh
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from fmu_mesh.errors import ErrorReport
+from fmu_mesh.launch.local import LocalMesh
+from fmu_mesh.launch.preparing import Options, prepare
+from fmu_mesh.wire.keys import Keys, RunKeys
+from fmu_mesh.wire.messages import ABORT, FINISH, FRAME, GRANT, HEADER, LAST, PROGRESS, NodeReport
+from tests.helpers import DEADLINE_S, Launched, Place, rows_of, wait_until, write_config
+
+WAYS = pytest.mark.parametrize("shared_memory", [True, False], ids=["shared memory", "Zenoh"])
+FAR = 2**62
+
+
+class Stranger:
+    """A plain client in the one mesh that runs here.
+
+    Attributes:
+        keys: the internal keys of the run, which any client can find out.
+    """
+
+    def __init__(self, session: zenoh.Session, mesh: str) -> None:
+        self.session = session
+        self.public = Keys("fmu_mesh", mesh)
+        found = session.liveliness().get(self.public.run("*").master, timeout=DEADLINE_S)
+        [token] = [str(reply.ok.key_expr) for reply in found if reply.ok is not None]
+        self.keys = RunKeys(self.public.root, token.split("/")[-2])
+
+    def put(self, key: str, payload: bytes, attachment: bytes | None = None) -> None:
+        """Publish, and wait where queues are full: what is sent must not be lost on the way."""
+        self.session.put(key, payload, attachment=attachment, congestion_control=zenoh.CongestionControl.BLOCK)
+
+    def ask(self, key: str, payload: bytes | None = None) -> list[str]:
+        """The texts of the refusals that a query gets."""
+        replies = self.session.get(key, payload=payload, timeout=DEADLINE_S)
+        return [reply.err.payload.to_bytes().decode() for reply in replies if reply.err is not None]
+
+    def refused(self) -> int:
+        """How many messages the processes of the mesh have refused."""
+        replies = self.session.get(f"{self.public.root}/*/status", timeout=DEADLINE_S)
+        return sum(int(json.loads(reply.ok.payload.to_bytes())["refused"]) for reply in replies if reply.ok is not None)
+
+
+def config_of(place: Place, *, shared_memory: bool, stop_time: float = 2.0, window: int = 256) -> Path:
+    """A cycle with a free input: frames go both ways, and something can be set."""
+    return write_config(
+        place.folder,
+        instances={
+            "left": {"fmu": "Gain", "start_values": {"k": 0.9}},
+            "right": {"fmu": "TransportDelay", "start_values": {"d": 0.01}},
+            "free": {"fmu": "Gain"},
+        },
+        connections=("left.y -> right.x", "right.y -> left.u"),
+        stop_time=stop_time,
+        simulation={"window": window},
+        zenoh={"shared_memory": shared_memory},
+    )
+
+
+def local_result(place: Place, config: Path) -> bytes:
+    output = place.folder / "local.csv"
+    LocalMesh(prepare(config, Options(output=output))).run()
+    return output.read_bytes()
+
+
+@contextmanager
+def paused(place: Place, config: Path) -> Iterator[tuple[Launched, Stranger]]:
+    """A mesh at rest at its first point, and a stranger in it."""
+    launched = place.start("launch", config, "--paused", "--no-progress")
+    with place.session() as session:
+        wait_until(lambda: place.run("status", "pair", "--json").output.count("paused"), "a mesh at rest")
+        yield launched, Stranger(session, "pair")
+
+
+def assert_unharmed(place: Place, config: Path, launched: Launched) -> None:
+    """The run goes on to its end, and its result is that of a single process."""
+    assert launched.running, launched.story()
+    assert place.run("resume", "pair").wait() == 0
+    assert launched.wait() == 0, launched.story()
+    assert "Traceback" not in launched.errors
+    assert config.with_suffix(".csv").read_bytes() == local_result(place, config)
+    place.assert_nothing_left()
+
+
+# ---- what is malformed, or comes by another key than exactly the expected one
+
+
+@WAYS
+def test_the_messages_that_once_ended_a_run_are_refused_and_it_goes_on(place: Place, *, shared_memory: bool) -> None:
+    config = config_of(place, shared_memory=shared_memory)
+    with paused(place, config) as (launched, stranger):
+        public, keys = stranger.public, stranger.keys
+
+        assert stranger.ask(f"{public.root}/@sync/**")
+        assert stranger.ask(public.mesh_key("command"), b'{"command":"\xff"}')
+        assert stranger.ask(public.mesh_key("command"), b'{"command":"step","points":1' + b"0" * 400 + b"}")
+        for key in (
+            public.register,
+            keys.ready("left"),
+            keys.report("left"),
+            keys.report("@record"),
+            keys.hello("left"),
+        ):
+            for payload in (b"", b"\xff", b"{}", b"[" * 3000, b'{"node":"left"}'):
+                assert stranger.ask(key, payload), key
+        stranger.put(public.variable("free", "in", "u"), b"1.0", b'{"time":1e308}')
+        stranger.put(f"{public.root}/left/log", b'{"instance":"\xff"}')
+        stranger.put(f"{public.root}/left/log", b"\xff" * 100)
+        for key in (keys.frames("left", "right"), keys.frames("right", "@record"), keys.progress("left")):
+            for payload in (
+                b"",
+                b"\x01",
+                bytes(HEADER.size - 1),
+                HEADER.pack(FRAME, 99, 1, 0),
+                HEADER.pack(77, 0, 0, 0),
+            ):
+                stranger.put(key, payload)
+            stranger.session.delete(key)
+
+        # What is for an inbox arrives nowhere while all messages go through shared memory.
+        wait_until(lambda: stranger.refused() >= (30 if shared_memory else 40), "refused messages")
+        assert "was refused" in launched.errors
+    assert_unharmed(place, config, launched)
+
+
+def keys_of(stranger: Stranger) -> list[str]:
+    """Every key of the mesh that means something to one of its processes."""
+    public, keys = stranger.public, stranger.keys
+    nodes = ["left", "right", "free", "@record", "@mesh", "nobody"]
+    of_nodes = [key(node) for key in (keys.node, keys.ready, keys.report, keys.hello, keys.progress) for node in nodes]
+    frames = [keys.frames(source, target) for source in ("left", "right") for target in nodes]
+    views = [public.mesh_key(what) for what in ("info", "status", "plan", "command")]
+    of_left = [f"{public.root}/left/{what}" for what in ("info", "status", "log", "out/y", "in/u", "param/k", "in/no")]
+    return [public.register, keys.master, *of_nodes, *frames, *keys.grants(nodes), *views, *of_left]
+
+
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=20),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=8), inner, max_size=4),
+    max_leaves=8,
+).map(lambda value: json.dumps(value).encode())
+HEADERS = st.builds(
+    lambda kind, link, count, point, rest: HEADER.pack(kind, link, count, point) + rest,
+    st.integers(9, 255),  # what is right in every respect is for access control
+    st.integers(0, 2**32 - 1),
+    st.integers(0, 2**32 - 1),
+    st.integers(-(2**63), 2**63 - 1),
+    st.binary(max_size=64),
+)
+PAYLOADS = st.none() | st.binary(max_size=HEADER.size - 1) | JSON | HEADERS | st.just(b"[" * 5000)
+WILDCARDS = st.sampled_from(["@sync/**", "@sync/*/**", "**", "*/*", "*/**", "@sync/*/report/**", "@sync/*/frame/**"])
+
+
+@WAYS
+def test_no_bytes_on_any_key_do_harm(place: Place, *, shared_memory: bool) -> None:
+    config = config_of(place, shared_memory=shared_memory)
+    with paused(place, config) as (launched, stranger):
+        known = st.sampled_from(keys_of(stranger))
+        wild = WILDCARDS.map(lambda rest: f"{stranger.public.root}/{rest}")
+        run = f"/{stranger.keys.run}/"
+        of_any_run = known.map(lambda key: key.replace(run, "/*/"))
+
+        @settings(max_examples=400, deadline=None, database=None, suppress_health_check=list(HealthCheck))
+        @given(known | wild | of_any_run, PAYLOADS, st.none() | st.binary(max_size=40) | JSON, st.booleans())
+        def send(key: str, payload: bytes | None, attachment: bytes | None, asks: bool) -> None:  # noqa: FBT001
+            if asks:
+                stranger.session.get(key, payload=payload, attachment=attachment, timeout=DEADLINE_S)
+            elif payload is None:
+                stranger.session.delete(key)
+            elif not key.endswith(("in/u", "param/k")):  # a value that fits is rightly taken
+                stranger.put(key, payload, attachment)
+
+        send()
+        wait_until(lambda: stranger.refused() >= 40, "40 refused messages")
+    assert_unharmed(place, config, launched)
+
+
+@WAYS
+def test_what_is_right_in_every_respect_but_its_key_is_refused(place: Place, *, shared_memory: bool) -> None:
+    config = config_of(place, shared_memory=shared_memory)
+    error = ErrorReport("StepFailed", "a lie", 3, instance="left", point=0)
+    with paused(place, config) as (launched, stranger):
+        root = stranger.public.root
+        for kind in (GRANT, FINISH, ABORT, PROGRESS, LAST):
+            for node in ("left", "right", "@record", "@mesh"):
+                message = HEADER.pack(kind, 0, 0, FAR) + (msgspec.json.encode(error) if kind == ABORT else b"")
+                for key in (f"{root}/@sync/*/**/to={node}", f"{root}/@sync/{stranger.keys.run}/x/to={node}"):
+                    stranger.put(key, message)
+        for report in (NodeReport("left", 0), NodeReport("left", 0, error)):
+            assert stranger.ask(f"{root}/@sync/*/report/of=left", msgspec.json.encode(report))
+            assert stranger.ask(f"{root}/@sync/**", msgspec.json.encode(report))
+        assert stranger.ask(f"{root}/@sync/*/report/of=nobody", msgspec.json.encode(NodeReport("nobody", 0)))
+        token = stranger.session.liveliness().declare_token(stranger.keys.node("left"))
+        token.undeclare()  # the node is there all the same
+        token = stranger.session.liveliness().declare_token(stranger.keys.master)
+        token.undeclare()
+    assert_unharmed(place, config, launched)
+
+
+# ---- what a registered peer may not send
+
+
+def assert_ends_with_names(place: Place, config: Path, launched: Launched, *names: str) -> None:
+    """The run ends with an error that names both ends, and what was recorded is right."""
+    assert launched.wait() == 4, launched.story()
+    for name in names:
+        assert name in launched.message
+    rows = rows_of(config.with_suffix(".csv"))
+    local_result(place, config)
+    assert rows == rows_of(place.folder / "local.csv")[: len(rows)]
+    place.assert_nothing_left()
+
+
+def grant(stranger: Stranger) -> None:
+    for key in stranger.keys.grants(["left", "right", "free", "@record"]):
+        stranger.put(key, HEADER.pack(GRANT, 0, 0, FAR))
+
+
+def progress(stranger: Stranger) -> None:
+    for node in ("left", "right", "free", "@record"):
+        stranger.put(stranger.keys.progress(node), HEADER.pack(PROGRESS, 0, 0, 2000))
+
+
+def end(stranger: Stranger) -> None:
+    assert not stranger.ask(stranger.keys.report("left"), msgspec.json.encode(NodeReport("left", 2000)))
+
+
+def termination(stranger: Stranger) -> None:
+    error = ErrorReport("TerminationRequested", "that is all", 0, instance="left", point=1500, time=1.5)
+    assert not stranger.ask(stranger.keys.report("left"), msgspec.json.encode(NodeReport("left", 1500, error)))
+
+
+def too_many_rows(stranger: Stranger) -> None:
+    rows = 1 << 16
+    for index in range(5):
+        stranger.put(stranger.keys.frames("left", "right"), HEADER.pack(FRAME, index, rows, 0) + bytes(8 * rows))
+
+
+@pytest.mark.parametrize(
+    ("forge", "names"),
+    [
+        (grant, ("the master grants point 4611686018427387904 to node '", "which may be granted ")),
+        (progress, ("says that it is at point 2000, and the master has granted point ",)),
+        (end, ("node 'left' says that it has ended at point 2000, and the master has granted point ",)),
+        (termination, ("node 'left' says that it has an FMU that ends the simulation at point 1500, and the master",)),
+        (too_many_rows, ("'left' sends its values up to point 65535 to node 'right', which has no room for them",)),
+    ],
+    ids=lambda value: getattr(value, "__name__", ""),
+)
+def test_a_registered_peer_that_breaks_the_protocol_ends_the_run_with_both_names(
+    place: Place, forge: Callable[[Stranger], None], names: tuple[str, ...]
+) -> None:
+    """A forgery that is sent exactly as a peer sends its messages cannot be told from a peer; it must do no harm."""
+    config = config_of(place, shared_memory=False)
+    with paused(place, config) as (launched, stranger):
+        forge(stranger)
+        place.run("resume", "pair")
+    assert_ends_with_names(place, config, launched, *names)
+
+
+def test_a_value_that_is_forged_as_a_peer_sends_it_is_found_when_that_peer_sends_its_own(place: Place) -> None:
+    config = config_of(place, shared_memory=False)
+    with paused(place, config) as (launched, stranger):
+        for index in range(5):
+            message = HEADER.pack(FRAME, index, 2, 0) + b"\x3f" * 16
+            stranger.put(stranger.keys.frames("left", "right"), message)
+        place.run("resume", "pair")
+    assert_ends_with_names(place, config, launched, "the values of 'left' came twice and differ")
