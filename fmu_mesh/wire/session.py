@@ -55,6 +55,8 @@ _CLOSE_S = 1.0
 _LOOK_S = 0.05
 _TOKENS_S = 2.0
 _LINK_S = 1.0
+_UNLINK_S = 0.2
+_LINK_LOOK_S = 0.01
 
 
 class Wiring(msgspec.Struct, frozen=True):
@@ -186,10 +188,8 @@ class RouterLink:
 
     def wait(self) -> None:
         """Give the link a moment to come up: a session in peer mode is open before it is."""
-        end = time.monotonic() + _LINK_S
-        never = threading.Event()
-        while self._endpoints and not self.look() and time.monotonic() < end:
-            never.wait(_LOOK_S)
+        if self._endpoints:
+            self._waits_until(there=True, seconds=_LINK_S)
 
     def look(self) -> bool:
         """Whether there is a router; from the first time on, it counts as lost where there is none."""
@@ -198,10 +198,23 @@ class RouterLink:
         return there
 
     def loss(self) -> str | None:
-        """In words that the router is gone; None where it is there, or there was none."""
-        if not self._had_router or self.look():
+        """In words that the router is gone; None where it is there, or there was none.
+
+        Zenoh tells that the tokens behind a link are gone a moment before it lets go of the link itself.
+        """
+        if not self._had_router or not self._waits_until(there=False, seconds=_UNLINK_S):
             return None
         return f"the link to the router at {', '.join(self._endpoints)} was lost"
+
+    def _waits_until(self, *, there: bool, seconds: float) -> bool:
+        """Wait until the router is there, or is not; whether that came."""
+        end = time.monotonic() + seconds
+        never = threading.Event()
+        while self.look() != there:
+            if time.monotonic() > end:
+                return False
+            never.wait(_LINK_LOOK_S)
+        return True
 
 
 class _Declared(Protocol):

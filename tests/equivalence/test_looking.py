@@ -512,6 +512,26 @@ def test_a_stream_is_what_is_recorded_point_by_point() -> None:
     assert [(time, value) for _, time, value in streamed] == rows[points[0] : points[-1] + 1]
 
 
+def test_what_a_get_answers_is_the_row_of_the_point_that_it_tells() -> None:
+    with running(stop_time=4000.0, factor=0) as mesh, plain_session(mesh) as session:
+        read: list[tuple[str, Stamped]] = []
+        while mesh.process.poll() is None and len(read) < 200_000:
+            replies = session.get(f"{ROOT}/pendulum/out/*", timeout=1.0)
+            samples = [reply.ok for reply in replies if reply.ok is not None]
+            read += [(str(sample.key_expr).rpartition("/")[2], stamped(sample)) for sample in samples]
+        assert mesh.end() == 0, mesh.lines
+        with mesh.result.open(encoding="utf-8", newline="") as file:
+            rows = list(csv.DictReader(file))
+
+    assert len(read) > 300
+    wrong = [
+        (name, point)
+        for name, (point, time, value) in read
+        if (float(rows[point]["time"]), float(rows[point][f"pendulum.{name}"])) != (time, value)
+    ]
+    assert not wrong, f"{len(wrong)} of {len(read)} values are not of their point"
+
+
 def test_a_stopped_subscriber_holds_nobody_up() -> None:
     points = 50_000
     with running(stop_time=1e6, factor=0) as mesh, plain_session(mesh) as session:

@@ -123,6 +123,47 @@ def test_a_node_that_is_killed_before_the_first_point_is_named(place: Place) -> 
     place.assert_nothing_left()
 
 
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT], ids=lambda number: number.name)
+def test_a_node_that_somebody_else_ends_is_lost_and_named(place: Place, number: signal.Signals) -> None:
+    launched, result = started(place, {"real_time_factor": 1}, 100)
+
+    launched.child("pendulum").send_signal(number)
+
+    assert launched.wait() == 4
+    text = f"node 'pendulum' was lost: its process was told to end ({number.name} was received)"
+    assert text in launched.message
+    place.assert_nothing_left()
+    assert_is_what_one_process_calculates(place, result)
+
+
+def test_a_run_whose_node_somebody_else_ends_starts_again_if_it_may(place: Place) -> None:
+    config = write_config(place.folder, stop_time=FAR_S, simulation={"real_time_factor": 1})
+    launched = place.start("launch", config, "--restarts", "1")
+
+    for time in range(2):
+        wait_until(lambda: launched.errors.count("mesh 'pair' at") > time, f"mesh {time}")  # noqa: B023 it is called within the turn
+        launched.child("delay").terminate()
+
+    assert launched.wait() == 4
+    assert launched.errors.count("starts again") == 1
+    place.assert_nothing_left()
+
+
+@pytest.mark.parametrize("step_s", [0.3, 0.15])
+def test_a_healthy_mesh_with_a_short_deadline_for_steps_is_left_alone(place: Place, step_s: float) -> None:
+    """Its master grants a point a second: what it says in between is that it lives."""
+    config = write_config(
+        place.folder,
+        stop_time=2.0,
+        simulation={"step_size": 1.0, "real_time_factor": 1},
+        timeouts={"step": step_s},
+    )
+
+    launched = place.run("launch", config)
+
+    assert launched.wait() == 0, launched.story()
+
+
 def test_ctrl_c_ends_a_run_that_may_start_again(place: Place) -> None:
     config = write_config(place.folder, stop_time=FAR_S, simulation={"real_time_factor": 1})
     launched = place.start("launch", config, "--restarts", "3")

@@ -158,6 +158,18 @@ def test_so_many_values_may_wait_for_their_time_and_no_more(linear: Steps) -> No
         linear.inputs.add("u", 0.0, 1e9)
 
 
+@pytest.mark.parametrize("time", [1e308, 1e20])
+def test_a_time_after_the_end_of_every_run_is_refused(linear: Steps, time: float) -> None:
+    with pytest.raises(ValueRefused, match="is later than any run ends"):
+        linear.inputs.add("u", 1.0, time)
+    assert linear.go(2) == [5.0, 5.0]
+
+
+def test_a_time_long_before_the_run_is_the_past(hold: Steps) -> None:
+    assert hold.inputs.add("u", 1.0, -1e308) == 0
+    assert hold.go(2) == [1.0, 1.0]
+
+
 def test_the_time_of_a_value_is_that_of_its_attachment() -> None:
     assert decode_time(b'{"time": 1.5}') == 1.5
     assert decode_time(b'{"point": 3, "time": 2}') == 2.0

@@ -1,0 +1,124 @@
+"""Meshes and nodes that meet on one router: who comes second is refused and changes nothing; a lost link is named."""
+
+from __future__ import annotations
+
+import json
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.helpers import Launched, Place, row_count, rows_of, wait_until, write_config
+
+POINTS = 4000
+
+
+@pytest.fixture
+def router(place: Place) -> Iterator[Launched]:
+    """A router that runs as long as the test."""
+    launched = place.start("router", "--listen", "tcp/127.0.0.1:0")
+    wait_until(lambda: "router at " in launched.output, "a router")
+    yield launched
+    if launched.running:
+        launched.signal(signal.SIGTERM)
+        launched.wait()
+
+
+def endpoint_of(router: Launched) -> str:
+    return router.output.split("router at ")[1].split()[0].rstrip(",")
+
+
+def through(router: Launched, place: Place, mode: str, name: str = "pair.yaml") -> Path:
+    """A mesh of some seconds whose processes meet on the router, or on this host and the router."""
+    zenoh = {"mode": mode, "connect": [endpoint_of(router)]}
+    config = write_config(place.folder, stop_time=POINTS * 0.001, simulation={"real_time_factor": 1}, zenoh=zenoh)
+    return config.rename(place.folder / name)
+
+
+def assert_ends_well(first: Launched, result: Path) -> None:
+    assert first.wait() == 0, first.story()
+    assert "refused" not in first.errors
+    assert len(rows_of(result)) == POINTS + 1
+
+
+def test_a_second_launch_of_a_mesh_is_refused_in_words_and_the_first_does_not_notice(
+    place: Place, router: Launched
+) -> None:
+    config = through(router, place, "client")
+    result = place.folder / "pair.csv"
+    first = place.start("launch", config, "--no-progress")
+    wait_until(lambda: row_count(result) > 100, "100 rows")
+
+    second = place.start("launch", config, "--no-progress", "--output", "second.csv")
+
+    assert second.wait() == 2
+    assert second.message.startswith("fmu-mesh: mesh 'pair' runs already where this one connects to. Stop it first")
+    assert not (place.folder / "second.csv").exists()
+    assert_ends_well(first, result)
+
+
+def test_two_launches_of_a_mesh_that_a_router_makes_meet_do_not_mix(place: Place, router: Launched) -> None:
+    """A router passes nothing on between peers; they meet when it has told them of each other, which takes its time."""
+    config = through(router, place, "peer")
+    result = place.folder / "pair.csv"
+    first = place.start("launch", config, "--no-progress")
+    wait_until(lambda: row_count(result) > 100, "100 rows")
+
+    second = place.start("launch", config, "--no-progress", "--output", "second.csv")
+
+    assert second.wait() in (0, 2), second.story()
+    assert_ends_well(first, result)
+    if second.wait() == 0:
+        assert (place.folder / "second.csv").read_bytes() == result.read_bytes()
+
+
+def test_a_second_process_for_a_node_is_refused_in_words_and_the_first_does_not_notice(
+    place: Place, router: Launched
+) -> None:
+    config = through(router, place, "client")
+    result = place.folder / "pair.csv"
+    # Each in a runtime folder of its own, as on hosts of their own: on one host its socket tells.
+    by_hand = [
+        place.start("master", config),
+        place.start("node", config, "pendulum"),
+        place.start("node", config, "delay"),
+    ]
+    wait_until(lambda: row_count(result) > 100, "100 rows")
+
+    with Place() as elsewhere:
+        second = elsewhere.start("node", config, "pendulum")
+        assert second.wait() == 4
+        assert "node 'pendulum' is there already; two processes run it" in second.message
+
+    assert [launched.wait() for launched in by_hand] == [0, 0, 0]
+    assert len(rows_of(result)) == POINTS + 1
+
+
+def test_a_router_that_is_gone_is_named_and_what_was_recorded_is_kept(place: Place, router: Launched) -> None:
+    config = through(router, place, "client")
+    result = place.folder / "pair.csv"
+    first = place.start("launch", config, "--no-progress")
+    wait_until(lambda: row_count(result) > 100, "100 rows")
+
+    router.signal(signal.SIGKILL)
+
+    assert first.wait() == 4
+    assert f"the link to the router at {endpoint_of(router)} was lost" in first.message
+    assert len(rows_of(result)) > 100
+
+
+def test_every_run_has_an_id_of_its_own(place: Place) -> None:
+    config = write_config(place.folder, stop_time=0.01)
+
+    def run_id() -> str:
+        launched = place.start("launch", config, "--paused", "--no-progress")
+        asked = wait_until(lambda: json.loads(place.run("info", "mesh", "--json").output or "null"), "a mesh")
+        assert wait_until(lambda: place.run("resume", "pair").wait() == 0, "a mesh that runs")
+        assert launched.wait() == 0
+        return str(asked["run"])
+
+    first, second = run_id(), run_id()
+
+    assert first != second
+    assert len(first) == 16

@@ -1,0 +1,68 @@
+"""What a GET answers: values of the point that is told with them, although the node steps meanwhile."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any, cast
+
+from fmu_mesh.model.ring import Layout, Ring
+from fmu_mesh.node.answering import Answers
+from fmu_mesh.node.stepping import Runner
+from tests.scenarios.scenario import variable
+
+ROWS = 8
+Y = variable("y", "output")
+
+
+class SteppingRunner:
+    """A runner that goes on by ``stride`` steps whenever somebody looks; each row holds its own number."""
+
+    def __init__(self, strides: list[int]) -> None:
+        self.outputs = Ring(Layout.of([("y", "Float64")]), ROWS)
+        self._strides = strides
+        self._step = 0
+        self._write(100)
+
+    @property
+    def step(self) -> int:
+        self._write(self._strides.pop(0) if self._strides else 1)
+        return self._step
+
+    def _write(self, steps: int) -> None:
+        for _ in range(steps):
+            self._step += 1
+            self.outputs.put(self._step, "y", float(self._step))
+
+
+def read(strides: list[int]) -> tuple[list[tuple[str, Any]], int]:
+    answers = Answers.__new__(Answers)
+    runner = cast("Runner", SteppingRunner(strides))
+    values: list[tuple[str, Any]]
+    values, step = answers._from_rows(runner, [("key", Y)])
+    return values, step
+
+
+def test_the_values_are_those_of_the_step_that_is_told() -> None:
+    values, step = read([])
+
+    assert values == [("key", float(step))]
+
+
+def test_a_row_that_was_overwritten_meanwhile_is_read_again() -> None:
+    values, step = read([1, ROWS - 1, 1, 2])
+
+    assert values == [("key", float(step))]
+    assert step == 100 + 1 + ROWS - 1 + 1
+
+
+def test_where_the_rows_go_by_too_fast_nothing_is_told_from_them() -> None:
+    values, _ = read([1, ROWS] * 20)
+
+    assert values == []
+
+
+def test_what_the_rows_do_not_hold_is_left_to_the_main_thread() -> None:
+    answers = Answers.__new__(Answers)
+    runner = SimpleNamespace(outputs=Ring(Layout.of([("y", "Float64")]), ROWS), step=3)
+
+    assert answers._from_rows(cast("Runner", runner), [("key", variable("x", "local"))]) == ([], 3)
