@@ -6,7 +6,7 @@ import ctypes
 import os
 import sys
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
@@ -18,6 +18,7 @@ from rich.progress import BarColumn, Progress, TextColumn
 
 from ..errors import ErrorReport, FmuMeshError, from_report
 from ..launch.events import End, Event, Log, Ready, Status
+from ..launch.wiring import is_socket, leaves_host
 from ..model.plan import Plan
 from ..wire.views import LogLine, MeshStatus
 
@@ -69,8 +70,7 @@ class Display:
         """Show one event of the master."""
         match event:
             case Ready(endpoints):
-                if endpoints:
-                    self._console.print(f"mesh '{self._plan.system.config.mesh}' at {', '.join(endpoints)}")
+                self._ready(endpoints)
             case Status(status):
                 self._status(status)
             case Log(line):
@@ -79,6 +79,16 @@ class Display:
                 self.ended(from_report(report))
             case End():
                 pass
+
+    def _ready(self, endpoints: Sequence[str]) -> None:
+        """Show where the mesh can be reached: where it was asked to listen, or else its socket; and who can."""
+        config = self._plan.system.config
+        shown = ", ".join([one for one in endpoints if not is_socket(one)] or endpoints)
+        if shown:
+            self._console.print(escape(f"mesh '{config.mesh}' at {shown}"), soft_wrap=True)
+        if config.zenoh.mode == "peer" and (wide := ", ".join(filter(leaves_host, config.zenoh.listen))):
+            text = f"warning: whoever can reach this host at {wide} can read, set and end this mesh"
+            self._console.print(f"[yellow]{escape(text)}[/]", soft_wrap=True)
 
     def ended(self, early: FmuMeshError) -> None:
         """Show why a run ended before its last point although nothing failed."""

@@ -111,6 +111,14 @@ def _add_config(parser: argparse.ArgumentParser) -> None:
         metavar="ENDPOINT",
         help="connect there, such as tcp/HOST:PORT, instead of to zenoh.connect of the configuration; repeatable",
     )
+    parser.add_argument(
+        "--listen",
+        type=endpoint,
+        action="append",
+        default=[],
+        metavar="ENDPOINT",
+        help="let the master listen there, such as at tcp/0.0.0.0:7447, instead of at zenoh.listen; repeatable",
+    )
 
 
 def _add_showing(parser: argparse.ArgumentParser) -> None:
@@ -146,6 +154,7 @@ def _options(arguments: argparse.Namespace) -> Options:
         real_time_factor=arguments.real_time_factor,
         output=arguments.output,
         connect=tuple(arguments.connect),
+        listen=tuple(arguments.listen),
         profile=getattr(arguments, "profile", None) is not None,
         showing=_showing(arguments),
         paused=getattr(arguments, "paused", False),

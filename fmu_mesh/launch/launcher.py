@@ -119,6 +119,8 @@ class Launcher:
         common = ["--run", run]
         for endpoint in self._options.connect:
             common += ["--connect", endpoint]
+        for endpoint in self._options.listen:
+            common += ["--listen", endpoint]
         changes = [f"--set={change}" for change in self._options.start_values]
         if self._options.window is not None:
             changes.append(f"--window={self._options.window}")

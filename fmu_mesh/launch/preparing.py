@@ -33,6 +33,7 @@ class Options(msgspec.Struct, frozen=True):
         real_time_factor: simulated over wall-clock time instead of the configured one; 0 for as fast as possible.
         output: the result file instead of the configured one.
         connect: Zenoh endpoints instead of the configured ones.
+        listen: likewise, where the master can be reached besides its socket.
         profile: whether the nodes measure where their time goes.
         showing: whether and how a physics engine shows its world.
         paused: whether the run starts at rest at its first point.
@@ -43,6 +44,7 @@ class Options(msgspec.Struct, frozen=True):
     real_time_factor: float | None = None
     output: Path | None = None
     connect: tuple[str, ...] = ()
+    listen: tuple[str, ...] = ()
     profile: bool = False
     showing: Showing = Showing()
     paused: bool = False
@@ -88,7 +90,9 @@ def planned(
 def zenoh_section(loaded: LoadedConfig, options: Options) -> ZenohConfig:
     """The `zenoh` section, with the endpoints of the command line if there are any."""
     section = loaded.config.zenoh
-    return replace(section, connect=list(options.connect)) if options.connect else section
+    return replace(
+        section, connect=list(options.connect) or section.connect, listen=list(options.listen) or section.listen
+    )
 
 
 def _with_options(loaded: LoadedConfig, options: Options) -> LoadedConfig:

@@ -43,7 +43,7 @@ from .opening import open_instance, stepped
 from .preparing import Options, prepare, zenoh_section
 from .process import die_with_parent, ended_by_signals
 from .results import result_opener
-from .wiring import MASTER, wiring
+from .wiring import MASTER, is_socket, wiring
 
 __all__ = ["BY_HAND", "run_master", "run_node"]
 
@@ -204,12 +204,12 @@ def run_master(
             session = open_session(wiring(config.zenoh, config_file, folder, MASTER, ()))
             stack.callback(close_session, session)
             endpoints = own_endpoints(session) if config.zenoh.mode == "peer" else tuple(config.zenoh.connect)
-            public = tuple(endpoint for endpoint in endpoints if not endpoint.startswith("unixsock-stream/"))
+            endpoints = tuple(sorted(endpoints, key=is_socket, reverse=True))
             master = Master(
                 plan,
                 session,
                 _Emitter(emit),
-                endpoints=public,
+                endpoints=endpoints,
                 config_file=str(config_file),
                 router=RouterLink(session, config.zenoh.connect),
                 launch=_launch(run),
@@ -217,8 +217,8 @@ def run_master(
             stack.callback(master.close)
             master.claim()
         if not child:
-            write_note(folder, MeshNote(config.mesh, config.zenoh.key_prefix, public, os.getpid(), str(config_file)))
-        emit(Ready(public))
+            write_note(folder, MeshNote(config.mesh, config.zenoh.key_prefix, endpoints, os.getpid(), str(config_file)))
+        emit(Ready(endpoints))
         master.watch = GrantWatch() if options.profile else None
         master.starts_paused = options.paused
         for reason in early:

@@ -1,11 +1,13 @@
 """Which process of a mesh listens and connects where.
 
-Processes of one host meet on Unix sockets in the folder of the run: one per node, so that data goes peer to peer. The
-master also listens where tools, other hosts and bridges can reach it.
+Processes of one host meet on Unix sockets in the folder of the run, which only their user can enter: one per node, so
+that data goes peer to peer. That of the master is also the way in for the tools of this user. Other hosts and users
+reach the master only where the configuration has it listen.
 """
 
 from __future__ import annotations
 
+import ipaddress
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -13,12 +15,10 @@ from ..model.config import ZenohConfig
 from ..wire.runtime import socket_endpoint
 from ..wire.session import Wiring
 
-__all__ = ["MASTER", "wiring"]
+__all__ = ["MASTER", "is_socket", "leaves_host", "wiring"]
 
 MASTER = "@mesh"
 """Name of the master's process where node names stand."""
-
-_ANY_LOOPBACK_PORT = "tcp/127.0.0.1:0"
 
 
 def wiring(config: ZenohConfig, config_file: Path, folder: Path, process: str, peers: Iterable[str]) -> Wiring:
@@ -37,7 +37,7 @@ def wiring(config: ZenohConfig, config_file: Path, folder: Path, process: str, p
     listen = [socket_endpoint(folder, process)]
     sockets = []
     if process == MASTER:
-        listen += config.listen or [_ANY_LOOPBACK_PORT]
+        listen += config.listen
     else:
         sockets = [socket_endpoint(folder, MASTER)]
         sockets += [socket_endpoint(folder, peer) for peer in sorted(set(peers)) if peer < process]
@@ -49,3 +49,18 @@ def wiring(config: ZenohConfig, config_file: Path, folder: Path, process: str, p
         gossip=bool(config.connect or config.listen),
         config=base,
     )
+
+
+def is_socket(endpoint: str) -> bool:
+    """Whether an endpoint is a Unix socket, which the permissions of its folder protect."""
+    return endpoint.startswith("unixsock-stream/")
+
+
+def leaves_host(endpoint: str) -> bool:
+    """Whether others than the users of this host may come in by an endpoint that somebody listens at."""
+    address = endpoint.partition("/")[2].partition("?")[0].partition("#")[0]
+    host = address.rpartition(":")[0].strip("[]")
+    try:
+        return not ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return not is_socket(endpoint) and host != "localhost"

@@ -241,7 +241,10 @@ class ZenohConfig(Base, frozen=True, kw_only=True):
     ] = "peer"
     listen: Annotated[
         list[Endpoint],
-        Meta(description="Endpoints where the master can be reached; default: a free loopback port."),
+        Meta(
+            description="Endpoints where other hosts and users can reach the master, too; default: none, only the "
+            "Unix socket in the runtime folder of its user."
+        ),
     ] = []
     connect: Annotated[list[Endpoint], Meta(description="Endpoints of a router or of another host's mesh.")] = []
     shared_memory: Annotated[

@@ -10,6 +10,7 @@ import fcntl
 import hashlib
 import os
 import shutil
+import stat
 import tempfile
 from collections.abc import Iterator
 from contextlib import suppress
@@ -27,6 +28,7 @@ __all__ = [
     "is_alive",
     "leave_run_folder",
     "meshes",
+    "process_state",
     "remove_run_folder",
     "remove_stale_folders",
     "run_folder",
@@ -46,7 +48,7 @@ class MeshNote(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What the note about a running mesh says.
 
     Attributes:
-        endpoints: Zenoh endpoints where the master can be reached.
+        endpoints: Zenoh endpoints where the master can be reached, the socket of this user first.
         pid: process that keeps the note: the launcher, or a master started by hand.
     """
 
@@ -58,30 +60,54 @@ class MeshNote(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def runtime_folder() -> Path:
-    """The user's own folder for running meshes; made with mode 0700.
+    """The user's own folder for running meshes, which nobody else can enter; made if it is not there.
 
     Raises:
-        ConfigurationError: it belongs to somebody else.
+        ConfigurationError: it cannot be made, or others can get into it.
     """
+    base = Path(os.environ.get("XDG_RUNTIME_DIR") or "/nonexistent")
     if chosen := os.environ.get("FMU_MESH_RUNTIME_DIR"):
-        folder = Path(chosen)
-    elif base := os.environ.get("XDG_RUNTIME_DIR"):
-        folder = Path(base) / "fmu_mesh"
+        folder = Path(chosen).absolute()
+    elif base.is_dir() and base.stat().st_uid == os.getuid():  # `su` leaves that of the other user in place
+        folder = base.absolute() / "fmu_mesh"
     else:
         folder = Path(tempfile.gettempdir()) / f"fmu_mesh-{os.getuid()}"
-    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-    if folder.stat().st_uid != os.getuid():
-        raise ConfigurationError(
-            f"the runtime folder '{folder}' belongs to another user", hint="Set FMU_MESH_RUNTIME_DIR."
-        )
-    return folder
+    return _private(folder)
 
 
 def run_folder(mesh: str, run: str) -> Path:
-    """The folder of one run of a mesh; ``run`` is the launcher's process id, or `hand` for those by hand."""
-    folder = runtime_folder() / f"{mesh}.{run}"
-    folder.mkdir(mode=0o700, exist_ok=True)
+    """The folder of one run of a mesh; ``run`` is the launcher's process id, or `hand` for those by hand.
+
+    Raises:
+        ConfigurationError: it cannot be made, or others can get into it.
+    """
+    folder = _private(runtime_folder() / f"{mesh}.{run}")
     (folder / "fmus").mkdir(exist_ok=True)
+    return folder
+
+
+def _private(folder: Path) -> Path:
+    """Make a folder with mode 0700, or see that the one that is there is this user's alone.
+
+    The sockets in it are the doors of a mesh: whoever can enter it, or has put it there, can read, set and end a run.
+    """
+    hint = "Set FMU_MESH_RUNTIME_DIR to a folder of your own."
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        found = folder.lstat()
+    except OSError as error:
+        raise ConfigurationError(
+            f"the runtime folder '{folder}' cannot be made: {error.strerror or error}", hint=hint
+        ) from error
+    if stat.S_ISLNK(found.st_mode):
+        raise ConfigurationError(f"the runtime folder '{folder}' is a symbolic link", hint=hint)
+    if found.st_uid != os.getuid():
+        raise ConfigurationError(f"the runtime folder '{folder}' belongs to another user", hint=hint)
+    if (mode := stat.S_IMODE(found.st_mode)) & 0o077:
+        raise ConfigurationError(
+            f"the runtime folder '{folder}' is open to other users (mode {mode:04o})",
+            hint=f"Close it with `chmod 700 {folder}`, or set FMU_MESH_RUNTIME_DIR to another folder.",
+        )
     return folder
 
 
@@ -97,7 +123,7 @@ def fmu_folder(folder: Path) -> Path:
 
 def enter_run_folder(folder: Path, node: str) -> None:
     """Note that this process is the node ``node`` of a run, so that others can tidy up for it if it is killed."""
-    folder.mkdir(mode=0o700, exist_ok=True)  # whoever left it last may just have removed it
+    _private(folder)  # whoever left it last may just have removed it
     draft = folder / f"{os.getpid()}.new"
     file = draft.open("w", encoding="utf-8")
     _held[folder] = file
@@ -217,8 +243,15 @@ def is_alive(pid: int) -> bool:
         return False
     except PermissionError:
         return True
-    try:
-        state = Path(f"/proc/{pid}/stat").read_bytes().rpartition(b")")[2].split()[0]
-    except (OSError, IndexError):  # gone meanwhile, or a system without /proc
+    state = process_state(pid)
+    if state is None:  # gone meanwhile, or a system without /proc
         return not Path("/proc/self/stat").exists()
-    return state not in (b"Z", b"X")
+    return state not in {"Z", "X"}
+
+
+def process_state(pid: int) -> str | None:
+    """The state of a process as one letter (proc(5): R runs, S sleeps, T is stopped, Z has ended); None if unknown."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text(encoding="ascii", errors="replace").rpartition(")")[2].split()[0]
+    except (OSError, IndexError):
+        return None
