@@ -16,4 +16,7 @@ def main() -> int:
 
 
 if __name__ == "__main__":
+    if not sys.flags.safe_path:
+        # `python -m` looks for modules in the current folder first; the command `fmu-mesh` does not, and both are one.
+        del sys.path[0]
     raise SystemExit(main())

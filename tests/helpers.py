@@ -170,7 +170,10 @@ class Place:
 
     def start(self, *arguments: str | Path, prefix: Sequence[str] = ()) -> Launched:
         """Start ``fmu-mesh`` with these arguments as a process of its own; ``prefix`` is a command that starts it."""
-        command = [*prefix, sys.executable, "-m", "fmu_mesh", *map(str, arguments)]
+        return self.start_command([*prefix, sys.executable, "-m", "fmu_mesh", *map(str, arguments)])
+
+    def start_command(self, command: Sequence[str]) -> Launched:
+        """Start any command here as a process of its own."""
         launched = Launched(command, self._environment, self.folder)
         self._started.append(launched)
         return launched

@@ -26,7 +26,7 @@ def generate_launch_description() -> LaunchDescription:
     """What `ros2 launch` runs."""
     node = LifecycleNode(
         executable=sys.executable,  # the Python that has fmu_mesh
-        arguments=["-m", "fmu_mesh.ros.node"],
+        arguments=["-Pm", "fmu_mesh.ros.node"],
         name="fmi_adapter_node",
         namespace="",
         parameters=[{"fmu_path": LaunchConfiguration("fmu_path")}],

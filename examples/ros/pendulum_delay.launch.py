@@ -31,7 +31,7 @@ def fmu_node(name: str, fmu: str, values: dict[str, float], remappings: list[tup
     """A node that runs an FMU."""
     return LifecycleNode(
         executable=sys.executable,  # the Python that has fmu_mesh
-        arguments=["-m", "fmu_mesh.ros.node"],
+        arguments=["-Pm", "fmu_mesh.ros.node"],
         name=name,
         namespace="example",
         parameters=[{"fmu_path": str(FMUS / fmu), **values}],

@@ -8,16 +8,26 @@ from __future__ import annotations
 import os
 import signal
 import subprocess
+import sys
 import threading
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import partial
 from typing import IO
 
-__all__ = ["Child", "how_it_ended"]
+__all__ = ["Child", "how_it_ended", "own_command"]
 
 _SHOWN_LINES = 200
 _LINE_BYTES = 1000
+
+
+def own_command(*arguments: str) -> list[str]:
+    """The command ``fmu-mesh`` with these arguments as a process of this Python.
+
+    -P: Python does not look for modules in the current folder, where a user's `random.py` or `token.py` would be
+    executed instead of the one that is meant.
+    """
+    return [sys.executable, "-Pm", "fmu_mesh", *arguments]
 
 
 class Child:

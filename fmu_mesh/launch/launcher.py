@@ -10,7 +10,6 @@ from __future__ import annotations
 import os
 import queue
 import signal
-import sys
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -23,7 +22,7 @@ from ..model.config import MujocoConfig
 from ..model.plan import RECORDER, Plan
 from ..ros.bag import is_bag
 from ..wire.runtime import MeshNote, remove_run_folder, remove_stale_folders, run_folder, runtime_folder, write_note
-from .child import Child, how_it_ended
+from .child import Child, how_it_ended, own_command
 from .events import End, Event, Ready, Status, decode_event
 from .preparing import Options
 
@@ -156,7 +155,7 @@ class Launcher:
         return [*(["--view"] if showing.view else []), *video]
 
     def _spawn(self, name: str, arguments: Sequence[str], folder: Path) -> None:
-        process = Child(name, [sys.executable, "-m", "fmu_mesh", *arguments], self._happened.put)
+        process = Child(name, own_command(*arguments), self._happened.put)
         self._processes[name] = process
         if name == _MASTER:
             process.start(lambda line: self._take_event(line, folder), self._take_output, self._take_exit)
