@@ -1,15 +1,17 @@
-"""Files that one process writes alone. Knows nothing of what is in them."""
+"""Files that one process writes alone, and the hashes of files. Knows nothing of what is in them."""
 
 from __future__ import annotations
 
 import fcntl
+import hashlib
 import os
+from functools import cache
 from io import BufferedWriter, FileIO
 from pathlib import Path
 
 from .errors import ConfigurationError
 
-__all__ = ["open_alone"]
+__all__ = ["open_alone", "sha256_of"]
 
 _BUFFER_BYTES = 1 << 16
 
@@ -33,6 +35,18 @@ def open_alone(path: Path) -> BufferedWriter:
         _lock(raw, path)
         raw.truncate(0)
     return BufferedWriter(raw, _BUFFER_BYTES)
+
+
+def sha256_of(path: Path) -> str:
+    """The SHA-256 of a file as hexadecimal digits; a process reads a file once, unless it changes."""
+    status = path.stat()
+    return _sha256(path, status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns)
+
+
+@cache
+def _sha256(path: Path, *_version: int) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _lock(raw: FileIO, path: Path) -> None:

@@ -1,6 +1,6 @@
 """FMUs: reading, extracting, loading and calling them. The only package that imports fmpy."""
 
-from .archive import Terms, sha256_of
+from .archive import Terms, content_of, sha256_of
 from .fmi1 import Fmi1Instance
 from .fmi2 import Fmi2Instance
 from .fmi3 import Fmi3Instance
@@ -17,6 +17,7 @@ __all__ = [
     "LogMessage",
     "Terms",
     "compile_sources",
+    "content_of",
     "open_instance",
     "read_description",
     "sha256_of",

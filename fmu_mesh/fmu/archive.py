@@ -24,10 +24,11 @@ from typing import Final
 
 import msgspec
 
+from .. import files
 from ..errors import LoadFailed
 from ..model.config import LimitsConfig
 
-__all__ = ["Contents", "Terms", "look_into", "sha256_of", "unpack"]
+__all__ = ["Contents", "Terms", "content_of", "look_into", "sha256_of", "unpack"]
 
 _HARMLESS_BYTES: Final = 64 * 2**20
 """An archive that unpacks to less is no bomb, however well it compresses."""
@@ -68,9 +69,7 @@ def look_into(path: Path, terms: Terms = Terms()) -> Contents:  # noqa: B008 a f
     """
     if path.is_dir():
         _refuse_sha256_of_folder(path, terms)
-        names = frozenset(
-            Path(parent, name).relative_to(path).as_posix() for parent, _, files in os.walk(path) for name in files
-        )
+        names = _names_in(path)
         sizes = {name: (path / name).stat().st_size for name in _XML_FILES if name in names}
         _refuse_large_description(path, sizes, terms.limits)
         return Contents(names, {name: (path / name).read_bytes() for name in sizes})
@@ -86,10 +85,17 @@ def look_into(path: Path, terms: Terms = Terms()) -> Contents:  # noqa: B008 a f
 
 def sha256_of(path: Path) -> str | None:
     """The SHA-256 of an archive as hexadecimal digits; None for a folder."""
-    if path.is_dir():
-        return None
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+    return None if path.is_dir() else files.sha256_of(path)
+
+
+def content_of(path: Path) -> str:
+    """A SHA-256 that tells an FMU from any other: of its archive, or of the names and contents of a folder's files."""
+    if not path.is_dir():
+        return files.sha256_of(path)
+    digest = hashlib.sha256()
+    for name in sorted(_names_in(path)):
+        digest.update(f"{files.sha256_of(path / name)} {name}\0".encode(errors="surrogateescape"))
+    return digest.hexdigest()
 
 
 @contextmanager
@@ -228,6 +234,13 @@ def _refuse_large_description(path: Path, sizes: dict[str, int], limits: LimitsC
 
 
 # --- a folder
+
+
+def _names_in(path: Path) -> frozenset[str]:
+    """The names of all files, with `/` between the parts."""
+    return frozenset(
+        Path(parent, name).relative_to(path).as_posix() for parent, _, names in os.walk(path) for name in names
+    )
 
 
 def _refuse_sha256_of_folder(path: Path, terms: Terms) -> None:

@@ -7,6 +7,7 @@ MuJoCo is an extra and is imported when a world is opened; nothing else of the p
 from .gazebo_classic import GazeboClassicInstance
 from .gazebo_world import describe_gazebo_world
 from .mujoco import MujocoInstance
+from .mujoco_files import world_content
 from .mujoco_model import describe_world
 from .pid import PidInstance, describe_pid
 from .rendering import Film, Picture, Window, check_film, check_window
@@ -23,4 +24,5 @@ __all__ = [
     "describe_gazebo_world",
     "describe_pid",
     "describe_world",
+    "world_content",
 ]

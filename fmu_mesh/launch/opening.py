@@ -10,8 +10,9 @@ from pathlib import Path
 
 import msgspec
 
-from ..errors import ConfigurationError
-from ..fmu import FmuInstance, LogMessage, Terms, compile_sources, read_description
+from .. import files
+from ..errors import ConfigurationError, LoadFailed
+from ..fmu import FmuInstance, LogMessage, Terms, compile_sources, content_of, read_description
 from ..fmu import open_instance as open_fmu
 from ..fmu import stepped as stepped_fmu
 from ..hosts import (
@@ -24,6 +25,7 @@ from ..hosts import (
     describe_gazebo_world,
     describe_pid,
     describe_world,
+    world_content,
 )
 from ..model.config import AnyInstanceConfig, GazeboClassicConfig, MujocoConfig, PidConfig
 from ..model.description import ModelDescription
@@ -32,7 +34,7 @@ from ..model.instance import Instance
 from ..model.plan import InstancePlan
 from ..model.system import System
 
-__all__ = ["Showing", "check_showing", "describe", "expected_model", "open_instance", "stepped"]
+__all__ = ["Showing", "check_showing", "content", "describe", "expected_model", "open_instance", "stepped"]
 
 
 class Showing(msgspec.Struct, frozen=True):
@@ -72,6 +74,26 @@ def describe(
             description = read_description(path, terms, config.kind)
             compile_sources(path, description, terms, tell)
             return description
+
+
+def content(path: Path, config: AnyInstanceConfig) -> str:
+    """A SHA-256 of all files that the model of an instance is made of, wherever they lie.
+
+    Raises:
+        LoadFailed: one cannot be read.
+    """
+    try:
+        match config:
+            case MujocoConfig():
+                return world_content(path)
+            case GazeboClassicConfig():
+                return files.sha256_of(path)  # nothing else is read, see `fmu_mesh.hosts.gazebo_world`
+            case PidConfig():
+                return ""  # it is part of our version
+            case _:
+                return content_of(path)
+    except OSError as error:
+        raise LoadFailed(f"'{path}' cannot be read: {error.strerror or error}.") from error
 
 
 def expected_model(config: AnyInstanceConfig) -> str:

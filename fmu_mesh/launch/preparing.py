@@ -18,7 +18,7 @@ from ..model.loading import LoadedConfig, examine
 from ..model.plan import Plan, make_plan
 from ..model.system import build
 from ..ros.mapping import resolve as resolve_ros
-from .opening import Showing, check_showing, describe, expected_model
+from .opening import Showing, check_showing, content, describe, expected_model
 from .results import check_results
 
 __all__ = ["Options", "planned", "prepare", "zenoh_section"]
@@ -84,7 +84,9 @@ def planned(
     system = build(loaded, descriptions, tuple(findings))
     check_results(loaded, system)
     check_showing(system, options.showing)
-    return make_plan(system, file=str(loaded.file))
+    sections = loaded.config.instances
+    contents = {name: content(Path(own.fmu), sections[name]) for name, own in system.instances.items()}
+    return make_plan(system, file=str(loaded.file), contents=contents)
 
 
 def zenoh_section(loaded: LoadedConfig, options: Options) -> ZenohConfig:

@@ -6,8 +6,7 @@ a mesh computes or receives the same one, and its digest proves it.
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Literal
 
 import msgspec
@@ -15,8 +14,17 @@ from msgspec.structs import replace
 
 from ..errors import ConfigurationError, Finding
 from ..simtime import TimeGrid
-from .config import HostConfig, InitializationConfig, InstanceConfig, LimitsConfig, TimeoutsConfig
+from .config import (
+    GazeboClassicConfig,
+    HostConfig,
+    InitializationConfig,
+    InstanceConfig,
+    LimitsConfig,
+    MujocoConfig,
+    TimeoutsConfig,
+)
 from .description import HostKind, Kind
+from .digest import digest_of
 from .graph import cycle_through, feedback_edges, strongly_connected, topological_order
 from .initialization import InitializationPlan, Loop, plan_initialization
 from .instance import StepOptions
@@ -175,13 +183,20 @@ class Plan(msgspec.Struct, frozen=True):
         return self.system.instances[instance].node
 
 
-def make_plan(system: System, *, window: int | None = None, file: str = "") -> Plan:
+def make_plan(
+    system: System,
+    *,
+    window: int | None = None,
+    file: str = "",
+    contents: Mapping[str, str] = {},
+) -> Plan:
     """Plan a validated system.
 
     Args:
         system: the system.
         window: overrides the window of the configuration, in points.
         file: name of the configuration file, for errors.
+        contents: the SHA-256 of what the model of each instance is, by instance name.
 
     Raises:
         ConfigurationError: a cycle has no delay; names the cycle.
@@ -209,25 +224,36 @@ def make_plan(system: System, *, window: int | None = None, file: str = "") -> P
         nodes={},
     )
     nodes = _nodes(plan)
-    digest = _digest(system, nodes)
+    digest = _digest(system, nodes, contents)
     return replace(plan, digest=digest, nodes={name: replace(node, digest=digest) for name, node in nodes.items()})
 
 
-def _digest(system: System, nodes: dict[str, NodePlan]) -> str:
-    """What all processes of a mesh must agree on; where files lie is each host's own matter."""
+def _digest(system: System, nodes: dict[str, NodePlan], contents: Mapping[str, str]) -> str:
+    """What all processes of a mesh must agree on: also what is in files, but not where they lie on each host."""
     agreed = [
         replace(
             node,
             result_file=None,
             limits=LimitsConfig(),
             instances=tuple(
-                replace(instance, fmu=system.instances[instance.name].description.guid, sha256=None)
+                replace(instance, fmu="", sha256=None, hosted=_without_path(instance.hosted))
                 for instance in node.instances
             ),
         )
         for node in nodes.values()
     ]
-    return hashlib.sha256(msgspec.json.encode(agreed, order="deterministic")).hexdigest()[:16]
+    models = {name: (own.description.guid, contents.get(name, "")) for name, own in system.instances.items()}
+    return digest_of(agreed, models)
+
+
+def _without_path(section: HostConfig | None) -> HostConfig | None:
+    match section:
+        case MujocoConfig():
+            return replace(section, mujoco="")
+        case GazeboClassicConfig():
+            return replace(section, gazebo_classic="")
+        case _:
+            return section
 
 
 def _with_delays(system: System) -> tuple[tuple[Connection, ...], tuple[Connection, ...]]:

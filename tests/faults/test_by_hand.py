@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+import shutil
 import signal
+import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from tests.helpers import DEADLINE_S, Launched, Place, row_count, rows_of, wait_until, write_config
+from fmu_mesh.fmu import read_description
+from fmus.build import build
+from tests.fmus.helpers import NO_COMPILER
+from tests.fmus.packing import unpacked
+from tests.helpers import DEADLINE_S, FMUS, Launched, Place, row_count, rows_of, wait_until, write_config
 
 
 def start(place: Place, config: Path, role: str, *options: str) -> Launched:
@@ -125,6 +133,84 @@ def test_a_master_that_waits_in_vain_says_whom_it_has_refused(place: Place) -> N
     assert master.wait() == 4
     assert "Refused: node 'pendulum' (process " in master.message
     assert "has another configuration, or other FMUs, than the master" in master.message
+    place.assert_nothing_left()
+
+
+def gains(place: Place, name: str, fmu: Path) -> Path:
+    """A configuration in a folder of its own with two Gains, of which the second is ``fmu``."""
+    folder = place.folder / name
+    folder.mkdir()
+    instances: dict[str, dict[str, Any]] = {
+        "first": {"fmu": "Gain", "start_values": {"u": 1.5}},
+        "second": {"fmu": str(fmu)},
+    }
+    return write_config(folder, instances=instances, connections=["first.y -> second.u"], timeouts={"start": 60.0})
+
+
+def archive_of_other_gain(place: Place, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An FMU with the description and the GUID of Gain that computes something else."""
+    if NO_COMPILER is not None:
+        pytest.skip(NO_COMPILER)
+    sources = shutil.copytree(FMUS / "src", place.folder / "src")
+    program = sources / "Gain" / "Gain.c"
+    text = program.read_text(encoding="utf-8")
+    assert "s->k * s->u" in text
+    program.write_text(text.replace("s->k * s->u", "s->k * s->u * 1.001"), encoding="utf-8")
+    guid = read_description(FMUS / "Gain.fmu").guid
+    monkeypatch.setattr("fmus.build.guid_of", lambda *_: guid)
+    return build(sources / "Gain", place.folder / "other")
+
+
+def folder_of_other_gain(place: Place, _monkeypatch: pytest.MonkeyPatch) -> Path:
+    folder = unpacked(place.folder / "other")
+    (folder / "resources").mkdir()
+    (folder / "resources" / "table.txt").write_text("1", encoding="utf-8")
+    return folder
+
+
+@pytest.mark.parametrize("other", [archive_of_other_gain, folder_of_other_gain])
+def test_a_node_with_another_fmu_of_the_same_guid_is_refused(
+    place: Place, monkeypatch: pytest.MonkeyPatch, other: Callable[[Place, pytest.MonkeyPatch], Path]
+) -> None:
+    fmu = other(place, monkeypatch)
+    assert read_description(fmu) == read_description(FMUS / "Gain.fmu")
+    config = gains(place, "a", FMUS / "Gain.fmu")
+    master, first = [start(place, config, role) for role in ("master", "first")]
+    wait_until_there(place, 2)
+
+    second = start(place, gains(place, "b", fmu), "second")
+
+    assert second.wait() == 4
+    assert "has another configuration, or other FMUs, than the master" in second.message
+    assert [master.wait(), first.wait()] == [4, 4]
+    assert row_count(config.with_suffix(".csv")) == 0
+    place.assert_nothing_left()
+
+
+def test_the_same_fmu_may_lie_elsewhere_on_the_host_of_a_node(place: Place) -> None:
+    copy = Path(shutil.copy(FMUS / "Gain.fmu", place.folder / "copied.fmu"))
+    config = gains(place, "a", FMUS / "Gain.fmu")
+    started = [start(place, config, role) for role in ("master", "first")]
+
+    started.append(start(place, gains(place, "b", copy), "second"))
+
+    assert [launched.wait() for launched in started] == [0, 0, 0]
+    assert len(rows_of(config.with_suffix(".csv"))) == 1001
+
+
+def test_a_node_of_another_version_of_ours_is_refused(place: Place) -> None:
+    config = write_config(place.folder, timeouts={"start": 60.0})
+    master = start(place, config, "master")
+    place.note()
+    program = (
+        "import sys, fmu_mesh; fmu_mesh.__version__ = '0.0.1'; from fmu_mesh.__main__ import main; sys.exit(main())"
+    )
+
+    node = place.start_command([sys.executable, "-c", program, "node", str(config), "pendulum"])
+
+    assert node.wait() == 4
+    assert "has another configuration, or other FMUs, than the master" in node.message
+    assert master.wait() == 4
     place.assert_nothing_left()
 
 
