@@ -1,4 +1,4 @@
-"""One child process of the launcher, and the threads that read what it writes.
+"""One child process of the launcher, the threads that read what it writes, and how long it has been stopped.
 
 Knows nothing of meshes; what happens is posted to the launcher's thread.
 """
@@ -10,12 +10,15 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from functools import partial
 from typing import IO
 
-__all__ = ["Child", "how_it_ended", "own_command"]
+from ..errors import Interrupted
+from ..wire.runtime import process_state
+
+__all__ = ["Child", "StopWatch", "how_it_ended", "own_command"]
 
 _SHOWN_LINES = 200
 _LINE_BYTES = 1000
@@ -85,6 +88,11 @@ class Child:
         """Whether it has not ended yet."""
         return self._popen is not None and self._popen.poll() is None
 
+    @property
+    def stopped(self) -> bool:
+        """Whether somebody has stopped it (SIGSTOP); a debugger that holds it for a moment has not."""
+        return self._popen is not None and self.running and process_state(self._popen.pid) == "T"
+
     def signal(self, number: signal.Signals) -> None:
         """Send a signal if it still runs."""
         if self._popen is not None and self.running:
@@ -133,8 +141,38 @@ class Child:
         self._post(lambda: on_exit(self.name, code))
 
 
+class StopWatch:
+    """How long children have been stopped, as far as the launcher was there to see it.
+
+    The launcher itself may have been stopped (Ctrl-Z): of the time between two looks no more counts than a turn takes.
+
+    Args:
+        patience_s: how long a child may be stopped.
+        turn_s: about how often the launcher looks.
+    """
+
+    def __init__(self, patience_s: float, turn_s: float) -> None:
+        self._patience_s = patience_s
+        self._turn_s = turn_s
+        self._looked: float | None = None
+        self._stopped_s: dict[str, float] = {}
+
+    def due(self, now: float) -> bool:
+        """Whether it is time for the next look."""
+        return self._looked is None or now - self._looked >= self._turn_s
+
+    def look(self, now: float, stopped: Iterable[str]) -> list[str]:
+        """Note which children are stopped now; returns those that have been for too long."""
+        passed_s = min(now - self._looked, 2 * self._turn_s) if self._looked is not None else 0.0
+        self._looked = now
+        self._stopped_s = {name: self._stopped_s.get(name, 0.0) + passed_s for name in stopped}
+        return [name for name, seconds in self._stopped_s.items() if seconds > self._patience_s]
+
+
 def how_it_ended(code: int) -> str:
     """What a message says of an exit code, or of a signal if it is negative."""
+    if code == Interrupted.exit_code:
+        return "was asked to end by a signal"
     if code >= 0:
         return f"ended with exit code {code}"
     try:

@@ -45,6 +45,7 @@ class End(msgspec.Struct, frozen=True, tag="end"):
         rows: rows in the result file.
         profile: where the time went, if that was asked for.
         ended_by: which FMU asked to end the simulation before its last point, if one did.
+        signal: by which signal the process of the master was asked to end, if it was.
     """
 
     status: MeshStatus
@@ -54,6 +55,7 @@ class End(msgspec.Struct, frozen=True, tag="end"):
     error: ErrorReport | None = None
     profile: MeshProfile | None = None
     ended_by: ErrorReport | None = None
+    signal: str | None = None
 
 
 Event = Ready | Status | Log | End

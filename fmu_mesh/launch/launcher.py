@@ -22,7 +22,8 @@ from ..model.config import MujocoConfig
 from ..model.plan import RECORDER, Plan
 from ..ros.bag import is_bag
 from ..wire.runtime import MeshNote, remove_run_folder, remove_stale_folders, run_folder, runtime_folder, write_note
-from .child import Child, how_it_ended, own_command
+from ..wire.session import LEASE_MS
+from .child import Child, StopWatch, how_it_ended, own_command
 from .events import End, Event, Ready, Status, decode_event
 from .preparing import Options
 
@@ -40,6 +41,8 @@ _GATEWAY_S = 2.0
 
 _SILENCE_S = 10.0
 """The master says something ten times a second; after this time without a word it is taken for lost."""
+
+_TURN_S = 0.25
 
 Output = Callable[[str, str], None]
 """Called with the name of a process and a line that it wrote to its standard output or error."""
@@ -81,6 +84,8 @@ class Launcher:
         self._how: dict[str, str] = {}
         self._end: End | None = None
         self._point: int | None = None
+        self._starting = True
+        self._stop_watch = StopWatch(LEASE_MS / 1000, _TURN_S)
         self._heard = time.monotonic()
         self._quiet = False
         self._ending = False
@@ -168,10 +173,20 @@ class Launcher:
 
     def _turn(self) -> None:
         try:
-            self._happened.get(timeout=0.25)()
+            self._happened.get(timeout=_TURN_S)()
             self._quiet = False
         except queue.Empty:
             self._quiet = True
+        if self._starting and self._stop_watch.due(now := time.monotonic()):
+            self._look_for_stopped(now)
+
+    def _look_for_stopped(self, now: float) -> None:
+        """A process that is stopped before it has met the others is missed by nobody else until the deadline."""
+        met = {_MASTER: self._point is not None, _GATEWAY: self._gateway_ready}
+        stopped = [name for name, process in self._processes.items() if not met.get(name) and process.stopped]
+        for name in self._stop_watch.look(now, stopped):
+            self._how[name] = "is stopped"
+            self._lost.append((name, -signal.SIGSTOP, now))
 
     def _take_event(self, line: bytes, folder: Path) -> None:
         try:
@@ -188,6 +203,7 @@ class Launcher:
             write_note(folder, note)
         elif isinstance(event, Status):
             self._point = event.status.point
+            self._starting = event.status.state == "starting"
             ended = self._gateway_ended
             if event.status.state in _GOING_ON and ended is not None and self._heard - ended > _GATEWAY_S:
                 self._gateway_ended = None
@@ -234,7 +250,7 @@ class Launcher:
         silent_s = now - self._heard if self._quiet else 0.0
         if self._end is not None:
             return not self._processes[_MASTER].running or silent_s > self._timeouts.stop
-        if any(name == _MASTER for name, _, _ in self._lost):
+        if any(name == _MASTER or code == -signal.SIGSTOP for name, code, _ in self._lost):
             return True
         # A node is gone: the master sees it within milliseconds and says so; if it does not, we do.
         # One that ended because of its FMU has told the master, which may have to wait for its recorder before it ends.
@@ -331,13 +347,18 @@ class Launcher:
         return max(rows, 0)
 
     def _with_cause(self, error: FmuMeshError) -> FmuMeshError:
-        """Say how the process of a lost node ended; only its parent knows."""
+        """Say how the process of a lost node ended, or who interrupted the run; only the parent of all knows."""
+        end = self._end
         if isinstance(error, MeshLost) and error.instance is not None:
             for name, how in self._how.items():
-                if f"node '{name}' was lost" in error.message:
+                lost = error.message.startswith(f"node '{name}' was lost")
+                if lost and error.message.endswith("does not answer any more"):  # or it has said why by itself
                     error.message = f"node '{name}' was lost: its process {how}"
-        elif isinstance(error, Interrupted) and self._interrupted_at is not None and self._end is not None:
-            error.message, error.point, error.time = "interrupted", self._end.status.point, self._end.status.time
+        elif isinstance(error, Interrupted) and end is not None and self._interrupted_at is not None:
+            error.message, error.point, error.time = "interrupted", end.status.point, end.status.time
+        elif isinstance(error, Interrupted) and end is not None and end.signal is not None:
+            text = f"{_MASTER} was lost: its process received {end.signal}"  # and not from this process
+            return MeshLost(text, point=end.status.point, time=end.status.time)
         return error
 
 

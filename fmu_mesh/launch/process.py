@@ -15,10 +15,13 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-__all__ = ["GRACE_S", "die_with_parent", "ended_by_signals"]
+__all__ = ["GRACE_S", "SIGNAL_RECEIVED", "die_with_parent", "ended_by_signals"]
 
 GRACE_S = 1.0
 """How long the main thread has to end by itself before the process is ended for it."""
+
+SIGNAL_RECEIVED = " was received"
+"""What follows the name of a signal in the reason of an end."""
 
 _PR_SET_PDEATHSIG = 1
 
@@ -51,7 +54,7 @@ def ended_by_signals(
     def wait_for_signal() -> None:
         number = os.read(reading, 1)
         if number:
-            end(f"{signal.Signals(number[0]).name} was received")
+            end(f"{signal.Signals(number[0]).name}{SIGNAL_RECEIVED}")
 
     def wait_for_stdin() -> None:
         while os.read(0, 4096):

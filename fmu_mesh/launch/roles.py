@@ -41,7 +41,7 @@ from ..wire.views import LogLine, MeshStatus
 from .events import End, Event, Log, Ready, Status
 from .opening import open_instance, stepped
 from .preparing import Options, prepare, zenoh_section
-from .process import die_with_parent, ended_by_signals
+from .process import SIGNAL_RECEIVED, die_with_parent, ended_by_signals
 from .results import result_opener
 from .wiring import MASTER, is_socket, wiring
 
@@ -186,13 +186,12 @@ def run_master(
     config = plan.system.config
     folder = run_folder(config.mesh, run)
     master: Master | None = None
-    early: list[str] = []
+    reasons: list[str] = []
 
     def interrupt(reason: str) -> None:
+        reasons.append(reason)
         if master is not None:
             master.interrupt(reason)
-        else:
-            early.append(reason)
 
     with ended_by_signals(interrupt, lambda: leave_run_folder(folder), watch_stdin=child), ExitStack() as stack:
         stack.callback(leave_run_folder, folder)
@@ -221,7 +220,7 @@ def run_master(
         emit(Ready(endpoints))
         master.watch = GrantWatch() if options.profile else None
         master.starts_paused = options.paused
-        for reason in early:
+        for reason in reasons:
             master.interrupt(reason)
         try:
             if RECORDER in plan.nodes:
@@ -233,7 +232,8 @@ def run_master(
         except FmuMeshError as ended:
             error = ended
         rows = recorder.rows if recorder is not None else 0
-        emit(_end_of(master, rows, plan.system.result_file, error))
+        signal = reasons[0].removesuffix(SIGNAL_RECEIVED) if reasons else None
+        emit(_end_of(master, rows, plan.system.result_file, error, signal))
         if error is not None:
             raise error
         master.wait_for_followers()
@@ -244,11 +244,11 @@ def _launch(run: str) -> str | None:
     return f"{socket.gethostname()}.{run}" if run != BY_HAND else None
 
 
-def _end_of(master: Master, rows: int, result_file: str | None, error: FmuMeshError | None) -> End:
+def _end_of(master: Master, rows: int, result_file: str | None, error: FmuMeshError | None, signal: str | None) -> End:
     """What is told of a run that is over."""
     report = error.report() if error is not None else None
     ended_by = master.ended_by.report() if master.ended_by is not None and error is None else None
-    return End(master.last_status(), master.seconds, rows, result_file, report, master.profile(), ended_by)
+    return End(master.last_status(), master.seconds, rows, result_file, report, master.profile(), ended_by, signal)
 
 
 @contextmanager

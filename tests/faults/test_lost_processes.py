@@ -12,8 +12,9 @@ import psutil
 import pytest
 
 from fmu_mesh.cli.main import main
+from fmu_mesh.launch.child import StopWatch
 from fmu_mesh.model.window import AUTO_WINDOW_POINTS, lazy_frame_rows
-from tests.helpers import Launched, Place, on_a_busy_machine, row_count, rows_of, wait_until, write_config
+from tests.helpers import DEADLINE_S, Launched, Place, on_a_busy_machine, row_count, rows_of, wait_until, write_config
 
 FAST = pytest.param({}, 2000, id="as fast as possible")
 PACED = pytest.param({"real_time_factor": 1}, 300, id="in real time")
@@ -121,6 +122,94 @@ def test_a_node_that_is_killed_before_the_first_point_is_named(place: Place) -> 
     assert launched.wait() == 4
     assert "node 'pendulum' was lost: its process was ended by SIGKILL" in launched.message
     place.assert_nothing_left()
+
+
+@pytest.mark.parametrize("victim", ["pendulum", "master", "gateway"])
+def test_a_process_that_is_stopped_before_it_has_met_the_others_is_named_long_before_the_deadline(
+    place: Place, victim: str
+) -> None:
+    sections: dict[str, dict[str, Any]] = {"timeouts": {"start": 10 * DEADLINE_S}}
+    if victim == "gateway":
+        sections["ros"] = {"profile": "ros2dds", "distribution": "jazzy"}
+    config = write_config(place.folder, stop_time=FAR_S, **sections)  # type: ignore[arg-type]  # they are sections
+    launched = place.start("launch", config)
+
+    launched.child(victim).suspend()
+
+    assert launched.wait(30.0) == 4
+    who = {"pendulum": "node 'pendulum'", "master": "the master", "gateway": "the gateway to ROS"}[victim]
+    assert f"{who} was lost: its process is stopped" in launched.message
+    place.assert_nothing_left()
+
+
+def test_a_process_that_goes_on_in_time_is_not_lost(place: Place) -> None:
+    config = write_config(place.folder)
+    launched = place.start("launch", config)
+    child = launched.child("pendulum")
+    child.suspend()
+    wait_until(lambda: child.status() == psutil.STATUS_STOPPED, "a stopped node")
+    launched.wait_for_error_line("mesh 'pair' at")
+
+    child.resume()
+
+    assert launched.wait() == 0, launched.errors
+    assert len(rows_of(config.with_suffix(".csv"))) == 1001
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT], ids=lambda number: number.name)
+def test_a_signal_of_somebody_else_to_the_master_is_a_loss_and_says_which(place: Place, number: signal.Signals) -> None:
+    launched, result = started(place, {"real_time_factor": 1}, 300)
+
+    launched.child("master").send_signal(number)
+
+    assert launched.wait() == 4
+    assert f"the master was lost: its process received {number.name}" in launched.message
+    assert f"({len(rows_of(result))} rows) is in '{result}'" in launched.message
+    point_in(launched.message)
+    place.assert_nothing_left()
+    assert_is_what_one_process_calculates(place, result)
+
+
+def test_a_run_whose_master_somebody_else_ends_starts_again_if_it_may(place: Place) -> None:
+    config = write_config(place.folder, stop_time=3.0, simulation={"real_time_factor": 1})
+    result = config.with_suffix(".csv")
+    launched = place.start("launch", config, "--restarts", "1")
+    wait_until(lambda: row_count(result) > 300, "300 rows")
+
+    launched.child("master").terminate()
+
+    said = launched.wait_for_error_line("starts again")
+    assert "the master was lost: its process received SIGTERM" in said
+    assert launched.wait() == 0
+    assert len(rows_of(result)) == 3001
+    place.assert_nothing_left()
+
+
+def test_a_gateway_that_somebody_else_ends_is_lost(place: Place) -> None:
+    ros = {"profile": "ros2dds", "distribution": "jazzy"}
+    config = write_config(place.folder, stop_time=FAR_S, simulation={"real_time_factor": 1}, ros=ros)
+    launched = place.start("launch", config)
+    wait_until(lambda: row_count(config.with_suffix(".csv")) > 100, "100 rows")
+
+    launched.child("gateway").terminate()
+
+    assert launched.wait() == 4
+    said = launched.errors.splitlines()
+    assert "the gateway to ROS | fmu-mesh: SIGTERM was received" in said
+    assert "the gateway to ROS was lost: its process was asked to end by a signal" in said[-1]
+    place.assert_nothing_left()
+
+
+def test_time_in_which_the_launcher_itself_was_stopped_is_not_that_of_a_child() -> None:
+    watch = StopWatch(patience_s=4.0, turn_s=0.25)
+
+    # It looks, is stopped for a minute, finds a child stopped by the same hand, and sees it go on.
+    assert watch.look(0.0, ["delay"]) == []
+    assert watch.look(60.0, ["delay"]) == []
+    assert watch.look(60.25, ["delay"]) == []
+    assert watch.look(60.5, []) == []
+    assert [watch.look(60.5 + 0.25 * turn, ["delay"]) for turn in range(1, 17)] == [[]] * 16
+    assert watch.look(64.75, ["delay"]) == ["delay"]
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT], ids=lambda number: number.name)
@@ -282,4 +371,4 @@ def test_a_mesh_that_does_not_answer_keeps_nobody_from_another_one(place: Place)
     assert "running" in status.output
     assert both.wait() == 4
     assert "one" in both.output
-    assert both.message.startswith("fmu-mesh: mesh 'two' did not answer at tcp/")
+    assert both.message.startswith("fmu-mesh: mesh 'two' did not answer at unixsock-stream/")
