@@ -25,7 +25,6 @@ from .wiring import MASTER
 __all__ = ["run_gateway"]
 
 _BY_HAND = "hand"
-_ANY_LOOPBACK_PORT = "tcp/127.0.0.1:0"
 
 
 def run_gateway(config_file: Path, options: Options, emit: Callable[[Event], None], *, run: str = _BY_HAND) -> None:
@@ -70,8 +69,8 @@ def run_gateway(config_file: Path, options: Options, emit: Callable[[Event], Non
         mesh = open_session(Wiring(mode="client", connect=connect, patience_s=loaded.config.timeouts.start))
         stack.callback(close_session, mesh)
         # A peer that gossips, as the nodes of ROS are: a router passes nothing on between peers, it makes them meet.
-        listen = tuple(section.listen) or (_ANY_LOOPBACK_PORT,)
-        wiring = Wiring(mode="peer", listen=listen, connect=tuple(section.connect), gossip=True)
+        # They have ports, to which this process connects; one of its own would be open to every user of the host.
+        wiring = Wiring(mode="peer", listen=tuple(section.listen), connect=tuple(section.connect), gossip=True)
         ros = open_session(wiring)
         stack.callback(close_session, ros)
         keys = Keys(loaded.config.zenoh.key_prefix, loaded.config.mesh)

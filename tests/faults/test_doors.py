@@ -18,7 +18,7 @@ import zenoh
 from fmu_mesh.errors import ConfigurationError
 from fmu_mesh.launch.wiring import leaves_host
 from fmu_mesh.wire.runtime import run_folder, runtime_folder
-from tests.helpers import Launched, Place, wait_until, write_config
+from tests.helpers import Launched, Place, row_count, wait_until, write_config
 
 FAR_S = 10_000.0
 NOBODY = 65534
@@ -83,6 +83,16 @@ def test_the_only_way_in_is_a_socket_that_any_zenoh_client_of_the_user_opens(pla
     assert ports(place) == []
     info = json.loads(place.run("info", "pair", "--json").output)
     assert info["endpoints"] == [endpoint]
+
+
+def test_a_gateway_to_ros_opens_no_port_either(place: Place) -> None:
+    ros = {"profile": "rmw_zenoh", "distribution": "jazzy", "connect": ["tcp/127.0.0.1:9"]}
+    config = write_config(place.folder, stop_time=FAR_S, simulation={"real_time_factor": 1}, ros=ros)
+    place.start("launch", config)
+
+    wait_until(lambda: row_count(config.with_suffix(".csv")) > 10, "rows, which come after the gateway is ready")
+
+    assert ports(place) == []
 
 
 @pytest.mark.skipif(os.getuid() != 0, reason="only root can become another user")
