@@ -247,13 +247,9 @@ def _digest(system: System, nodes: dict[str, NodePlan], contents: Mapping[str, s
 
 
 def _without_path(section: HostConfig | None) -> HostConfig | None:
-    match section:
-        case MujocoConfig():
-            return replace(section, mujoco="")
-        case GazeboClassicConfig():
-            return replace(section, gazebo_classic="")
-        case _:
-            return section
+    if isinstance(section, MujocoConfig):
+        return replace(section, mujoco="")
+    return replace(section, gazebo_classic="") if isinstance(section, GazeboClassicConfig) else section
 
 
 def _with_delays(system: System) -> tuple[tuple[Connection, ...], tuple[Connection, ...]]:
