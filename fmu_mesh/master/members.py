@@ -12,6 +12,7 @@ import msgspec
 import zenoh
 
 from ..errors import DeadlineExceeded, FmuMeshError, MessageRefused
+from ..model.digest import difference
 from ..model.plan import RECORDER, Plan
 from ..wire.inbox import Inbox
 from ..wire.keys import Keys, RunKeys, batched
@@ -104,7 +105,8 @@ class Members:
         if node not in self._plan.nodes:
             return f"this mesh has no node '{node}'"
         if registration.digest != self._plan.digest:
-            return f"node '{node}' ({where}) has another configuration, or other FMUs, than the master"
+            what = difference(self._plan.digest, registration.digest, self._plan.system.instances)
+            return f"node '{node}' ({where}) has {what}, not that of the master"
         # Who asks again, because no answer came, is the same.
         if self._admitted.get(node, registration) != registration:
             return f"node '{node}' is there already; two processes run it"
