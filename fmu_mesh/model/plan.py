@@ -304,7 +304,7 @@ def _nodes(plan: Plan) -> dict[str, NodePlan]:
             units=tuple(dict.fromkeys(within[name] for name in members)),
             links=links,
         )
-    if system.result_file is not None and system.recorded:
+    if system.recorded:
         nodes[RECORDER] = _node(plan, RECORDER, instances=(), units=(), links=links)
     return nodes
 
@@ -363,8 +363,7 @@ def _node(
 def _output_layout(plan: Plan, name: str) -> Layout:
     """Connected and recorded outputs of an instance, in the order of its model description."""
     wanted = {c.source.name for c in plan.connections if c.source_instance == name}
-    if plan.system.result_file is not None:
-        wanted |= {_base(plan, instance, variable) for instance, variable in plan.system.recorded if instance == name}
+    wanted |= {_base(plan, instance, variable) for instance, variable in plan.system.recorded if instance == name}
     variables = plan.system.instances[name].description.variables
     return Layout.of(v for v in variables if v.name in wanted)
 
@@ -403,9 +402,8 @@ def _links(plan: Plan) -> tuple[Link, ...]:
         target_node = plan.node_of(c.target_instance)
         if target_node != plan.node_of(c.source_instance):
             needed.setdefault((c.source_instance, target_node), set()).add(c.source.name)
-    if plan.system.result_file is not None:
-        for name, variable in plan.system.recorded:
-            needed.setdefault((name, RECORDER), set()).add(_base(plan, name, variable))
+    for name, variable in plan.system.recorded:
+        needed.setdefault((name, RECORDER), set()).add(_base(plan, name, variable))
     links = []
     ends = sorted(needed, key=lambda end: (end[0], end[1] == RECORDER, end[1]))
     initial = _needed_initially(plan, needed)

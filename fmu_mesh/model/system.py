@@ -118,8 +118,9 @@ def build(
     connections = resolve_connections(config.connections, variables, collected)
     check_extrapolation(connections, config.instances, descriptions, collected)
     connections += coupled_connections(config, variables, connections, collected)
-    recorded = _recorded(config, variables, collected)
-    result_file = _result_file(loaded, collected)
+    recorded, result_file = _recorded(config, variables, collected), _result_file(loaded, collected)
+    if not recorded or result_file is None:  # one without the other records nothing
+        recorded, result_file = (), None
     _check_zenoh(loaded, collected)
     if grid is None or len(instances) < len(config.instances):
         collected.raise_any()
