@@ -1,40 +1,65 @@
-"""Files that one process writes alone, and the hashes of files. Knows nothing of what is in them."""
+"""Files that one process writes alone, and that stay as they were until there is something to write; hashes of files.
+
+Knows nothing of their format. A run opens and locks its result file at the start, so that a path that cannot be
+written and a second run are refused before anything happens, and writes to it from its first point on:
+
+* A file that exists is opened and locked, and emptied by the first bytes. It stays the same file: its permissions,
+  its owner, links to it and a `tail -f` keep working, and a folder that is read-only does not matter.
+* A file that does not exist begins as an empty `<name>.starting` beside it, which is locked as well, and gets its name
+  with the first bytes. A run that ends before them removes it; if the run was killed, the next one does.
+* A device or a pipe is just written.
+
+`docs/adr/0050-a-result-replaces-the-last-one-at-its-first-point.md` says why.
+"""
 
 from __future__ import annotations
 
 import fcntl
 import hashlib
 import os
+import stat
+from contextlib import suppress
 from functools import cache
-from io import BufferedWriter, FileIO
+from io import FileIO
 from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
 
 from .errors import ConfigurationError
 
-__all__ = ["open_alone", "sha256_of"]
+if TYPE_CHECKING:
+    from _typeshed import ReadableBuffer
 
-_BUFFER_BYTES = 1 << 16
+__all__ = ["Kept", "OwnFile", "open_alone", "sha256_of"]
+
+_DRAFT = ".starting"
+_TRIES = 10
+"""How often to look again for a file that others rename or remove at the same moment."""
 
 
-def open_alone(path: Path) -> BufferedWriter:
-    """Open a result file, empty, for one writer: two runs of one configuration would write into each other's rows.
+class Kept(NamedTuple):
+    """What of a file survives the end of its process, however it ends: ``rows`` in the first ``size`` bytes."""
+
+    rows: int = 0
+    size: int = 0
+
+
+def open_alone(path: Path) -> OwnFile:
+    """Open a result file for one writer: two runs of one configuration would write into each other's rows.
 
     Args:
-        path: the file; its folder is made, an older file is replaced.
+        path: the file; its folder is made, what is in it stays until the first bytes are written.
 
     Raises:
         ConfigurationError: another run writes it, or it cannot be written.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        # Without O_TRUNC: an older file stays as it is until this one is ours.
-        raw = FileIO(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o666), "wb")
+        return OwnFile(path)
+    except BlockingIOError as error:
+        hint = "Wait for its end, or choose another file with --output."
+        raise ConfigurationError(f"another run is writing the result file '{path}'", hint=hint) from error
     except OSError as error:
         raise ConfigurationError(f"the result file '{path}' cannot be written: {error.strerror}") from error
-    if path.is_file():  # and not a device such as /dev/null
-        _lock(raw, path)
-        raw.truncate(0)
-    return BufferedWriter(raw, _BUFFER_BYTES)
 
 
 def sha256_of(path: Path) -> str:
@@ -43,18 +68,109 @@ def sha256_of(path: Path) -> str:
     return _sha256(path, status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns)
 
 
+class OwnFile(FileIO):
+    """An open file that nobody else writes; made by `open_alone`.
+
+    A write that failed is not the last word of a full disk: all writes after it fail as well, so that there is never a
+    gap in the file.
+
+    Attributes:
+        size: bytes written so far.
+    """
+
+    def __init__(self, path: Path) -> None:
+        descriptor, self._draft = _open_locked(path)
+        super().__init__(descriptor, "wb")
+        self._path = path
+        self._untouched = stat.S_ISREG(os.fstat(descriptor).st_mode)
+        self._failure: OSError | None = None
+        self.size = 0
+
+    def write(self, data: ReadableBuffer, /) -> int:
+        """Write bytes; returns how many, which may be fewer than there are."""
+        if self._failure is not None:
+            raise self._failure
+        try:
+            if self._untouched:
+                self._begin()
+            written = super().write(data)
+        except OSError as error:
+            self._failure = error
+            raise
+        self.size += written
+        return written
+
+    def close(self) -> None:
+        """Close the file; without a byte written, nothing has changed."""
+        if not self.closed and self._untouched and self._draft is not None:
+            with suppress(OSError):
+                self._draft.unlink()
+        super().close()
+
+    def _begin(self) -> None:
+        self._untouched = False
+        if self._draft is not None:
+            self._draft.rename(os.path.realpath(self._path))
+        self.truncate(0)
+
+
 @cache
 def _sha256(path: Path, *_version: int) -> str:
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def _lock(raw: FileIO, path: Path) -> None:
+def _open_locked(path: Path) -> tuple[int, Path | None]:
+    """The descriptor of a file, and its draft if there is no such file yet.
+
+    Raises:
+        BlockingIOError: somebody else has locked it.
+        OSError: it cannot be opened.
+    """
+    draft = Path(f"{os.path.realpath(path)}{_DRAFT}")
+    for _ in range(_TRIES):
+        try:
+            descriptor, is_draft = os.open(path, os.O_WRONLY | os.O_CLOEXEC), False
+        except FileNotFoundError:
+            flags = os.O_WRONLY | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC
+            descriptor, is_draft = os.open(draft, flags, 0o666), True
+        try:
+            if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+                return descriptor, None
+            _lock(descriptor)
+            if _is_at(draft if is_draft else path, descriptor):
+                if not is_draft:
+                    _remove(draft)
+                    return descriptor, None
+                if not path.exists():
+                    return descriptor, draft
+                draft.unlink()  # between the two looks another run has begun, and given its file the name
+        except BaseException:
+            os.close(descriptor)
+            raise
+        os.close(descriptor)
+    raise BlockingIOError
+
+
+def _lock(descriptor: int) -> None:
     try:
-        fcntl.flock(raw, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError as error:
-        raw.close()
-        hint = "Wait for its end, or choose another file with --output."
-        raise ConfigurationError(f"another run is writing the result file '{path}'", hint=hint) from error
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise
     except OSError:
         return  # a file system without locks
+
+
+def _is_at(path: Path, descriptor: int) -> bool:
+    """Whether what is open is what the path leads to, and not something that was renamed or removed since."""
+    try:
+        return os.path.samestat(path.stat(), os.fstat(descriptor))
+    except FileNotFoundError:
+        return False
+
+
+def _remove(draft: Path) -> None:
+    """Remove a draft that a run has left that was killed."""
+    with suppress(OSError), draft.open("r+b") as file:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        draft.unlink()

@@ -224,8 +224,10 @@ def run_master(
             master.interrupt(reason)
         try:
             if RECORDER in plan.nodes:
-                opener = result_opener(config_file, plan.system)
-                with Recorder(plan.nodes[RECORDER], session, opener, launch=_launch(run)) as recorder:
+                open_file = result_opener(config_file, plan.system)
+                with Recorder(
+                    plan.nodes[RECORDER], session, open_file, lambda: master.has_begun, launch=_launch(run)
+                ) as recorder:
                     master.run()
             else:
                 master.run()

@@ -200,6 +200,11 @@ class Master:
         self._inbox.close()
 
     @property
+    def has_begun(self) -> bool:
+        """Whether all nodes have reached the first point; from any thread."""
+        return self._slowest >= 0
+
+    @property
     def seconds(self) -> float:
         """Wall-clock time from the first grant to the last point in s, pauses left out."""
         return self._clock.elapsed()

@@ -69,12 +69,19 @@ class Recorder:
         plan: the recorder's part of the plan.
         session: the session of this process; stays the caller's.
         open_file: opens the result file.
+        has_begun: whether all instances have reached point 0; nothing is written before.
 
     Use it as a context manager: the thread runs inside, and the file is complete up to the last complete row outside.
     """
 
     def __init__(
-        self, plan: NodePlan, session: zenoh.Session, open_file: OpenResult = CsvFile, *, launch: str | None = None
+        self,
+        plan: NodePlan,
+        session: zenoh.Session,
+        open_file: OpenResult = CsvFile,
+        has_begun: Callable[[], bool] = lambda: True,
+        *,
+        launch: str | None = None,
     ) -> None:
         self._plan = plan
         self._session = session
@@ -88,6 +95,7 @@ class Recorder:
             Path(plan.result_file or ""),
             [(f"{i}.{v}", by_name[i].type_of(v)) for i, v in plan.recorded],
         )
+        self._has_begun = has_begun
         self._written = 0
         self._rested = 0
         self._rested_at = 0.0
@@ -107,7 +115,7 @@ class Recorder:
 
     @property
     def rows(self) -> int:
-        """Rows written so far."""
+        """Rows written so far; outside, those that are in the file."""
         return self._file.rows
 
     def __enter__(self) -> Self:
@@ -260,7 +268,7 @@ class Recorder:
 
     def _write_rows(self) -> None:
         rows = self._complete() + 1
-        if rows <= self._written:
+        if rows <= self._written or not (self._written or self._has_begun()):
             return
         while (first := self._written) < rows:
             end = min(rows, first - first % self._plan.ring_rows + self._plan.ring_rows)  # rings are read in one piece

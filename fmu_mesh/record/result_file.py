@@ -9,6 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from ..files import Kept
 from ..model.description import VariableType
 
 __all__ = ["OpenResult", "ResultFile"]
@@ -17,13 +18,23 @@ __all__ = ["OpenResult", "ResultFile"]
 class ResultFile(Protocol):
     """Takes rows in the order of their points, from point 0 on; `close` at the end.
 
-    Attributes:
-        path: the file.
-        rows: rows written so far.
+    Until the first row is written, the path shows what was there before.
     """
 
-    path: Path
-    rows: int
+    @property
+    def path(self) -> Path:
+        """The file."""
+        ...
+
+    @property
+    def rows(self) -> int:
+        """Rows written so far; once it is closed, those that are in the file, also where the disk was full."""
+        ...
+
+    @property
+    def kept(self) -> Kept:
+        """What the operating system has by now."""
+        ...
 
     def write(self, times: NDArray[np.float64], columns: Sequence[NDArray[Any]]) -> None:
         """Append one row per time; ``columns`` are arrays of the same length, which hold during the call only."""
@@ -34,7 +45,7 @@ class ResultFile(Protocol):
         ...
 
     def close(self) -> None:
-        """Write what is left and close the file."""
+        """Write what is left and close the file; without a row, nothing has changed."""
         ...
 
 

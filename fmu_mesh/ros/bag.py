@@ -7,6 +7,7 @@ Owns which topics a recording has and how rows become messages. What a topic is 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from io import BufferedWriter
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -17,7 +18,7 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from ..errors import ConfigurationError
-from ..files import open_alone
+from ..files import Kept, open_alone
 from ..model.config import RosConfig
 from ..model.findings import Findings
 from ..model.loading import LoadedConfig
@@ -32,6 +33,7 @@ from .types import CLOCK, MessageTypes
 __all__ = ["BagTopics", "McapFile", "bag_topics", "is_bag"]
 
 SUFFIX = ".mcap"
+_BUFFER_BYTES = 1 << 16
 _QOS = (
     "- history: keep_last\n  depth: 10\n  reliability: reliable\n  durability: volatile\n"
     "  deadline:\n    sec: 9223372036\n    nsec: 854775807\n"
@@ -103,13 +105,14 @@ class McapFile:
     A message is logged and published at its simulation time. There is one at every point of one of its variables.
 
     Args:
-        path: the file; its folder is made, an older file is replaced.
+        path: the file; its folder is made, an older file is replaced by the first row.
         columns: (name, type) of every column that `write` is given, the name being `instance.variable`.
         topics: what to make of them.
 
     Attributes:
         path: the file.
-        rows: rows written so far.
+        rows: rows written so far; once it is closed, those that are in the file.
+        kept: what the operating system has by now.
 
     Raises:
         ConfigurationError: the file cannot be written, or the package `mcap` is not there.
@@ -120,9 +123,10 @@ class McapFile:
         self.path = path
         self.rows = 0
         index = {name: number for number, (name, _) in enumerate(columns)}
-        self._file = open_alone(path)
+        self.kept = Kept()
+        self._own = open_alone(path)
+        self._file = BufferedWriter(self._own, _BUFFER_BYTES)
         self._mcap = writer(self._file)
-        self._mcap.start(profile="ros2", library="fmu_mesh")
         self._types = topics.types
         self._schemas: dict[str, int] = {}
         self._outputs = [
@@ -144,6 +148,8 @@ class McapFile:
 
     def write(self, times: NDArray[np.float64], columns: Sequence[NDArray[Any]]) -> None:
         """Append one row per time; ``columns`` are arrays of the same length."""
+        if not self.rows:
+            self._mcap.start(profile="ros2", library="fmu_mesh")
         rows = zip(*(column.tolist() for column in columns), strict=True) if columns else iter([()] * len(times))
         for time, row in zip(times.tolist(), rows, strict=True):
             point, stamp = self.rows, nanoseconds(time)
@@ -157,14 +163,19 @@ class McapFile:
     def flush(self) -> None:
         """Hand everything to the operating system, so that it survives the end of this process."""
         self._mcap.flush()
+        self.kept = Kept(self.rows, self._own.size)
 
     def close(self) -> None:
-        """Write what is left and close the file."""
-        if not self._file.closed:
-            try:
+        """Write what is left and close the file; without a row, nothing has changed."""
+        if self._file.closed:
+            return
+        written, self.rows = self.rows, self.kept.rows
+        try:
+            if written:
                 self._mcap.finish()
-            finally:
-                self._file.close()
+        finally:
+            self._file.close()
+        self.rows, self.kept = written, Kept(written, self._own.size)
 
     def _add(self, channel: int, stamp: int, data: bytes, point: int) -> None:
         self._mcap.add_message(channel, log_time=stamp, publish_time=stamp, data=data, sequence=point & 0xFFFFFFFF)

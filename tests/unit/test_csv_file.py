@@ -5,13 +5,15 @@ from __future__ import annotations
 import csv
 import math
 from pathlib import Path
+from resource import RLIMIT_FSIZE, getrlimit, setrlimit
 
 import numpy as np
 import pytest
 
 from fmu_mesh.errors import ConfigurationError
+from fmu_mesh.files import Kept
 from fmu_mesh.model.description import VariableType
-from fmu_mesh.record.csv_file import CsvFile
+from fmu_mesh.record.csv_file import CsvFile, cut_after_last_row
 
 COLUMNS: list[tuple[str, VariableType]] = [
     ("p.a", "Float64"),
@@ -71,11 +73,11 @@ def test_every_float_reads_back_with_the_same_bits_and_is_as_short_as_repr(
 
 
 def test_a_name_with_a_comma_is_quoted(tmp_path: Path) -> None:
-    with CsvFile(tmp_path / "a.csv", [("p.der(a,2)", "Float64"), ('p."x"', "Float64")]):
-        pass
+    with CsvFile(tmp_path / "a.csv", [("p.der(a,2)", "Float64"), ('p."x"', "Float64")]) as file:
+        file.write(np.array([0.0]), [np.array([1.0]), np.array([2.0])])
 
-    with (tmp_path / "a.csv").open(newline="") as file:
-        assert next(csv.reader(file)) == ["time", "p.der(a,2)", 'p."x"']
+    with (tmp_path / "a.csv").open(newline="") as written:
+        assert next(csv.reader(written)) == ["time", "p.der(a,2)", 'p."x"']
 
 
 def test_many_rows_at_once_are_all_written(tmp_path: Path) -> None:
@@ -133,3 +135,79 @@ def test_text_is_quoted_and_binary_is_base64(tmp_path: Path) -> None:
             ["0.1", "two\nlines", "/wA=", "0", "true"],
             ["inf", "[1]", "YWJj", "1", "false"],
         ]
+
+
+def test_until_the_first_row_nothing_changes(tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    with CsvFile(path, []) as file:
+        file.flush()
+        assert not path.exists()
+    assert list(tmp_path.iterdir()) == []
+
+    path.write_text("an older result")
+    with CsvFile(path, []) as file:
+        file.flush()
+    assert path.read_text() == "an older result"
+
+
+def test_every_look_at_the_file_while_it_is_written_shows_whole_rows(tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    with CsvFile(path, COLUMNS) as file:
+        for _ in range(40):
+            numbers = np.arange(700, dtype=np.int32)
+            file.write(numbers / 3, [numbers / 7, numbers, numbers % 2 == 1, numbers])
+            if file.kept.rows:
+                text = path.read_text()
+                assert (text.count("\n") - 1, len(text)) == file.kept
+                assert text.endswith("\n")
+        assert file.kept.rows > 0
+
+
+def test_what_a_full_disk_leaves_ends_with_a_whole_row_and_nothing_follows_when_there_is_room_again(
+    tmp_path: Path,
+) -> None:
+    """The limit for the size of a file is the disk that a test can fill."""
+    path = tmp_path / "a.csv"
+    times = np.arange(20_000) / 7
+    before = getrlimit(RLIMIT_FSIZE)
+    file = CsvFile(path, [])
+    try:
+        setrlimit(RLIMIT_FSIZE, (100_000, before[1]))
+        with pytest.raises(OSError, match="too large"):
+            file.write(times, [])
+    finally:
+        setrlimit(RLIMIT_FSIZE, before)
+    file.write(times[:1], [])
+    with pytest.raises(OSError, match="too large"):
+        file.flush()
+    file.close()
+
+    lines = path.read_text().splitlines(keepends=True)
+    assert len(lines) > 4000
+    assert [float(line) for line in lines[1:]] == times[: len(lines) - 1].tolist()
+    assert lines[-1].endswith("\n")
+    assert file.rows == len(lines) - 1
+
+
+@pytest.mark.parametrize(
+    ("text", "kept", "rows", "left"),
+    [
+        ("time,a\n0.0,1\n0.1,2\n", Kept(), 2, "time,a\n0.0,1\n0.1,2\n"),
+        ("time,a\n0.0,1\n0.1,", Kept(), 1, "time,a\n0.0,1\n"),
+        ('time,a\n0.0,"two\nlines"\n0.1,"two\nli', Kept(), 1, 'time,a\n0.0,"two\nlines"\n'),
+        ('time,a\n0.0,"say ""a\nb"""\n0.1,""\n0.2,"""', Kept(), 2, 'time,a\n0.0,"say ""a\nb"""\n0.1,""\n'),
+        ('"time\n', Kept(), 0, ""),
+        ("time,a\n0.", Kept(), 0, ""),
+        ("", Kept(), 0, ""),
+        ("time,a\n0.0,1\n0.1,2\n0.", Kept(1, 13), 2, "time,a\n0.0,1\n0.1,2\n"),
+        ("time,a\n0.0,1\n", Kept(1, 13), 1, "time,a\n0.0,1\n"),
+        ("another", Kept(1, 13), 0, "another"),
+    ],
+)
+def test_a_file_is_cut_after_its_last_whole_row(tmp_path: Path, text: str, kept: Kept, rows: int, left: str) -> None:
+    path = tmp_path / "a.csv"
+    path.write_text(text)
+
+    assert cut_after_last_row(path, kept) == rows
+
+    assert path.read_text() == left
