@@ -20,12 +20,12 @@ import msgspec
 from ..errors import DeadlineExceeded, FmuError, FmuMeshError, Interrupted, MeshLost, from_report
 from ..model.config import MujocoConfig
 from ..model.plan import RECORDER, Plan
-from ..ros.bag import is_bag
 from ..wire.runtime import MeshNote, remove_run_folder, remove_stale_folders, run_folder, runtime_folder, write_note
 from ..wire.session import LEASE_MS
 from .child import Child, StopWatch, how_it_ended, own_command
 from .events import End, Event, Ready, Status, decode_event
 from .preparing import Options
+from .results import rows_left
 
 __all__ = ["Launcher", "Output"]
 
@@ -83,6 +83,7 @@ class Launcher:
         self._gateway_ended: float | None = None
         self._how: dict[str, str] = {}
         self._end: End | None = None
+        self._rows: int | None = None
         self._point: int | None = None
         self._starting = True
         self._stop_watch = StopWatch(LEASE_MS / 1000, _TURN_S)
@@ -109,6 +110,8 @@ class Launcher:
                 self._turn()
         finally:
             self._end_all()
+            if self._rows is None and (result_file := self._plan.system.result_file) is not None:
+                self._rows = rows_left(result_file, folder)
             remove_run_folder(folder)
         return self._outcome()
 
@@ -209,6 +212,7 @@ class Launcher:
                 self._gateway_ended = None
                 self._lost.append((_GATEWAY, 0, ended))
         elif isinstance(event, End):
+            self._rows = event.rows
             asked = event.error is not None and event.error.kind == Interrupted.__name__
             if not (self._signalled and asked):  # it was this process that asked, and not why the run ends
                 self._end = event
@@ -291,7 +295,7 @@ class Launcher:
 
     def _outcome(self) -> End:
         """How the run ended, as the master says; as this process saw it where the master could not say it any more."""
-        rows = self._recorded_rows()
+        result_file, rows = self._plan.system.result_file, self._rows or 0
         gateway_lost = any(name == _GATEWAY for name, _, _ in self._lost)  # of which the master knows nothing
         if self._end is not None and not gateway_lost:
             if self._end.error is None:
@@ -304,8 +308,8 @@ class Launcher:
         if type(error) in (Interrupted, MeshLost) and rows > (error.point or 0):
             # What is recorded is newer than what the last progress said.
             error.point, error.time = rows - 1, self._plan.grid.time(rows - 1)
-        if rows:
-            kept = f"What was recorded up to then ({rows} rows) is in '{self._plan.system.result_file}'."
+        if rows and result_file is not None and Path(result_file).is_file():
+            kept = f"What was recorded up to then ({rows} rows) is in '{result_file}'."
             error.hint = f"{error.hint} {kept}" if error.hint else kept
         raise error
 
@@ -327,24 +331,6 @@ class Launcher:
         instances = ", ".join(item.name for item in self._plan.nodes[name].instances)
         text = f"node '{name}' was lost: its process {self._how[name]}"
         return MeshLost(text, instance=instances, point=point, time=self._plan.grid.time(point))
-
-    def _recorded_rows(self) -> int:
-        """Complete rows in the result file of this run; what follows the last of them is cut off."""
-        name = self._plan.system.result_file
-        if self._point is None or name is None or not Path(name).is_file():
-            return 0
-        if is_bag(name):  # it has no lines to count
-            return self._end.rows if self._end is not None else 0
-        rows, end, offset = -1, 0, 0
-        with Path(name).open("r+b") as file:
-            while chunk := file.read(1 << 20):
-                rows += chunk.count(b"\n")
-                if (last := chunk.rfind(b"\n")) >= 0:
-                    end = offset + last + 1
-                offset += len(chunk)
-            if end < offset:
-                file.truncate(end)
-        return max(rows, 0)
 
     def _with_cause(self, error: FmuMeshError) -> FmuMeshError:
         """Say how the process of a lost node ended, or who interrupted the run; only the parent of all knows."""

@@ -1,19 +1,23 @@
-"""Which kind of file the results of a run go into, by its name."""
+"""Which kind of file the results of a run go into, by its name, and what is there after its process was killed."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
+from ..errors import ConfigurationError
+from ..files import open_alone
 from ..model.description import VariableType
 from ..model.findings import Findings
 from ..model.loading import LoadedConfig, load
 from ..model.system import System
-from ..record.csv_file import CsvFile
+from ..record.csv_file import CsvFile, cut_after_last_row
+from ..record.noted import NotedFile, noted
 from ..record.result_file import OpenResult, ResultFile
 from ..ros.bag import BagTopics, McapFile, bag_topics, is_bag
 
-__all__ = ["check_results", "result_opener"]
+__all__ = ["check_results", "result_opener", "rows_left"]
 
 
 def check_results(loaded: LoadedConfig, system: System) -> None:
@@ -26,15 +30,31 @@ def check_results(loaded: LoadedConfig, system: System) -> None:
         _topics(loaded, system)
 
 
-def result_opener(config_file: Path, system: System) -> OpenResult:
-    """What opens the result file of a run: an MCAP if it is called so, else a CSV."""
-    if not is_bag(system.result_file):
-        return CsvFile
+def result_opener(config_file: Path, system: System, folder: Path | None = None) -> OpenResult:
+    """What opens the result file of a run: an MCAP if it is called so, else a CSV.
 
-    def open_bag(path: Path, columns: Sequence[tuple[str, VariableType]]) -> ResultFile:
-        return McapFile(path, columns, _topics(load(config_file), system))
+    Args:
+        config_file: the configuration file.
+        system: what it means.
+        folder: of the run, where somebody asks `rows_left` if this process is killed.
+    """
 
-    return open_bag
+    def open_result(path: Path, columns: Sequence[tuple[str, VariableType]]) -> ResultFile:
+        file = McapFile(path, columns, _topics(load(config_file), system)) if is_bag(path) else CsvFile(path, columns)
+        return NotedFile(file, folder) if folder is not None else file
+
+    return open_result
+
+
+def rows_left(result_file: str, folder: Path) -> int:
+    """Rows in the result file of the run in ``folder``, whose master was killed; cuts off what follows the last row."""
+    path, kept = Path(result_file), noted(folder)
+    if path.exists() and not path.is_file():
+        return 0  # a device keeps nothing
+    with suppress(ConfigurationError, OSError), open_alone(path):  # nobody else may write it now; removes what it left
+        if kept is not None and path.is_file():
+            return kept.rows if is_bag(path) else cut_after_last_row(path, kept)
+    return 0
 
 
 def _topics(loaded: LoadedConfig, system: System) -> BagTopics:

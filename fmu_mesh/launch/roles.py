@@ -224,7 +224,7 @@ def run_master(
             master.interrupt(reason)
         try:
             if RECORDER in plan.nodes:
-                open_file = result_opener(config_file, plan.system)
+                open_file = result_opener(config_file, plan.system, folder if child else None)
                 with Recorder(
                     plan.nodes[RECORDER], session, open_file, lambda: master.has_begun, launch=_launch(run)
                 ) as recorder:
