@@ -167,10 +167,6 @@ def _launch(arguments: argparse.Namespace) -> int:
         raise ConfigurationError("--paused is for a mesh that others can reach, and --local has none of it.")
     if arguments.local and options.profile:
         raise ConfigurationError("--profile measures nodes, and --local has none", hint="Leave one of them out.")
-    if arguments.local and options.real_time_factor:
-        raise ConfigurationError(
-            "--real-time-factor is kept by the master, and --local has none", hint="Leave one of them out."
-        )
     if arguments.restarts and (arguments.local or options.paused):
         other = "--local" if arguments.local else "--paused"
         raise ConfigurationError(f"--restarts and {other} do not go together", hint="Leave one of them out.")

@@ -9,36 +9,29 @@ from __future__ import annotations
 import logging
 import shutil
 import tempfile
+import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import closing
+from collections.abc import Callable, Mapping
+from contextlib import closing, suppress
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import NamedTuple
 
-import numpy as np
-
-from ..errors import (
-    ConfigurationError,
-    FmuError,
-    FmuMeshError,
-    Interrupted,
-    StepFailed,
-    TerminationRequested,
-)
+from ..errors import ConfigurationError, FmuError, FmuMeshError, Interrupted, StepFailed, TerminationRequested
 from ..fmu import LogMessage, Terms
 from ..fmu.guard import CallWatch, Guarded, floating_point_changed, restore_floating_point
+from ..master.pacing import Pacer
 from ..model.elements import scaled
 from ..model.fixed_point import FixedPoint
 from ..model.initialization import Loop, Tear
 from ..model.instance import Instance
 from ..model.plan import Plan
 from ..model.ring import Layout, Ring
-from ..model.types import DTYPES, Value, VariableType
+from ..model.types import Value
 from ..record.csv_file import CsvFile
-from ..record.recorder import unwritable
-from ..record.result_file import OpenResult, ResultFile
+from ..record.result_file import OpenResult
+from ..record.row_buffer import RowBuffer
 from ..simtime import TimeGrid
 from .opening import Showing, open_instance, stepped
 
@@ -47,10 +40,11 @@ __all__ = ["LocalMesh"]
 log = logging.getLogger(__name__)
 
 _ROWS = 1024
+_FLUSH_S = 0.2
 
 
 class LocalMesh:
-    """Runs a plan in this process.
+    """Runs a plan in this process, as fast as its real-time factor allows.
 
     Args:
         plan: the plan; its processes and window play no part.
@@ -96,14 +90,17 @@ class LocalMesh:
         self._showing = showing
         self._open_result = open_result
         self._stop: str | None = None
+        self._stopped = threading.Event()
         self._folder: Path | None = None
 
     def interrupt(self, reason: str) -> None:
         """From any thread: end the run with `Interrupted` at the next point."""
         self._stop = reason
+        self._stopped.set()
 
     def clean_up(self) -> None:
-        """From another thread, when the main thread does not come back from an FMU: remove the extracted files."""
+        """From another thread, when the main thread does not come back from an FMU: keep rows, remove other files."""
+        self._save_from_outside()
         if self._folder is not None:
             shutil.rmtree(self._folder, ignore_errors=True)
 
@@ -118,11 +115,16 @@ class LocalMesh:
         try:
             self._run()
         except FmuMeshError as error:
-            # Where the file itself is the trouble, how much of it there is can only be seen in it.
-            if self.rows and not isinstance(error, ConfigurationError):
-                kept = f"What was recorded up to then ({self.rows} rows) is in '{self._plan.system.result_file}'."
+            if kept := self._kept():
                 error.hint = f"{error.hint} {kept}" if error.hint else kept
             raise
+
+    def _kept(self) -> str | None:
+        """What is told of a run that ended early and left rows; a device keeps none."""
+        file = self._plan.system.result_file
+        if not self.rows or file is None or not Path(file).is_file():
+            return None
+        return f"What was recorded up to then ({self.rows} rows) is in '{file}'."
 
     def _check_one_process(self) -> None:
         """Two instances of an FMU that allows one per process cannot run here, whatever their groups.
@@ -142,7 +144,7 @@ class LocalMesh:
 
     def _run(self) -> None:
         plan = self._plan
-        recorded = plan.system.recorded if plan.system.result_file is not None else ()
+        recorded = plan.system.recorded
         layouts = {name: Layout.of(i.description.variables) for name, i in plan.system.instances.items()}
         columns = [(f"{instance}.{name}", layouts[instance].column(name).type) for instance, name in recorded]
         members: dict[str, _Member] = {}
@@ -150,20 +152,20 @@ class LocalMesh:
         with tempfile.TemporaryDirectory(prefix="fmu_mesh-", dir=self._parent) as folder, closing(watch):
             self._folder = Path(folder)
             file = self._open_result(Path(plan.system.result_file), columns) if plan.system.result_file else None
+            rows = RowBuffer(file, plan.grid, [type_ for _, type_ in columns])
+            self._save = lambda: self._close(rows)
             try:
                 for name in plan.order:
                     members[name] = _Member(plan, name, self._guarded(name, Path(folder), watch))
                 self._initialize(members)
                 started = time.perf_counter()
                 try:
-                    with watch.stepping(lambda: (self._stepping, self.point), plan.system.config.timeouts.step):
-                        self._loop(members, file)
+                    with watch.stepping(self._position, plan.system.config.timeouts.step):
+                        self._loop(members, rows)
                 finally:
                     self.seconds = time.perf_counter() - started
             finally:
-                if file is not None:
-                    self.rows = file.rows
-                    _close(file)
+                self._save()
                 for member in members.values():
                     member.instance.close()
 
@@ -181,10 +183,18 @@ class LocalMesh:
         """From the watching thread: the main thread is in an FMU, and nothing of this object changes any more."""
         if self._stepping:
             error.point, error.time = self.point, self._plan.grid.time(self.point)
-        self._save()
-        if self.rows:
-            error.hint = f"{error.hint} What was recorded ({self.rows} rows) is in '{self._plan.system.result_file}'."
+        self._save_from_outside()
+        if kept := self._kept():
+            error.hint = f"{error.hint} {kept}"
         self._on_hang(error)
+
+    def _save_from_outside(self) -> None:
+        with suppress(FmuMeshError):  # the process ends now, and its reason is another one
+            self._save()
+
+    def _position(self) -> tuple[str, int]:
+        """Who steps at which point; nobody is late while all wait for the wall clock."""
+        return (self._stepping, self.point) if self._stepping else ("", time.monotonic_ns())
 
     def _initialize(self, members: dict[str, _Member]) -> None:
         grid = self._plan.grid
@@ -226,24 +236,22 @@ class LocalMesh:
         c = next(c for c in self._plan.connections if (c.target_instance, c.target_name) == (tear.target, tear.input))
         return scaled(_at(known[c.source_instance, c.source.name], c.source_index), c.factor, c.offset)
 
-    def _loop(self, members: dict[str, _Member], file: ResultFile | None) -> None:
+    def _loop(self, members: dict[str, _Member], rows: RowBuffer) -> None:
         plan, grid = self._plan, self._plan.grid
-        types = [members[instance].type_of(variable) for instance, variable in plan.system.recorded]
         recorded = [members[instance].reader(variable) for instance, variable in plan.system.recorded]
-        buffer: list[list[Value]] = []
-        first = 0
-        self._save = lambda: self._save_rows(
-            file, lambda result: _write(result, grid, first, buffer, types) if buffer else None
-        )
+        factor = plan.system.config.simulation.real_time_factor
+        pacer = Pacer(plan, factor)
+        pacer.start(0)
         try:
             for point in range(grid.last_point + 1):
                 self.point = point
-                if file is not None:
-                    buffer.append([read(point // points) for read, points in recorded])
-                    if len(buffer) == _ROWS:
-                        _write(file, grid, first, buffer, types)
-                        first, buffer = point + 1, []
-                        self._progress(point)
+                if recorded:
+                    rows.add([read(point // points) for read, points in recorded])
+                if point % _ROWS == _ROWS - 1:
+                    rows.write()
+                    self._progress(point)
+                if factor and point < grid.last_point:
+                    self._wait_for_the_clock(pacer, rows)
                 if self._stop is not None:
                     raise Interrupted(self._stop, point=point, time=grid.time(point))
                 if point == grid.last_point:
@@ -256,18 +264,28 @@ class LocalMesh:
         except StepFailed as error:
             error.point, error.time = self.point, grid.time(self.point)
             raise
-        finally:
-            self._save = lambda: None
-            if file is not None:
-                _write(file, grid, first, buffer, types)
+        rows.write()
         self._progress(self.point)
 
-    def _save_rows(self, file: ResultFile | None, write: Callable[[ResultFile], None]) -> None:
-        """From the watching thread: bring to the file what the main thread cannot any more."""
-        if file is not None:
-            write(file)
-            self.rows = file.rows
-            _close(file)
+    def _wait_for_the_clock(self, pacer: Pacer, rows: RowBuffer) -> None:
+        """Wait until the wall clock allows the next step, or the run is to end; meanwhile what there is can be seen."""
+        while not self._stopped.is_set():
+            granted, pause_s = pacer.limit(self.point + 1, self.point)
+            if granted > self.point:
+                return
+            self._stepping = ""
+            if time.monotonic() - rows.flushed_at > _FLUSH_S:
+                rows.write(flush=True)
+                self._progress(self.point)
+            self._stopped.wait(pause_s)
+
+    def _close(self, rows: RowBuffer) -> None:
+        """Bring to the file what is not there yet, and close it; from the watching thread if the main thread cannot."""
+        self._save = lambda: None
+        try:
+            rows.close()
+        finally:
+            self.rows = rows.count
 
 
 class _Member:
@@ -332,10 +350,6 @@ class _Member:
             change = None if same else partial(scaled, factor=c.factor, offset=c.offset)
             self._feeds.append(_Feed(read, points, late, change, self._inputs.writer(c.target_name)))
 
-    def type_of(self, variable: str) -> VariableType:
-        """The type of an output, or of an element of it."""
-        return self.plan.outputs.column(variable).type
-
     def reader(self, variable: str) -> tuple[Callable[[int], Value], int]:
         """An output as a function of the own step, and how many points that has.
 
@@ -373,23 +387,3 @@ def _at(value: Value, index: tuple[int, ...]) -> Value:
         assert isinstance(value, list)
         value = value[number]
     return value
-
-
-def _write(
-    file: ResultFile, grid: TimeGrid, first: int, rows: list[list[Value]], types: Sequence[VariableType]
-) -> None:
-    if not rows:
-        return
-    times = grid.times(first, first + len(rows))
-    try:
-        columns = zip(zip(*rows, strict=True), types, strict=True)
-        file.write(times, [np.array(column, dtype=DTYPES[type_]) for column, type_ in columns])
-    except OSError as error:
-        raise unwritable(file.path, error) from error
-
-
-def _close(file: ResultFile) -> None:
-    try:
-        file.close()
-    except OSError as error:
-        raise unwritable(file.path, error) from error

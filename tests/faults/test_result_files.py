@@ -1,9 +1,11 @@
-"""A result file that cannot be written, from the start or from some point on."""
+"""A result file that cannot be written, from the start or from some point on, or that is no ordinary file."""
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
+import threading
 from pathlib import Path
 
 import pytest
@@ -67,3 +69,40 @@ def test_a_second_run_does_not_write_into_the_file_of_the_first(place: Place, op
     assert first.wait() == 130
     assert len(rows_of(result)) > 10
     place.assert_nothing_left()
+
+
+@pytest.mark.parametrize(
+    ("options", "zenoh"), [((), {"shared_memory": False}), (("--local",), {})], ids=["distributed", "local"]
+)
+def test_a_disk_that_gets_full_in_mid_run_leaves_whole_rows_as_many_as_are_told(
+    place: Place, options: tuple[str, ...], zenoh: dict[str, bool]
+) -> None:
+    """The limit for the size of a file is the disk that a test can fill."""
+    config = write_config(place.folder, stop_time=100.0, zenoh=zenoh)
+    result = config.with_suffix(".csv")
+
+    launched = place.start("launch", config, *options, prefix=["prlimit", "--fsize=1000000"])
+
+    assert launched.wait() == 2
+    rows = rows_of(result)
+    assert f"the result file '{result}' cannot be written: File too large" in launched.message
+    assert f"({len(rows)} rows) is in '{result}'" in launched.message
+    assert result.stat().st_size > 990_000
+    assert [row[0] for row in rows] == [point * 0.001 for point in range(len(rows))]
+    place.assert_nothing_left()
+
+
+@MODES
+def test_a_result_may_go_into_a_pipe(place: Place, options: tuple[str, ...]) -> None:
+    pipe = place.folder / "pipe"
+    os.mkfifo(pipe)
+    read: list[bytes] = []
+    reader = threading.Thread(target=lambda: read.append(pipe.read_bytes()), daemon=True)
+    reader.start()
+
+    piped = place.run("launch", write_config(place.folder), "--output", pipe, *options)
+    plain = place.run("launch", place.folder / "pair.yaml", "--local")
+
+    assert (piped.wait(), plain.wait()) == (0, 0), piped.errors
+    reader.join(10.0)
+    assert read == [(place.folder / "pair.csv").read_bytes()]

@@ -246,7 +246,6 @@ def test_a_wrong_option_is_told_as_it_was_written(
         (["launch", "mesh.yaml", "--plot", "plot.xyz"], "a plot cannot be written as 'plot.xyz'"),
         (["launch", "mesh.yaml", "--plot", "plot.png", "--output", "x.mcap"], "plots are drawn from CSV"),
         (["launch", "mesh.yaml", "--real-time-factor", "-1"], "--real-time-factor -1"),
-        (["launch", "mesh.yaml", "--real-time-factor", "1", "--local"], "kept by the master, and --local has none"),
         (["plot", "mesh.csv"], "the result file 'mesh.csv' cannot be read"),
         (["play", "mesh.yam"], "the bag 'mesh.yam' does not exist. Did you mean 'mesh.yaml'?"),
         (["play", "."], "it has no metadata.yaml"),
@@ -336,9 +335,9 @@ def test_two_runs_do_not_write_into_one_result_file(tmp_path: Path) -> None:
 
         first.write(np.array([0.0]), [np.array([1.0])])
     assert file.read_bytes() == kept
-    with CsvFile(file, [("gain.y", "Float64")]):
-        pass
-    assert file.read_bytes() == b"time,gain.y\n"
+    with CsvFile(file, [("gain.y", "Float64")]) as second:
+        second.write(np.array([0.5]), [np.array([2.0])])
+    assert file.read_bytes() == b"time,gain.y\n0.5,2.0\n"
 
 
 def test_the_command_itself_ends_with_exit_code_2_and_no_traceback(tmp_path: Path) -> None:

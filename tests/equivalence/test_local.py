@@ -1,0 +1,122 @@
+"""A run in one process: paced by the wall clock, without a result, and ended while an FMU does not return."""
+
+from __future__ import annotations
+
+import re
+import signal
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from fmu_mesh.errors import StepFailed
+from fmu_mesh.launch.local import LocalMesh
+from fmu_mesh.model.plan import Plan
+from tests.helpers import Place, row_count, rows_of, wait_until, write_config
+from tests.scenarios.scenario import Counter, Scenario
+
+MODES = pytest.mark.parametrize("options", [(), ("--local",)], ids=["distributed", "local"])
+
+
+def seconds_in(output: str) -> float:
+    found = re.search(r"points in ([\d.]+) s", output)
+    assert found is not None, output
+    return float(found[1])
+
+
+@pytest.mark.parametrize("options", [(), ("--real-time-factor", "2")], ids=["file", "option"])
+def test_the_wall_clock_holds_a_run_in_one_process_too(place: Place, options: tuple[str, ...]) -> None:
+    """The step that ends at point 601 begins at point 600, 0.3 s after the first."""
+    simulation = {} if options else {"real_time_factor": 2}
+    config = write_config(place.folder, stop_time=0.601, simulation=simulation)
+    paced, free = place.folder / "paced.csv", place.folder / "free.csv"
+
+    slow = place.run("launch", config, "--local", "--output", paced, *options)
+    fast = place.run("launch", config, "--local", "--output", free, "--real-time-factor", "0")
+
+    assert (slow.wait(), fast.wait()) == (0, 0), slow.errors
+    assert seconds_in(slow.output) >= 0.3
+    assert paced.read_bytes() == free.read_bytes()
+
+
+def test_the_rows_of_a_paced_run_in_one_process_are_there_while_it_runs_and_ctrl_c_ends_it(place: Place) -> None:
+    config = write_config(place.folder, stop_time=10_000.0, simulation={"real_time_factor": 1, "step_size": 0.01})
+    result = config.with_suffix(".csv")
+    launched = place.start("launch", config, "--local")
+    wait_until(lambda: row_count(result) > 30, "rows")
+
+    launched.signal(signal.SIGINT)
+
+    assert launched.wait() == 130
+    rows = rows_of(result)
+    assert len(rows) < 1000
+    assert f"({len(rows)} rows) is in '{result}'" in launched.message
+    place.assert_nothing_left()
+
+
+def test_a_step_that_waits_for_the_wall_clock_does_not_hang(place: Place) -> None:
+    simulation = {"real_time_factor": 1, "step_size": 2.5}
+    config = write_config(
+        place.folder,
+        instances={"gain": {"fmu": "Gain"}},
+        connections=[],
+        stop_time=5.0,
+        simulation=simulation,
+        timeouts={"step": 1.0},
+    )
+
+    launched = place.run("launch", config, "--local")
+
+    assert launched.wait() == 0, launched.errors
+    assert len(rows_of(config.with_suffix(".csv"))) == 3
+
+
+@MODES
+def test_without_a_result_file_an_output_may_be_unconnected(place: Place, options: tuple[str, ...]) -> None:
+    launched = place.run("launch", write_config(place.folder, record={"file": None}), *options)
+
+    assert launched.wait() == 0, launched.errors
+    assert "result" not in launched.output
+    assert "1000 points in" in launched.output
+
+
+class Ended(Counter):
+    """An instance in whose fourth step the process is ended from outside, as by Ctrl-C when an FMU does not return.
+
+    Args:
+        clean_up: what is called then, on another thread.
+    """
+
+    def __init__(self, plan: Plan, name: str, clean_up: Callable[[], None]) -> None:
+        super().__init__(plan, name)
+        self._clean_up = clean_up
+
+    def do_step(self, step: int) -> None:
+        if step == 3:
+            thread = threading.Thread(target=self._clean_up)
+            thread.start()
+            thread.join()
+            raise StepFailed("the process has ended here", instance="b")
+        super().do_step(step)
+
+
+def test_the_rows_before_a_step_that_does_not_return_are_kept_when_the_process_is_ended(tmp_path: Path) -> None:
+    result = tmp_path / "result.csv"
+    plan = Scenario(("a -> b",), points=10).plan(record=True)
+    plan = msgspec.structs.replace(plan, system=msgspec.structs.replace(plan.system, result_file=str(result)))
+    found: list[str] = []
+
+    def clean_up() -> None:
+        mesh.clean_up()
+        found.append(result.read_text())
+
+    mesh = LocalMesh(
+        plan, open_instance=lambda name: Ended(plan, name, clean_up) if name == "b" else Counter(plan, name)
+    )
+    with pytest.raises(StepFailed):
+        mesh.run()
+
+    assert found == ["time,a.point,b.point\n" + "".join(f"{k}.0,{k}.0,{k}.0\n" for k in range(4))]
+    assert result.read_text() == found[0]
