@@ -82,6 +82,9 @@ def check_window() -> None:
 class Film:
     """A film file.
 
+    A film cannot be read without its end, so it gets its name at its end: until then it is `<name>.unfinished.mp4`
+    beside it. A run that ends before the world has made a step leaves no film, and an older one as it was.
+
     Args:
         path: the file; its suffix says the format.
         instance: for errors.
@@ -92,10 +95,13 @@ class Film:
 
     def __init__(self, path: Path, instance: str) -> None:
         self._path = path
+        self._file = Path(os.path.realpath(path))
+        self._draft = self._file.with_name(f"{path.stem}.unfinished{path.suffix}")
         self._instance = instance
         self._rate = FILM_RATES[path.suffix]
         self._first: float | None = None
         self._pictures = 0
+        self._has_moved = False
         self._renderer: Any = None
         self._writer: Any = None
         _choose_backend()
@@ -104,6 +110,7 @@ class Film:
         """Add as many pictures as the time since the last one asks for."""
         if self._first is None:
             self._first = time_s
+        self._has_moved = time_s > self._first
         # A point may miss the time of its picture by the last bit.
         due = math.floor((time_s - self._first) * self._rate * (1.0 + 1e-12)) + 1
         if due <= self._pictures:
@@ -122,33 +129,41 @@ class Film:
         self._pictures = due
 
     def finish(self) -> None:
-        """Write the file."""
+        """Complete the file and give it its name."""
+        self._end(keep=True)
+
+    def close(self) -> None:
+        """Complete what there is of the file."""
+        try:
+            self._end(keep=self._has_moved)
+        except LoadFailed as error:
+            log.warning("film_not_written", extra={"error": str(error)})
+
+    def _end(self, *, keep: bool) -> None:
         writer, self._writer = self._writer, None
         renderer, self._renderer = self._renderer, None
         if renderer is not None:
             renderer.close()
-        if writer is not None:
-            try:
-                writer.close()
-            except Exception as error:
-                raise self._failed(error) from error
-
-    def close(self) -> None:
-        """Write what there is of the file."""
+        if writer is None:
+            return
         try:
-            self.finish()
-        except LoadFailed as error:
-            log.warning("film_not_written", extra={"error": str(error)})
+            writer.close()
+            if keep:
+                self._draft.replace(self._file)
+        except Exception as error:
+            raise self._failed(error) from error
+        finally:
+            self._draft.unlink(missing_ok=True)
 
     def _start(self, model: Any) -> None:  # noqa: ANN401  mujoco has no types
         import imageio.v2 as imageio  # noqa: PLC0415  an extra, and slow to import
 
-        self._path.parent.mkdir(parents=True, exist_ok=True)
+        self._file.parent.mkdir(parents=True, exist_ok=True)
         self._renderer = engine().Renderer(model, HEIGHT, WIDTH)
         if self._path.suffix == ".gif":
-            self._writer = imageio.get_writer(self._path, duration=1000 / self._rate, loop=0)
+            self._writer = imageio.get_writer(self._draft, duration=1000 / self._rate, loop=0)
         else:
-            self._writer = imageio.get_writer(self._path, fps=self._rate, codec="libx264")
+            self._writer = imageio.get_writer(self._draft, fps=self._rate, codec="libx264")
 
     def _failed(self, error: Exception) -> LoadFailed:
         reason = " ".join(str(error).split())

@@ -34,6 +34,32 @@ import mujoco
 mujoco.Renderer(mujoco.MjModel.from_xml_string("<mujoco/>"), 16, 16).close()
 """
 
+FILM = """\
+import sys
+from pathlib import Path
+from fmu_mesh.hosts import Film
+path = Path(sys.argv[1])
+older = path.read_bytes() if path.exists() else None
+def look():
+    print(sorted(p.name for p in path.parent.iterdir()))
+def film():
+    film = Film(path, "world")
+    film.show(model, data, 0.0)
+    return film
+Film(path, "chooses how to render")
+import mujoco
+model = mujoco.MjModel.from_xml_string("<mujoco/>")
+data = mujoco.MjData(model)
+film().close()
+look()
+assert older is None or path.read_bytes() == older
+ended_early = film()
+ended_early.show(model, data, 0.1)
+assert older is None or path.read_bytes() == older
+ended_early.close()
+look()
+"""
+
 
 @functools.cache
 def why_no_films() -> str | None:
@@ -85,6 +111,24 @@ def test_a_film_shows_the_world_from_the_first_point_to_the_last(
     assert 100 < changed.sum() < changed.size / 10  # and it moves
     assert results[0].read_bytes() == results[1].read_bytes()
     place.assert_nothing_left(5.0)
+
+
+@pytest.mark.usefixtures("renderer")
+@pytest.mark.parametrize("suffix", [".mp4", ".gif"])
+@pytest.mark.parametrize("older", [b"an older film", None], ids=["older film", "no film"])
+def test_a_film_has_its_name_at_its_end_and_only_if_the_world_has_moved(
+    tmp_path: Path, suffix: str, older: bytes | None
+) -> None:
+    film = tmp_path / f"film{suffix}"
+    if older is not None:
+        film.write_bytes(older)
+    names = [film.name] if older is not None else []
+
+    done = subprocess.run([sys.executable, "-c", FILM, film], capture_output=True, text=True, timeout=60, check=False)
+
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines() == [f"{names}", f"{[film.name]}"]
+    assert len(pictures_of(film)) > 0
 
 
 @pytest.mark.usefixtures("renderer")
