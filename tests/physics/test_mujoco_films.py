@@ -137,7 +137,9 @@ def test_a_film_that_cannot_be_written_ends_the_run_with_the_reason(place: Place
     (place.folder / "file").touch()
     film = place.folder / "file" / f"film{suffix}"
 
-    launched = place.run("launch", CONFIGS / "fluid_body.yaml", "--local", "--no-progress", "--video", film)
+    options = ("--local", "--no-progress", "--output", place.folder / "result.csv", "--video", film)
+
+    launched = place.run("launch", CONFIGS / "fluid_body.yaml", *options)
 
     assert launched.wait() == 3
     assert f"the film '{film}' cannot be made: " in launched.message
