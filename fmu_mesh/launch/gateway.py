@@ -14,13 +14,12 @@ from ..ros.mapping import message_types, resolve
 from ..ros.serving import open_profiles, parameter_services
 from ..ros.topics import RosPlan
 from ..ros.types import MessageTypes
-from ..wire.keys import Keys
+from ..wire.keys import MASTER, Keys
 from ..wire.runtime import leave_run_folder, run_folder, socket_endpoint
 from ..wire.session import Wiring, close_session, open_session
 from .events import Event, Ready
 from .preparing import Options, prepare
 from .process import die_with_parent, ended_by_signals
-from .wiring import MASTER
 
 __all__ = ["run_gateway"]
 

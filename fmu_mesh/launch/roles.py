@@ -26,6 +26,7 @@ from ..model.loading import load
 from ..model.plan import RECORDER, NodePlan, Plan
 from ..node.node import Node
 from ..record.recorder import Recorder
+from ..wire.keys import MASTER
 from ..wire.runtime import (
     MeshNote,
     enter_run_folder,
@@ -43,7 +44,7 @@ from .opening import open_instance, stepped
 from .preparing import Options, prepare, zenoh_section
 from .process import SIGNAL_RECEIVED, die_with_parent, ended_by_signals
 from .results import result_opener
-from .wiring import MASTER, is_socket, wiring
+from .wiring import is_socket, wiring
 
 __all__ = ["BY_HAND", "run_master", "run_node"]
 

@@ -12,13 +12,11 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from ..model.config import ZenohConfig
+from ..wire.keys import MASTER
 from ..wire.runtime import socket_endpoint
 from ..wire.session import Wiring
 
-__all__ = ["MASTER", "is_socket", "leaves_host", "wiring"]
-
-MASTER = "@mesh"
-"""Name of the master's process where node names stand."""
+__all__ = ["is_socket", "leaves_host", "wiring"]
 
 
 def wiring(config: ZenohConfig, config_file: Path, folder: Path, process: str, peers: Iterable[str]) -> Wiring:

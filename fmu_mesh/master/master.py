@@ -14,7 +14,6 @@ The master never sees a value. Its work per grant depends on the number of nodes
 
 from __future__ import annotations
 
-import logging
 import operator
 import time
 from collections.abc import Callable, Sequence
@@ -36,8 +35,7 @@ from ..errors import (
 )
 from ..model.plan import RECORDER, Plan
 from ..wire.inbox import Inbox
-from ..wire.keys import Keys, RunKeys
-from ..wire.membership import MASTER
+from ..wire.keys import MASTER, Keys, RunKeys
 from ..wire.messages import FINISH, GRANT, PROGRESS, NodeReport, decode_json
 from ..wire.profile import TIME_LINE_ENTRIES, MeshProfile
 from ..wire.refusals import payload_of
@@ -45,14 +43,13 @@ from ..wire.session import RouterLink, tokens
 from ..wire.shared_memory import SharedInbox, available
 from ..wire.values import json_encoding
 from ..wire.views import Command, CommandAnswer, MeshInfo, MeshState, MeshStatus
+from .followers import Followers
 from .members import Members, spoken
 from .pacing import Clock, Pacer, Reach
 from .profiling import CLOCK, PAUSE, GrantWatch
 from .serving import STATUS_S, Events, Server, mesh_info
 
 __all__ = ["Master"]
-
-log = logging.getLogger(__name__)
 
 _HEARTBEAT_S = 0.5
 _LEAST_HEARTBEAT_S = 0.01
@@ -108,8 +105,6 @@ class Master:
         self._slowest = -1
         self._reports: dict[str, NodeReport] = {}
         self._failure: FmuMeshError | None = None
-        self._followers: set[str] = set()
-        self._lost_followers: set[str] = set()
         self.ended_by: TerminationRequested | None = None
         self._state: MeshState = "starting"
         self._grant = 0
@@ -129,6 +124,7 @@ class Master:
         senders = {self._run_keys.progress(node): node for node in self._nodes}
         capacity = (plan.window + 64) * len(self._nodes) + 1024
         self._inbox.open(session, self._run_keys, MASTER, senders, capacity)
+        self._followers = Followers(self._inbox, lambda: self._state in ("running", "paused"))
         self._members = Members(plan, session, self._run_keys, self._inbox, self._lose, launch)
         self._send = self._members.send
         self._server = Server(session, self._keys, self._inbox, events, self.last_status, plan.system.instances)
@@ -183,15 +179,9 @@ class Master:
             self._token.undeclare()
 
     def wait_for_followers(self) -> None:
-        """Stay, as the router, until those that need the last sample have it; their tokens tell, Zenoh does not."""
-        if self._lost_followers:
-            log.warning("a gateway was gone before the last point; ROS has nothing of what came after it")
-        deadline = time.monotonic() + self._timeouts.stop
-        while self._followers and self._failure is None:
-            if (left := deadline - time.monotonic()) <= 0:
-                log.warning("a gateway did not take its last samples within %g s", self._timeouts.stop)
-                return
-            self._inbox.wait(left)
+        """Stay, as the router, until those that need the last sample have it."""
+        if self._failure is None:
+            self._followers.wait(self._timeouts.stop)
 
     def close(self) -> None:
         """Undeclare everything."""
@@ -360,7 +350,7 @@ class Master:
         server.show("plan", lambda: self._plan.nodes)
         server.serve(self._keys.mesh_key("command"), self._command)
         server.watch(keys.node("*"), self._members.token_changed)
-        server.watch(keys.follower("*"), self._follower_changed)
+        server.watch(keys.follower("*"), self._followers.changed)
         server.hand_on_logs()
 
     def _take_report(self, query: zenoh.Query) -> None:
@@ -416,16 +406,6 @@ class Master:
                 time=self._plan.grid.time(point),
             )
         )
-
-    def _follower_changed(self, sample: zenoh.Sample) -> None:
-        name = str(sample.key_expr)
-        if sample.kind == zenoh.SampleKind.PUT:
-            self._followers.add(name)
-            self._lost_followers.discard(name)
-        else:
-            self._followers.discard(name)
-            if self._state in ("running", "paused"):
-                self._lost_followers.add(name)
 
     def _command(self, query: zenoh.Query) -> None:
         """pause, resume, step N and stop; the grant is all that they move."""

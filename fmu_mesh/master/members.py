@@ -15,8 +15,8 @@ from ..errors import DeadlineExceeded, FmuMeshError, MessageRefused
 from ..model.digest import difference
 from ..model.plan import RECORDER, Plan
 from ..wire.inbox import Inbox
-from ..wire.keys import Keys, RunKeys, batched
-from ..wire.membership import MASTER, Admission, Ready, Registration, Welcome
+from ..wire.keys import MASTER, Keys, RunKeys, batched
+from ..wire.membership import Admission, Ready, Registration, Welcome
 from ..wire.messages import GRANT, HEADER, decode_json, encode_abort
 from ..wire.refusals import payload_of
 from ..wire.session import tokens, undeclare_all

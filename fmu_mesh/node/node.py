@@ -21,7 +21,6 @@ import sys
 import time
 from collections.abc import Callable
 
-import msgspec
 import zenoh
 
 from ..errors import (
@@ -40,7 +39,8 @@ from ..model.instance import Instance
 from ..model.plan import NodePlan
 from ..wire.frames import FrameReceiver
 from ..wire.inbox import Inbox, Message
-from ..wire.membership import MASTER, Membership, shared_inbox
+from ..wire.keys import MASTER
+from ..wire.membership import Membership, shared_inbox
 from ..wire.messages import (
     ABORT,
     FINISH,
@@ -52,7 +52,7 @@ from ..wire.messages import (
     NodeReport,
     decode_abort,
 )
-from ..wire.session import RouterLink, ask
+from ..wire.session import RouterLink
 from .activity import Activity
 from .feeding import connect_feeds
 from .initialization import Initialization
@@ -105,11 +105,9 @@ class Node:
         self._plan = plan
         self._session = session
         self._open_instance = open_instance
-        self._router = router or RouterLink(session)
         self._grant = 0
         self._finished = False
         self.failure_is_known = False
-        self._master_is_gone = False
         self._heard = time.monotonic()
         self._lazy_flushed = 0.0
         self._lazy_pending = False
@@ -121,14 +119,14 @@ class Node:
         self._remote: dict[int, tuple[FrameReceiver, list[RemoteFeed]]] = {}
         self._initialization = Initialization(plan, self._wait_for_initial_value)
         self._inbox = Inbox(shared_inbox(plan, spins=True))
-        self._membership = Membership(plan, session, self._inbox, launch)
+        self._membership = Membership(plan, session, self._inbox, launch, router)
         self._profiler: Profiler | None = None
         # The calls that a profile measures; without one they are what they seem.
         self._poll = self._inbox.poll
         self._take = self._sort_in
         self._put_progress: Callable[[bytes], None]
         self._activity = Activity(plan, self._inbox.refusals)
-        self.server = Server(plan, session, self._inbox, self._activity, self._report)
+        self.server = Server(plan, session, self._inbox, self._activity, self._membership.report)
 
     def run(self) -> None:
         """Load, initialize and step to the last point, then report to the master.
@@ -150,7 +148,7 @@ class Node:
         except FmuMeshError as error:
             located = self._located(error)
             aborted = isinstance(error, _Aborted)
-            if aborted or not self._master_is_gone:  # its token may be gone before its last word comes
+            if aborted or not self._membership.lost_master:  # its token may be gone before its last word comes
                 self._send_last_rows()
             self.failure_is_known = aborted or self._report_failure(located)
             raise located from error
@@ -165,7 +163,7 @@ class Node:
 
     def report_hang(self, error: FmuError) -> bool:
         """From a watching thread, while an FMU does not return: tell the master; whether it knows now."""
-        if not self._master_is_gone:
+        if not self._membership.lost_master:
             sys.setswitchinterval(_ALONE_S)  # should the FMU return now, the main thread waits until the rows are sent
             self._send_last_rows()
         return self.server.report_hang(error, self._patience_s())
@@ -194,8 +192,7 @@ class Node:
         except MeshLost as error:
             if not self._membership.given_up:
                 raise
-            raise self._without_master() from error
-        self._router.look()
+            raise self._membership.without_master() from error
         self._heard = time.monotonic()
         if welcome.profile:
             self._profiler = Profiler(self._plan.node, welcome.profile, self._plan.window)
@@ -308,14 +305,7 @@ class Node:
 
     def _sort_in(self, message: Message) -> None:
         """One message into the rings, or a new grant; one that is neither is refused."""
-        sender = message[0]
-        try:
-            if sender == MASTER:
-                self._take_from_master(message)
-            else:
-                self._take_from_node(message)
-        except MessageRefused as refused:
-            self._inbox.refusals.add(sender, refused.message)
+        self._inbox.hand_on(message, self._take_from_master, self._take_from_node)
 
     def _take_from_node(self, message: Message) -> None:
         sender, kind, number, count, point, data = message
@@ -386,21 +376,13 @@ class Node:
         """
         if not self._membership.master_is_gone:
             return
-        error = self._without_master()
+        error = self._membership.without_master()
         deadline = time.monotonic() + _LAST_WORD_S
         while not self._finished and (left := deadline - time.monotonic()) > 0:
             if (message := self._inbox.wait(left)) is not None:
                 self._take(message)
         if not self._finished:
             raise error
-
-    def _without_master(self) -> MeshLost:
-        """What to say, and from now on to assume, where the master does not answer any more."""
-        self._master_is_gone = True
-        loss = self._router.loss()
-        if loss is not None:
-            return MeshLost(f"{loss}, and the master with it")
-        return MeshLost("the master is gone", hint="See the messages of its process.")
 
     def _located(self, error: FmuMeshError) -> FmuMeshError:
         """The error with the point and time of its instance."""
@@ -425,7 +407,7 @@ class Node:
         """Tell the master, unless it is the one that is gone; whether it knows now."""
         self._activity.advancing = None
         self._activity.state = "failed"
-        if self._master_is_gone:
+        if self._membership.lost_master:
             return True
         self.server.say_everything()
         try:
@@ -457,16 +439,7 @@ class Node:
         profile = self._profiler.profile() if self._profiler is not None and error is None else None
         report = NodeReport(self._plan.node, point, error.report() if error is not None else None, profile)
         # Behind the last samples: the master, who brings them to clients, goes when it has all reports.
-        self._report(report, timeout_s, PRIORITY)
-
-    def _report(self, report: NodeReport, timeout_s: float, priority: zenoh.Priority = zenoh.Priority.DEFAULT) -> None:
-        """From any thread: tell the master how this node has ended.
-
-        Raises:
-            MeshLost: the master does not take it within ``timeout_s`` seconds, or this node is none of its own.
-        """
-        key = self._membership.keys(timeout_s).report(self._plan.node)
-        ask(self._session, key, msgspec.json.encode(report), timeout_s, "the master", priority=priority)
+        self._membership.report(report, timeout_s, priority=PRIORITY)
 
 
 class _Aborted(FmuMeshError):

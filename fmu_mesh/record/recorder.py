@@ -15,7 +15,6 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-import msgspec
 import numpy as np
 import zenoh
 from numpy.typing import NDArray
@@ -25,7 +24,8 @@ from ..model.description import VariableType
 from ..model.plan import RECORDER, Link, NodePlan
 from ..wire.frames import FrameReceiver
 from ..wire.inbox import Inbox, Message
-from ..wire.membership import MASTER, Membership, shared_inbox
+from ..wire.keys import MASTER
+from ..wire.membership import Membership, shared_inbox
 from ..wire.messages import (
     ABORT,
     FINISH,
@@ -38,7 +38,6 @@ from ..wire.messages import (
     NodeReport,
     decode_abort,
 )
-from ..wire.session import ask
 from .csv_file import CsvFile
 from .result_file import OpenResult
 from .turns import Turns
@@ -218,14 +217,7 @@ class Recorder:
             self._leaving.wait(rest_s)
 
     def _take(self, message: Message) -> None:
-        sender = message[0]
-        try:
-            if sender == MASTER:
-                self._take_from_master(message)
-            else:
-                self._take_from_node(message)
-        except MessageRefused as refused:
-            self._inbox.refusals.add(sender, refused.message)
+        self._inbox.hand_on(message, self._take_from_master, self._take_from_node)
 
     def _take_from_node(self, message: Message) -> None:
         sender, kind, number, count, point, data = message
@@ -317,8 +309,7 @@ class Recorder:
         report = NodeReport(RECORDER, max(self._written - 1, 0), error.report() if error is not None else None)
         patience_s, left = self._plan.timeouts.stop, self._leaving.is_set
         try:
-            key = self._membership.keys(patience_s).report(RECORDER)
-            ask(self._session, key, msgspec.json.encode(report), patience_s, "the master", over=left)
+            self._membership.report(report, patience_s, left)
         except MeshLost:
             if not left():
                 raise

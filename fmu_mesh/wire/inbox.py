@@ -17,7 +17,8 @@ from typing import Final, Protocol, Self
 import zenoh
 from zenoh.handlers import FifoChannel
 
-from .keys import RunKeys
+from ..errors import MessageRefused
+from .keys import MASTER, RunKeys
 from .messages import HEADER, WAKE
 from .refusals import Refusals
 from .shared_memory import Arrived, Offer, SharedInbox
@@ -129,6 +130,16 @@ class Inbox:
             return message
         self._run_posted()
         return None
+
+    def hand_on(
+        self, message: Message, from_master: Callable[[Message], None], from_node: Callable[[Message], None]
+    ) -> None:
+        """Give a message to who takes those of its sender; what that one refuses is counted."""
+        sender = message[0]
+        try:
+            (from_master if sender == MASTER else from_node)(message)
+        except MessageRefused as refused:
+            self.refusals.add(sender, refused.message)
 
     def _decoded(self, sender: str, data: bytes) -> Message | None:
         if sender == _NOBODY:

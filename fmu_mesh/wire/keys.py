@@ -9,13 +9,16 @@ from typing import Literal
 
 import msgspec
 
-__all__ = ["RUN_ID_BYTES", "Keys", "RunKeys", "VariableKind", "batched", "escape", "unescape"]
+__all__ = ["MASTER", "RUN_ID_BYTES", "Keys", "RunKeys", "VariableKind", "batched", "escape", "unescape"]
 
 VariableKind = Literal["out", "in", "param", "local"]
 
 _UNSAFE = re.compile(r"[/*$?#%]|^@|[\x00-\x20\x7f]")
 _ESCAPED = re.compile(r"%([0-9A-F]{2})")
 _GRANT_CHUNKS = 16
+
+MASTER = "@mesh"
+"""Name of the master where node names stand."""
 
 RUN_ID_BYTES = 8
 """A run's id is written as hexadecimal digits, so it never begins with `@`, whose chunk matches no wildcard."""
@@ -135,7 +138,7 @@ class RunKeys(msgspec.Struct, frozen=True):
 
     def progress(self, node: str) -> str:
         """Progress of a node, for the master."""
-        return f"{self.base}/progress/{_of(node)}/to=@mesh"
+        return f"{self.base}/progress/{_of(node)}/to={MASTER}"
 
     def wake(self, node: str) -> str:
         """A node's own key to wake itself up; never leaves the process."""

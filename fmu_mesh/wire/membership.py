@@ -25,16 +25,13 @@ from ..errors import DeadlineExceeded, FmuMeshError, MeshLost, MessageRefused
 from ..model.plan import NodePlan
 from ..model.window import FRAME_OVERHEAD
 from .inbox import Inbox
-from .keys import RUN_ID_BYTES, Keys, RunKeys
-from .messages import decode_json
+from .keys import MASTER, RUN_ID_BYTES, Keys, RunKeys
+from .messages import NodeReport, decode_json
 from .refusals import payload_of
-from .session import ask, tokens
+from .session import RouterLink, ask, tokens
 from .shared_memory import Offer, SharedInbox, SharedOutlet, available
 
-__all__ = ["MASTER", "Admission", "Membership", "Ready", "Registration", "Welcome", "shared_inbox"]
-
-MASTER = "@mesh"
-"""Name of the master where node names stand."""
+__all__ = ["Admission", "Membership", "Ready", "Registration", "Welcome", "shared_inbox"]
 
 T = TypeVar("T")
 
@@ -120,15 +117,26 @@ class Membership:
         session: the session of this process; stays the caller's.
         inbox: its inbox, made with `shared_inbox`; opened by `join`.
         launch: the launcher that started this process; None where it was started by hand.
+        router: the link to the router that connects this process to the others, if there is one.
 
     Attributes:
         given_up: whether `give_up` was called.
+        lost_master: whether the master was found to be gone.
 
     Call sequence: `register`, then `join` once, then `sender` for everything that is sent to, and `close` at the end.
     """
 
-    def __init__(self, plan: NodePlan, session: zenoh.Session, inbox: Inbox, launch: str | None = None) -> None:
+    def __init__(
+        self,
+        plan: NodePlan,
+        session: zenoh.Session,
+        inbox: Inbox,
+        launch: str | None = None,
+        router: RouterLink | None = None,
+    ) -> None:
         self._plan = plan
+        self._router = router or RouterLink(session)
+        self.lost_master = False
         self._session = session
         self._inbox = inbox
         self._launch = launch
@@ -193,6 +201,35 @@ class Membership:
         """Whether the master's token is gone; may ask, so it is no question for a callback of Zenoh."""
         return self._keys is not None and not tokens(self._session, self._keys.master)
 
+    def without_master(self) -> MeshLost:
+        """What to say where the master is gone, which is so from now on."""
+        self.lost_master = True
+        loss = self._router.loss()
+        if loss is not None:
+            return MeshLost(f"{loss}, and the master with it")
+        return MeshLost("the master is gone", hint="See the messages of its process.")
+
+    def report(
+        self,
+        report: NodeReport,
+        timeout_s: float,
+        over: Callable[[], bool] = lambda: False,
+        priority: zenoh.Priority = zenoh.Priority.DEFAULT,
+    ) -> None:
+        """From any thread: tell the master how this participant has ended.
+
+        Args:
+            report: what it is told.
+            timeout_s: how long it may take to take it, in s.
+            over: whether nobody wants to know any more.
+            priority: behind what was sent with the same one before.
+
+        Raises:
+            MeshLost: the master has not taken it in time, or this is no node of its run.
+        """
+        key = self.keys(timeout_s).report(self._plan.node)
+        ask(self._session, key, msgspec.json.encode(report), timeout_s, "the master", over=over, priority=priority)
+
     def join(self) -> Welcome:
         """Wait until the links with all other nodes work in both directions, then tell the master.
 
@@ -225,6 +262,7 @@ class Membership:
             over=self._has_nothing_to_join,
         )
         welcome = _understood(answer, Welcome)
+        self._router.look()
         self._shared = frozenset(welcome.shared)
         if welcome.offer is not None and self._outlet(welcome.offer, MASTER, "the master") is None:
             raise FmuMeshError(

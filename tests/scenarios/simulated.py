@@ -263,9 +263,6 @@ class _SimulatedNode(Node):
         super().__init__(plan, cast("zenoh.Session", _Session(process)), open_instance)
         self._membership = _SimulatedMembership(plan, self._session, self._inbox)
 
-    def _report(self, *_: object, **__: object) -> None:
-        return
-
 
 class _SimulatedMembership(Membership):
     """Everybody is there, and is reached through the wire of this module."""
@@ -275,6 +272,9 @@ class _SimulatedMembership(Membership):
 
     def keys(self, _patience_s: float) -> RunKeys:
         return RUN
+
+    def report(self, *_: object, **__: object) -> None:
+        return
 
     def join(self) -> Welcome:
         plan = self._plan
