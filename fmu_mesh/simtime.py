@@ -45,14 +45,17 @@ class TimeGrid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return self.time(self.last_point) if self.last_point < ENDLESS else None
 
 
-def steps_between(duration: float, step_size: float) -> int | None:
-    """How many steps of ``step_size`` fill ``duration`` (both in s), or None if it is not a whole number.
+def steps_between(start: float, stop: float, step_size: float) -> int | None:
+    """How many steps of ``step_size`` lie between ``start`` and ``stop`` (s), or None if it is not a whole number.
 
-    Decimal step sizes have no exact binary form (40 s are 20,000.000000000004 steps of 2 ms), so the quotient may be
-    off a whole number by a few units in its last place; anything more is a different duration.
+    Decimal numbers have no exact binary form: 40 s are 20,000.000000000004 steps of 2 ms, and from 1000000.1 s to
+    1000000.4 s there are 3.0000000005 steps of 0.1 s. So the quotient may be off a whole number by a few units in its
+    last place, and the two times by a few units in theirs; anything more is a different duration.
     """
+    duration = stop - start
     if not (math.isfinite(duration) and math.isfinite(step_size)) or step_size <= 0.0 or duration < 0.0:
         return None
     quotient = duration / step_size
     nearest = round(quotient)
-    return nearest if abs(quotient - nearest) <= 8 * math.ulp(max(quotient, 1.0)) else None
+    of_times = math.ulp(max(abs(start), abs(stop))) / step_size
+    return nearest if abs(quotient - nearest) <= 8 * max(math.ulp(max(quotient, 1.0)), of_times) else None

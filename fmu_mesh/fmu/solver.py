@@ -156,7 +156,7 @@ class EulerSolver:
         """The ends of equal steps, no longer than allowed, from ``time`` to ``stop``; the first is the last item."""
         if self._maximum is None:
             return [stop]
-        whole = steps_between(stop - time, self._maximum)
+        whole = steps_between(time, stop, self._maximum)
         count = max(1, math.ceil((stop - time) / self._maximum) if whole is None else whole)
         return [stop, *(time + (stop - time) * (number / count) for number in range(count - 1, 0, -1))]
 

@@ -119,7 +119,7 @@ class GazeboClassicInstance:
     def bind(self, inputs: Ring, outputs: Sequence[Ring], grid: TimeGrid, points: int, step: int = 0) -> None:
         """Let `do_step` work on these rings, ``points`` of ``grid`` each; write the current outputs as row ``step``."""
         step_size = points * grid.step_size
-        whole = steps_between(step_size, self._world.step_size) or math.ceil(step_size / self._world.step_size)
+        whole = steps_between(0.0, step_size, self._world.step_size) or math.ceil(step_size / self._world.step_size)
         self._substeps = self._config.physics_steps or max(1, whole)
         self._inputs = inputs
         self._taken = [self._world.places[name] for name in inputs.layout.names]

@@ -367,4 +367,4 @@ def _bodies_of(entries: Iterable[Entry]) -> set[int]:
 
 def _fewest_steps(step_size: float, longest: float) -> int:
     """The fewest equal steps that fill ``step_size`` and are not longer than ``longest`` (both in s)."""
-    return max(1, steps_between(step_size, longest) or math.ceil(step_size / longest))
+    return max(1, steps_between(0.0, step_size, longest) or math.ceil(step_size / longest))

@@ -160,7 +160,7 @@ def _last_point(start: float, stop: float, step: float, findings: Findings) -> i
         found = f"more than {ENDLESS} points from {start:g} s to {stop:g} s in steps of {step:g} s"
         findings.add("simulation.step_size", found, "a larger step size or an earlier stop time")
         return None
-    last_point = steps_between(stop - start, step)
+    last_point = steps_between(start, stop, step)
     if last_point is None:
         below = math.floor((stop - start) / step)
         expected = f"a whole multiple of it, as with stop_time {start + below * step:.12g}"
@@ -209,7 +209,7 @@ def _step_points(name: str, config: AnyInstanceConfig, base: float, findings: Fi
         return 1
     if not (math.isfinite(base) and base > 0.0) or step / base > ENDLESS:
         return 1
-    points = steps_between(step, base)
+    points = steps_between(0.0, step, base)
     if not points:
         below = math.floor(step / base)
         near = [f"{multiple * base:.12g}" for multiple in (below, below + 1) if multiple > 0]

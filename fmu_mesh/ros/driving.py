@@ -188,7 +188,7 @@ class FmuDriver:
         stop_time = self._settings.stop_time
         self._last_step = math.inf
         if stop_time is not None:
-            exact = steps_between(stop_time, adapter.step_size)
+            exact = steps_between(0.0, stop_time, adapter.step_size)
             self._last_step = math.floor(stop_time / adapter.step_size) if exact is None else exact
         return adapter
 

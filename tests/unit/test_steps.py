@@ -214,6 +214,19 @@ def test_euler_takes_steps_of_the_largest_size_that_is_allowed(event_fmu: EventF
     assert [x, y] == pytest.approx([expected_x, expected_y], rel=1e-12)  # the ten steps are not all 0.01 to the bit
 
 
+@pytest.mark.parametrize("parts", [1, 3])
+def test_euler_takes_as_many_steps_at_late_times_as_at_early_ones(
+    parts: int, event_fmu: EventFmu, tmp_path: Path
+) -> None:
+    options = StepOptions(solver=SolverSettings("euler", maximum_step_size=0.01 / parts))
+
+    with running(event_fmu("Oscillator", 2), tmp_path, "model_exchange", 0.01, options) as oscillator:
+        for step in range(390):
+            oscillator.do_step(step)
+
+        assert oscillator.get_values(["completed_steps"]) == [390 * parts]
+
+
 # ---- the FMU state
 
 
