@@ -41,6 +41,14 @@ class ContinuousInstance(FmuInstance):
     _clocks: Clocks | None = None
     _row: _RowBytes = ()
     _slopes: Mapping[str, float] = {}
+    _stop_time = math.inf
+
+    def enter_initialization(
+        self, start_time: float, stop_time: float | None, start_values: Mapping[str, Value]
+    ) -> None:
+        """See `Instance`."""
+        self._stop_time = math.inf if stop_time is None else stop_time
+        super().enter_initialization(start_time, stop_time, start_values)
 
     def do_step(self, step: int) -> None:
         """Set the inputs of row ``step``, advance to own step ``step + 1``, write the outputs to row ``step + 1``."""
@@ -126,6 +134,7 @@ class ContinuousInstance(FmuInstance):
             self._model_calls(),
             self._options.solver,
             tell_completed_steps=self._description.tell_completed_steps,
+            stop_time=self._stop_time,
             clocks=self._clocks,
         )
         return self._loop

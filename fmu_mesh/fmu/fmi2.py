@@ -141,14 +141,14 @@ class Fmi2Instance(Fmi2Values):
         """`do_step` where something is between the rows and the FMU: a conversion, or a step that is retried."""
         self._set_inputs(step & self._input_mask)
         time = self._start_time + step * self._points * self._base_step_size
-        status = self._do_step(self._self, time, self._step_size, 1)
+        status = self._do_step(self._self, time, self._step_sizes.of(step), 1)
         if status > WARNING:
             self._finish(status)
         self._step = step + 1
         self._read_outputs((step + 1) & self._output_mask)
 
     def _fuse(self) -> Fused | None:
-        step = fmi2_step(self._plain_do_step, self._step_size)
+        step = fmi2_step(self._plain_do_step, self._step_sizes)
         return fuse(self._self, self._direct_setters, step, self._direct_getters)
 
     def _finish_fused(self, outcome: int, step: int) -> None:

@@ -21,6 +21,7 @@ from typing import Any, Final
 from fmpy.fmi1 import FMICallException
 
 from ..model.description import ModelDescription
+from ..simtime import StepSizes, step_within
 from .calls import hot, pointer
 from .clocks import Clocks
 from .fused import Step, fmi3_step
@@ -108,9 +109,9 @@ class Fmi3Steps:
         self._update()
         self._look_ahead()
 
-    def fused(self, step_size: float) -> Step:
-        """fmi3DoStep by ``step_size`` (s) as a part of one compiled call."""
-        return fmi3_step(self._do_step, step_size, self._pointers, self._results.addresses[0])
+    def fused(self, sizes: StepSizes) -> Step:
+        """fmi3DoStep as a part of one compiled call."""
+        return fmi3_step(self._do_step, sizes, self._pointers, self._results.addresses[0])
 
     def step(self, start: float, step_size: float, end: float) -> bool:
         """Go on from ``start`` by ``step_size`` to ``end`` (s); False if the FMU asked to end the simulation before."""
@@ -133,7 +134,8 @@ class Fmi3Steps:
                 continue
             target = self._target(time, min(end, time + largest))
             if status is None:
-                status = self._attempt(time, step_size if (time, target) == (start, end) else target - time)
+                whole = (time, target) == (start, end)
+                status = self._attempt(time, step_size if whole else step_within(time, target - time, target))
             if status == DISCARD and self._varies and largest > step_size / SMALLEST:
                 largest, status = largest / 2.0, None
                 continue

@@ -36,6 +36,7 @@ class EventLoop:
         calls: the functions of the model.
         settings: of the solver.
         tell_completed_steps: whether the FMU wants to know of completed integrator steps.
+        stop_time: what the FMU was told, in s; its time is never set to a later one.
         clocks: the clocks of the model, if it has some.
 
     Attributes:
@@ -49,12 +50,19 @@ class EventLoop:
     """
 
     def __init__(
-        self, calls: ModelCalls, settings: SolverSettings, *, tell_completed_steps: bool, clocks: Clocks | None = None
+        self,
+        calls: ModelCalls,
+        settings: SolverSettings,
+        *,
+        tell_completed_steps: bool,
+        stop_time: float = math.inf,
+        clocks: Clocks | None = None,
     ) -> None:
         self.terminated = False
         self._clocks = clocks if clocks is not None else NO_CLOCKS
         self._calls = calls
         self._tell = tell_completed_steps
+        self._stop_time = stop_time
         self._time = 0.0
         self._next_event = math.inf
         self._event_time = -math.inf
@@ -112,7 +120,7 @@ class EventLoop:
         if not resolvable(self._time, self._next_event):
             event = True
             if self._next_event > self._time:  # by rounding: the model has to see that its time has come
-                self._time = self._next_event
+                self._time = min(self._next_event, self._stop_time)
                 self._calls.set_time(self._time)
         if event and not self.terminated:
             self._count_events()

@@ -9,6 +9,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Final
 
+from ..simtime import step_within
+
 __all__ = ["DISCARD", "SMALLEST", "take_sub_steps"]
 
 DISCARD: Final = 2
@@ -30,8 +32,9 @@ def take_sub_steps(attempt: Callable[[float, float], int], time: float, step_siz
     """
     done, size, status = 0, SMALLEST // 2, DISCARD
     while done < SMALLEST:
-        # Binary fractions of the step: their sums are exact, and the last sub-step ends where the step does.
-        status = attempt(time + step_size * (done / SMALLEST), step_size * (size / SMALLEST))
+        # Binary fractions of the step, whose sums are exact; the time is rounded, but not past the end of the step.
+        start = time + step_size * (done / SMALLEST)
+        status = attempt(start, step_within(start, step_size * (size / SMALLEST), time + step_size))
         if status == DISCARD and size > 1:
             size //= 2
         elif status >= DISCARD:

@@ -5,11 +5,15 @@ from __future__ import annotations
 import math
 from decimal import Decimal
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fmu_mesh.simtime import steps_between
+from fmu_mesh.simtime import ENDLESS, TimeGrid, step_within, steps_between
+
+ROUND_STOPS = (1, 2, 5, 10, 20, 30, 40, 50, 60, 100, 120, 300, 600, 3600)
+ROUND_STEPS = ("0.1", "0.05", "0.02", "0.01", "0.005", "0.002", "0.001", "0.0005")
 
 round_numbers = st.builds(
     lambda digits, exponent: Decimal(digits).scaleb(exponent), st.integers(-9999, 9999), st.integers(-4, 3)
@@ -17,6 +21,54 @@ round_numbers = st.builds(
 round_steps = st.builds(
     lambda digits, exponent: Decimal(digits).scaleb(exponent), st.integers(1, 99), st.integers(-5, 0)
 )
+
+
+def assert_nothing_ends_after_the_stop_time(grid: TimeGrid, points: int) -> None:
+    """Every step of an instance ends by the stop time, and only the last one has another size, by rounding only."""
+    stop = grid.stop_time
+    assert stop is not None
+    sizes = grid.step_sizes(points)
+    count = grid.last_point // points
+    starts = grid.start_time + np.arange(count) * points * grid.step_size
+    assert (starts[:-1] + points * grid.step_size <= stop).all()
+    assert {sizes.of(step) for step in range(count - 1)} <= {points * grid.step_size}
+    if count:
+        last = grid.time((count - 1) * points)
+        assert last + sizes.of(count - 1) <= stop
+        resolution = math.ulp(max(abs(grid.start_time), abs(stop)))
+        assert abs(sizes.of(count - 1) - points * grid.step_size) <= 4 * resolution
+
+
+@pytest.mark.parametrize("stop", ROUND_STOPS)
+def test_no_step_of_a_round_size_ends_after_a_round_stop_time(stop: int) -> None:
+    for text in ROUND_STEPS:
+        count = int(Decimal(stop) / Decimal(text))
+        assert steps_between(0.0, float(stop), float(text)) == count
+        assert_nothing_ends_after_the_stop_time(TimeGrid(0.0, float(text), count), 1)
+
+
+@given(round_numbers, round_steps, st.integers(0, 2000), st.integers(1, 7))
+def test_no_step_ends_after_the_stop_time_from_any_round_start(
+    start: Decimal, step: Decimal, count: int, points: int
+) -> None:
+    assert_nothing_ends_after_the_stop_time(TimeGrid(float(start), float(step), count), points)
+
+
+@given(st.floats(-1e6, 1e6), st.floats(1e-6, 1e3), st.integers(1, 10_000))
+def test_no_step_ends_after_the_stop_time_whatever_the_numbers(start: float, step: float, count: int) -> None:
+    assert_nothing_ends_after_the_stop_time(TimeGrid(start, step, count), 1)
+
+
+@given(st.floats(-10.0, 10.0), st.floats(1e-3, 20.0))
+def test_a_step_that_ends_in_time_keeps_its_size(time: float, size: float) -> None:
+    assert step_within(time, size, time + size) == size
+    assert step_within(time, size, math.inf) == size
+
+
+def test_a_run_without_an_end_has_one_step_size() -> None:
+    sizes = TimeGrid(0.5, 0.1, ENDLESS).step_sizes(3)
+
+    assert sizes.regular == sizes.last == 3 * 0.1
 
 
 @given(round_numbers, round_steps, st.integers(0, 100_000))

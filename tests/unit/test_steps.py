@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import ctypes
 import math
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 from typing import cast
 
 import pytest
@@ -13,8 +15,9 @@ import pytest
 from fmu_mesh.errors import StepFailed, TerminationRequested
 from fmu_mesh.fmu import FmuInstance, open_instance, read_description, stepped
 from fmu_mesh.fmu.extrapolation import LinearInputs
+from fmu_mesh.fmu.fmi3_steps import Fmi3Steps
 from fmu_mesh.fmu.substeps import DISCARD, SMALLEST, take_sub_steps
-from fmu_mesh.model.description import Kind
+from fmu_mesh.model.description import Kind, ModelDescription
 from fmu_mesh.model.instance import LinearInput, SolverSettings, StepOptions
 from fmu_mesh.model.ring import Layout, Ring
 from fmu_mesh.model.types import Value
@@ -135,6 +138,30 @@ def test_an_fmu_of_fmi_3_with_a_fixed_step_size_is_not_asked_for_another_one(
         pytest.raises(StepFailed, match=r"fmi3DoStep returned discard; the FMU says: the step is too long"),
     ):
         stairs.do_step(0)
+
+
+def test_the_rest_of_a_step_after_an_early_return_ends_where_the_step_does() -> None:
+    """0.11 - 0.04 is rounded up, so that 0.04 and it are more than 0.11."""
+    calls: list[tuple[float, float]] = []
+
+    def stepped(_component: int, time: float, size: float, _no_set_state: bool, *results: int) -> int:  # noqa: FBT001 as in C
+        calls.append((time, size))
+        ctypes.c_bool.from_address(results[2]).value = time == 0.0
+        ctypes.c_double.from_address(results[3]).value = 0.04
+        return 0
+
+    function = ctypes.CFUNCTYPE(
+        ctypes.c_int, ctypes.c_void_p, ctypes.c_double, ctypes.c_double, ctypes.c_bool, *[ctypes.c_void_p] * 4
+    )(stepped)
+    fmu = SimpleNamespace(component=1, dll=SimpleNamespace(fmi3DoStep=function))
+    description = ModelDescription("m", "m", "3.0", "co_simulation", "", (), can_handle_variable_step_size=True)
+    assert 0.04 + (0.11 - 0.04) > 0.11
+
+    assert Fmi3Steps(fmu, description).step(0.0, 0.11, 0.11)
+
+    assert calls[0] == (0.0, 0.11)
+    assert calls[1][0] == 0.04
+    assert sum(calls[1]) <= 0.11
 
 
 # ---- the end that an FMU asks for

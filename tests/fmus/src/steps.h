@@ -3,7 +3,7 @@
  * Steps that are not simply taken, in FMI 1.0 or 2.0 (the FMU defines the names): one longer than `longest_step` is
  * discarded up to there, and with `polls` above 0 a step goes on by itself, until it was asked for its status that many
  * times (for ever, if that is below 0), and ends with the status `ends_as`. The output is the
- * input at the end of the step. What the standard forbids is an error.
+ * input at the end of the step. What the standard forbids is an error: a step past the stop time, if only by rounding, too.
  */
 #include <stddef.h>
 #include <stdlib.h>
@@ -21,7 +21,7 @@ typedef struct {
     char name[64];
     Logger logger;
     int running, pending, discarded, polled;
-    double accepted, start, size;
+    double accepted, start, size, stop;
     double slope; /* of U, for the next step */
     double r[REALS];
     int i[INTEGERS];
@@ -40,7 +40,7 @@ static Model *instantiated(const char *name, const char *guid, Logger logger)
     if (strcmp(guid, FMU_GUID) != 0 || strlen(name) >= sizeof m->name) return NULL;
     strcpy(m->name, name);
     m->logger = logger;
-    m->r[LONGEST_STEP] = 1e300;
+    m->r[LONGEST_STEP] = m->stop = 1e300;
     return m;
 }
 
@@ -86,6 +86,7 @@ static Status started(Model *m, double time, double size, int repeats)
     if (m->discarded && repeats < 0) return fail(m, "a step after a discarded one");
     if (repeats >= 0 && repeats != m->discarded) return fail(m, "newStep is wrong");
     if (time < m->accepted - 1e-9 || time > m->accepted + 1e-9) return fail(m, "a step from another time");
+    if (time + size > m->stop) return fail(m, "a step past the stop time");
     m->i[ATTEMPTS]++;
     m->start = time;
     m->size = size;

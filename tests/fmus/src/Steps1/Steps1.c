@@ -32,7 +32,7 @@ EXPORT Status NAME(InitializeSlave)(Component c, fmi1Real start, fmi1Boolean sto
 {
     Model *m = c;
 
-    (void)stop_defined, (void)stop;
+    if (stop_defined) m->stop = stop;
     m->running = 1;
     m->accepted = m->r[REACHED] = start;
     return fmi1OK;

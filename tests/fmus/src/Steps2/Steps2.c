@@ -30,7 +30,8 @@ EXPORT Status NAME(SetupExperiment)(Component c, fmi2Boolean tolerance_defined, 
 {
     Model *m = c;
 
-    (void)tolerance_defined, (void)tolerance, (void)stop_defined, (void)stop;
+    (void)tolerance_defined, (void)tolerance;
+    if (stop_defined) m->stop = stop;
     m->accepted = m->r[REACHED] = start;
     return fmi2OK;
 }

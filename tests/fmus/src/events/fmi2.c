@@ -328,6 +328,7 @@ fmi2Status fmi2SetTime(fmi2Component c, fmi2Real time)
     Instance *instance = called(c, "fmi2SetTime", CONTINUOUS | EVENT);
 
     if (time < instance->completed[0]) broken("fmi2SetTime to before the second last step", "continuous-time mode");
+    if (time > instance->stop) broken("fmi2SetTime past the stop time", "continuous-time mode");
     instance->model.time = time;
     return fmi2OK;
 }
@@ -409,7 +410,7 @@ fmi2Status fmi2DoStep(fmi2Component c, fmi2Real time, fmi2Real step_size, fmi2Bo
     (void)no_set_state;
     if (time != instance->model.time && !(time - instance->model.time < 1e-9 && instance->model.time - time < 1e-9))
         broken("fmi2DoStep from another time", "step complete");
-    if (step_size <= 0.0 || time + step_size > instance->stop + 1e-9) broken("fmi2DoStep past the stop time", "running");
+    if (step_size <= 0.0 || time + step_size > instance->stop) broken("fmi2DoStep past the stop time", "running");
     if (model_discards(&instance->model, step_size)) {
         instance->mode = STEP_FAILED;
         return says(instance, fmi2Discard, "the step is too long");

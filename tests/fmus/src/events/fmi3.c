@@ -387,6 +387,7 @@ fmi3Status fmi3SetTime(fmi3Instance c, fmi3Float64 time)
     Instance *instance = called(c, "fmi3SetTime", CONTINUOUS);
 
     if (time < instance->completed[0]) broken("fmi3SetTime to before the second last step", "continuous-time mode");
+    if (time > instance->stop) broken("fmi3SetTime past the stop time", "continuous-time mode");
     instance->model.time = time;
     return fmi3OK;
 }
@@ -469,7 +470,7 @@ fmi3Status fmi3DoStep(fmi3Instance c, fmi3Float64 time, fmi3Float64 step_size, f
     if (time - instance->model.time > 1e-9 || instance->model.time - time > 1e-9)
         broken("fmi3DoStep from another time", "step mode");
     if (instance->event_needed) broken("fmi3DoStep", "step mode, where event mode is needed");
-    if (step_size <= 0.0 || time + step_size > instance->stop + 1e-9) broken("fmi3DoStep past the stop time", "step mode");
+    if (step_size <= 0.0 || time + step_size > instance->stop) broken("fmi3DoStep past the stop time", "step mode");
     if (model_discards(&instance->model, step_size)) return says(instance, fmi3Discard, "the step is too long");
     advance(&instance->model, time, step_size, instance->event_mode_used && instance->early_return_allowed, last_time,
             &event);
