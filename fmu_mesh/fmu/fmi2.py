@@ -23,10 +23,13 @@ from ..simtime import TimeGrid
 from .buffers import Buffer, NumberBuffer, StringBuffer
 from .callbacks import FMI2_CALLBACKS, register, unregister
 from .calls import Function, Pointer, hot
+from .fmi2_steps import RetriedSteps
 from .fused import DOING, GETTING, STATUS_BITS, STEPPING, Fused, fmi2_step, fuse
 from .instance import STATUS_NAMES, WARNING, FmuInstance, Verb
+from .solver import resolvable
+from .state import Standing
 from .step_status import PENDING, RETRY, SMALLER_STEPS, StepStatus, discarded
-from .substeps import DISCARD, SMALLEST, take_sub_steps
+from .substeps import DISCARD, SMALLEST
 
 __all__ = ["Fmi2Instance", "Fmi2Values"]
 
@@ -39,8 +42,6 @@ _SUFFIX: Final[dict[VariableType, str]] = {
     "Boolean": "Boolean",
     "String": "String",
 }
-_ENDS: Final = 6
-"""Stands for the status of a step that was a wish to end the simulation."""
 _DIRECT: Final = ("Float64", "Int32")
 """The types that lie in a ring as in C; a Boolean and an Enumeration are an `int` in FMI 2.0 (2.1.2)."""
 
@@ -117,12 +118,14 @@ class Fmi2Instance(Fmi2Values):
     """One instance of an FMI 2.0 co-simulation FMU."""
 
     _library = FMU2Slave
-    _retrying: _Retrying | None = None
+    _retrying: RetriedSteps | None = None
+    _terminated = False
+    """Whether the FMU has asked to end the simulation with the step that is complete now."""
 
     def bind(self, inputs: Ring, outputs: Sequence[Ring], grid: TimeGrid, points: int, step: int = 0) -> None:
         """Let `do_step` work on these rings, ``points`` of ``grid`` each; write the current outputs as row ``step``."""
         super().bind(inputs, outputs, grid, points, step)
-        is_plain = self._do_step is self._plain_do_step and not (self._setters or self._getters)
+        is_plain = self._do_step is self._plain_do_step and not (self._setters or self._getters or self._terminated)
         self._fused = self._fuse() if is_plain else None
         self._hot = (self._fused.call if self._fused is not None else None, self._input_mask, self._output_mask)
 
@@ -134,16 +137,18 @@ class Fmi2Instance(Fmi2Values):
             return
         time = self._start_time + step * self._points * self._base_step_size  # `grid.time`, without a call
         if outcome := fused(step & input_mask, time, (step + 1) & output_mask):
-            self._finish_fused(outcome, step)
+            self._finish_fused(outcome, step, time)
         self._step = step + 1
 
     def _step_by_calls(self, step: int) -> None:
         """`do_step` where something is between the rows and the FMU: a conversion, or a step that is retried."""
+        self._check_not_terminated()
         self._set_inputs(step & self._input_mask)
         time = self._start_time + step * self._points * self._base_step_size
-        status = self._do_step(self._self, time, self._step_sizes.of(step), 1)
+        step_size = self._step_sizes.of(step)
+        status = self._do_step(self._self, time, step_size, 1)
         if status > WARNING:
-            self._finish(status)
+            self._finish(status, time + step_size)
         self._step = step + 1
         self._read_outputs((step + 1) & self._output_mask)
 
@@ -151,11 +156,11 @@ class Fmi2Instance(Fmi2Values):
         step = fmi2_step(self._plain_do_step, self._step_sizes)
         return fuse(self._self, self._direct_setters, step, self._direct_getters)
 
-    def _finish_fused(self, outcome: int, step: int) -> None:
+    def _finish_fused(self, outcome: int, step: int, time: float) -> None:
         """What follows from a status above warning, as in `_step_by_calls`."""
         stage, status = divmod(outcome, 1 << STATUS_BITS)
         if stage == STEPPING:
-            self._finish(status)
+            self._finish(status, time + self._step_sizes.of(step))
             self._step = step + 1
             self._read_outputs((step + 1) & self._output_mask)
             return
@@ -166,10 +171,16 @@ class Fmi2Instance(Fmi2Values):
     def advance(self, time: float, step_size: float) -> None:
         """One step of ``step_size`` from ``time`` (both in s) without rings, for callers with their own time base."""
         self._check_live()
+        self._check_not_terminated()
         try:
             self._fmu.doStep(currentCommunicationPoint=time, communicationStepSize=step_size)
         except FMICallException as error:
-            self._finish(error.status)
+            self._finish(error.status, time + step_size)
+
+    def set_values(self, values: Mapping[str, Value]) -> None:
+        """Set variables by name; an FMU that has asked to end takes no more (FMI 2.0, 4.2.4)."""
+        if not self._terminated:
+            super().set_values(values)
 
     def set_input_derivatives(self, derivatives: Mapping[str, float]) -> None:
         """First time derivatives (1/s) of Real inputs for the next step (FMI 2.0, 4.2.1)."""
@@ -192,18 +203,22 @@ class Fmi2Instance(Fmi2Values):
         self._do_step = self._plain_do_step
         self._step_status = StepStatus(self._fmu.dll, self._component, "fmi2")
         if self._options.retry_discarded_steps:
-            self._retrying = _Retrying(self._fmu, self._do_step, self._waited, self._asks_to_end, self._failed)
+            self._retrying = RetriedSteps(self._fmu, self._do_step, self._waited, self._asks_to_end, self._failed)
             self._do_step = self._retrying
         if self._options.linear_inputs:
             self._step_of_fmu, self._do_step = self._do_step, self._step_with_derivatives
             self._derivatives = {}
 
-    def _finish(self, status: int) -> None:
-        """Bring a step to its end that was not simply taken (FMI 2.0, 4.2.1).
+    def _stand(self, standing: Standing) -> None:
+        super()._stand(standing)
+        self._terminated = False
+
+    def _finish(self, status: int, end: float) -> None:
+        """Bring a step to its ``end`` (s) that was not simply taken (FMI 2.0, 4.2.1).
 
         Raises:
             StepFailed: it cannot be.
-            TerminationRequested: the FMU asks to end the simulation.
+            TerminationRequested: the FMU asks to end the simulation before the end of the step.
         """
         if status == PENDING:
             status = self._waited()
@@ -213,7 +228,13 @@ class Fmi2Instance(Fmi2Values):
             raise self._failed(f"fmi2DoStep returned {STATUS_NAMES[status]}")
         messages = self._last_messages
         if self._asks_to_end() if self._retrying is None else self._retrying.ends:
-            raise TerminationRequested("the FMU asked to end the simulation", instance=self.name)
+            # The outputs are valid up to the last successful time, and are a row if that is the end of the step.
+            last_time = self._step_status.last_successful_time()
+            self._terminated = last_time is not None and not resolvable(last_time, end)
+            if not self._terminated:
+                raise self._end_requested()
+            self._hot = (None, 0, 0)  # the next step is refused, which costs the compiled call nothing
+            return
         if self._retrying is not None:
             raise self._failed(discarded("fmi2DoStep", None, SMALLEST), hint=SMALLER_STEPS)
         last_time = self._step_status.last_successful_time()
@@ -224,6 +245,13 @@ class Fmi2Instance(Fmi2Values):
         )
         hint = RETRY if can_retry else SMALLER_STEPS
         raise self._failed(discarded("fmi2DoStep", last_time, None), hint=hint)
+
+    def _check_not_terminated(self) -> None:
+        if self._terminated:
+            raise self._end_requested()
+
+    def _end_requested(self) -> TerminationRequested:
+        return TerminationRequested("the FMU asked to end the simulation", instance=self.name)
 
     def _waited(self) -> int:
         status = self._step_status.wait()
@@ -244,55 +272,3 @@ class Fmi2Instance(Fmi2Values):
         if self._retrying is not None:
             self._retrying.free()
         super()._free()
-
-
-class _Retrying:
-    """fmi2DoStep that goes back to where a discarded step began, and takes smaller ones.
-
-    After fmi2Discard, only fmi2SetFMUstate leads on (FMI 2.0, 4.2.4), so the state is kept before every step.
-
-    Attributes:
-        ends: whether the last discarded step was a wish to end the simulation.
-    """
-
-    def __init__(
-        self,
-        fmu: Any,  # noqa: ANN401 FMPy is untyped
-        do_step: Function,
-        waited: Callable[[], int],
-        asks_to_end: Callable[[], bool],
-        failed: Callable[[str], Exception],
-    ) -> None:
-        self.ends = False
-        self._fmu = fmu
-        self._do_step = do_step
-        self._waited = waited
-        self._asks_to_end = asks_to_end
-        self._failed = failed
-        self._state = ctypes.c_void_p()
-
-    def __call__(self, component: Pointer, time: float, step_size: float, _no_set_state: int) -> int:
-        def attempt(start: float, size: float) -> int:
-            self._fmu.fmi2GetFMUstate(self._fmu.component, ctypes.byref(self._state))
-            status = self._do_step(component, start, size, 0)
-            if status == PENDING:
-                status = self._waited()
-            if status == DISCARD:
-                self.ends = self._asks_to_end()
-                if self.ends:
-                    return _ENDS
-                self._fmu.fmi2SetFMUstate(self._fmu.component, self._state)
-            return status
-
-        try:
-            status = attempt(time, step_size)
-            if status == DISCARD:
-                status = take_sub_steps(attempt, time, step_size)
-        except FMICallException as error:
-            raise self._failed(f"{error.function} returned {STATUS_NAMES[error.status]}") from error
-        return DISCARD if self.ends else status
-
-    def free(self) -> None:
-        """Free the state that was kept."""
-        if self._state.value is not None:
-            self._fmu.fmi2FreeFMUstate(self._fmu.component, ctypes.byref(self._state))

@@ -88,6 +88,32 @@ def test_linear_inputs_give_the_same_floats(algorithm: str, place: Place, event_
     assert launched == local
 
 
+@pytest.mark.parametrize(
+    ("version", "more"), [(2, {}), (2, {"retry_discarded_steps": True}), (3, {})], ids=["FMI 2", "retrying", "FMI 3"]
+)
+def test_the_step_at_whose_end_an_fmu_asks_to_end_is_a_row(
+    version: Version, more: Mapping[str, Any], place: Place, event_fmu: EventFmu
+) -> None:
+    """The third stair is at 3 s; an FMU of FMI 2.0 discards the step that ends there, and it has got to its end."""
+    start_values = {"period": 1.0, "end": 3}
+    content = {
+        "simulation": {"stop_time": 1000.0, "step_size": 0.25},
+        "instances": {
+            "stairs": {"fmu": str(event_fmu("Stairs", version)), "start_values": start_values, **more},
+            "oscillator": {"fmu": str(event_fmu("Oscillator", 2))},
+        },
+        "connections": [],
+    }
+
+    launched, local = both_ways(place, content)
+
+    assert launched == local
+    header, *rows = [line.split(b",") for line in launched.splitlines()]
+    assert len(rows) == 13
+    assert rows[-1][0] == b"3.0"
+    assert rows[-1][header.index(b"stairs.counter")] == b"3"
+
+
 def test_an_fmu_that_asks_to_end_ends_the_run_at_its_point_for_all(place: Place, event_fmu: EventFmu) -> None:
     content = system(event_fmu, ALL_2)
     content["instances"]["stairs"]["start_values"] |= {"end": 3, "increment": 1}

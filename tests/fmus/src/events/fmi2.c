@@ -416,7 +416,7 @@ fmi2Status fmi2DoStep(fmi2Component c, fmi2Real time, fmi2Real step_size, fmi2Bo
         return says(instance, fmi2Discard, "the step is too long");
     }
     advance(&instance->model, time, step_size, false, &reached, &event);
-    if (instance->model.terminate && reached < time + step_size) {
+    if (instance->model.terminate) { /* at the end of the step, too */
         instance->mode = STEP_FAILED;
         return says(instance, fmi2Discard, "the last stair");
     }
