@@ -101,9 +101,10 @@ def _instances(plan: Plan) -> list[str]:
 
 
 def _solver(instance: SystemInstance) -> str:
-    """How a model-exchange FMU is solved; nothing for co-simulation, which has a solver of its own."""
+    """How a model-exchange FMU is solved; of co-simulation, which has its own solver, the tolerance that it is told."""
     if instance.description.kind == "co_simulation":
-        return ""
+        told = instance.options.tolerance
+        return f", tolerance {told:g}" if told is not None else ""
     solver = instance.options.solver
     tolerance = f" {solver.relative_tolerance:g}" if solver.name == "cvode" else ""
     return f" model exchange, {solver.name}{tolerance}"

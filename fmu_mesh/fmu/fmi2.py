@@ -81,7 +81,7 @@ class Fmi2Values(FmuInstance):
 
     def _tolerance(self) -> float | None:
         """The tolerance that the FMU is told (FMI 2.0, 2.1.6)."""
-        return self._description.default_experiment.tolerance
+        return self._options.tolerance or self._description.default_experiment.tolerance
 
     def _exit_initialization(self) -> None:
         self._initializing("fmi2ExitInitializationMode", self._fmu.exitInitializationMode)

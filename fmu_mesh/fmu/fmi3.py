@@ -63,7 +63,7 @@ class Fmi3Values(FmuInstance):
 
     def _tolerance(self) -> float | None:
         """The tolerance that the FMU is told (FMI 3.0, 2.3.2)."""
-        return self._description.default_experiment.tolerance
+        return self._options.tolerance or self._description.default_experiment.tolerance
 
     def _message_came(self, _environment: int | None, status: int, category: bytes, message: bytes) -> None:
         self.logged(status, category or b"", message or b"")

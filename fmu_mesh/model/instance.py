@@ -39,11 +39,13 @@ class StepOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     Attributes:
         solver: of a model-exchange FMU.
+        tolerance: relative tolerance that a co-simulation FMU is told; None: that of its default experiment.
         retry_discarded_steps: whether a step that the FMU discards is tried again in smaller ones.
         linear_inputs: the inputs whose connections are extrapolated.
     """
 
     solver: SolverSettings = SolverSettings()
+    tolerance: float | None = None
     retry_discarded_steps: bool = False
     linear_inputs: tuple[LinearInput, ...] = ()
 

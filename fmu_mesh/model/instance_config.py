@@ -82,6 +82,15 @@ class InstanceConfig(Base, frozen=True, kw_only=True, tag_field=KIND, tag="fmu")
         Meta(description="Which kind of the FMU to use; auto: co-simulation if it has both."),
     ] = "auto"
     solver: Annotated[SolverConfig, Meta(description="The solver of a model-exchange FMU.")] = SolverConfig()
+    tolerance: Annotated[
+        float | None,
+        Meta(
+            description="Relative tolerance that a co-simulation FMU of FMI 2.0 or 3.0 is told for its own solver; "
+            "default: that of its default experiment, if it has one. For model exchange: `solver.relative_tolerance`.",
+            extra_json_schema=POSITIVE,
+            examples=[1e-6],
+        ),
+    ] = None
     retry_discarded_steps: Annotated[
         bool,
         Meta(

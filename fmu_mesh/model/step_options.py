@@ -1,4 +1,4 @@
-"""How instances are to be stepped: `kind`, `solver`, `retry_discarded_steps` and `extrapolation` of a configuration.
+"""How instances are to be stepped: `kind`, `solver`, `tolerance`, `retry_discarded_steps` and `extrapolation`.
 
 Owns which of these wishes an FMU can fulfil, by its capability flags; what it cannot is a finding with the reason.
 """
@@ -26,18 +26,26 @@ def resolve_step_options(
     if not isinstance(config, InstanceConfig):
         return StepOptions()
     solver = config.solver
-    for key in ("relative_tolerance", "maximum_step_size"):
-        value = getattr(solver, key)
+    settings = {
+        "tolerance": config.tolerance,
+        "solver.relative_tolerance": solver.relative_tolerance,
+        "solver.maximum_step_size": solver.maximum_step_size,
+    }
+    for key, value in settings.items():
         if value is not None and not (math.isfinite(value) and value > 0.0):
-            findings.add(f"instances.{name}.solver.{key}", f"{value:g}", "a number > 0")
+            findings.add(f"instances.{name}.{key}", f"{value:g}", "a number > 0")
     if description.kind == "co_simulation" and solver != InstanceConfig(fmu="").solver:
         found = f"a solver for '{name}', which runs as co-simulation and has a solver of its own"
         findings.add(f"instances.{name}.solver", found, "`kind: model_exchange`, or no solver")
+    if config.tolerance is not None and (refusal := _takes_no_tolerance(description)) is not None:
+        why, expected = refusal
+        findings.add(f"instances.{name}.tolerance", f"{config.tolerance:g}, but {why}", expected)
     if config.retry_discarded_steps and (reason := _cannot_retry(description)) is not None:
         findings.add(f"instances.{name}.retry_discarded_steps", f"true, but {reason}", "false")
     tolerance = solver.relative_tolerance or description.default_experiment.tolerance or _DEFAULT_TOLERANCE
     return StepOptions(
         solver=SolverSettings(solver.name, tolerance, solver.maximum_step_size),
+        tolerance=config.tolerance,
         retry_discarded_steps=config.retry_discarded_steps,
     )
 
@@ -79,6 +87,15 @@ def capability_warnings(
             tool = description.generation_tool
             found = f"the FMU of '{name}' needs an execution tool ({tool or 'it does not say which'})"
             findings.add(f"instances.{name}.fmu", found, f"{tool or 'that tool'} on the host that runs it")
+
+
+def _takes_no_tolerance(description: ModelDescription) -> tuple[str, str] | None:
+    """Why an FMU cannot be told a tolerance, and what to write instead; None if it can."""
+    if description.kind == "model_exchange":
+        return "the FMU runs as model exchange, with a solver of ours", "`solver: {relative_tolerance: ...}`"
+    if description.fmi_version.startswith("1."):
+        return "co-simulation in FMI 1.0 cannot be told one (fmiInitializeSlave)", "no tolerance"
+    return None
 
 
 def _cannot_retry(description: ModelDescription) -> str | None:

@@ -181,8 +181,8 @@ STRUCTURE = [
     ),
     pytest.param(
         changed("{fmu: delay.fmu}", "delay.fmu"),
-        "mesh.yaml:5: instances.delay: 'delay.fmu'; expected a mapping with fmu, kind, solver, retry_discarded_steps, "
-        "start_values, step_size, group, host and 3 more",
+        "mesh.yaml:5: instances.delay: 'delay.fmu'; expected a mapping with fmu, kind, solver, tolerance, "
+        "retry_discarded_steps, start_values, step_size, group and 4 more",
         id="text for a mapping",
     ),
     pytest.param(

@@ -1,4 +1,4 @@
-"""`kind`, `solver`, `retry_discarded_steps` and `extrapolation`: what is refused and why, and what is shown."""
+"""`kind`, `solver`, `tolerance`, `retry_discarded_steps`, `extrapolation`: what is refused and why, what is shown."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from fmu_mesh.launch.local import LocalMesh
 from fmu_mesh.launch.preparing import prepare
 from fmu_mesh.model.plan import Plan
 from tests.fmus.event_fmus import Version
+from tests.fmus.helpers import find_fmu
 
 EventFmu = Callable[..., Path]
 
@@ -86,6 +87,29 @@ def test_settings_of_a_solver_are_checked_together(event_fmu: EventFmu, tmp_path
     assert "instances.one.solver.maximum_step_size: -1; expected a number > 0" in message
     assert "instances.two.solver: a solver for 'two', which runs as co-simulation" in message
     assert "instances.three.retry_discarded_steps: true, but a model-exchange FMU has no steps of its own" in message
+
+
+def test_a_tolerance_is_refused_where_the_fmu_cannot_be_told_one(event_fmu: EventFmu, tmp_path: Path) -> None:
+    ball, steps = str(event_fmu("Ball", 2)), str(find_fmu("Steps1", tmp_path))
+
+    message = refused(
+        tmp_path,
+        {
+            "none": {"fmu": ball, "tolerance": 0.0},
+            "model": {"fmu": ball, "kind": "model_exchange", "tolerance": 1e-8},
+            "oldest": {"fmu": steps, "tolerance": 1e-8},
+        },
+    )
+
+    assert "instances.none.tolerance: 0; expected a number > 0" in message
+    assert (
+        "instances.model.tolerance: 1e-08, but the FMU runs as model exchange, with a solver of ours; expected "
+        "`solver: {relative_tolerance: ...}`" in message
+    )
+    assert (
+        "instances.oldest.tolerance: 1e-08, but co-simulation in FMI 1.0 cannot be told one (fmiInitializeSlave); "
+        "expected no tolerance" in message
+    )
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@
 
 #define EXPORT __attribute__((visibility("default")))
 
-enum { U, Y, LONGEST_STEP, REACHED, REALS };
+enum { U, Y, LONGEST_STEP, REACHED, TOLERANCE, REALS };
 enum { POLLS, ENDS_AS, ATTEMPTS, MUTE, INTEGERS };
 enum { PENDING = 5 };
 

@@ -15,7 +15,7 @@
 #include "fmi3Functions.h"
 #include "fmu_guid.h"
 
-enum { X, Y, U, V, INTERVAL, ANNOUNCED, LAST, COUNT };
+enum { X, Y, U, V, INTERVAL, ANNOUNCED, LAST, TOLERANCE, COUNT };
 enum { INSTANTIATED = 1, INITIALIZATION = 2, EVENT = 4, STEP = 8, TERMINATED = 16 };
 
 typedef struct {
@@ -93,7 +93,8 @@ static fmi3Status go(Model *m, int from, int to, const char *why)
 fmi3Status fmi3EnterInitializationMode(fmi3Instance i, fmi3Boolean defined, fmi3Float64 tolerance, fmi3Float64 start,
                                        fmi3Boolean stop_defined, fmi3Float64 stop)
 {
-    (void)defined, (void)tolerance, (void)stop_defined, (void)stop;
+    (void)stop_defined, (void)stop;
+    ((Model *)i)->values[TOLERANCE] = defined ? tolerance : -1.0;
     ((Model *)i)->values[X] = start;
     return go(i, INSTANTIATED, INITIALIZATION, "fmi3EnterInitializationMode is not allowed now");
 }

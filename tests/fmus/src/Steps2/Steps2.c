@@ -30,8 +30,8 @@ EXPORT Status NAME(SetupExperiment)(Component c, fmi2Boolean tolerance_defined, 
 {
     Model *m = c;
 
-    (void)tolerance_defined, (void)tolerance;
     if (stop_defined) m->stop = stop;
+    m->r[TOLERANCE] = tolerance_defined ? tolerance : -1.0;
     m->accepted = m->r[REACHED] = start;
     return fmi2OK;
 }
