@@ -27,6 +27,9 @@ Dependencies = dict[str, tuple[str, ...] | None]
 def variables_of(source: FmpyDescription, root: ET.Element) -> tuple[Variable, ...]:
     """All variables whose type we know, in the order of the model description; FMI 3.0 aliases at the end.
 
+    Of several with one name, which no version of FMI allows and some FMUs have, the last one is the variable: a name is
+    a key, a column and an address, and cannot stand for two things.
+
     Args:
         source: the description as FMPy reads it.
         root: the root of the XML.
@@ -39,12 +42,13 @@ def variables_of(source: FmpyDescription, root: ET.Element) -> tuple[Variable, .
         convert = _fmi3 if source.fmiVersion.startswith("3.") else _fmi2
         dependencies = _initial_unknowns(source)
     units = base_units(source)
-    return tuple(
+    variables = (
         with_unit(convert(variable, element, dependencies), variable, element, units)
         for variable in source.modelVariables
         if variable.type in FMI2_TYPES or variable.type in TYPES
         for element in (elements[(variable.alias or variable).name],)
     )
+    return tuple({variable.name: variable for variable in variables}.values())
 
 
 def _fmi1(source: ModelVariable, element: ET.Element, dependencies: Dependencies) -> Variable:
