@@ -11,30 +11,10 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["ENDLESS", "StepSizes", "TimeGrid", "step_within", "steps_between"]
+__all__ = ["ENDLESS", "TimeGrid", "step_within", "steps_between"]
 
 ENDLESS = 2**53
 """The last point of a run without an end; above it, the product of a point and the step size is no longer exact."""
-
-
-class StepSizes(msgspec.Struct, frozen=True):
-    """The communication step sizes of one instance, in s: one for all its steps, and one for its last step.
-
-    Attributes:
-        regular: of every step but the last.
-        last_step: the own step that ends at the last point, or before it.
-        last_time: the time at which that step begins, in s.
-        last: its size, which ends no later than the stop time; see `step_within`.
-    """
-
-    regular: float
-    last_step: int
-    last_time: float
-    last: float
-
-    def of(self, step: int) -> float:
-        """The size of the own step ``step``."""
-        return self.regular if step != self.last_step else self.last
 
 
 class TimeGrid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -61,29 +41,32 @@ class TimeGrid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def stop_time(self) -> float | None:
-        """The time of the last point in s, which is what FMUs are told; None for a run without an end."""
+        """The time of the last point in s; None for a run without an end."""
         return self.time(self.last_point) if self.last_point < ENDLESS else None
 
-    def step_sizes(self, points: int) -> StepSizes:
-        """The step sizes of an instance whose own steps take ``points`` points each."""
-        regular, last_step = points * self.step_size, self.last_point // points - 1
-        last_time = self.time(last_step * points)
-        stop_time = math.inf if self.stop_time is None else self.stop_time
-        return StepSizes(regular, last_step, last_time, step_within(last_time, regular, stop_time))
+    def told_stop_time(self, points: int) -> float | None:
+        """The stop time in s that an FMU is told whose own steps take ``points`` points; None for a run without an end.
+
+        An FMU adds up what it is given, the start of a step and its size: 1999 * 0.01 + 0.01 is 20.000000000000004. So
+        it is told the end of its last step where that is later than `stop_time`, which it is by rounding only.
+        """
+        if self.stop_time is None:
+            return None
+        last_start = self.time((self.last_point // points - 1) * points)
+        return max(self.stop_time, last_start + points * self.step_size)
 
 
-def step_within(time: float, step_size: float, stop_time: float) -> float:
-    """``step_size``, or a little less where rounding would bring a step from ``time`` past ``stop_time`` (all in s).
+def step_within(time: float, step_size: float, end: float) -> float:
+    """``step_size``, or a little less where rounding would bring a step from ``time`` past ``end`` (all in s).
 
-    An FMU adds the two numbers that it is given, and 1999 * 0.01 + 0.01 is 20.000000000000004. The sum of ``time`` and
-    the returned size is never greater than ``stop_time``. Only rounding is corrected: without it, the step must end at
-    ``stop_time`` or before.
+    For the parts of a step: the sum of ``time`` and the returned size is never greater than ``end``. Only rounding is
+    corrected: without it, the step must end at ``end`` or before.
     """
-    if time + step_size <= stop_time:
+    if time + step_size <= end:
         return step_size
-    rest = stop_time - time
-    # The difference itself is rounded, too, where the step begins before 0 and ends after it.
-    return rest if time + rest <= stop_time else math.nextafter(rest, 0.0)
+    rest = end - time
+    # The difference itself is rounded, too: 0.04 + (0.11 - 0.04) is greater than 0.11.
+    return rest if time + rest <= end else math.nextafter(rest, 0.0)
 
 
 def steps_between(start: float, stop: float, step_size: float) -> int | None:

@@ -72,7 +72,7 @@ class Fmi1Instance(FmuInstance):
         for set_row in self._setters:
             set_row(slot)
         time = self._start_time + step * self._points * self._base_step_size  # `grid.time`, without a call
-        self.advance(time, self._step_sizes.of(step))
+        self.advance(time, self._step_size)
         self._step = step + 1
         self._read_outputs((step + 1) & self._output_mask)
 

@@ -145,22 +145,21 @@ class Fmi2Instance(Fmi2Values):
         self._check_not_terminated()
         self._set_inputs(step & self._input_mask)
         time = self._start_time + step * self._points * self._base_step_size
-        step_size = self._step_sizes.of(step)
-        status = self._do_step(self._self, time, step_size, 1)
+        status = self._do_step(self._self, time, self._step_size, 1)
         if status > WARNING:
-            self._finish(status, time + step_size)
+            self._finish(status, time + self._step_size)
         self._step = step + 1
         self._read_outputs((step + 1) & self._output_mask)
 
     def _fuse(self) -> Fused | None:
-        step = fmi2_step(self._plain_do_step, self._step_sizes)
+        step = fmi2_step(self._plain_do_step, self._step_size)
         return fuse(self._self, self._direct_setters, step, self._direct_getters)
 
     def _finish_fused(self, outcome: int, step: int, time: float) -> None:
         """What follows from a status above warning, as in `_step_by_calls`."""
         stage, status = divmod(outcome, 1 << STATUS_BITS)
         if stage == STEPPING:
-            self._finish(status, time + self._step_sizes.of(step))
+            self._finish(status, time + self._step_size)
             self._step = step + 1
             self._read_outputs((step + 1) & self._output_mask)
             return

@@ -58,19 +58,19 @@ class SteppedInEvents(FmuInstance):
             self._step = step + 1
             return
         self._set_inputs(step & input_mask)
-        self._go_on(lambda: steps.step(start, self._step_sizes.of(step), end))
+        self._go_on(lambda: steps.step(start, self._step_size, end))
         self._step = step + 1
         self._read_outputs((step + 1) & output_mask)
 
     def _fuse(self) -> Fused | None:
-        step = self._steps.fused(self._step_sizes)
+        step = self._steps.fused(self._step_size)
         return fuse(self._self, self._direct_setters, step, self._direct_getters, sized=True)
 
     def _finish_fused(self, outcome: int, step: int, start: float, end: float) -> None:
         """What follows where the step was more than a step, or a status is above warning."""
         stage, status = divmod(outcome, 1 << STATUS_BITS)
         if stage == STEPPING:
-            self._go_on(lambda: self._steps.finish(status, start, self._step_sizes.of(step), end))
+            self._go_on(lambda: self._steps.finish(status, start, self._step_size, end))
             self._step = step + 1
             self._read_outputs((step + 1) & self._output_mask)
             return

@@ -21,7 +21,7 @@ from typing import Any, Final
 from fmpy.fmi1 import FMICallException
 
 from ..model.description import ModelDescription
-from ..simtime import StepSizes, step_within
+from ..simtime import step_within
 from .calls import hot, pointer
 from .clocks import Clocks
 from .fused import Step, fmi3_step
@@ -109,9 +109,9 @@ class Fmi3Steps:
         self._update()
         self._look_ahead()
 
-    def fused(self, sizes: StepSizes) -> Step:
-        """fmi3DoStep as a part of one compiled call."""
-        return fmi3_step(self._do_step, sizes, self._pointers, self._results.addresses[0])
+    def fused(self, step_size: float) -> Step:
+        """fmi3DoStep by ``step_size`` (s) as a part of one compiled call."""
+        return fmi3_step(self._do_step, step_size, self._pointers, self._results.addresses[0])
 
     def step(self, start: float, step_size: float, end: float) -> bool:
         """Go on from ``start`` by ``step_size`` to ``end`` (s); False if the FMU asked to end the simulation before."""

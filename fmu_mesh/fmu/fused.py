@@ -13,7 +13,6 @@ from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 from ..compiled import Compiled, compile_function
-from ..simtime import StepSizes
 from .calls import DirectCall, Function, Pointer, address_of, hot
 from .instance import WARNING
 
@@ -34,27 +33,24 @@ class Step(NamedTuple):
 
     Attributes:
         function: what is called.
-        arguments: those after the component, as LLVM writes them; ``%time`` is the start of the step in s, ``%size``
-            its size.
-        sizes: of the steps.
+        arguments: those after the component, as LLVM writes them; ``%time`` is the start of the step in s.
         flags: address of 32 bits that are 0 before the call, and afterwards, too, if it was nothing but a step.
     """
 
     function: Function
     arguments: str
-    sizes: StepSizes
     flags: int | None = None
 
 
-def fmi2_step(function: Function, sizes: StepSizes) -> Step:
-    """fmi2DoStep (FMI 2.0, 4.2.1)."""
-    return Step(function, "double %time, double %size, i32 1", sizes)
+def fmi2_step(function: Function, step_size: float) -> Step:
+    """fmi2DoStep by ``step_size`` (s) (FMI 2.0, 4.2.1)."""
+    return Step(function, f"double %time, double {_double(step_size)}, i32 1")
 
 
-def fmi3_step(function: Function, sizes: StepSizes, results: Sequence[Pointer], flags: int) -> Step:
-    """fmi3DoStep; ``results`` are what it says besides its status (FMI 3.0, 4.2.1)."""
+def fmi3_step(function: Function, step_size: float, results: Sequence[Pointer], flags: int) -> Step:
+    """fmi3DoStep by ``step_size`` (s); ``results`` are what it says besides its status (FMI 3.0, 4.2.1)."""
     said = ", ".join(f"ptr {_pointer(result)}" for result in results)
-    return Step(function, f"double %time, double %size, i1 zeroext true, {said}", sizes, flags)
+    return Step(function, f"double %time, double {_double(step_size)}, i1 zeroext true, {said}", flags)
 
 
 class Fused(NamedTuple):
@@ -126,17 +122,10 @@ next{number}:"""
     call(STEPPING, step.function, step.arguments, step.flags)
     for getter in getters:
         move(GETTING, getter, "%out")
-    text = f"define i32 @step(i64 %in, double %time, i64 %out) {{{_size(step.sizes)}{''.join(calls)}\n  ret i32 0\n}}"
+    text = f"define i32 @step(i64 %in, double %time, i64 %out) {{{''.join(calls)}\n  ret i32 0\n}}"
     if (code := compile_function("step", text)) is None:
         return None
     return Fused(hot(ctypes.CFUNCTYPE(ctypes.c_int)(code.address), _DECLARATION), code)
-
-
-def _size(sizes: StepSizes) -> str:
-    """``%size``, of the step that begins at ``%time``."""
-    return f"""
-  %last = fcmp oeq double %time, {_double(sizes.last_time)}
-  %size = select i1 %last, double {_double(sizes.last)}, double {_double(sizes.regular)}"""
 
 
 def _pointer(made: Function | Pointer) -> str:

@@ -162,7 +162,7 @@ class FmuInstance(KeepsFmuState, ABC):
         self._start_time = grid.start_time
         self._base_step_size = grid.step_size
         self._points = points
-        self._step_sizes = grid.step_sizes(points)
+        self._step_size = points * grid.step_size
         self._step = step
         self._input_mask = inputs.mask
         self._output_mask = outputs[0].mask

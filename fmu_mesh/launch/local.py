@@ -199,7 +199,8 @@ class LocalMesh:
     def _initialize(self, members: dict[str, _Member]) -> None:
         grid = self._plan.grid
         for member in members.values():
-            member.instance.enter_initialization(grid.start_time, grid.stop_time, member.plan.start_values)
+            stop_time = grid.told_stop_time(member.plan.step_points)
+            member.instance.enter_initialization(grid.start_time, stop_time, member.plan.start_values)
         levels = self._plan.initialization.levels
         known: dict[tuple[str, str], Value] = {}
         loops = iter((*self._plan.initialization.loops, None))

@@ -223,7 +223,8 @@ class Node:
         self._activity.state = "initializing"
         grid = self._plan.grid
         for runner in self._runners.values():
-            runner.instance.enter_initialization(grid.start_time, grid.stop_time, runner.plan.start_values)
+            stop_time = grid.told_stop_time(runner.plan.step_points)
+            runner.instance.enter_initialization(grid.start_time, stop_time, runner.plan.start_values)
         self._initialization.run(self._runners.values())
         for runner in self._runners.values():
             runner.instance.exit_initialization()

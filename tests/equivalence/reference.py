@@ -2,7 +2,7 @@
 
 What a step uses is written here from its definition: the step of a target from point k to point k + m uses the value of
 the source at point k (delay 1) or k + m (delay 0), and an output holds its value until the next own point of its
-instance. A step whose end would be past the last point by rounding ends there.
+instance.
 """
 
 from __future__ import annotations
@@ -76,7 +76,6 @@ def run_fmpy(reference: Reference) -> Table:
 
 def _loop(reference: Reference, fmus: Mapping[str, _Fmu]) -> Table:
     start, h = reference.start_time, reference.step_size
-    stop = start + reference.last_point * h
     values: dict[tuple[str, str], list[float]] = {}
     points = {unit.name: unit.points for unit in reference.units}
     wanted = list(dict.fromkeys([*((p.source, p.output) for p in reference.pipes), *reference.recorded]))
@@ -96,8 +95,7 @@ def _loop(reference: Reference, fmus: Mapping[str, _Fmu]) -> Table:
                 if pipe.target == unit.name:
                     value = value_at(pipe.source, pipe.output, begin if pipe.delay else end)
                     fmus[unit.name].set(pipe.input, _scaled(pipe, value))
-            time, step_size = start + begin * h, unit.points * h
-            fmus[unit.name].fmi.doStep(time, step_size if time + step_size <= stop else stop - time)
+            fmus[unit.name].fmi.doStep(start + begin * h, unit.points * h)
             for name, output in wanted:
                 if name == unit.name:
                     values[name, output].append(fmus[name].get(output))

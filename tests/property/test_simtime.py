@@ -23,52 +23,52 @@ round_steps = st.builds(
 )
 
 
-def assert_nothing_ends_after_the_stop_time(grid: TimeGrid, points: int) -> None:
-    """Every step of an instance ends by the stop time, and only the last one has another size, by rounding only."""
-    stop = grid.stop_time
+def assert_no_step_ends_after_the_told_stop_time(grid: TimeGrid, points: int) -> None:
+    """Every step of an instance, as its FMU adds it up, ends by the time that it is told, late by rounding only."""
+    stop, told = grid.stop_time, grid.told_stop_time(points)
     assert stop is not None
-    sizes = grid.step_sizes(points)
-    count = grid.last_point // points
-    starts = grid.start_time + np.arange(count) * points * grid.step_size
-    assert (starts[:-1] + points * grid.step_size <= stop).all()
-    assert {sizes.of(step) for step in range(count - 1)} <= {points * grid.step_size}
-    if count:
-        last = grid.time((count - 1) * points)
-        assert last + sizes.of(count - 1) <= stop
-        resolution = math.ulp(max(abs(grid.start_time), abs(stop)))
-        assert abs(sizes.of(count - 1) - points * grid.step_size) <= 4 * resolution
+    assert told is not None
+    starts = grid.start_time + np.arange(grid.last_point // points) * points * grid.step_size
+    assert (starts + points * grid.step_size <= told).all()
+    assert 0.0 <= told - stop <= 4 * math.ulp(max(abs(grid.start_time), abs(stop), points * grid.step_size))
 
 
 @pytest.mark.parametrize("stop", ROUND_STOPS)
-def test_no_step_of_a_round_size_ends_after_a_round_stop_time(stop: int) -> None:
+def test_no_step_of_a_round_size_ends_after_what_is_told_for_a_round_stop_time(stop: int) -> None:
     for text in ROUND_STEPS:
         count = int(Decimal(stop) / Decimal(text))
         assert steps_between(0.0, float(stop), float(text)) == count
-        assert_nothing_ends_after_the_stop_time(TimeGrid(0.0, float(text), count), 1)
+        assert_no_step_ends_after_the_told_stop_time(TimeGrid(0.0, float(text), count), 1)
 
 
 @given(round_numbers, round_steps, st.integers(0, 2000), st.integers(1, 7))
-def test_no_step_ends_after_the_stop_time_from_any_round_start(
+def test_no_step_ends_after_the_told_stop_time_from_any_round_start(
     start: Decimal, step: Decimal, count: int, points: int
 ) -> None:
-    assert_nothing_ends_after_the_stop_time(TimeGrid(float(start), float(step), count), points)
+    assert_no_step_ends_after_the_told_stop_time(TimeGrid(float(start), float(step), count), points)
 
 
 @given(st.floats(-1e6, 1e6), st.floats(1e-6, 1e3), st.integers(1, 10_000))
-def test_no_step_ends_after_the_stop_time_whatever_the_numbers(start: float, step: float, count: int) -> None:
-    assert_nothing_ends_after_the_stop_time(TimeGrid(start, step, count), 1)
+def test_no_step_ends_after_the_told_stop_time_whatever_the_numbers(start: float, step: float, count: int) -> None:
+    assert_no_step_ends_after_the_told_stop_time(TimeGrid(start, step, count), 1)
+
+
+def test_a_run_without_an_end_tells_no_stop_time() -> None:
+    assert TimeGrid(0.5, 0.1, ENDLESS).told_stop_time(3) is None
 
 
 @given(st.floats(-10.0, 10.0), st.floats(1e-3, 20.0))
 def test_a_step_that_ends_in_time_keeps_its_size(time: float, size: float) -> None:
     assert step_within(time, size, time + size) == size
-    assert step_within(time, size, math.inf) == size
 
 
-def test_a_run_without_an_end_has_one_step_size() -> None:
-    sizes = TimeGrid(0.5, 0.1, ENDLESS).step_sizes(3)
-
-    assert sizes.regular == sizes.last == 3 * 0.1
+@pytest.mark.parametrize("end", [0.11, 0.25, 0.7, 1.3])
+def test_the_rest_of_a_step_ends_by_its_end_and_is_the_rest_but_for_rounding(end: float) -> None:
+    """From any hundredth before it: 0.04 + (0.11 - 0.04) is greater than 0.11, as many of these sums are."""
+    for time in (hundredths / 100 for hundredths in range(-100, round(end * 100))):
+        rest = step_within(time, end - time, end)
+        assert time + rest <= end
+        assert end - time - math.ulp(end - time) <= rest <= end - time
 
 
 @given(round_numbers, round_steps, st.integers(0, 100_000))

@@ -15,12 +15,11 @@ from fmu_mesh.fmu.calls import DirectCall, Rows, hot, memory, pointer
 from fmu_mesh.fmu.fused import GETTING, SETTING, STATUS_BITS, STEPPING, Fused, fmi2_step, fmi3_step, fuse
 from fmu_mesh.model.ring import Layout, Ring
 from fmu_mesh.model.types import VariableType
-from fmu_mesh.simtime import StepSizes, TimeGrid
+from fmu_mesh.simtime import TimeGrid
 from tests.fmus.helpers import find_fmu
 
 COMPONENT = 4711
 ROW_SIZE = 16
-SIZES = StepSizes(regular=0.1, last_step=9, last_time=0.9, last=0.09)
 
 _MOVE = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_size_t, ctypes.c_void_p)
 _STEP = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_double, ctypes.c_double, ctypes.c_int)
@@ -47,7 +46,7 @@ class Recorded:
         self._step = hot(self._keep[-1], "int (*)(void *, double, double, int)")
 
     def fuse(self) -> Fused:
-        one = fuse(pointer(COMPONENT), self._setters, fmi2_step(self._step, SIZES), self._getters)
+        one = fuse(pointer(COMPONENT), self._setters, fmi2_step(self._step, 0.1), self._getters)
         assert one is not None
         return one
 
@@ -82,16 +81,6 @@ def test_all_functions_are_called_in_their_order_on_their_rows() -> None:
 
     assert one.call(4, 0.3, 6) == 0
     assert recorded.calls == ALL
-
-
-def test_the_last_step_has_a_size_of_its_own() -> None:
-    recorded = Recorded()
-    one = recorded.fuse()
-
-    for time in (0.8, 0.9):
-        one.call(0, time, 1)
-
-    assert [call[2:4] for call in recorded.calls if call[0] == "step"] == [(0.8, 0.1), (0.9, 0.09)]
 
 
 @pytest.mark.parametrize(
@@ -130,7 +119,7 @@ class Recorded3:
         self._references = (ctypes.c_uint * 2)(6, 5)
         rows = Rows(ctypes.addressof(self._memory), ROW_SIZE)
         moves = [(moved, memory(self._references), 2, rows, 9)]
-        step = fmi3_step(stepped, SIZES, [pointer(address) for address in self.addresses], first)
+        step = fmi3_step(stepped, 0.1, [pointer(address) for address in self.addresses], first)
         one = fuse(pointer(COMPONENT), moves, step, moves, sized=True)
         assert one is not None
         self.one = one
