@@ -412,7 +412,11 @@ class Master:
         if query.payload is None and str(query.key_expr) != self._keys.mesh_key("command"):
             query.drop()  # somebody looks at all keys
             return
-        command = decode_json(payload_of(query, self._keys.mesh_key("command")), Command)
+        data = payload_of(query, self._keys.mesh_key("command"))
+        try:
+            command = decode_json(data, Command)
+        except MessageRefused as error:
+            raise MessageRefused(f"not a command: {error}") from error
         if self._state not in ("running", "paused"):
             query.reply_err(f"the mesh is {self._state}; there is nothing to {command.command}")
             query.drop()

@@ -280,8 +280,11 @@ class SharedOutlet:
     ) -> None:
         assert _SEMAPHORES is not None
         _, self._post, self._trywait, self._clockwait = _SEMAPHORES
-        self._memory = memory = _open(offer)
         offset, size = offer.channels[sender]
+        if offset % 64 or size % 64 or not (_CHANNELS <= offset < offset + _DATA + size <= offer.size):
+            msg = f"the buffer of '{sender}' does not lie in the memory of {target}"
+            raise ValueError(msg)
+        self._memory = memory = _open(offer)
         self._doorbell = memory.semaphore(_DOORBELL)
         self._items = memory.semaphore(offset + _ITEMS)
         self._spaces = memory.semaphore(offset + _SPACES)

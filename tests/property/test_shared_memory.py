@@ -12,7 +12,7 @@ from collections.abc import Callable
 
 import msgspec
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
@@ -132,6 +132,18 @@ def test_a_wake_ends_a_wait_and_a_wait_ends_by_itself() -> None:
 def test_memory_that_is_not_the_offered_one_is_not_used(change: dict[str, object]) -> None:
     offer = replace(SharedInbox({"a": SIZE}).offer, **change)
     assert SharedOutlet.open(offer, "a", "node 'b'", None, 1.0) is None
+
+
+@given(st.integers(-(2**70), 2**70) | st.sampled_from([0, 64, 128]), st.integers(-(2**70), 2**70) | st.just(SIZE))
+@example(128 + 64, SIZE)
+@example(128, 2 * SIZE)
+@example(129, SIZE)
+def test_a_buffer_outside_the_memory_is_not_used(offset: int, size: int) -> None:
+    inbox = SharedInbox({"a": SIZE})
+    own = inbox.offer.channels["a"]
+    outlet = SharedOutlet.open(replace(inbox.offer, channels={"a": (offset, size)}), "a", "node 'b'", None, 1.0)
+
+    assert outlet is None or (own[0] <= offset and size >= 0 and offset + size <= sum(own))
 
 
 def test_a_closed_inbox_cannot_be_opened_any_more() -> None:
