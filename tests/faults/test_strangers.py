@@ -178,7 +178,7 @@ def test_no_bytes_on_any_key_do_harm(place: Place, *, shared_memory: bool) -> No
 
         @settings(max_examples=400, deadline=None, database=None, suppress_health_check=list(HealthCheck))
         @given(known | wild | of_any_run, PAYLOADS, st.none() | st.binary(max_size=40) | JSON, st.booleans())
-        def send(key: str, payload: bytes | None, attachment: bytes | None, asks: bool) -> None:  # noqa: FBT001
+        def send(key: str, payload: bytes | None, attachment: bytes | None, asks: bool) -> None:  # noqa: FBT001  hypothesis draws it
             if asks:
                 stranger.session.get(key, payload=payload, attachment=attachment, timeout=DEADLINE_S)
             elif payload is None:

@@ -403,7 +403,10 @@ def test_no_frame_breaks_a_receiver(data: bytes, first: int, count: int, before:
 # ---- the result file
 
 
-@given(st.lists(st.tuples(any_float, any_float, st.integers(-(2**31), 2**31 - 1), st.booleans()), max_size=30))
+recorded_rows = st.tuples(any_float, any_float, st.integers(-(2**31), 2**31 - 1), st.booleans())
+
+
+@given(st.lists(recorded_rows, min_size=1, max_size=30))  # a file is there from its first row on
 @example([(-0.0, 5e-324, 0, True), (math.nan, math.inf, 1, False), (0.0, -math.inf, -1, True)])
 @example([(1.7976931348623157e308, 2.2250738585072014e-308, 0, True), (0.1, 1e23, 1, False)])
 def test_floats_of_a_result_file_read_back_to_the_same_bits(rows: list[tuple[float, float, int, bool]]) -> None:
