@@ -18,7 +18,8 @@ import fcntl
 import hashlib
 import os
 import stat
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from functools import cache
 from io import FileIO
 from pathlib import Path
@@ -29,7 +30,7 @@ from .errors import ConfigurationError
 if TYPE_CHECKING:
     from _typeshed import ReadableBuffer
 
-__all__ = ["Kept", "OwnFile", "open_alone", "sha256_of"]
+__all__ = ["Kept", "OwnFile", "open_alone", "replaced", "sha256_of"]
 
 _DRAFT = ".starting"
 _TRIES = 10
@@ -60,6 +61,24 @@ def open_alone(path: Path) -> OwnFile:
         raise ConfigurationError(f"another run is writing the result file '{path}'", hint=hint) from error
     except OSError as error:
         raise ConfigurationError(f"the result file '{path}' cannot be written: {error.strerror}") from error
+
+
+@contextmanager
+def replaced(path: Path) -> Iterator[Path]:
+    """Inside, where to write a file that is of no use until it is complete; it gets its name at the end.
+
+    If that fails, an older file stays as it was. A device or a pipe is written itself.
+    """
+    target = Path(os.path.realpath(path))
+    if target.exists() and not target.is_file():
+        yield path
+        return
+    draft = target.with_name(f"{target.stem}.unfinished{path.suffix}")
+    try:
+        yield draft
+        draft.replace(target)
+    finally:
+        draft.unlink(missing_ok=True)
 
 
 def sha256_of(path: Path) -> str:

@@ -8,6 +8,7 @@ import importlib.util
 import re
 from array import array
 from collections.abc import Mapping, Sequence
+from io import BytesIO
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
@@ -17,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import ConfigurationError
+from ..files import replaced
 from ..model.description import Variable
 from ..model.findings import listed, nearest, nearest_file
 from ..model.plan import Plan
@@ -220,7 +222,10 @@ def draw(results: Results, output: Path, *, title: str, variables: Mapping[str, 
             axes.set_xlabel("time in s")
     try:
         output.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(output)
+        picture = BytesIO()  # a backend that cannot write fails in ways of its own
+        figure.savefig(picture, format=output.suffix.removeprefix(".") or None)
+        with replaced(output) as draft:
+            draft.write_bytes(picture.getvalue())
     except (OSError, ValueError) as error:  # a ValueError names the formats there are
         raise ConfigurationError(f"the plot '{output}' cannot be written: {error}.") from error
 

@@ -14,6 +14,7 @@ from typing import Any
 import msgspec
 
 from ..errors import ConfigurationError
+from ..files import replaced
 from ..model.plan import RECORDER, Plan
 from ..wire.profile import GRANT, MeshProfile, NodeProfile
 from .tables import table
@@ -55,7 +56,8 @@ def show_profile(plan: Plan, profile: MeshProfile, seconds: float, file: Path) -
         return
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
-        file.write_bytes(msgspec.json.encode(trace(plan, profile, seconds)))
+        with replaced(file) as draft:
+            draft.write_bytes(msgspec.json.encode(trace(plan, profile, seconds)))
     except OSError as error:
         raise ConfigurationError(f"the trace file '{file}' cannot be written: {error.strerror}") from error
     print(f"trace: {file} (open it at ui.perfetto.dev or chrome://tracing)")

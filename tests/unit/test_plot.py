@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import importlib.util
 import math
+import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -37,6 +40,21 @@ def results(tmp_path: Path) -> Path:
 def pixels(picture: Path) -> NDArray[np.float64]:
     """Height x width x colour."""
     return np.asarray(image.imread(picture), dtype=np.float64)
+
+
+@pytest.mark.skipif(shutil.which("prlimit") is None, reason="needs prlimit")
+@pytest.mark.parametrize("format_", ["png", "svg", "pdf"])
+def test_a_plot_for_which_the_disk_has_no_room_leaves_the_last_one(results: Path, format_: str) -> None:
+    plot = results.with_suffix(f".{format_}")
+    plot.write_bytes(b"the last one")
+    command = ["prlimit", "--fsize=1000", sys.executable, "-m", "fmu_mesh", "plot", str(results), "--output", str(plot)]
+
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+
+    assert done.returncode == 2
+    assert done.stderr.startswith(f"fmu-mesh: the plot '{plot}' cannot be written: ")
+    assert plot.read_bytes() == b"the last one"
+    assert sorted(path.name for path in results.parent.iterdir()) == ["run.csv", plot.name]
 
 
 def test_a_result_file_is_read_as_it_was_written(results: Path) -> None:
