@@ -22,10 +22,11 @@ from ..model.config import MujocoConfig
 from ..model.plan import RECORDER, Plan
 from ..wire.runtime import MeshNote, remove_run_folder, remove_stale_folders, run_folder, runtime_folder, write_note
 from ..wire.session import LEASE_MS
+from ..wire.views import GOING_ON
 from .child import Child, StopWatch, how_it_ended, own_command
 from .events import End, Event, Ready, Status, decode_event
 from .preparing import Options
-from .results import rows_left
+from .results import rows_left, what_is_kept
 
 __all__ = ["Launcher", "Output"]
 
@@ -35,7 +36,6 @@ _REPORT_S = 1.5
 _TOLD_S = 8.0
 _INTERRUPT_S = 0.9
 _KILL_S = 0.7
-_GOING_ON = ("starting", "initializing", "running", "paused")
 _GATEWAY_S = 2.0
 """A gateway ends with its mesh; one that has ended so long before it has lost its link."""
 
@@ -208,7 +208,7 @@ class Launcher:
             self._point = event.status.point
             self._starting = event.status.state == "starting"
             ended = self._gateway_ended
-            if event.status.state in _GOING_ON and ended is not None and self._heard - ended > _GATEWAY_S:
+            if event.status.state in GOING_ON and ended is not None and self._heard - ended > _GATEWAY_S:
                 self._gateway_ended = None
                 self._lost.append((_GATEWAY, 0, ended))
         elif isinstance(event, End):
@@ -308,8 +308,7 @@ class Launcher:
         if type(error) in (Interrupted, MeshLost) and rows > (error.point or 0):
             # What is recorded is newer than what the last progress said.
             error.point, error.time = rows - 1, self._plan.grid.time(rows - 1)
-        if rows and result_file is not None and Path(result_file).is_file():
-            kept = f"What was recorded up to then ({rows} rows) is in '{result_file}'."
+        if kept := what_is_kept(result_file, rows):
             error.hint = f"{error.hint} {kept}" if error.hint else kept
         raise error
 

@@ -34,6 +34,7 @@ from ..record.result_file import OpenResult
 from ..record.row_buffer import RowBuffer
 from ..simtime import TimeGrid
 from .opening import Showing, open_instance, stepped
+from .results import what_is_kept
 
 __all__ = ["LocalMesh"]
 
@@ -115,16 +116,9 @@ class LocalMesh:
         try:
             self._run()
         except FmuMeshError as error:
-            if kept := self._kept():
+            if kept := what_is_kept(self._plan.system.result_file, self.rows):
                 error.hint = f"{error.hint} {kept}" if error.hint else kept
             raise
-
-    def _kept(self) -> str | None:
-        """What is told of a run that ended early and left rows; a device keeps none."""
-        file = self._plan.system.result_file
-        if not self.rows or file is None or not Path(file).is_file():
-            return None
-        return f"What was recorded up to then ({self.rows} rows) is in '{file}'."
 
     def _check_one_process(self) -> None:
         """Two instances of an FMU that allows one per process cannot run here, whatever their groups.
@@ -184,7 +178,7 @@ class LocalMesh:
         if self._stepping:
             error.point, error.time = self.point, self._plan.grid.time(self.point)
         self._save_from_outside()
-        if kept := self._kept():
+        if kept := what_is_kept(self._plan.system.result_file, self.rows):
             error.hint = f"{error.hint} {kept}"
         self._on_hang(error)
 

@@ -17,7 +17,7 @@ from ..record.noted import NotedFile, noted
 from ..record.result_file import OpenResult, ResultFile
 from ..ros.bag import BagTopics, McapFile, bag_topics, is_bag
 
-__all__ = ["check_results", "result_opener", "rows_left"]
+__all__ = ["check_results", "result_opener", "rows_left", "what_is_kept"]
 
 
 def check_results(loaded: LoadedConfig, system: System) -> None:
@@ -55,6 +55,13 @@ def rows_left(result_file: str, folder: Path) -> int:
         if kept is not None and path.is_file():
             return kept.rows if is_bag(path) else cut_after_last_row(path, kept)
     return 0
+
+
+def what_is_kept(result_file: str | None, rows: int) -> str | None:
+    """What is told of a run that ended early and left rows; a device keeps none."""
+    if not rows or result_file is None or not Path(result_file).is_file():
+        return None
+    return f"What was recorded up to then ({rows} rows) is in '{result_file}'."
 
 
 def _topics(loaded: LoadedConfig, system: System) -> BagTopics:

@@ -42,7 +42,7 @@ from ..wire.refusals import payload_of
 from ..wire.session import RouterLink, tokens
 from ..wire.shared_memory import SharedInbox, available
 from ..wire.values import json_encoding
-from ..wire.views import Command, CommandAnswer, MeshInfo, MeshState, MeshStatus
+from ..wire.views import GOING_ON, Command, CommandAnswer, MeshInfo, MeshState, MeshStatus
 from .followers import Followers
 from .members import Members, spoken
 from .pacing import Clock, Pacer, Reach
@@ -53,7 +53,6 @@ __all__ = ["Master"]
 
 _HEARTBEAT_S = 0.5
 _LEAST_HEARTBEAT_S = 0.01
-_GOING_ON = ("starting", "initializing", "running", "paused")
 
 
 class Master:
@@ -355,7 +354,7 @@ class Master:
 
     def _take_report(self, query: zenoh.Query) -> None:
         node = RunKeys.node_in(str(query.key_expr))
-        report = decode_json(payload_of(query, self._run_keys.report(node)), NodeReport)
+        report = decode_json(payload_of(query), NodeReport)
         if report.node != node or not self._members.is_admitted(node):
             raise MessageRefused("it is from no node that has registered")
         error = from_report(report.error) if report.error is not None else None
@@ -365,7 +364,7 @@ class Master:
                 self._fail(self._broken(node, f"has an FMU that ends the simulation at point {error.point}"))
             elif error.point < self._last_point:
                 self.ended_by = error
-        elif error is None and self._state in _GOING_ON:
+        elif error is None and self._state in GOING_ON:
             self._fail(self._broken(node, f"has ended at point {report.point}"))
         else:
             self._reports[node] = report
@@ -412,7 +411,7 @@ class Master:
         if query.payload is None and str(query.key_expr) != self._keys.mesh_key("command"):
             query.drop()  # somebody looks at all keys
             return
-        data = payload_of(query, self._keys.mesh_key("command"))
+        data = payload_of(query)
         try:
             command = decode_json(data, Command)
         except MessageRefused as error:

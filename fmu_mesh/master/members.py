@@ -15,7 +15,7 @@ from ..errors import DeadlineExceeded, FmuMeshError, MessageRefused
 from ..model.digest import difference
 from ..model.plan import RECORDER, Plan
 from ..wire.inbox import Inbox
-from ..wire.keys import MASTER, Keys, RunKeys, batched
+from ..wire.keys import MASTER, RunKeys, batched
 from ..wire.membership import Admission, Ready, Registration, Welcome
 from ..wire.messages import GRANT, HEADER, decode_json, encode_abort
 from ..wire.refusals import payload_of
@@ -84,15 +84,13 @@ class Members:
         Raises:
             MessageRefused: it is no registration.
         """
-        config = self._plan.system.config
-        key = Keys(config.zenoh.key_prefix, config.mesh).register
-        registration = decode_json(payload_of(query, key), Registration)
+        registration = decode_json(payload_of(query), Registration)
         if registration.launch == self._launch:
             reason = self._reason_against(registration)
             if reason is None:
                 self._admitted[registration.node] = registration
                 admission = Admission(self._keys.run, self._grant_keys[registration.node])
-                query.reply(key, msgspec.json.encode(admission))
+                query.reply(query.key_expr, msgspec.json.encode(admission))
             else:
                 self._refused.append(reason)
                 log.info("node_refused", extra={"reason": reason})
@@ -123,7 +121,7 @@ class Members:
             MessageRefused: it is none, or not of a node of this run.
         """
         node = RunKeys.node_in(str(query.key_expr))
-        data = payload_of(query, self._keys.ready(node))
+        data = payload_of(query)
         if node not in self._admitted or node in self._ready:
             raise MessageRefused("it is from no node that has registered")
         ready = decode_json(data, Ready)

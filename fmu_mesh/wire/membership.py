@@ -317,9 +317,8 @@ class Membership:
 
     def _answer_hello(self, query: zenoh.Query) -> None:
         """On a foreign thread: a target asks; tell it whether its shared memory can be reached from here."""
-        assert self._keys is not None
         with self._inbox.refusals.guard(str(query.key_expr), query):
-            hello = decode_json(payload_of(query, self._keys.hello(self._plan.node)), Hello)
+            hello = decode_json(payload_of(query), Hello)
             if hello.node not in {link.target_node for link in self._plan.links_out}:
                 raise MessageRefused("it is from no node that this one sends to")
             outlet = self._outlet(hello.offer, hello.node, f"node '{hello.node}'")

@@ -11,6 +11,7 @@ from ..model.description import Clock, DefaultExperiment, PlainValue
 from ..simtime import ENDLESS
 
 __all__ = [
+    "GOING_ON",
     "Command",
     "CommandAnswer",
     "ConnectionView",
@@ -25,6 +26,9 @@ __all__ = [
 ]
 
 MeshState = Literal["starting", "initializing", "running", "paused", "stopping", "done", "failed"]
+
+GOING_ON: frozenset[MeshState] = frozenset(("starting", "initializing", "running", "paused"))
+"""The states of a mesh that has not come to its end."""
 
 
 class VariableView(msgspec.Struct, frozen=True, omit_defaults=True):

@@ -99,18 +99,28 @@ def _status_of_delay(place: Place) -> dict[str, Any] | None:
     return json.loads(asked.output) if asked.wait() == 0 else None
 
 
-def test_a_run_that_is_lost_again_and_again_starts_again_as_often_as_it_may(place: Place) -> None:
+@pytest.mark.parametrize(
+    ("number", "how"),
+    [
+        (signal.SIGKILL, "its process was ended by SIGKILL"),
+        (signal.SIGTERM, "its process was told to end (SIGTERM was received)"),
+    ],
+    ids=lambda value: getattr(value, "name", ""),
+)
+def test_a_run_that_is_lost_again_and_again_starts_again_as_often_as_it_may(
+    place: Place, number: signal.Signals, how: str
+) -> None:
     config = write_config(place.folder, stop_time=FAR_S, simulation={"real_time_factor": 1})
     launched = place.start("launch", config, "--restarts", "1")
 
     for time in range(2):
         wait_until(lambda: launched.errors.count("mesh 'pair' at") > time, f"mesh {time}")  # noqa: B023 it is called within the turn
-        launched.child("pendulum").kill()
+        launched.child("pendulum").send_signal(number)
 
     assert launched.wait() == 4
     place.assert_nothing_left()
     assert launched.errors.count("starts again") == 1
-    assert "node 'pendulum' was lost: its process was ended by SIGKILL" in launched.errors.splitlines()[-1]
+    assert f"node 'pendulum' was lost: {how}" in launched.errors.splitlines()[-1]
 
 
 def test_a_node_that_is_killed_before_the_first_point_is_named(place: Place) -> None:
@@ -223,19 +233,6 @@ def test_a_node_that_somebody_else_ends_is_lost_and_named(place: Place, number: 
     assert text in launched.message
     place.assert_nothing_left()
     assert_is_what_one_process_calculates(place, result)
-
-
-def test_a_run_whose_node_somebody_else_ends_starts_again_if_it_may(place: Place) -> None:
-    config = write_config(place.folder, stop_time=FAR_S, simulation={"real_time_factor": 1})
-    launched = place.start("launch", config, "--restarts", "1")
-
-    for time in range(2):
-        wait_until(lambda: launched.errors.count("mesh 'pair' at") > time, f"mesh {time}")  # noqa: B023 it is called within the turn
-        launched.child("delay").terminate()
-
-    assert launched.wait() == 4
-    assert launched.errors.count("starts again") == 1
-    place.assert_nothing_left()
 
 
 @pytest.mark.parametrize("step_s", [0.3, 0.15])
