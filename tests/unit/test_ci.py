@@ -1,0 +1,54 @@
+"""What the scripts of CI say at their end: a stage that did not run must not look as if it had passed."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+
+SCRIPT = """
+set -euo pipefail
+. .ci/stages
+trap 'tell_stages; exit $?' EXIT
+stage "the first"
+skip "the bridge" "it is not built"
+stage "all tests"
+tests sh -c 'echo "some tests"; echo "== 3 tests in 1 s"; exit CODE'
+"""
+
+
+@pytest.mark.parametrize(("code", "verdict"), [(0, "ran      all tests"), (1, "FAILED   all tests")])
+def test_the_end_of_a_script_of_ci_names_the_stages_and_closes_with_the_line_of_pytest(code: int, verdict: str) -> None:
+    script = SCRIPT.replace("CODE", str(code))
+
+    done = subprocess.run(["bash", "-c", script], cwd=ROOT, capture_output=True, text=True, check=False)
+
+    assert done.returncode == code
+    assert done.stdout.split("== Stages\n")[1].splitlines() == [
+        "ran      the first",
+        verdict,
+        "SKIPPED  the bridge: it is not built",
+        "",
+        "== 3 tests in 1 s",
+    ]
+
+
+def test_a_stage_that_there_is_not_is_refused() -> None:
+    done = subprocess.run([ROOT / ".ci" / "long", "zenohd"], capture_output=True, text=True, check=False)
+
+    assert (done.returncode, done.stderr) == (2, "zenohd is no stage; there are: bridge gazebo\n")
+
+
+@pytest.mark.parametrize("name", ["run", "long"])
+def test_a_script_of_ci_leaves_nothing_out_without_a_reason(name: str) -> None:
+    text = (ROOT / ".ci" / name).read_text(encoding="utf-8")
+
+    skipped = re.findall(r'\bskip ("[^"]*") *(.*)', text)
+
+    assert skipped
+    assert all(re.match(r'"[^"]{5,}"', reason) for _, reason in skipped)
+    assert "|| echo" not in text
