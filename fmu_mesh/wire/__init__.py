@@ -1,1 +1,5 @@
-"""Everything that touches Zenoh: keys, messages, sessions, the inbox. The only package that imports zenoh."""
+"""Zenoh as this project uses it: keys, messages, sessions, the inbox.
+
+Sessions are opened here only. `node`, `master`, `record` and `ros` import zenoh, too, and declare on a session that
+they are given.
+"""

@@ -622,3 +622,19 @@ def test_the_package_has_no_other_lazy_names() -> None:
 
     with pytest.raises(AttributeError, match="has no attribute 'FmiAdapter'"):
         fmu_mesh.FmiAdapter  # noqa: B018 the look-up is what fails
+
+
+def test_an_array_of_fmi_3_is_an_input_with_a_line_between_its_times_and_one_of_another_shape_is_refused(
+    find: Find,
+) -> None:
+    with FMIAdapter(find("AllTypes3"), 0.5) as adapter:
+        adapter.set_input_value("float64_array_in", 0.0, [[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]])
+        adapter.set_input_value("float64_array_in", 1.0, [[3.0, 2.0, 3.0], [4.0, 5.0, 8.0]])
+        adapter.set_input_value("string_array_in", 0.0, [["a", "b", "c"], ["d", "e", "f"]])
+        adapter.exit_initialization_mode(0.0)
+        adapter.do_steps_until(1.0)
+
+        assert adapter.get_output_value("float64_array_out") == [[2.0, 2.0, 3.0], [4.0, 5.0, 7.0]]
+        assert adapter.get_output_value("string_array_out") == [["a", "b", "c"], ["d", "e", "f"]]
+        with pytest.raises(CallRefused, match=r"Float64\[2,3\]"):
+            adapter.set_input_value("float64_array_in", 2.0, [1.0, 2.0])
