@@ -78,6 +78,26 @@ def test_a_pendulum_that_the_engine_damps_is_that_with_the_damper_fmu_in_every_f
     assert [fmu[point] for point in (1000, 2000, 5000, 10_000)] == pytest.approx(reference, abs=3e-3)
 
 
+@pytest.mark.parametrize(
+    ("engine", "apart"), [("ode", "0.00e+00"), ("bullet", "0.00e+00"), ("simbody", "3.46e-04"), ("dart", "1.39e-03")]
+)
+def test_the_pendulums_of_each_engine_are_as_far_apart_as_the_pages_say(
+    engine: str, apart: str, tmp_path: Path
+) -> None:
+    config = with_gazebo("damped_pendulum", tmp_path)
+    world = (CONFIGS / "worlds" / "damped_pendulum.sdf").read_text(encoding="utf-8")
+    assert '<physics type="ode">' in world
+    path = tmp_path / "world.sdf"
+    path.write_text(world.replace('type="ode"', f'type="{engine}"'), encoding="utf-8")
+    text = config.read_text(encoding="utf-8").replace(f"{CONFIGS}/worlds/damped_pendulum.sdf", str(path))
+    config.write_text(text, encoding="utf-8")
+
+    result = columns(config, tmp_path / "gazebo.csv")
+
+    difference = np.abs(result["world.engine.position"] - result["world.fmu.position"]).max()
+    assert f"{difference:.2e}" == apart
+
+
 def test_a_cube_is_braked_by_the_drag_and_a_free_one_is_not(tmp_path: Path) -> None:
     result = columns(with_gazebo("fluid_body", tmp_path), tmp_path / "gazebo.csv")
 
