@@ -8,6 +8,7 @@ from ..errors import ConfigurationError
 from ..model.config import Config, RosConfig
 from ..model.findings import Findings, nearest_file
 from ..model.loading import LoadedConfig
+from ..model.start_values import sized
 from .names import topic_problem
 from .topics import Descriptions, Resolver, RosPlan
 from .types import MessageTypes, is_message_name
@@ -57,7 +58,10 @@ def resolve(loaded: LoadedConfig, descriptions: Descriptions, findings: Findings
     _check_section(loaded.config, section, findings)
     if types is None:
         return None
-    return Resolver(loaded.config, section, descriptions, types, findings).plan()
+    # Sizes that are too large are found with the start values that give them.
+    instances, untold = loaded.config.instances, loaded.findings()
+    full = {name: sized(name, own, instances[name], untold) for name, own in descriptions.items() if name in instances}
+    return Resolver(loaded.config, section, full, types, findings).plan()
 
 
 def _check_section(config: Config, section: RosConfig, findings: Findings) -> None:

@@ -14,6 +14,7 @@ from msgspec.structs import replace
 
 from ..model.config import Config, RosConfig, RosProfile, RosTopicConfig
 from ..model.description import ModelDescription, Variable
+from ..model.driven import driven_inputs
 from ..model.findings import Findings, listed, nearest
 from .names import absolute, name_problems, ros_name, topic_problem
 from .types import Basic, FieldType, MessageTypes, Nested, UnknownField, UnknownType, carries, default_type
@@ -112,7 +113,7 @@ class Resolver:
         self._descriptions = descriptions
         self._types = types
         self._findings = findings
-        self._connected = {connection.target for connection in config.connections}
+        self._driven = driven_inputs(config, descriptions)
         self._owners: dict[tuple[str, Direction], str] = {}
         self._messages: dict[str, tuple[str, str]] = {}
 
@@ -169,7 +170,7 @@ class Resolver:
         wanted = [
             variable
             for variable in (description.variables if description is not None else ())
-            if variable.causality in ("output", "input") and f"{instance}.{variable.name}" not in self._connected
+            if variable.causality in ("output", "input") and f"{instance}.{variable.name}" not in self._driven
             if default_type(variable.type, array=bool(variable.shape)) is not None
         ]
         problems = name_problems(variable.name for variable in wanted)
@@ -272,11 +273,11 @@ class Resolver:
             case "output" | "local" as causality:
                 assert variable is not None
                 return self._as_port(instance, variable, "out" if causality == "output" else "local", field), "out"
-            case "input" if reference not in self._connected:
+            case "input" if reference not in self._driven:
                 assert variable is not None
                 return self._as_port(instance, variable, "in", field), "in"
             case "input":
-                self._findings.add(path, f"the connected input '{reference}'", "an input without a connection")
+                self._findings.add(path, f"the connected input '{reference}'", self._driven[reference])
             case str(causality):
                 expected = "an output, a local variable or an input; parameters are parameters in ROS, too"
                 self._findings.add(path, f"'{reference}', a {causality}", expected)

@@ -13,14 +13,20 @@ from fmu_mesh.model.description import ModelDescription, Variable
 from fmu_mesh.model.loading import load
 from fmu_mesh.ros.mapping import resolve
 from fmu_mesh.ros.topics import RosPlan
-from tests.helpers import write_config
+from tests.fmus.helpers import find_fmu
+from tests.helpers import FMUS, write_config
 
+WORLDS = Path(__file__).resolve().parents[2] / "configs" / "worlds"
 TWIST = "geometry_msgs/msg/TwistStamped"
 
 
 def planned(folder: Path, **ros: Any) -> RosPlan:  # noqa: ANN401 what a file may hold
     """The plan of a mesh of a pendulum, a delay that it feeds, and a gain that nothing feeds."""
-    path = configured(folder, **ros)
+    return plan_of(configured(folder, **ros))
+
+
+def plan_of(path: Path) -> RosPlan:
+    """The plan of a file, with what its instances say of themselves."""
     plan = prepare(path)
     loaded = load(path)
     found = resolve(loaded, {name: own.description for name, own in plan.system.instances.items()}, loaded.findings())
@@ -53,6 +59,78 @@ def test_without_topics_all_outputs_and_unconnected_inputs_have_one(tmp_path: Pa
     ]
     assert {"pendulum.l", "pendulum.d", "delay.d", "gain.k"} <= {parameter.name for parameter in plan.parameters}
     assert (plan.node, plan.clock_points) == ("pair", 10)
+
+
+def coupled(folder: Path, ros: str, *, controlled: bool) -> Path:
+    """An arm of Gazebo with an actuator, fluid dynamics and, where it is ``controlled``, a controller."""
+    pid = "[{name: c, joint: weak, instance: pid}]" if controlled else "[]"
+    path = folder / "arm.yaml"
+    path.write_text(
+        f"""
+mesh: arm
+simulation: {{stop_time: 1, step_size: 0.01}}
+instances:
+  world:
+    gazebo_classic: {WORLDS}/electrical_actuator.sdf
+    controllers: {pid}
+    actuators: [{{name: a, joint: weak, instance: motor}}]
+    fluid_dynamics: [{{name: f, link: weak_arm, instance: drag}}]
+  pid: {{controller: position_pid}}
+  motor: {{fmu: {FMUS}/SimpleElectricalActuator.fmu}}
+  drag: {{fmu: {FMUS}/LinearFluidDrag.fmu}}
+ros: {ros}
+""",
+        encoding="utf-8",
+    )
+    return path
+
+
+@pytest.mark.parametrize("controlled", [True, False])
+def test_inputs_that_controllers_actuators_and_fluid_dynamics_drive_are_not_subscribed(
+    tmp_path: Path, *, controlled: bool
+) -> None:
+    plan = plan_of(coupled(tmp_path, "{}", controlled=controlled))
+
+    subscribed = {topic.name for topic in plan.topics if topic.direction == "in"}
+    world = {name for name in subscribed if name.startswith("/world/weak")}
+    assert world == set()
+    assert {"/world/tuned_effort", "/world/tuned_effort_command", "/world/bare_effort"} <= subscribed
+    assert {name for name in subscribed if not name.startswith("/world/")} == (
+        {"/pid/target"} if controlled else {"/pid/target", "/pid/position", "/pid/velocity", "/motor/actuatorInput"}
+    )
+
+
+@pytest.mark.parametrize(
+    ("reference", "expected"),
+    [
+        ("world.weak.effort", "an input without a connection"),
+        ("world.weak_arm.force_x", "an input without a connection"),
+        ("world.weak.effort_command", "'motor.actuatorInput': the joint 'weak' has the actuator 'a'"),
+    ],
+)
+def test_an_input_that_a_coupling_drives_is_refused_as_a_topic(tmp_path: Path, reference: str, expected: str) -> None:
+    config = coupled(tmp_path, f"{{topics: [{reference}]}}", controlled=False)
+
+    with pytest.raises(ConfigurationError) as caught:
+        prepare(config)
+
+    assert f"the connected input '{reference}'; expected {expected}" in str(caught.value)
+
+
+def test_an_array_of_which_one_element_is_connected_is_not_subscribed(tmp_path: Path) -> None:
+    fmu = str(find_fmu("AllTypes3", tmp_path))
+    path = write_config(
+        tmp_path,
+        instances={"a": {"fmu": fmu}, "b": {"fmu": fmu, "start_values": {"columns": 5}}},
+        connections=["a.float64_array_out[2,1] -> b.float64_array_in[1,5]"],
+        ros={},
+    )
+
+    topics = {topic.name: topic for topic in plan_of(path).topics}
+
+    assert "/a/float64_array_in" in topics
+    assert "/b/float64_array_in" not in topics
+    assert topics["/b/float32_array_in"].ports[0].variable.shape == (2, 5)
 
 
 def test_topics_are_set_by_hand_for_a_variable_an_instance_or_several_variables(tmp_path: Path) -> None:
