@@ -40,8 +40,17 @@ class RosTopicConfig(Base, frozen=True, kw_only=True):
             examples=[{"twist.linear.x": "path_filter.v"}],
         ),
     ] = {}
+    constants: Annotated[
+        dict[str, str | float | int | bool],
+        Meta(
+            description="What every published message has besides, by field, such as the name of a frame.",
+            examples=[{"transforms[0].child_frame_id": "base_link"}],
+        ),
+    ] = {}
     profile: Annotated[RosTopicProfile | None, Meta(description="Another profile than that of the mesh.")] = None
-    frame_id: Annotated[str, Meta(description="frame_id of the header, where the message has one.")] = ""
+    frame_id: Annotated[
+        str, Meta(description="frame_id of the header, where the message or one of its elements has one.")
+    ] = ""
     reliability: Annotated[
         Literal["reliable", "best_effort"],
         Meta(description="Reliability in ROS; a best-effort publisher needs a best-effort subscription here."),

@@ -26,8 +26,9 @@ from ..model.types import nested, split_element
 from .cdr import Codec
 from .mapping import message_types
 from .messages import Assembler
+from .resolver import Resolver
 from .stamp import nanoseconds, to_stamp
-from .topics import Descriptions, Resolver, RosPlan, Topic
+from .topics import Descriptions, RosPlan, Topic
 from .types import CLOCK, MessageTypes
 
 __all__ = ["BagTopics", "McapFile", "bag_topics", "is_bag"]

@@ -22,16 +22,16 @@ from ..model.loading import LoadedConfig
 from ..model.types import nested
 from ..wire.views import InstanceInfo
 from .mapping import message_types
+from .resolver import Resolver
 from .seen import descriptions_of
-from .topics import Port, Resolver, Topic
-from .types import MessageTypes
+from .topics import Port, Topic
+from .types import MessageTypes, path_parts
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
 
 __all__ = ["Bag", "Sample", "chosen_topics"]
 
-_PART = re.compile(r"[^.\[\]]+|\[\d+\]")
 _CHOICE = re.compile(r"(?P<topic>/?[^=:]+)(:(?P<field>[^=]+))?=(?P<variable>.+)")
 
 StampSource = Literal["header", "log"]
@@ -112,7 +112,7 @@ class Bag:
         Raises:
             ConfigurationError: a message does not have what its topic needs.
         """
-        wanted = {topic.name: [(_parts(port.path), port) for port in topic.ports] for topic in topics}
+        wanted = {topic.name: [(path_parts(port.path), port) for port in topic.ports] for topic in topics}
         connections = [connection for connection in self._reader.connections if connection.topic in wanted]
         for connection, logged, data in self._reader.messages(connections) if connections else ():
             message: Any = self._reader.deserialize(data, connection.msgtype)
@@ -190,11 +190,6 @@ def _header_stamp(message: Any) -> int | None:  # noqa: ANN401 a message of rosb
     if stamp is None or not (stamp.sec or stamp.nanosec):
         return None
     return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
-
-
-def _parts(path: str) -> list[str | int]:
-    """`pose.covariance[7]` as `pose`, `covariance`, 7."""
-    return [int(part[1:-1]) if part.startswith("[") else part for part in _PART.findall(path)]
 
 
 def _value_at(message: Any, parts: Sequence[str | int], port: Port, topic: str) -> Value:  # noqa: ANN401 of rosbags

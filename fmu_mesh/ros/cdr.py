@@ -14,15 +14,12 @@ from typing import Any, Final
 
 import numpy as np
 
-from .types import Array, Basic, FieldType, MessageTypes, Nested, Sequence
+from .types import MAX_ELEMENTS, Array, Basic, FieldType, MessageTypes, Nested, Sequence
 
 __all__ = ["MAX_MESSAGE_SIZE", "CdrError", "Codec", "Message"]
 
 MAX_MESSAGE_SIZE: Final = 4 * 2**20
 """Bytes that a message may have."""
-
-MAX_ELEMENTS: Final = 1 << 16
-"""Strings and nested messages that all sequences and arrays of a message may hold together."""
 
 Message = dict[str, Any]
 """A decoded message."""
@@ -100,7 +97,7 @@ class Codec:
 
     def empty(self) -> Message:
         """A message in which every number is 0, every string and every sequence empty."""
-        message: Message = self._empty(Nested(self.message))
+        message: Message = self.empty_field(Nested(self.message))
         return message
 
     def encode(self, message: Mapping[str, Any]) -> bytes:
@@ -130,19 +127,20 @@ class Codec:
             raise CdrError(f"{len(data) - reader.position} bytes are left behind the message")
         return message
 
-    def _empty(self, kind: FieldType) -> Any:  # noqa: ANN401 a value of any type
+    def empty_field(self, kind: FieldType) -> Any:  # noqa: ANN401 a value of any type
+        """What a field of this kind has in an empty message."""
         match kind:
             case Basic("string"):
                 return ""
             case Basic(basic):
                 return struct.unpack(_format(basic, "<"), bytes(struct.calcsize(_format(basic, "<"))))[0]
             case Nested(message):
-                return {name: self._empty(own) for name, own in self._types.fields(message)}
+                return {name: self.empty_field(own) for name, own in self._types.fields(message)}
             case Sequence(element) | Array(element):
                 length = kind.length if isinstance(kind, Array) else 0
                 if (dtype := _dtype(element)) is not None:
                     return np.zeros(length, dtype)
-                return [self._empty(element) for _ in range(length)]
+                return [self.empty_field(element) for _ in range(length)]
 
     # --- encoding
 

@@ -227,7 +227,7 @@ class Gateway:
         try:
             values, stamp = own.disassembler.values(data)
         except CdrError as error:
-            own.complain(f"a message of {len(data)} bytes is no '{own.topic.message}': {error}")
+            own.complain(f"a message of {len(data)} bytes is no '{own.topic.message}' that can be used: {error}")
             return
         attachment = own.attachment(stamp)
         for key, value in zip(own.keys, values, strict=True):

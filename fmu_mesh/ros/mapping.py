@@ -10,7 +10,8 @@ from ..model.findings import Findings, nearest_file
 from ..model.loading import LoadedConfig
 from ..model.start_values import sized
 from .names import topic_problem
-from .topics import Descriptions, Resolver, RosPlan
+from .resolver import Resolver
+from .topics import Descriptions, RosPlan
 from .types import MessageTypes, is_message_name
 
 __all__ = ["message_types", "resolve"]

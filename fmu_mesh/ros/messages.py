@@ -6,9 +6,9 @@ Owns which values belong into one message: those of one communication point, nev
 from __future__ import annotations
 
 import math
-import re
 from collections import deque
 from collections.abc import Callable, Iterator
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -18,12 +18,11 @@ from ..model.types import flattened, nested
 from .cdr import CdrError, Codec, Message
 from .stamp import from_stamp, to_stamp
 from .topics import Port, Topic
-from .types import Basic, MessageTypes, Sequence
+from .types import HEADER, Array, Basic, FieldType, MessageTypes, Nested, Sequence, path_parts
 
 __all__ = ["Assembler", "Disassembler"]
 
 _WAITING = 1 << 14
-_PART = re.compile(r"[^.\[\]]+|\[[0-9]+\]")
 _FLOATS = {"NaN": float("nan"), "INF": float("inf"), "-INF": float("-inf")}
 
 
@@ -38,12 +37,18 @@ class Assembler:
         self.topic = topic
         self._codec = Codec(types, topic.message)
         self._message = self._codec.empty()
-        self._setters = [_setter(self._message, port, types, topic.message) for port in topic.ports]
+        self._setters = [self._setter(port, types) for port in topic.ports]
+        for path, value in topic.constants:
+            owner, last = self._place(path, types)
+            owner[last] = value
         self._steps = [port.step_points for port in topic.ports]
         self._waiting: list[deque[tuple[int, float, Any]]] = [deque(maxlen=_WAITING) for _ in topic.ports]
         self._last = -1
-        if topic.stamped:
-            self._message["header"]["frame_id"] = topic.frame_id
+        self._headers = list(_headers(self._message, Nested(topic.message), types))
+        named = {path for path, _ in topic.constants} | {port.path for port in topic.ports}
+        for path, header in self._headers:
+            if f"{path}.frame_id" not in named:
+                header["frame_id"] = topic.frame_id
 
     def add(self, port: int, point: int, time: float, value: Value) -> Iterator[tuple[bytes, float]]:
         """Take the value of a port at a point, and yield the messages that are complete now, with their times in s.
@@ -74,9 +79,55 @@ class Assembler:
         """
         for put, value in zip(self._setters, values, strict=True):
             put(value)
-        if self.topic.stamped:
-            self._message["header"]["stamp"] = to_stamp(time)
+        stamp = to_stamp(time) if self._headers else None
+        for _, header in self._headers:
+            header["stamp"] = stamp
         return self._codec.encode(self._message)
+
+    def _setter(self, port: Port, types: MessageTypes) -> Callable[[Any], None]:
+        """A function that puts a value of the mesh into its field."""
+        container, last = self._place(port.path, types)
+        kind = types.field(self.topic.message, port.path)
+        element = kind if isinstance(kind, Basic) else getattr(kind, "element", None)
+        floats = isinstance(element, Basic) and element.kind in ("float64", "float32")
+        shape = port.variable.shape
+        if shape and "layout" in self._message:
+            self._message["layout"]["dim"] = [
+                {"label": f"dim{axis}", "size": size, "stride": math.prod(shape[axis:])}
+                for axis, size in enumerate(shape)
+            ]
+
+        def one(value: Any) -> Any:  # noqa: ANN401 a value of any variable
+            return _FLOATS[value] if floats and isinstance(value, str) else value
+
+        def put(value: Any) -> None:  # noqa: ANN401 a value of any variable
+            container[last] = [one(own) for own in flattened(value, len(shape))] if shape else one(value)
+
+        return put
+
+    def _place(self, path: str, types: MessageTypes) -> tuple[Any, str | int]:
+        """What holds the field at ``path``, and its name or index there; every sequence on the way is long enough.
+
+        Elements that this adds are empty, as is all that nobody gives a value.
+        """
+        parts = path_parts(path)
+        container: Any = self._message
+        reached = ""
+        for part, following in pairwise(parts):
+            reached += f"[{part}]" if isinstance(part, int) else f".{part}" if reached else part
+            if isinstance(following, int):
+                kind = types.field(self.topic.message, reached)
+                container[part] = self._with_length(container[part], following + 1, kind)
+            container = container[part]
+        return container, parts[-1]
+
+    def _with_length(self, elements: Any, length: int, kind: FieldType) -> list[Any]:  # noqa: ANN401 an array or a list
+        """The elements as a list, of at least ``length`` where it is a sequence."""
+        # The list that another port has already.
+        listed: list[Any] = elements if isinstance(elements, list) else elements.tolist()
+        if isinstance(kind, Sequence):
+            listed += [self._codec.empty_field(kind.element) for _ in range(length - len(listed))]
+        return listed
 
 
 class Disassembler:
@@ -85,7 +136,7 @@ class Disassembler:
     def __init__(self, topic: Topic, types: MessageTypes) -> None:
         self.topic = topic
         self._codec = Codec(types, topic.message)
-        self._paths = [_parts(port.path) for port in topic.ports]
+        self._paths = [path_parts(port.path) for port in topic.ports]
 
     def values(self, data: bytes) -> tuple[list[Value], float | None]:
         """The values of the ports, and the stamp in s; None without a header, or with a stamp of zero.
@@ -101,7 +152,7 @@ class Disassembler:
                 for part in path:
                     value = value[part]
             except IndexError as error:
-                raise CdrError(f"the message has no '{port.path}'") from error
+                raise CdrError(f"it has no '{port.path}'") from error
             values.append(_in_shape(value, port))
         if not self.topic.stamped:
             return values, None
@@ -110,36 +161,17 @@ class Disassembler:
         return values, time or None
 
 
-def _parts(path: str) -> list[str | int]:
-    """`pose.covariance[7]` as `pose`, `covariance`, 7."""
-    return [int(part[1:-1]) if part.startswith("[") else part for part in _PART.findall(path)]
-
-
-def _setter(message: Message, port: Port, types: MessageTypes, name: str) -> Callable[[Any], None]:
-    """A function that puts a value of the mesh into its field of ``message``."""
-    parts = _parts(port.path)
-    container: Any = message
-    for depth, part in enumerate(parts[:-1]):
-        following = container[part]
-        if isinstance(parts[depth + 1], int):
-            following = container[part] = _with_length(following, int(parts[depth + 1]) + 1, types, name, port.path)
-        container = following
-    kind = types.field(name, port.path)
-    element = kind if isinstance(kind, Basic) else getattr(kind, "element", None)
-    floats = isinstance(element, Basic) and element.kind in ("float64", "float32")
-    last, shape = parts[-1], port.variable.shape
-    if shape and "layout" in message:
-        message["layout"]["dim"] = [
-            {"label": f"dim{axis}", "size": size, "stride": math.prod(shape[axis:])} for axis, size in enumerate(shape)
-        ]
-
-    def one(value: Any) -> Any:  # noqa: ANN401 a value of any variable
-        return _FLOATS[value] if floats and isinstance(value, str) else value
-
-    def put(value: Any) -> None:  # noqa: ANN401 a value of any variable
-        container[last] = [one(own) for own in flattened(value, len(shape))] if shape else one(value)
-
-    return put
+def _headers(value: Any, kind: FieldType, types: MessageTypes, path: str = "") -> Iterator[tuple[str, Message]]:  # noqa: ANN401 any field
+    """The path and the value of every header in a message, also in its elements."""
+    match kind:
+        case Nested(message) if message == HEADER and path:
+            yield path, value
+        case Nested(message):
+            for name, own in types.fields(message):
+                yield from _headers(value[name], own, types, f"{path}.{name}" if path else name)
+        case Array(Nested() as element) | Sequence(Nested() as element):
+            for index, own_value in enumerate(value):
+                yield from _headers(own_value, element, types, f"{path}[{index}]")
 
 
 def _in_shape(value: Any, port: Port) -> Value:  # noqa: ANN401 a field of any message
@@ -154,19 +186,3 @@ def _in_shape(value: Any, port: Port) -> Value:  # noqa: ANN401 a field of any m
     if not isinstance(plain, list) or len(plain) != port.variable.size:
         raise CdrError(f"'{port.path}' needs {port.variable.size} elements for '{port.variable.name}'")
     return nested(plain, port.variable.shape)
-
-
-def _with_length(
-    elements: Any,  # noqa: ANN401 an array or a list
-    length: int,
-    types: MessageTypes,
-    name: str,
-    path: str,
-) -> list[Any]:
-    """The elements as a list, with zeros up to ``length`` where a sequence is shorter."""
-    listed = elements if isinstance(elements, list) else list(elements)  # the list that another port has already
-    kind = types.field(name, path[: path.rfind("[")])
-    if isinstance(kind, Sequence) and isinstance(kind.element, Basic):
-        zero: Any = "" if kind.element.kind == "string" else 0
-        listed += [zero] * (length - len(listed))
-    return listed

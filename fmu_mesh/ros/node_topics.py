@@ -6,10 +6,12 @@ Owns the node's parameters `names`, `messages` and `stamped`. Knows nothing of p
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from itertools import pairwise
 from typing import Any, Literal
 
 import msgspec
+import numpy as np
 
 from ..errors import ConfigurationError
 from ..model.description import ModelDescription, Value, Variable
@@ -19,7 +21,7 @@ from ..model.yaml_text import Plain, read
 from .names import topic_problem
 from .node_parameters import names_of
 from .peer import message_class
-from .types import default_type
+from .types import MAX_ELEMENTS, default_type, path_parts
 
 __all__ = ["Topic", "fill", "message_time", "own_names", "topics_of", "values_in"]
 
@@ -27,7 +29,11 @@ STAMPED = "geometry_msgs/msg/PointStamped"
 """The smallest message with a header and a float64 that every ROS has: the value is in `point.x`."""
 STAMPED_FIELD = "point.x"
 
-_INDEXED = re.compile(r"(?P<name>[A-Za-z_]\w*)\[(?P<index>\d+)\]")
+_PATH = re.compile(r"\w+(\[\d{1,9}\])?(\.\w+(\[\d{1,9}\])?)*", re.ASCII)
+_SEQUENCE = re.compile(r"sequence<(?P<element>.*?)(, (?P<bound>\d+))?>")
+
+_EMPTY: Mapping[str, str | bytes | bool] = {"string": "", "wstring": "", "boolean": False, "octet": b"\0"}
+"""What an element of a sequence has until it is given a value; a number has 0."""
 
 
 class Topic(msgspec.Struct, frozen=True):
@@ -106,19 +112,21 @@ def topics_of(
 
 
 def fill(topic: Topic, message: Any, values: Mapping[str, Value], time: int) -> None:  # noqa: ANN401 a ROS message
-    """Set the fields of a message, and the stamp of its header if it has one, to ``time`` in ns."""
-    if hasattr(message, "header"):
-        message.header.stamp.sec, message.header.stamp.nanosec = divmod(time, 1_000_000_000)
+    """Set the fields of a message, and the stamp of its header if it has one, to ``time`` in ns.
+
+    Sequences get the elements that a path needs; so does the header of such an element get the stamp.
+    """
+    _stamp(message, time)
     for path, variable in topic.fields:
-        owner, name, index = _place(message, path)
-        if index is None:
-            value = values[variable]
-            if topic.shape:
-                value = flattened(value, len(topic.shape))
-            # A field takes its own type only; a truth value or a whole number is a number there.
-            setattr(owner, name, value if topic.shape else type(getattr(owner, name))(value))
-        else:
-            getattr(owner, name)[index] = values[variable]
+        owner, last = _place(message, path, lambda own: _stamp(own, time))
+        if isinstance(last, int):
+            owner[last] = values[variable]
+            continue
+        value = values[variable]
+        if topic.shape:
+            value = flattened(value, len(topic.shape))
+        # A field takes its own type only; a truth value or a whole number is a number there.
+        setattr(owner, last, value if topic.shape else type(getattr(owner, last))(value))
 
 
 def values_in(topic: Topic, message: Any) -> dict[str, Value]:  # noqa: ANN401 a ROS message
@@ -129,9 +137,9 @@ def values_in(topic: Topic, message: Any) -> dict[str, Value]:  # noqa: ANN401 a
     """
     values: dict[str, Value] = {}
     for path, variable in topic.fields:
-        owner, name, index = _place(message, path)
-        field = getattr(owner, name)
-        value = field if index is None else field[index]
+        value = message
+        for part in path_parts(path):
+            value = value[part] if isinstance(part, int) else getattr(value, part)
         values[variable] = nested(list(value), topic.shape) if topic.shape else value
     return values
 
@@ -201,23 +209,63 @@ def _check_field(topic: str, message: str, path: str, problems: list[str]) -> No
     except ConfigurationError as error:
         problems.append(f"'{topic}': {error.message.rstrip('.')}")
         return
+    if _PATH.fullmatch(path) is None:
+        problems.append(f"'{topic}': '{path}' is no field such as 'poses[0].position.x'")
+        return
     try:
-        owner, name, index = _place(sample, path)
-        field = getattr(owner, name)
-        if index is None:
-            if not isinstance(field, bool | int | float | str):
-                problems.append(f"'{topic}': '{path}' of '{message}' is no single value")
-        elif len(field) and index >= len(field):
-            problems.append(f"'{topic}': '{path}' of '{message}' is beyond its {len(field)} elements")
-    except AttributeError:
+        owner, last = _place(sample, path)
+        field = owner[last] if isinstance(last, int) else getattr(owner, last)
+    except IndexError as error:
+        problems.append(f"'{topic}': '{path}' of '{message}' is beyond its {error} elements")
+    except (AttributeError, TypeError):
         problems.append(f"'{topic}': '{message}' has no field '{path}'")
+    else:
+        if not isinstance(field, bool | int | float | str | bytes | np.generic):
+            problems.append(f"'{topic}': '{path}' of '{message}' is no single value")
 
 
-def _place(message: Any, path: str) -> tuple[Any, str, int | None]:  # noqa: ANN401 a ROS message
-    """The message that has the last part of a path, its name there, and the index if it has one."""
-    *parents, last = path.split(".")
+def _place(message: Any, path: str, passed: Callable[[Any], None] = lambda _owner: None) -> tuple[Any, str | int]:  # noqa: ANN401 a ROS message
+    """What holds the field at a path, and its name or index there; sequences on the way are made long enough.
+
+    Args:
+        message: a ROS message.
+        path: such as `poses[0].position.x`.
+        passed: called with every message in an array that is on the way.
+
+    Raises:
+        AttributeError: there is no such field.
+        IndexError: an array cannot have so many elements; the text is how many it can have.
+        TypeError: something that has an index is no array.
+    """
+    parts = path_parts(path)
     owner = message
-    for parent in parents:
-        owner = getattr(owner, parent)
-    indexed = _INDEXED.fullmatch(last)
-    return (owner, last, None) if indexed is None else (owner, indexed["name"], int(indexed["index"]))
+    for part, following in pairwise(parts):
+        if isinstance(following, int):
+            assert isinstance(part, str)  # ROS has no arrays of arrays
+            _lengthen(owner, part, following + 1)
+            owner = getattr(owner, part)
+        elif isinstance(part, int):
+            owner = owner[part]
+            passed(owner)
+        else:
+            owner = getattr(owner, part)
+    return owner, parts[-1]
+
+
+def _lengthen(owner: Any, name: str, length: int) -> None:  # noqa: ANN401 a ROS message
+    """Let the array ``name`` of a message have ``length`` elements at least; new ones are empty."""
+    elements = getattr(owner, name)
+    sequence = _SEQUENCE.fullmatch(owner.get_fields_and_field_types()[name])
+    most = len(elements) if sequence is None else int(sequence["bound"] or MAX_ELEMENTS)
+    if length > most:
+        raise IndexError(most)
+    if sequence is not None and length > len(elements):
+        kind = sequence["element"]
+        package, slash, own = kind.partition("/")
+        make = message_class(f"{package}/msg/{own}") if slash else lambda: _EMPTY.get(kind, 0)
+        elements.extend(make() for _ in range(length - len(elements)))
+
+
+def _stamp(message: Any, time: int) -> None:  # noqa: ANN401 a ROS message
+    if hasattr(message, "header"):
+        message.header.stamp.sec, message.header.stamp.nanosec = divmod(time, 1_000_000_000)

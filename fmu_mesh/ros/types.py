@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 import msgspec
 
@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 __all__ = [
     "CLOCK",
+    "HEADER",
+    "MAX_ELEMENTS",
     "TIME",
     "Array",
     "Basic",
@@ -32,15 +34,22 @@ __all__ = [
     "carries",
     "default_type",
     "is_message_name",
+    "path_parts",
 ]
 
 CLOCK = "rosgraph_msgs/msg/Clock"
 TIME = "builtin_interfaces/msg/Time"
+HEADER = "std_msgs/msg/Header"
+
+MAX_ELEMENTS: Final = 1 << 16
+"""Strings and nested messages that all sequences and arrays of a message may hold together; an index is below it."""
 
 Distribution = Literal["humble", "jazzy", "kilted", "lyrical"]
 
 _MESSAGE_NAME = re.compile(r"[a-z][a-z0-9_]*/(?:msg|srv)/[A-Z][A-Za-z0-9_]*")
-_INDEXED = re.compile(r"(?P<name>[^\[\]]+)\[(?P<index>[0-9]+)\]")
+_INDEXED = re.compile(r"(?P<name>[^\[\]]+)\[(?P<index>[^\[\]]*)\]")
+_INDEX = re.compile(r"[0-9]{1,9}")
+_PART = re.compile(r"[^.\[\]]+|\[[0-9]+\]")
 
 
 class Basic(msgspec.Struct, frozen=True):
@@ -82,10 +91,10 @@ class UnknownType(ValueError):
 
 
 class UnknownField(ValueError):
-    """A message has no field at this place; ``names`` has the paths of those that it has."""
+    """A message has no field at this place, and why; ``names`` has the paths of those that it has."""
 
-    def __init__(self, message: str, path: str, names: tuple[str, ...]) -> None:
-        super().__init__(f"'{message}' has no field '{path}'")
+    def __init__(self, message: str, path: str, names: tuple[str, ...], reason: str = "") -> None:
+        super().__init__(f"'{message}' has no field '{path}'{f': {reason}' if reason else ''}")
         self.names = names
 
 
@@ -151,35 +160,42 @@ class MessageTypes:
         return tuple((name, _field_type(description)) for name, description in self.store.fielddefs[message][1])
 
     def field(self, message: str, path: str) -> FieldType:
-        """The type of the field at a path such as `twist.linear.x`, `pose.covariance[7]` or `data[0]`.
+        """The type of the field at a path such as `twist.linear.x`, `pose.covariance[7]` or `transforms[0].header`.
 
         Raises:
             UnknownType: there is no such type.
-            UnknownField: there is no such field, or its index is beyond the length of the array.
+            UnknownField: there is no such field, or its index is not one of the array.
         """
         kind: FieldType = Nested(message)
+        reached = ""
         for part in path.split("."):
             indexed = _INDEXED.fullmatch(part)
             name = indexed["name"] if indexed is not None else part
             found = dict(self.fields(kind.message)).get(name) if isinstance(kind, Nested) else None
-            if found is not None and indexed is not None:
-                found = _element(found, int(indexed["index"]))
-            if found is None:
-                raise UnknownField(message, path, tuple(self.paths(message)))
-            kind = found
+            reason = ""
+            if isinstance(kind, Array | Sequence) and isinstance(kind.element, Nested):
+                reason = f"'{reached}' is an array, write an index, such as {reached}[0].{part}"
+            elif found is not None and indexed is not None:
+                reason = _index_problem(found, indexed["index"])
+                found = found.element if isinstance(found, Array | Sequence) else None
+            if found is None or reason:
+                raise UnknownField(message, path, tuple(self.paths(message)), reason)
+            kind, reached = found, f"{reached}.{part}" if reached else part
         return kind
 
     def paths(self, message: str, prefix: str = "") -> Iterator[str]:
-        """The paths of all fields that are no message themselves."""
+        """The paths of all fields that are no message themselves; of arrays of messages, those of the first element."""
         for name, kind in self.fields(message):
             if isinstance(kind, Nested):
                 yield from self.paths(kind.message, f"{prefix}{name}.")
+            elif isinstance(kind, Array | Sequence) and isinstance(kind.element, Nested):
+                yield from self.paths(kind.element.message, f"{prefix}{name}[0].")
             else:
                 yield f"{prefix}{name}"
 
     def has_header(self, message: str) -> bool:
         """Whether a message starts with a `std_msgs/msg/Header`, and so has a stamp."""
-        return ("header", Nested("std_msgs/msg/Header")) in self.fields(message)
+        return ("header", Nested(HEADER)) in self.fields(message)
 
     def type_hash(self, message: str) -> str:
         """The RIHS01 hash of a message or of a service defined by `define_service` (REP 2016)."""
@@ -220,6 +236,11 @@ class MessageTypes:
                 pass
         except UnknownType as error:
             raise ConfigurationError(f"the definition of '{message}': {error}") from error
+
+
+def path_parts(path: str) -> list[str | int]:
+    """`pose.covariance[7]` as `pose`, `covariance`, 7."""
+    return [int(part[1:-1]) if part.startswith("[") else part for part in _PART.findall(path)]
 
 
 def is_message_name(name: str) -> bool:
@@ -329,10 +350,16 @@ def _element_type(description: object) -> Basic | Nested:
     return kind
 
 
-def _element(kind: FieldType, index: int) -> FieldType | None:
+def _index_problem(kind: FieldType, index: str) -> str:
+    """Why a field has no element with this index; empty if it has, or can have."""
+    last = MAX_ELEMENTS - 1
     match kind:
-        case Array(element, length) if index < length:
-            return element
-        case Sequence(element, bound) if not bound or index < bound:
-            return element
-    return None
+        case Array(_, length):
+            last = min(last, length - 1)
+        case Sequence(_, bound) if bound:
+            last = min(last, bound - 1)
+        case Basic() | Nested():
+            return "it is no array"
+    if _INDEX.fullmatch(index) is None or int(index) > last:
+        return f"an index is a whole number from 0 to {last}"
+    return ""

@@ -16,6 +16,8 @@ import psutil
 import pytest
 import zenoh
 
+from fmu_mesh.ros.cdr import Codec
+from fmu_mesh.ros.types import MessageTypes, Nested
 from tests.helpers import DEADLINE_S, Launched, Place, row_count, rows_of, wait_until, write_config
 from tests.ros.peers import free_port
 
@@ -229,6 +231,53 @@ def test_a_mesh_runs_on_where_nobody_of_ros_is_there(place: Place, ros: Ros) -> 
 
     assert len(rows_of(place.folder / "lab.csv")) == 101
     assert ros.samples == {}
+
+
+def test_transforms_go_out_and_an_element_comes_in_while_a_message_without_it_changes_nothing(
+    place: Place, ros: Ros
+) -> None:
+    store = MessageTypes("jazzy").store
+    poses = Codec(MessageTypes("jazzy"), "geometry_msgs/msg/PoseArray")
+    empty = poses.empty()
+    there = empty | {"poses": [poses.empty_field(Nested("geometry_msgs/msg/Pose")) for _ in range(2)]}
+    there["poses"][1]["position"]["x"] = 2.5
+    config = configured(
+        place,
+        ros,
+        factor=1,
+        stop_time=1000.0,
+        topics=[
+            {
+                "topic": "/tf",
+                "type": "tf2_msgs/msg/TFMessage",
+                "fields": {"transforms[1].transform.rotation.w": "gain.y"},
+                "constants": {"transforms[1].child_frame_id": "tool"},
+                "frame_id": "world",
+            },
+            {"topic": "/poses", "type": "geometry_msgs/msg/PoseArray", "fields": {"poses[1].position.x": "gain.u"}},
+        ],
+    )
+
+    def newest() -> Any:  # noqa: ANN401 a message of rosbags
+        return store.deserialize_cdr(ros.samples["tf"][-1], "tf2_msgs/msg/TFMessage")
+
+    mesh = place.start("launch", config, "--no-progress")
+    wait_until(lambda: "tf" in ros.samples, "the first transform")
+    ros.session.put("poses", poses.encode(there))
+    wait_until(lambda: newest().transforms[1].transform.rotation.w == 2.5, "the element at the output")
+    ros.session.put("poses", poses.encode(empty))
+    wait_until(lambda: "that can be used: it has no 'poses[1].position.x'" in mesh.errors, "the warning")
+    seen = len(ros.samples["tf"])
+    wait_until(lambda: len(ros.samples["tf"]) > seen + 10, "a mesh that runs on")
+
+    transforms = newest().transforms
+    assert [own.child_frame_id for own in transforms] == ["", "tool"]
+    assert [own.header.frame_id for own in transforms] == ["world", "world"]
+    assert [own.transform.rotation.w for own in transforms] == [0.0, 2.5]
+    stamps = [own.header.stamp.sec + own.header.stamp.nanosec / 1e9 for own in transforms]
+    assert stamps[0] == stamps[1] > 0.1
+    assert place.run("stop", "lab").wait() == 0
+    assert mesh.wait() == 130, mesh.errors
 
 
 def test_the_kept_configuration_with_topics_runs(place: Place) -> None:

@@ -14,10 +14,11 @@ from fmu_mesh.model.description import Variable, VariableType
 from fmu_mesh.ros.cdr import CdrError, Codec
 from fmu_mesh.ros.messages import Assembler, Disassembler
 from fmu_mesh.ros.topics import Port, Topic
-from fmu_mesh.ros.types import MessageTypes
+from fmu_mesh.ros.types import MessageTypes, Nested
 
 TYPES = MessageTypes("kilted")
 TWIST = "geometry_msgs/msg/TwistStamped"
+TF = "tf2_msgs/msg/TFMessage"
 
 
 def port(path: str, *, kind: VariableType = "Float64", steps: int = 1, shape: tuple[int, ...] = ()) -> Port:
@@ -27,9 +28,20 @@ def port(path: str, *, kind: VariableType = "Float64", steps: int = 1, shape: tu
     return Port(path, "one", variable, "out", steps)
 
 
-def topic(message: str, *ports: Port, direction: Literal["out", "in"] = "out") -> Topic:
-    stamped = TYPES.has_header(message)
-    return Topic("/t", message, direction, ports, "ros2dds", stamped=stamped, frame_id="base", reliability="reliable")
+def topic(
+    message: str, *ports: Port, direction: Literal["out", "in"] = "out", constants: tuple[tuple[str, str], ...] = ()
+) -> Topic:
+    return Topic(
+        "/t",
+        message,
+        direction,
+        ports,
+        "ros2dds",
+        stamped=TYPES.has_header(message),
+        frame_id="base",
+        reliability="reliable",
+        constants=constants,
+    )
 
 
 def decoded(message: str, data: bytes) -> dict[str, Any]:
@@ -142,6 +154,49 @@ def test_a_message_without_the_element_that_a_variable_needs_is_refused() -> Non
         Disassembler(topic(name, port("data[3]"), direction="in"), TYPES).values(empty)
     with pytest.raises(CdrError, match="needs 2 elements"):
         Disassembler(topic(name, port("data", shape=(2,)), direction="in"), TYPES).values(empty)
+
+
+def test_elements_of_an_array_of_messages_are_made_up_to_the_last_that_is_mapped() -> None:
+    ports = (port("transforms[2].transform.translation.x"), port("transforms[0].transform.rotation.w"))
+    constants = (("transforms[2].child_frame_id", "tool"), ("transforms[2].header.frame_id", "arm"))
+    assembler = Assembler(topic(TF, *ports, constants=constants), TYPES)
+
+    first, second = (assembler.make([0.5, 0.25], 1.5) for _ in range(2))
+    message = decoded(TF, second)
+
+    assert first == second  # nothing of a message grows with the next
+    transforms = message["transforms"]
+    assert [own["transform"]["translation"]["x"] for own in transforms] == [0.0, 0.0, 0.5]
+    assert [own["transform"]["rotation"]["w"] for own in transforms] == [0.25, 0.0, 0.0]
+    assert [own["child_frame_id"] for own in transforms] == ["", "", "tool"]
+    assert [own["header"]["frame_id"] for own in transforms] == ["base", "base", "arm"]
+    assert [own["header"]["stamp"] for own in transforms] == [{"sec": 1, "nanosec": 500_000_000}] * 3
+
+
+def test_an_element_of_an_array_of_messages_is_read_and_a_message_without_it_is_refused() -> None:
+    disassembler = Disassembler(topic(TF, port("transforms[1].transform.rotation.w"), direction="in"), TYPES)
+    codec = Codec(TYPES, TF)
+    message = codec.empty()
+    short = [codec.empty_field(Nested("geometry_msgs/msg/TransformStamped"))]
+
+    for elements in ([], short):
+        with pytest.raises(CdrError, match=r"has no 'transforms\[1\]"):
+            disassembler.values(codec.encode(message | {"transforms": elements}))
+    there = decoded(TF, Assembler(topic(TF, port("transforms[1].transform.rotation.w")), TYPES).make([0.5], 0.0))
+
+    assert disassembler.values(codec.encode(there)) == ([0.5], None)
+
+
+def test_texts_and_numbers_fill_the_sequences_of_one_message() -> None:
+    name = "sensor_msgs/msg/JointState"
+    ports = (port("position[1]"), port("effort[0]"), port("name[0]", kind="String"))
+    assembler = Assembler(topic(name, *ports, constants=(("name[1]", "wrist"),)), TYPES)
+
+    message = decoded(name, assembler.make(["INF", 2.0, "elbow"], 0.0))
+
+    assert message["name"] == ["elbow", "wrist"]
+    assert message["position"].tolist() == [0.0, math.inf]
+    assert (message["velocity"].tolist(), message["effort"].tolist()) == ([], [2.0])
 
 
 def test_the_stamp_of_a_message_comes_with_its_values_and_zero_is_none() -> None:

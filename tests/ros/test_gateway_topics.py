@@ -222,6 +222,86 @@ def test_what_is_wrong_is_told_with_the_way_out(tmp_path: Path, ros: dict[str, A
     assert message in str(caught.value)
 
 
+JOINTS, PRIMITIVE, TF = "sensor_msgs/msg/JointState", "shape_msgs/msg/SolidPrimitive", "tf2_msgs/msg/TFMessage"
+
+
+def mapped(message: str, fields: dict[str, str], **more: Any) -> dict[str, Any]:  # noqa: ANN401 what a file may hold
+    return {"topics": [{"topic": "/t", "type": message, "fields": fields, **more}]}
+
+
+@pytest.mark.parametrize(
+    ("ros", "message"),
+    [
+        (mapped(TF, {"transforms.transform.rotation.w": "delay.y"}), "write an index, such as transforms[0].transform"),
+        (
+            mapped(TF, {"transforms[0].transform.rotation.q": "delay.y"}),
+            "has no field 'transforms[0].transform.rotation.q'",
+        ),
+        (mapped(TF, {"transforms[0].transform": "delay.y"}), "it is a message itself"),
+        (mapped(TF, {"transforms[-1].transform.rotation.w": "delay.y"}), "an index is a whole number from 0 to 65535"),
+        (mapped(TF, {"transforms[99999999].transform.rotation.w": "gain.u"}), "a whole number from 0 to 65535"),
+        (mapped(TF, {"transforms[65535].transform.rotation.w": "delay.y"}), "bytes are too many for a message"),
+        (mapped(PRIMITIVE, {"dimensions[3]": "gain.u"}), "an index is a whole number from 0 to 2"),
+        (mapped(JOINTS, {"position[100000]": "delay.y"}), "an index is a whole number from 0 to 65535"),
+        (mapped(JOINTS, {"position": "delay.y"}), "one value into an array; write an index, such as data[0]"),
+        (
+            mapped(JOINTS, {"position[1]": "delay.y", "position[01]": "gain.y"}),
+            "'position[01]', which 'position[1]' gives already; expected a value once for each field",
+        ),
+        (
+            mapped(JOINTS, {"position[0]": "delay.y"}, constants={"header.stamp.sec": 5}),
+            "'header.stamp.sec', which is the simulation time",
+        ),
+        (
+            mapped(JOINTS, {"position[0]": "delay.y"}, constants={"name[0]": 5}),
+            "5 for 'name[0]' of 'sensor_msgs/msg/JointState'; expected a value of the type string",
+        ),
+        (
+            mapped(JOINTS, {"position[0]": "delay.y"}, constants={"nam[0]": "x"}),
+            "has no field 'nam[0]'; expected one of",
+        ),
+        (mapped(JOINTS, {"position[0]": "delay.y"}, constants={"effort": 1.0}), "expected a field of one value"),
+        (mapped(JOINTS, {"position[0]": "delay.y"}, constants={"effort[0]": True}), "a value of the type float64"),
+        (mapped(PRIMITIVE, {"dimensions[0]": "delay.y"}, constants={"type": 300}), "'type' cannot be 300"),
+        (mapped(JOINTS, {"position[0]": "gain.u"}, constants={"name[0]": "a"}), "a topic that is subscribed"),
+    ],
+)
+def test_what_could_not_be_sent_or_received_is_told_by_check(tmp_path: Path, ros: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigurationError) as caught:
+        prepare(configured(tmp_path, **ros))
+
+    assert message in str(caught.value)
+
+
+def test_an_array_that_has_not_as_many_elements_as_its_field_is_told(tmp_path: Path) -> None:
+    fields = {"covariance": "a.float64_array_out"}
+    path = write_config(
+        tmp_path,
+        instances={"a": {"fmu": str(find_fmu("AllTypes3", tmp_path)), "start_values": {"columns": 5}}},
+        connections=[],
+        ros=mapped("geometry_msgs/msg/PoseWithCovariance", fields),
+    )
+
+    with pytest.raises(ConfigurationError, match="it has 36 elements, and the variable 10"):
+        prepare(path)
+
+
+def test_elements_of_arrays_of_messages_are_topics_in_both_directions(tmp_path: Path) -> None:
+    out = {"transforms[0].transform.translation.x": "pendulum.a", "transforms[1].transform.rotation.w": "delay.y"}
+    names = {"transforms[0].child_frame_id": "rod", "transforms[1].child_frame_id": "late"}
+
+    plan = planned(
+        tmp_path,
+        topics=[
+            {"topic": "/tf", "type": TF, "fields": out, "constants": names, "frame_id": "world"},
+            {"topic": "/poses", "type": "geometry_msgs/msg/PoseArray", "fields": {"poses[3].position.x": "gain.u"}},
+        ],
+    )
+
+    assert [(topic.name, topic.direction) for topic in plan.topics] == [("/tf", "out"), ("/poses", "in")]
+    assert plan.topics[0].constants == tuple(names.items())
+
+
 def test_names_that_collide_or_start_with_a_digit_are_told_with_all_else_that_is_wrong(tmp_path: Path) -> None:
     loaded = load(configured(tmp_path, topics=["pendulum", "delay.nothing"]))
     variables = tuple(

@@ -437,6 +437,36 @@ def test_fields_of_one_message_are_variables_in_both_directions(ros: Ros) -> Non
     assert {name for name, _ in peer.get_topic_names_and_types()} & {"/u1", "/u2", "/y"} == set()
 
 
+def test_an_element_of_an_array_of_messages_is_a_variable_in_both_directions(ros: Ros) -> None:
+    from geometry_msgs.msg import Pose, PoseArray  # noqa: PLC0415 only where ROS is installed
+
+    node = ros.fmu(
+        fmu_path=str(FMUS / "Gain.fmu"),
+        step_size=0.01,
+        messages=[
+            "/given: {type: geometry_msgs/msg/PoseArray, fields: {'poses[1].position.x': u}}",
+            "/taken: {type: geometry_msgs/msg/PoseArray, fields: {'poses[2].position.y': y}}",
+        ],
+    )
+    peer = ros.peer()
+    publisher = peer.create_publisher(PoseArray, "/given", 10)
+    subscription, messages = ros.collect(peer, PoseArray, "/taken")
+    start(node)
+    ros.matched(publisher, subscription)
+    message = PoseArray(poses=[Pose(), Pose()])
+    message.poses[1].position.x = 0.25
+    publisher.publish(message)
+
+    ros.until(lambda: messages and messages[-1].poses[2].position.y == 0.25, "the element")
+    publisher.publish(PoseArray(poses=[Pose()]))  # without the element: it is left out
+    after = len(messages)
+    ros.until(lambda: len(messages) > after + 3, "a node that goes on")
+
+    assert [len(own.poses) for own in messages] == [3] * len(messages)
+    assert messages[-1].poses[2].position.y == 0.25
+    assert state_of(node) == "active"
+
+
 @pytest.mark.parametrize(
     ("parameters", "complaint"),
     [
@@ -448,6 +478,31 @@ def test_fields_of_one_message_are_variables_in_both_directions(ros: Ros) -> Non
         ({"fmu_path": PENDULUM, "messages": ["/t: {type: std_msgs/msg/Float64, fields: {dat: a}}"]}, "no field 'dat'"),
         ({"fmu_path": PENDULUM, "messages": ["/t: {type: no_msgs/msg/No, fields: {data: a}}"]}, "'no_msgs'"),
         ({"fmu_path": PENDULUM, "messages": ["/t: {type: std_msgs/msg/Float64, fields: {data: b}}"]}, "'b' in '/t'"),
+        (
+            {"fmu_path": PENDULUM, "messages": ["/t: {type: geometry_msgs/msg/PoseArray, fields: {'poses[0]': a}}"]},
+            "'poses[0]' of 'geometry_msgs/msg/PoseArray' is no single value",
+        ),
+        (
+            {
+                "fmu_path": PENDULUM,
+                "messages": ["/t: {type: std_msgs/msg/Float64MultiArray, fields: {'data[-1]': a}}"],
+            },
+            "'data[-1]' is no field such as",
+        ),
+        (
+            {
+                "fmu_path": PENDULUM,
+                "messages": ["/t: {type: std_msgs/msg/Float64MultiArray, fields: {'data[65536]': a}}"],
+            },
+            "is beyond its 65536 elements",
+        ),
+        (
+            {
+                "fmu_path": PENDULUM,
+                "messages": ["/t: {type: geometry_msgs/msg/PoseWithCovariance, fields: {'covariance[36]': a}}"],
+            },
+            "is beyond its 36 elements",
+        ),
         ({"fmu_path": PENDULUM, "publish_clock": True, "use_sim_time": True}, "publish /clock and run by it"),
     ],
 )

@@ -57,6 +57,39 @@ def test_a_field_that_is_not_there_is_told_with_those_that_are(path: str) -> Non
     assert "pose.pose.position.x" in caught.value.names
 
 
+@pytest.mark.parametrize(
+    ("message", "path", "reason"),
+    [
+        (
+            "tf2_msgs/msg/TFMessage",
+            "transforms.transform",
+            "an array, write an index, such as transforms[0].transform",
+        ),
+        ("tf2_msgs/msg/TFMessage", "transforms[65536].child_frame_id", "an index is a whole number from 0 to 65535"),
+        ("tf2_msgs/msg/TFMessage", "transforms[-1].child_frame_id", "an index is a whole number from 0 to 65535"),
+        ("sensor_msgs/msg/JointState", "position[" + "9" * 5000 + "]", "an index is a whole number from 0 to 65535"),
+        ("sensor_msgs/msg/JointState", "position[two]", "an index is a whole number from 0 to 65535"),
+        ("sensor_msgs/msg/JointState", "position[]", "an index is a whole number from 0 to 65535"),
+        ("geometry_msgs/msg/PoseWithCovariance", "covariance[36]", "an index is a whole number from 0 to 35"),
+        ("shape_msgs/msg/SolidPrimitive", "dimensions[3]", "an index is a whole number from 0 to 2"),
+        ("geometry_msgs/msg/PoseArray", "header[0].frame_id", "it is no array"),
+        ("std_msgs/msg/Float64", "data[0]", "it is no array"),
+    ],
+)
+def test_an_index_that_is_none_of_the_array_is_told_with_those_that_are(message: str, path: str, reason: str) -> None:
+    with pytest.raises(UnknownField) as caught:
+        TYPES.field(message, path)
+
+    assert str(caught.value).endswith(reason)
+
+
+def test_an_element_of_an_array_of_messages_has_fields_as_any_message() -> None:
+    assert TYPES.field("tf2_msgs/msg/TFMessage", "transforms[7].transform.rotation.w") == Basic("float64")
+    assert TYPES.field("sensor_msgs/msg/JointState", "name[65535]") == Basic("string")
+    assert TYPES.field("shape_msgs/msg/SolidPrimitive", "dimensions[2]") == Basic("float64")
+    assert "transforms[0].child_frame_id" in TYPES.paths("tf2_msgs/msg/TFMessage")
+
+
 def test_an_unknown_type_is_told() -> None:
     with pytest.raises(UnknownType, match="'std_msgs/msg/Flot64'"):
         TYPES.fields("std_msgs/msg/Flot64")
@@ -75,6 +108,7 @@ def test_a_custom_definition_is_as_good_as_one_of_ros() -> None:
         ("Wheel", "float64 x", "is no name of a message type"),
         ("lab_msgs/msg/Wheel", "float64", "is not understood"),
         ("lab_msgs/msg/Wheel", "Rim rim", "there is no message type 'lab_msgs/msg/Rim'"),
+        ("lab_msgs/msg/Wheel", "Rim[] rims", "there is no message type 'lab_msgs/msg/Rim'"),
         ("std_msgs/msg/Float64", "float32 data", "is defined already"),
     ],
 )
