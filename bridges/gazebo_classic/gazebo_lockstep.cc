@@ -7,8 +7,8 @@
 // 17 digits, so that they arrive as they were sent:
 //
 //   > world <bytes>                         and then so many bytes of SDF
-//   > joint <model>::<joint> limited|free   any number of times; free: whatever velocity limit its file says
-//   > link <model>::<link>                  any number of times
+//   > joint <model>::<joint> limited|free   any number of times; free: whatever velocity limit its file says; a model in
+//   > link <model>::<link>                  a model is <outer>::<inner>
 //   > go                                    loads the world
 //   < gazebo <version> <engine>
 //   < <state>                               the state as loaded
@@ -43,6 +43,7 @@ namespace {
 
 using gazebo::physics::JointPtr;
 using gazebo::physics::LinkPtr;
+using gazebo::physics::ModelPtr;
 using gazebo::physics::WorldPtr;
 using ignition::math::Vector3d;
 
@@ -70,16 +71,17 @@ struct Asked {
   std::vector<bool> free;  // of each joint
 };
 
-std::pair<std::string, std::string> model_and_part(const std::string &scoped) {
-  const auto colons = scoped.rfind("::");
-  if (colons == std::string::npos) throw std::runtime_error(scoped + " is no <model>::<name>");
-  return {scoped.substr(0, colons), scoped.substr(colons + 2)};
-}
-
-gazebo::physics::ModelPtr model_named(const WorldPtr &world, const std::string &name) {
-  const auto model = world->ModelByName(name);
-  if (!model) throw std::runtime_error("the world has no model " + name);
-  return model;
+// The part that get finds by its name in a model of the world. Both names may have "::" in them: a model may be in a
+// model, and a link of an expanded file may be called after the model that it came from.
+template <typename Part>
+Part part_named(const WorldPtr &world, const std::string &scoped, Part (*get)(const ModelPtr &, const std::string &)) {
+  for (auto colons = scoped.rfind("::"); colons != std::string::npos && colons > 0;
+       colons = scoped.rfind("::", colons - 1)) {
+    const auto model = world->ModelByName(scoped.substr(0, colons));
+    const auto part = model ? get(model, scoped.substr(colons + 2)) : Part();
+    if (part) return part;
+  }
+  throw std::runtime_error("the world has no " + scoped);
 }
 
 class World {
@@ -91,17 +93,14 @@ class World {
     if (!world_) throw std::runtime_error("Gazebo cannot load this world");
     world_->Physics()->SetRealTimeUpdateRate(0);
     for (const auto &scoped : asked.joints) {
-      const auto [model, name] = model_and_part(scoped);
-      joints_.push_back(model_named(world_, model)->GetJoint(name));
-      if (!joints_.back()) throw std::runtime_error("the world has no joint " + scoped);
+      joints_.push_back(part_named<JointPtr>(
+          world_, scoped, [](const ModelPtr &model, const std::string &name) { return model->GetJoint(name); }));
       joints_.back()->SetEffortLimit(0, -1.0);
       if (asked.free[joints_.size() - 1]) joints_.back()->SetVelocityLimit(0, -1.0);
     }
-    for (const auto &scoped : asked.links) {
-      const auto [model, name] = model_and_part(scoped);
-      links_.push_back(model_named(world_, model)->GetLink(name));
-      if (!links_.back()) throw std::runtime_error("the world has no link " + scoped);
-    }
+    for (const auto &scoped : asked.links)
+      links_.push_back(part_named<LinkPtr>(
+          world_, scoped, [](const ModelPtr &model, const std::string &name) { return model->GetLink(name); }));
     accelerations_.resize(joints_.size());
   }
 

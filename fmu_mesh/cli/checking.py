@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from ..launch.opening import check_engines
 from ..launch.preparing import Options, prepare
 from ..model.description import Variable
 from ..model.findings import listed, shown
@@ -40,6 +41,7 @@ def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.Arg
 def _check(arguments: argparse.Namespace) -> int:
     plan = prepare(arguments.config, Options(start_values=tuple(arguments.set), window=arguments.window), say)
     print("\n".join(plan_page(plan)))
+    check_engines(plan.system, str(arguments.config))
     print(f"\nOK: {arguments.config} can run.")
     return 0
 

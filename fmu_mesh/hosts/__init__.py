@@ -4,7 +4,7 @@ Each is an `Instance` with a model description of its own, so that checks, plans
 MuJoCo is an extra and is imported when a world is opened; nothing else of the package imports it. Gazebo is a process.
 """
 
-from .gazebo_classic import GazeboClassicInstance
+from .gazebo_classic import GazeboClassicInstance, check_gazebo_classic
 from .gazebo_world import describe_gazebo_world
 from .mujoco import MujocoInstance
 from .mujoco_files import world_content
@@ -20,6 +20,7 @@ __all__ = [
     "PidInstance",
     "Window",
     "check_film",
+    "check_gazebo_classic",
     "check_window",
     "describe_gazebo_world",
     "describe_pid",

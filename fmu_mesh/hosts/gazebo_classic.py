@@ -29,12 +29,26 @@ from ..model.description import ModelDescription, Value
 from ..model.ring import Ring
 from ..simtime import TimeGrid, steps_between
 from .frames import relative_velocity, to_body
-from .gazebo_process import PROGRAM_VARIABLE, GazeboGone, GazeboProcess
+from .gazebo_process import PROGRAM_VARIABLE, GazeboGone, GazeboProcess, check_program
 from .gazebo_world import JOINT_STATE, LINK_STATE, Place, load_gazebo_world
 
-__all__ = ["GazeboClassicInstance"]
+__all__ = ["GazeboClassicInstance", "check_gazebo_classic"]
 
 Floats = NDArray[np.float64]
+
+HOW_TO_GET_IT = f"Build bridges/gazebo_classic and put it on the path, or its command into ${PROGRAM_VARIABLE}."
+
+
+def check_gazebo_classic() -> None:
+    """See whether worlds of Gazebo classic can be opened on this host.
+
+    Raises:
+        LoadFailed: they cannot; says why.
+    """
+    try:
+        check_program()
+    except GazeboGone as error:
+        raise LoadFailed(f"Gazebo classic does not run on this host: {error}", hint=HOW_TO_GET_IT) from error
 
 
 class GazeboClassicInstance:
@@ -63,7 +77,7 @@ class GazeboClassicInstance:
             raise LoadFailed(
                 f"Gazebo classic does not run '{path}': {error}",
                 instance=name,
-                hint=f"Build bridges/gazebo_classic and put it on the path, or its command into ${PROGRAM_VARIABLE}.",
+                hint=HOW_TO_GET_IT,
             ) from error
         joints, links = len(world.joints), len(world.links)
         self._arrays: dict[str, Floats] = {

@@ -17,7 +17,7 @@ import tempfile
 import time
 from collections.abc import Sequence
 
-__all__ = ["PROGRAM_VARIABLE", "GazeboGone", "GazeboProcess", "find_program"]
+__all__ = ["PROGRAM_VARIABLE", "GazeboGone", "GazeboProcess", "check_program", "find_program"]
 
 PROGRAM_VARIABLE = "FMU_MESH_GAZEBO"
 """The environment variable with the command of the lock-step program, as a shell would split it."""
@@ -43,6 +43,29 @@ def find_program() -> list[str]:
     if shutil.which(command[0]) is None:
         raise GazeboGone(f"there is no '{command[0]}'")
     return command
+
+
+def check_program() -> None:
+    """See whether the lock-step program starts here, without a world.
+
+    Raises:
+        GazeboGone: it does not, or does not answer.
+    """
+    try:
+        done = subprocess.run(
+            find_program(),
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            env=_environment(),
+            timeout=_START_S,
+            check=False,
+        )
+    except OSError as error:
+        raise GazeboGone(f"'{find_program()[0]}' does not start: {error.strerror}") from error
+    except subprocess.TimeoutExpired as error:
+        raise GazeboGone(f"it has not answered for {_START_S:g} s") from error
+    if not done.stdout.startswith(b"error standard input ended"):
+        raise GazeboGone(_ended(done.returncode, done.stderr[-_TAIL:]))
 
 
 class GazeboProcess:
@@ -147,10 +170,15 @@ class GazeboProcess:
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(_END_S)
         size = os.fstat(self._errors.fileno()).st_size
-        tail = os.pread(self._errors.fileno(), _TAIL, max(0, size - _TAIL)).decode(errors="replace")
-        lines = [line.strip() for line in tail.splitlines() if line.strip()]
-        words = f"; the last it wrote is: {lines[-1]}" if lines else ""
-        return f"its process has ended with {self._process.returncode}{words}"
+        tail = os.pread(self._errors.fileno(), _TAIL, max(0, size - _TAIL))
+        return _ended(self._process.returncode, tail)
+
+
+def _ended(code: int | None, tail: bytes) -> str:
+    """How a process has ended, with the last line of what it wrote."""
+    lines = [line.strip() for line in tail.decode(errors="replace").splitlines() if line.strip()]
+    words = f"; the last it wrote is: {lines[-1]}" if lines else ""
+    return f"its process has ended with {code}{words}"
 
 
 def _environment() -> dict[str, str]:

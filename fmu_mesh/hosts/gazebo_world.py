@@ -1,8 +1,8 @@
 """An SDF world as a model description, and where the value of each of its variables lies.
 
 Owns names, units and meaning of the variables, which are those of `fmu_mesh.hosts.mujoco_model`, so that one
-configuration serves both engines; there are no sensors and no actuators of the model. It reads the file itself: Gazebo
-is needed to run a world, not to check a configuration. What happens in a step is `fmu_mesh.hosts.gazebo_classic`.
+configuration serves both engines; there are no sensors and no actuators of the model. What of the file is simulated is
+`fmu_mesh.hosts.gazebo_sdf`, and what happens in a step is `fmu_mesh.hosts.gazebo_classic`.
 
 A joint or link is named as in the file where that name is unique, and `model::name` where it is not.
 """
@@ -13,7 +13,7 @@ import hashlib
 import math
 import xml.etree.ElementTree as ET
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -22,6 +22,7 @@ import msgspec
 from ..errors import LoadFailed
 from ..model.config import GazeboClassicConfig
 from ..model.description import Causality, DefaultExperiment, ModelDescription, Variable
+from .gazebo_sdf import Model, read_world
 
 __all__ = ["GazeboWorld", "Joint", "Link", "Place", "describe_gazebo_world", "load_gazebo_world"]
 
@@ -71,7 +72,7 @@ class GazeboWorld(msgspec.Struct, frozen=True):
     """A world.
 
     Attributes:
-        text: the file.
+        text: what Gazebo gets.
         step_size: of the engine in s.
         places: by variable name.
     """
@@ -99,46 +100,34 @@ def load_gazebo_world(path: Path, config: GazeboClassicConfig) -> GazeboWorld:
     Raises:
         LoadFailed: it is no world that Gazebo could load without looking elsewhere.
     """
-    try:
-        text = path.read_bytes()
-        root = ET.fromstring(text)  # noqa: S314  a file of the user's own; it is run as a simulation anyway
-    except (OSError, ET.ParseError) as error:
-        reason = error.strerror if isinstance(error, OSError) else str(error)
-        raise LoadFailed(f"'{path}' cannot be read as an SDF world: {reason}") from error
-    worlds = root.findall("world")
-    if root.tag != "sdf" or len(worlds) != 1:
-        raise LoadFailed(f"'{path}' is no SDF file with one world", hint="Gazebo classic 11 reads SDF up to 1.7.")
-    (world,) = worlds
-    if (include := root.find(".//include")) is not None:
-        uri = include.findtext("uri", "without a uri").strip()
-        raise LoadFailed(
-            f"'{path}' includes a model ({uri})", hint="Write the model into the file: nothing is fetched for a run."
-        )
-    step_size = _number(world.findtext("physics/max_step_size"), _DEFAULT_STEP_SIZE, path)
+    sdf = read_world(path)
+    step_size = _number(sdf.element.findtext("physics/max_step_size"), _DEFAULT_STEP_SIZE, path)
     free = {actuator.joint for actuator in config.actuators if actuator.disable_velocity_effort_limits}
-    joints, links = _joints(world, free, path), _links(world)
+    moving = [model for model in sdf.models if model.moving]
+    joints, links = _joints(moving, free, path), _links(moving)
     variables = dict(_variables(joints, links))
     description = ModelDescription(
-        model_name=world.get("name") or path.stem,
+        model_name=sdf.element.get("name") or path.stem,
         model_identifier="gazebo_classic",
         fmi_version="",
         kind="physics_engine",
-        guid=hashlib.sha256(text).hexdigest()[:32],
+        guid=hashlib.sha256(sdf.source).hexdigest()[:32],
         variables=tuple(
             msgspec.structs.replace(variable, value_reference=number) for number, variable in enumerate(variables)
         ),
         generation_tool="Gazebo classic",
         default_experiment=DefaultExperiment(step_size=step_size),
+        problems=sdf.notes,
     )
     places = {variable.name: place for variable, place in variables.items()}
-    return GazeboWorld(text, step_size, joints, links, description, places)
+    return GazeboWorld(sdf.text, step_size, joints, links, description, places)
 
 
-def _joints(world: ET.Element, free: set[str], path: Path) -> tuple[Joint, ...]:
+def _joints(models: Sequence[Model], free: set[str], path: Path) -> tuple[Joint, ...]:
     found = [
-        (f"{model.get('name')}::{joint.get('name')}", joint)
-        for model in world.findall("model")
-        for joint in model.findall("joint")
+        (f"{model.scoped}::{joint.get('name')}", joint)
+        for model in models
+        for joint in model.element.findall("joint")
         if joint.get("type") in {"revolute", "prismatic"}
     ]
     names = _names([scoped for scoped, _ in found])
@@ -154,13 +143,8 @@ def _joints(world: ET.Element, free: set[str], path: Path) -> tuple[Joint, ...]:
     )
 
 
-def _links(world: ET.Element) -> tuple[Link, ...]:
-    scoped = [
-        f"{model.get('name')}::{link.get('name')}"
-        for model in world.findall("model")
-        for link in model.findall("link")
-        if model.findtext("static", "false").strip() not in {"true", "1"}
-    ]
+def _links(models: Sequence[Model]) -> tuple[Link, ...]:
+    scoped = [f"{model.scoped}::{link.get('name')}" for model in models for link in model.element.findall("link")]
     return tuple(Link(*names) for names in zip(scoped, _names(scoped), strict=True))
 
 

@@ -25,6 +25,7 @@ kind: no two variables have one name.
 from __future__ import annotations
 
 import hashlib
+import xml.etree.ElementTree as ET
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
@@ -137,7 +138,7 @@ def load_world(path: Path, config: MujocoConfig) -> World:
         default_experiment=DefaultExperiment(step_size=float(model.opt.timestep)),
         can_get_and_set_state=True,
         can_serialize_state=True,
-        problems=tuple(" ".join(text.split()) for text in warnings),
+        problems=(*(" ".join(text.split()) for text in warnings), *_left_out(mujoco, model, data)),
     )
     return World(model, description, numbered, tuple(_limits(mujoco, model, free)), keyframe)
 
@@ -265,6 +266,31 @@ def _limits(mujoco: ModuleType, model: Any, free: set[str]) -> Iterator[tuple[in
         if scalar and model.jnt_actfrclimited[number] and joint.name not in free:
             lower, upper = model.jnt_actfrcrange[number]
             yield int(joint.dofadr[0]), float(lower), float(upper)
+
+
+def _left_out(mujoco: ModuleType, model: Any, data: bytes) -> Iterator[str]:  # noqa: ANN401  mujoco has no types
+    """What is in the file and has no variables. Of a free joint, position and velocity are those of its body."""
+    joints = [model.joint(number) for number in range(model.njnt)]
+    for joint in joints:
+        if joint.type[0] == mujoco.mjtJoint.mjJNT_BALL:
+            yield f"the joint '{joint.name}' is simulated, and has no variables, as it is a ball joint"
+    scalar = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+    nameless = {
+        "joints": sum(not joint.name for joint in joints if int(joint.type[0]) in scalar),
+        "sensors": sum(not model.sensor(number).name for number in range(model.nsensor)),
+        "actuators": sum(not model.actuator(number).name for number in range(model.nu)),
+    }
+    for what, count in nameless.items():
+        if count:
+            yield f"{what} without a name have no variables; there are {count}"
+    try:
+        root = ET.fromstring(data)  # noqa: S314  a file of the user's own; it is run as a simulation anyway
+    except ET.ParseError:  # MuJoCo reads more than XML
+        return
+    bodies = {model.body(number).name for number in range(model.nbody)}
+    links = [name for link in root.findall("link") if (name := link.get("name", "")) not in bodies]
+    if root.tag == "robot" and links:
+        yield f"links that a fixed joint makes part of another have no variables: {listed(links)}"
 
 
 def _text(model: Any, address: int) -> str:  # noqa: ANN401  mujoco has no types

@@ -11,7 +11,7 @@ from pathlib import Path
 import msgspec
 
 from .. import files
-from ..errors import ConfigurationError, LoadFailed
+from ..errors import ConfigurationError, Finding, LoadFailed
 from ..fmu import FmuInstance, LogMessage, Terms, compile_sources, content_of, read_description
 from ..fmu import open_instance as open_fmu
 from ..fmu import stepped as stepped_fmu
@@ -22,6 +22,7 @@ from ..hosts import (
     Picture,
     PidInstance,
     Window,
+    check_gazebo_classic,
     describe_gazebo_world,
     describe_pid,
     describe_world,
@@ -34,7 +35,16 @@ from ..model.instance import Instance
 from ..model.plan import InstancePlan
 from ..model.system import System
 
-__all__ = ["Showing", "check_showing", "content", "describe", "expected_model", "open_instance", "stepped"]
+__all__ = [
+    "Showing",
+    "check_engines",
+    "check_showing",
+    "content",
+    "describe",
+    "expected_model",
+    "open_instance",
+    "stepped",
+]
 
 
 class Showing(msgspec.Struct, frozen=True):
@@ -145,6 +155,23 @@ def open_instance(
 def stepped(instance: Instance, item: InstancePlan) -> Instance:
     """What is stepped for an opened instance: it with its linear inputs, if it has some."""
     return stepped_fmu(instance, item.options) if isinstance(instance, FmuInstance) else instance
+
+
+def check_engines(system: System, file: str) -> None:
+    """See whether the engines of all instances that no `host` is named for are on this host.
+
+    Raises:
+        ConfigurationError: one is missing.
+    """
+    hosted = {name: own.hosted for name, own in system.instances.items()}
+    here = [name for name, own in hosted.items() if isinstance(own, GazeboClassicConfig) and own.host is None]
+    try:
+        if here:
+            check_gazebo_classic()
+    except LoadFailed as error:
+        expected = f"an engine that runs here, or the `host` of the instance. {error.hint}"
+        findings = (Finding(file, f"instances.{name}.gazebo_classic", error.message, expected) for name in here)
+        raise ConfigurationError(f"{file}: an engine is missing on this host", findings=tuple(findings)) from error
 
 
 def check_showing(system: System, showing: Showing) -> None:

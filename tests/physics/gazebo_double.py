@@ -22,6 +22,9 @@ def loaded() -> tuple[int, int]:
     """Read what comes before `go`: how many joints and links there are."""
     commands = []
     while (line := sys.stdin.readline()) != "go\n":
+        if not line:
+            say("error standard input ended before go")
+            sys.exit()
         command, *words = line.split()
         if command == "world":
             sys.stdin.read(int(words[0]))

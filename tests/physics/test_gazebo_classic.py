@@ -105,6 +105,73 @@ def test_a_cube_is_braked_by_the_drag_and_a_free_one_is_not(tmp_path: Path) -> N
     assert result["world.free_cube.position_x"][-1] == pytest.approx(2.0, abs=1e-3)
 
 
+INERTIA = "<inertial><mass>1</mass><inertia><ixx>0.1</ixx><iyy>0.1</iyy><izz>0.1</izz></inertia></inertial>"
+
+
+def link(name: str, x: float = 0.0, z: float = 2.0, more: str = "") -> str:
+    return f"<link name='{name}'><pose>{x} 0 {z} 0 0 0</pose>{INERTIA}{more}</link>"
+
+
+def joint(name: str, kind: str, parent: str, child: str, more: str = "") -> str:
+    axis = f"<axis><xyz>0 1 0</xyz>{more}</axis>"
+    return f"<joint name='{name}' type='{kind}'><parent>{parent}</parent><child>{child}</child>{axis}</joint>"
+
+
+def ran(folder: Path, content: str, *efforts: str, stop_time: float = 1.0) -> dict[str, Array]:
+    """A run of a world without gravity but along z, with constant efforts."""
+    path = folder / "world.sdf"
+    path.write_text(f"<sdf version='1.6'><world name='w'>{content}</world></sdf>", encoding="utf-8")
+    starts = ", ".join(f"'{effort}.effort': 0.1" for effort in efforts)
+    config = folder / "mesh.yaml"
+    config.write_text(
+        f"mesh: m\nsimulation: {{stop_time: {stop_time}, step_size: 0.001}}\n"
+        f"instances: {{world: {{gazebo_classic: world.sdf, start_values: {{{starts}}}}}}}\n",
+        encoding="utf-8",
+    )
+    return columns(config, folder / "result.csv")
+
+
+def test_joints_of_models_in_models_move_by_their_efforts(tmp_path: Path) -> None:
+    inner = f"{link('p')}{link('q', 1.0)}{joint('inner', 'revolute', 'p', 'q')}{joint('held', 'fixed', 'world', 'p')}"
+    outer = f"{link('a', 3.0)}{joint('fast', 'fixed', 'world', 'a')}<model name='i'>{inner}</model>"
+    result = ran(tmp_path, f"<gravity>0 0 0</gravity><model name='o'>{outer}</model>", "inner")
+
+    # 0.1 N m on 0.1 kg m2: 1 rad/s2, in steps of 1 ms.
+    assert result["world.inner.velocity"][-1] == pytest.approx(1.0, abs=1e-3)
+    assert result["world.inner.position"][-1] == pytest.approx(0.5, abs=1e-3)
+
+
+def test_a_continuous_joint_turns_beyond_what_a_limit_says(tmp_path: Path) -> None:
+    limit = "<limit><lower>-0.1</lower><upper>0.1</upper></limit>"
+    content = f"{link('a')}{link('b')}{joint('f', 'fixed', 'world', 'a')}{joint('c', 'continuous', 'a', 'b', limit)}"
+    result = ran(tmp_path, f"<gravity>0 0 0</gravity><model name='m'>{content}</model>", "c", stop_time=4.0)
+
+    assert result["world.c.position"][-1] == pytest.approx(8.0, rel=1e-3)
+
+
+@pytest.mark.parametrize(("included", "height"), [("model://ground_plane", 0.5), ("model://sun", 0.6 - 9.8 / 2)])
+def test_a_box_lies_on_the_included_ground_and_falls_without_it(included: str, height: float, tmp_path: Path) -> None:
+    box = "<collision name='c'><geometry><box><size>1 1 1</size></box></geometry></collision>"
+    content = f"<model name='m'>{link('box', z=0.6, more=box)}</model><include><uri>{included}</uri></include>"
+    result = ran(tmp_path, f"<gravity>0 0 -9.8</gravity>{content}")
+
+    assert result["world.box.position_z"][-1] == pytest.approx(height, abs=1e-2)
+
+
+def test_a_link_that_an_expanded_file_calls_after_its_model_is_found(tmp_path: Path) -> None:
+    result = ran(tmp_path, f"<gravity>0 0 -9.8</gravity><model name='m'>{link('arm::hand')}</model>")
+
+    assert result["world.hand.position_z"][-1] == pytest.approx(2.0 - 9.8 / 2, abs=1e-2)
+
+
+def test_a_joint_that_has_no_variables_is_simulated(tmp_path: Path) -> None:
+    hanging = f"{link('a')}{link('b', 1.0)}{joint('f', 'fixed', 'world', 'a')}{joint('ball', 'ball', 'a', 'b')}"
+    result = ran(tmp_path, f"<gravity>0 0 -9.8</gravity><model name='m'>{hanging}</model>")
+
+    assert result["world.b.position_z"][-1] == pytest.approx(2.0, abs=1e-6)
+    assert not any(name.startswith("world.ball.") for name in result)
+
+
 def test_a_distributed_run_equals_the_one_in_one_process_in_every_float(place: Place, tmp_path: Path) -> None:
     config = with_gazebo("electrical_actuator", tmp_path, stop_time=1.0)
     results: list[list[tuple[float, ...]]] = []

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import shlex
 import sys
+import xml.etree.ElementTree as ET
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
@@ -15,6 +16,7 @@ import pytest
 from fmu_mesh.cli.main import main
 from fmu_mesh.errors import FmuError, InitializationFailed, LoadFailed, StepFailed
 from fmu_mesh.hosts import GazeboClassicInstance, describe_gazebo_world, gazebo_process
+from fmu_mesh.hosts.gazebo_world import load_gazebo_world
 from fmu_mesh.launch.local import LocalMesh
 from fmu_mesh.launch.preparing import Options, prepare
 from fmu_mesh.model.config import ActuatorConfig, GazeboClassicConfig
@@ -115,8 +117,20 @@ def test_names_that_two_models_share_are_told_apart_by_the_model(tmp_path: Path)
         ("no xml", "cannot be read as an SDF world: syntax error"),
         ("<sdf version='1.6'><model name='m'/></sdf>", "is no SDF file with one world"),
         (
-            "<sdf version='1.6'><world name='w'><include><uri>model://sun</uri></include></world></sdf>",
-            "includes a model (model://sun)",
+            "<sdf version='1.6'><world name='w'><include><uri>model://house</uri></include></world></sdf>",
+            "includes a model (model://house)",
+        ),
+        (
+            "<sdf><world><include><uri>model://a</uri></include><model><include><uri>b/Sunny</uri></include></model></world></sdf>",
+            "includes models (model://a, b/Sunny)",
+        ),
+        (
+            "<sdf version='1.6'><world name='w'><world name='v'/><joint name='j' type='fixed'/></world></sdf>",
+            "has what Gazebo classic does not simulate: the world 'v' in a world; the joint 'j' outside of a model",
+        ),
+        (
+            "<sdf><world><model name='m'><model name='n'><joint name='j' type='hinge'/></model></model></world></sdf>",
+            "the joint 'm::n::j' of the type 'hinge'",
         ),
         (
             "<sdf version='1.6'><world name='w'><physics><max_step_size>fast</max_step_size></physics></world></sdf>",
@@ -132,6 +146,142 @@ def test_a_file_that_gazebo_could_not_load_by_itself_is_refused(text: str, expec
         describe_gazebo_world(path, GazeboClassicConfig(gazebo_classic=""))
 
     assert expected in caught.value.message
+
+
+@pytest.mark.parametrize(
+    "uri",
+    [
+        "model://{name}",
+        "model://{name}/",
+        "https://fuel.gazebosim.org/1.0/OpenRobotics/models/{title}",
+        "https://fuel.ignitionrobotics.org/1.0/OpenRobotics/models/{quoted}/3",
+        "https://fuel.gazebosim.org/1.0/openrobotics/models/{title}/tip",
+    ],
+)
+def test_the_sun_and_the_ground_need_no_file(uri: str, tmp_path: Path) -> None:
+    sun, ground = (
+        uri.format(name=name, title=title, quoted=title.replace(" ", "%20"))
+        for name, title in (("sun", "Sun"), ("ground_plane", "Ground Plane"))
+    )
+    included = f"<include><uri>{sun}</uri></include><include><uri>{ground}</uri><name>floor</name></include>"
+
+    world = load_gazebo_world(write_world(tmp_path, included + arm()), GazeboClassicConfig(gazebo_classic=""))
+
+    root = ET.fromstring(world.text)  # noqa: S314  written above
+    assert [model.get("name") for model in root.findall("world/model")] == ["floor", "arm"]
+    assert root.find("world/model[@name='floor']/link/collision/geometry/plane") is not None
+    assert list(root.iter("include")) == []
+    assert len(world.description.problems) == 2
+    assert [link.name for link in world.links] == ["rod"]
+
+
+def test_a_file_in_which_nothing_is_changed_goes_to_gazebo_as_it_is(tmp_path: Path) -> None:
+    path = write_world(tmp_path, arm())
+
+    world = load_gazebo_world(path, GazeboClassicConfig(gazebo_classic=""))
+
+    assert world.text == path.read_bytes()
+    assert world.description.problems == ()
+
+
+def test_a_continuous_joint_is_a_revolute_one_without_limits_of_its_position(tmp_path: Path) -> None:
+    limit = "<limit><lower>-1</lower><upper>1</upper><effort>5</effort></limit>"
+    content = f"<model name='m'><joint name='j' type='continuous'><axis>{limit}</axis></joint></model>"
+
+    world = load_gazebo_world(write_world(tmp_path, content), GazeboClassicConfig(gazebo_classic=""))
+
+    [joint] = world.joints
+    assert (joint.scoped, joint.revolute, joint.effort_limit) == ("m::j", True, 5.0)
+    root = ET.fromstring(world.text)  # noqa: S314  written above
+    assert [element.get("type") for element in root.iter("joint")] == ["revolute"]
+    assert [element.tag for element in root.find(".//limit") or ()] == ["effort"]
+
+
+def test_models_in_models_have_their_joints_and_links(tmp_path: Path) -> None:
+    inner = f"<model name='hand'>{arm('finger', 'knuckle')}<link name='palm'/></model>"
+    content = f"<model name='robot'><link name='base'/>{inner}</model>" + arm("other", "knuckle")
+
+    world = load_gazebo_world(write_world(tmp_path, content), GazeboClassicConfig(gazebo_classic=""))
+
+    assert [(joint.scoped, joint.name) for joint in world.joints] == [
+        ("robot::hand::finger::knuckle", "robot::hand::finger::knuckle"),
+        ("other::knuckle", "other::knuckle"),
+    ]
+    assert {link.scoped for link in world.links} == {
+        "robot::base",
+        "robot::hand::palm",
+        "robot::hand::finger::rod",
+        "other::rod",
+    }
+
+
+def test_what_has_no_variables_or_is_not_there_is_a_warning_of_check_with_its_name(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], fault: Callable[[str], None]
+) -> None:
+    fault("nothing")
+    kinds = ("ball", "universal", "screw", "revolute2", "gearbox", "fixed", "revolute")
+    joints = "".join(f"<joint name='{kind}_joint' type='{kind}'/>" for kind in kinds)
+    mesh = "<collision name='hull'><geometry><mesh><uri>model://hull.dae</uri></mesh></geometry></collision>"
+    write_world(
+        tmp_path,
+        f"<model name='m'>{joints}<link name='l'>{mesh}<sensor name='eye' type='camera'/></link></model>"
+        f"<model name='wall'><static>true</static><joint name='door' type='revolute'/></model>"
+        "<plugin name='p' filename='libwind.so'/><include><uri>model://sun</uri></include>",
+    )
+    config = tmp_path / "mesh.yaml"
+    config.write_text(
+        "mesh: m\nsimulation: {stop_time: 1, step_size: 0.01}\ninstances:\n  world: {gazebo_classic: world.sdf}\n",
+        encoding="utf-8",
+    )
+
+    assert main(["check", str(config)]) == 0
+
+    page = capsys.readouterr().out
+    warned = [line.removeprefix("  world: world.sdf: ") for line in page.partition("Warnings\n")[2].splitlines()]
+    assert [line for line in warned if line.startswith(("the", "model"))] == [
+        "the included 'model://sun' is left out: a light moves nothing",
+        *(
+            f"the joint 'm::{kind}_joint' is simulated, and has no variables, as it is a {kind} joint"
+            for kind in ("ball", "universal", "screw", "revolute2", "gearbox")
+        ),
+        "the collision 'm::hull' is not simulated unless Gazebo finds model://hull.dae",
+        "the joint 'wall::door' has no variables: its model is static",
+        "the sensor 'eye' has no variables",
+        "the plugin 'libwind.so' does nothing unless Gazebo finds it",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("command", "reason"),
+    [
+        ("no-such-program --flag", "there is no 'no-such-program'"),
+        (
+            "/bin/sh -c 'echo the library is missing >&2; exit 3'",
+            "ended with 3; the last it wrote is: the library is missing",
+        ),
+        ("/bin/true", "its process has ended with 0"),
+    ],
+)
+def test_check_finds_that_gazebo_is_missing_after_it_has_shown_the_plan(
+    command: str, reason: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("FMU_MESH_GAZEBO", command)
+    write_world(tmp_path, arm())
+    text = "mesh: m\nsimulation: {stop_time: 1, step_size: 0.01}\ninstances:\n  world: {gazebo_classic: world.sdf%s}\n"
+    here, elsewhere = tmp_path / "here.yaml", tmp_path / "elsewhere.yaml"
+    here.write_text(text % "", encoding="utf-8")
+    elsewhere.write_text(text % ", host: workstation", encoding="utf-8")
+
+    code = main(["check", str(here)])
+    said = capsys.readouterr()
+    other = main(["check", str(elsewhere)])
+
+    assert (code, other) == (2, 0)
+    assert "world.elbow.position" in said.out
+    assert "can run" not in said.out
+    assert "instances.world.gazebo_classic: Gazebo classic does not run on this host" in said.err
+    assert reason in said.err
+    assert "FMU_MESH_GAZEBO" in said.err
 
 
 def test_a_missing_world_is_a_finding_in_its_place(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -392,3 +392,52 @@ def test_a_world_that_flies_apart_ends_the_run_and_does_not_start_again(tmp_path
         world.go(100, slide_effort=1.0)
 
     assert error.value.variable == "slide.acceleration"
+
+
+NAMELESS = """
+<mujoco>
+  <worldbody>
+    <body name='b'>
+      <joint name='shoulder' type='ball'/><geom size='0.1'/>
+      <body><joint/><geom size='0.1'/></body>
+    </body>
+    <body><freejoint name='float'/><geom size='0.1'/></body>
+  </worldbody>
+  <sensor><clock/></sensor>
+</mujoco>"""
+
+FUSED = """
+<robot name='r'>
+  <link name='base'/>
+  <link name='arm'>
+    <inertial><mass value='1'/><inertia ixx='1' iyy='1' izz='1' ixy='0' ixz='0' iyz='0'/></inertial>
+  </link>
+  <link name='camera'/>
+  <joint name='turn' type='continuous'><parent link='base'/><child link='arm'/></joint>
+  <joint name='mount' type='fixed'><parent link='arm'/><child link='camera'/></joint>
+</robot>"""
+
+
+@pytest.mark.parametrize(
+    ("text", "notes"),
+    [
+        (
+            NAMELESS,
+            (
+                "the joint 'shoulder' is simulated, and has no variables, as it is a ball joint",
+                "joints without a name have no variables; there are 1",
+                "sensors without a name have no variables; there are 1",
+            ),
+        ),
+        (FUSED, ("links that a fixed joint makes part of another have no variables: base, camera",)),
+    ],
+    ids=["MJCF", "URDF"],
+)
+def test_what_of_a_model_has_no_variables_is_told(text: str, notes: tuple[str, ...], tmp_path: Path) -> None:
+    path = tmp_path / "model.xml"
+    path.write_text(text, encoding="utf-8")
+
+    description = describe_world(path, MujocoConfig(mujoco=""))
+
+    assert description.problems == notes
+    assert ("turn.position" in {v.name for v in description.variables}) == ("robot" in text)
