@@ -257,8 +257,8 @@ def mapped(message: str, fields: dict[str, str], **more: Any) -> dict[str, Any]:
             "5 for 'name[0]' of 'sensor_msgs/msg/JointState'; expected a value of the type string",
         ),
         (
-            mapped(JOINTS, {"position[0]": "delay.y"}, constants={"nam[0]": "x"}),
-            "has no field 'nam[0]'; expected one of",
+            mapped(JOINTS, {"position[0]": "delay.y"}, constants={"names[0]": "x"}),
+            "has no field 'names[0]'; expected one of",
         ),
         (mapped(JOINTS, {"position[0]": "delay.y"}, constants={"effort": 1.0}), "expected a field of one value"),
         (mapped(JOINTS, {"position[0]": "delay.y"}, constants={"effort[0]": True}), "a value of the type float64"),
