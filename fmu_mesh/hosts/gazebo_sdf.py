@@ -114,14 +114,14 @@ def _without_known_includes(world: ET.Element) -> Iterator[str]:
             continue
         if name == "sun":
             world[number] = ET.Comment("a light")
-            yield f"the included '{uri}' is left out: a light moves nothing"
+            yield f"left out, as a light moves nothing: the included '{uri}'"
             continue
         ground = ET.fromstring(_GROUND)  # noqa: S314  our own text
         ground.set("name", include.findtext("name", "ground_plane").strip())
         if (pose := include.find("pose")) is not None:
             ground.append(pose)
         world[number] = ground
-        yield f"the included '{uri}' is a static plane with friction, as Gazebo's own model is"
+        yield f"a static plane stands for the included '{uri}'"
 
 
 def _refuse_includes(world: ET.Element, path: Path) -> None:
@@ -136,16 +136,21 @@ def _refuse_includes(world: ET.Element, path: Path) -> None:
 
 
 def _refuse_what_gazebo_leaves_out(world: ET.Element, models: tuple[Model, ...], path: Path) -> None:
-    """What Gazebo passes over, so that the world would move in another way than its file says."""
+    """What Gazebo passes over, so that the world would move in another way than its file says; and names with spaces.
+
+    Spaces end a name in what Gazebo's process is told.
+    """
     problems = [f"the world '{inner.get('name')}' in a world" for inner in world.findall("world")]
     problems += [f"the joint '{joint.get('name')}' outside of a model" for joint in world.findall("joint")]
     for model in models:
         for joint in model.element.findall("joint"):
             if joint.get("type") not in _JOINTS:
                 problems.append(f"the joint '{model.scoped}::{joint.get('name')}' of the type '{joint.get('type')}'")
+        names = [f"{model.scoped}::{own.get('name')}" for own in model.element if own.tag in {"joint", "link"}]
+        problems += [f"a space in the name '{name}'" for name in names if model.moving and len(name.split()) != 1]
     if problems:
         hint = f"There are joints of the types {', '.join(_JOINTS)}, each in a <model>."
-        raise LoadFailed(f"'{path}' has what Gazebo classic does not simulate: {'; '.join(problems)}", hint=hint)
+        raise LoadFailed(f"'{path}' has what cannot be simulated with Gazebo classic: {'; '.join(problems)}", hint=hint)
 
 
 def _make_revolute(joint: ET.Element) -> None:
