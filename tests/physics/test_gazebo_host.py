@@ -134,7 +134,7 @@ def test_names_that_two_models_share_are_told_apart_by_the_model(tmp_path: Path)
         ),
         (
             "<sdf><world><model name='my arm'><link name='rod'/></model></world></sdf>",
-            "a space in the name 'my arm::rod'",
+            "a space in the name 'my arm::a'",
         ),
         (
             "<sdf version='1.6'><world name='w'><physics><max_step_size>fast</max_step_size></physics></world></sdf>",
