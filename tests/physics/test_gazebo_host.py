@@ -126,14 +126,14 @@ def test_names_that_two_models_share_are_told_apart_by_the_model(tmp_path: Path)
         ),
         (
             "<sdf version='1.6'><world name='w'><world name='v'/><joint name='j' type='fixed'/></world></sdf>",
-            "has what cannot be simulated with Gazebo classic: the world 'v' in a world; the joint 'j' outside of a model",
+            "cannot be simulated with Gazebo classic: the world 'v' in a world; the joint 'j' outside of a model",
         ),
         (
             "<sdf><world><model name='m'><model name='n'><joint name='j' type='hinge'/></model></model></world></sdf>",
             "the joint 'm::n::j' of the type 'hinge'",
         ),
         (
-            "<sdf><world><model name='my arm'><link name='rod'/></model></world></sdf>",
+            "<sdf><world><model name='my arm'><link name='a'/></model></world></sdf>",
             "a space in the name 'my arm::a'",
         ),
         (
