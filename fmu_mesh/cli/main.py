@@ -33,6 +33,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     logging.basicConfig(
         level=os.environ.get("FMU_MESH_LOG", "WARNING").upper(), format="%(name)s: %(levelname)s: %(message)s"
     )
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)  # a folder of its own that it misses is nobody's concern
     run: Command = options.run_command
     try:
         return run(options)

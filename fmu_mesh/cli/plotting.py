@@ -1,4 +1,4 @@
-"""`plot`: a result file as a picture. matplotlib is imported when something is drawn; it is an extra."""
+"""`plot`: a result file as a picture; what is read, and which units its variables have. How it looks is `drawing`."""
 
 from __future__ import annotations
 
@@ -7,50 +7,29 @@ import csv
 import importlib.util
 import re
 from array import array
-from collections.abc import Mapping, Sequence
-from io import BytesIO
-from itertools import pairwise
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import Any, TextIO
 
-import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
-from ..errors import ConfigurationError
-from ..files import replaced
+from ..errors import ConfigurationError, FmuMeshError
 from ..model.description import Variable
 from ..model.findings import listed, nearest, nearest_file
 from ..model.plan import Plan
+from ..model.system import System
 from ..model.types import is_float
 from .arguments import add_command
+from .drawing import FLAGS, VALUE, Curve, Results, draw
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-__all__ = ["Results", "add_commands", "check_plot", "draw", "plot_results", "read_results", "reduced"]
+__all__ = ["add_commands", "check_plot", "plot_results", "plotted_where_it_ends", "read_results"]
 
 _TIME = "time"
 _WORDS = {"true": 1.0, "false": 0.0, "": float("nan"), '""': float("nan")}
 _QUOTED = re.compile(r'"(?:[^"]|"")*"')
-_MAX_POINTS = 4000
-"""Points drawn per line: more than twice the pixels of the picture's width would show nothing new."""
-
-
-class Results(msgspec.Struct, frozen=True):
-    """The columns of a result file.
-
-    Attributes:
-        times: the times in s.
-        columns: the values by variable; true is 1 and false is 0.
-        flags: the variables that hold nothing but true and false.
-        whole: the variables that are Integer or Enumeration: a Real is never written without a point or an exponent.
-    """
-
-    times: NDArray[np.float64]
-    columns: dict[str, NDArray[np.float64]]
-    flags: frozenset[str]
-    whole: frozenset[str]
+_DIMENSIONLESS = ("1", "-")
+"""Units that say that there is none."""
 
 
 def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.ArgumentParser) -> None:
@@ -68,7 +47,7 @@ def _plot(arguments: argparse.Namespace) -> int:
     _require_matplotlib()
     output = arguments.output if arguments.output is not None else arguments.results.with_suffix(".png")
     results = read_results(arguments.results, arguments.variables)
-    draw(results, output, title=arguments.results.stem, variables={})
+    draw(results, output, title=arguments.results.stem, curves={})
     print(f"plot: {output}")
     return 0
 
@@ -104,22 +83,71 @@ def _require_matplotlib() -> None:
         raise ConfigurationError("plots need matplotlib.", hint="Install it with `pip install 'fmu-mesh[plot]'`.")
 
 
-def plot_results(result: Path, plot: Path, plan: Plan | None) -> None:
-    """Draw the result file of a run; with its plan, the units are known, and each has axes of its own.
+def plot_results(result: Path, plot: Path, plan: Plan) -> None:
+    """Draw the result file of a run. Its plan tells the units, and each has axes of its own.
 
     Raises:
         ConfigurationError: the result cannot be read, or the plot cannot be written.
     """
-    results = read_results(result)
-    if plan is None:
-        draw(results, plot, title=result.stem, variables={})
-        return
-    variables = {}
+    curves = {}
     for instance, name in plan.system.recorded:
         variable = plan.system.instances[instance].description.variable_of(name)
         if variable is not None:
-            variables[f"{instance}.{name}"] = variable
-    draw(results, plot, title=plan.system.config.mesh, variables=variables)
+            curves[f"{instance}.{name}"] = _curve(plan.system, instance, variable)
+    draw(read_results(result), plot, title=plan.system.config.mesh, curves=curves)
+    print(f"plot: {plot}")
+
+
+@contextmanager
+def plotted_where_it_ends(plan: Plan, plot: Path | None) -> Iterator[None]:
+    """Inside, a run: if it ends early, what it recorded up to then is drawn, and never what an earlier run has left."""
+    result = plan.system.result_file
+    before = _state_of(result)
+    try:
+        yield
+    except FmuMeshError:
+        if plot is not None and result is not None and _state_of(result) != before:
+            plot_results(Path(result), plot, plan)
+        raise
+
+
+def _state_of(result: str | None) -> tuple[int, int, int] | None:
+    """What changes of a file when something is written into it."""
+    if result is None or not Path(result).is_file():
+        return None
+    status = Path(result).stat()
+    return status.st_ino, status.st_size, status.st_mtime_ns
+
+
+def _curve(system: System, instance: str, variable: Variable) -> Curve:
+    """On which axes a variable is drawn: one for each unit."""
+    if variable.type == "Boolean":
+        return Curve(FLAGS)
+    if not is_float(variable.type):
+        return Curve("number")
+    unit = variable.unit or _unit_passed_on(system, instance, variable)
+    if unit is None or unit in _DIMENSIONLESS:
+        return Curve(VALUE)
+    return Curve(f"value in {unit}", note="" if variable.unit else " (no unit)")
+
+
+def _unit_passed_on(system: System, instance: str, variable: Variable) -> str | None:
+    """The unit of what comes out of an output again that declares none, such as that of a transport delay.
+
+    It depends on a single input, which declares no unit either, and on nothing else that could have one.
+    """
+    for _ in system.instances:  # a cycle of such outputs ends here
+        match variable.dependencies:
+            case (name,):
+                ends = [c for c in system.connections if (c.target_instance, c.target.name) == (instance, name)]
+            case _:
+                return None
+        if len(ends) != 1 or ends[0].target.unit or (ends[0].factor, ends[0].offset) != (1.0, 0.0):
+            return None
+        instance, variable = ends[0].source_instance, ends[0].source
+        if variable.unit:
+            return variable.unit
+    return None
 
 
 def read_results(path: Path, wanted: Sequence[str] | None = None) -> Results:
@@ -183,107 +211,20 @@ def _read(path: Path, file: TextIO) -> tuple[list[str], list[str], array[float]]
 def _chosen(path: Path, names: list[str], wanted: Sequence[str] | None) -> Sequence[str]:
     unknown = [name for name in wanted or () if name not in names]
     if unknown:
-        suggestion = nearest(unknown[0], names)
-        hint = f"Did you mean '{suggestion}'?" if suggestion is not None else f"There are: {listed(names)}."
-        raise ConfigurationError(f"'{path}' has no variable {listed([repr(name) for name in unknown])}.", hint=hint)
+        meant = [name for text in unknown for name in _meant(text, names)]
+        hint = f"Did you mean {_either(meant)}?" if meant else f"There are: {listed(names)}."
+        raise ConfigurationError(f"'{path}' has no variable {_either(unknown)}.", hint=hint)
     return wanted or names
 
 
-def draw(results: Results, output: Path, *, title: str, variables: Mapping[str, Variable]) -> None:
-    """Draw results into a file whose suffix says its format.
-
-    Args:
-        results: what to draw.
-        output: the file; its folder is made.
-        title: the line above all axes.
-        variables: what is known of the variables, by name.
-
-    Raises:
-        ConfigurationError: the file cannot be written.
-    """
-    # The object interface: no window, no global state of pyplot. It is an extra, so it is imported late.
-    from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415  matplotlib is an extra, and slow to import
-    from matplotlib.figure import Figure  # noqa: PLC0415  matplotlib is an extra, and slow to import
-
-    groups: dict[str, list[str]] = {}
-    for name in results.columns:
-        groups.setdefault(_axis_of(name, results, variables), []).append(name)
-    groups = groups or {"": []}
-    figure = Figure(
-        figsize=(10.0, 1.2 + 2.8 * len(groups) + (1.0 if len(groups) == 1 else 0.0)), dpi=120, layout="constrained"
-    )
-    FigureCanvasAgg(figure)
-    figure.suptitle(title, fontweight="bold")
-    all_axes = figure.subplots(len(groups), 1, sharex=True, squeeze=False)[:, 0]
-    for number, (axes, (label, names)) in enumerate(zip(all_axes, groups.items(), strict=True)):
-        _draw_axes(axes, results, names, label)
-        axes.label_outer()
-        if number == len(groups) - 1:
-            axes.set_xlabel("time in s")
-    try:
-        output.parent.mkdir(parents=True, exist_ok=True)
-        picture = BytesIO()  # a backend that cannot write fails in ways of its own
-        figure.savefig(picture, format=output.suffix.removeprefix(".") or None)
-        with replaced(output) as draft:
-            draft.write_bytes(picture.getvalue())
-    except (OSError, ValueError) as error:  # a ValueError names the formats there are
-        raise ConfigurationError(f"the plot '{output}' cannot be written: {error}.") from error
+def _meant(text: str, names: Sequence[str]) -> list[str]:
+    """The columns that somebody may have meant: those of variables with this name, or else the nearest name."""
+    alike = [name for name in names if name.partition(".")[2] == text]
+    near = nearest(text, names) or nearest(text, {name.partition(".")[2]: name for name in names})
+    if alike or near is None:
+        return alike
+    return [near] if near in names else [name for name in names if name.partition(".")[2] == near]
 
 
-def _axis_of(name: str, results: Results, variables: Mapping[str, Variable]) -> str:
-    """What stands at the axis on which a variable is drawn; one for each unit."""
-    variable = variables.get(name)
-    if name in results.flags or (variable is not None and variable.type == "Boolean"):
-        return "true (1) or false (0)"
-    if variable is None:
-        return "value"
-    if not is_float(variable.type):
-        return "number"
-    return f"value in {variable.unit}" if variable.unit else "value, no unit"
-
-
-def _draw_axes(axes: Axes, results: Results, names: Sequence[str], label: str) -> None:
-    colours = {name: f"C{number}" for number, name in enumerate(results.columns)}
-    for name in names:
-        steps = name in results.flags or name in results.whole
-        times, values = reduced(results.times, results.columns[name], _MAX_POINTS)
-        lone = "o" if len(times) == 1 else None  # a line of one point would show nothing
-        axes.plot(
-            times,
-            values,
-            label=name,
-            color=colours[name],
-            drawstyle="steps-post" if steps else "default",
-            linewidth=1.4,
-            marker=lone,
-        )
-    axes.set_ylabel(label)
-    axes.grid(visible=True, alpha=0.35)
-    axes.margins(x=0.01)
-    if names and all(name in results.flags for name in names):
-        axes.set_yticks([0, 1])
-        axes.set_ylim(-0.1, 1.1)
-    if not len(results.times):
-        axes.text(0.5, 0.5, "no points were recorded", ha="center", va="center", transform=axes.transAxes)
-    if names:
-        # Beside the axes, where it hides no line.
-        axes.legend(loc="upper left", bbox_to_anchor=(1.005, 1.0), borderaxespad=0.0, frameon=False)
-
-
-def reduced(
-    times: NDArray[np.float64], values: NDArray[np.float64], most: int
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """About ``most`` points that look like all of them: the least and the greatest of every stretch."""
-    values = np.where(np.isinf(values), np.nan, values)
-    if len(times) <= most:
-        return times, values
-    edges = np.linspace(0, len(times), most // 2 + 1).astype(int)
-    kept = {0, len(times) - 1}
-    for first, end in pairwise(edges):
-        stretch = values[first:end]
-        if np.isnan(stretch).all():
-            kept.add(int(first))  # so that the gap shows
-        else:
-            kept.update((int(first + np.nanargmin(stretch)), int(first + np.nanargmax(stretch))))
-    picked = np.array(sorted(kept))
-    return times[picked], values[picked]
+def _either(names: Sequence[str]) -> str:
+    return " or ".join(filter(None, [listed([repr(name) for name in names[:-1]], nothing=""), repr(names[-1])]))

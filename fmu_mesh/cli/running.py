@@ -30,7 +30,7 @@ from ..wire.runtime import enter_run_folder, fmu_folder, leave_run_folder, remov
 from ..wire.views import LogLine
 from .arguments import add_command, add_window, count, endpoint, number
 from .display import Display, say, stdout_as_stderr, summary
-from .plotting import check_plot, plot_results
+from .plotting import check_plot, plot_results, plotted_where_it_ends
 from .profiling import add_profile, show_profile
 
 __all__ = ["add_commands", "close", "run_launcher"]
@@ -174,7 +174,10 @@ def _launch(arguments: argparse.Namespace) -> int:
     if arguments.plot is not None:
         check_plot(arguments.plot, plan.system.result_file)
     profile: MeshProfile | None = None
-    with Display(plan, show_progress=not arguments.no_progress) as display:
+    with (
+        plotted_where_it_ends(plan, arguments.plot),
+        Display(plan, show_progress=not arguments.no_progress) as display,
+    ):
         if arguments.local:
             point, seconds, rows = _run_local(plan, arguments.config, display, options.showing)
         else:
@@ -261,7 +264,6 @@ def close(plan: Plan, point: int, seconds: float, rows: int, plot: Path | None) 
     result = plan.system.result_file
     if plot is not None and result is not None:
         plot_results(Path(result), plot, plan)
-        print(f"plot: {plot}")
     for line in summary(plan, point=point, seconds=seconds, rows=rows, result_file=result):
         print(line)
 
@@ -289,7 +291,10 @@ def _master(arguments: argparse.Namespace) -> int:
         if isinstance(event, End):
             ends.append(event)
 
-    with Display(plan, show_progress=not arguments.no_progress) as display:
+    with (
+        plotted_where_it_ends(plan, arguments.plot),
+        Display(plan, show_progress=not arguments.no_progress) as display,
+    ):
         run_master(arguments.config, options, show, plan=plan)
     if ends[0].profile is not None:
         show_profile(plan, ends[0].profile, ends[0].seconds, arguments.profile)

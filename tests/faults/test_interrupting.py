@@ -71,6 +71,20 @@ def test_a_signal_ends_the_run_within_two_seconds_with_a_readable_partial_result
     assert f"point {len(rows) - 1}, t = " in launched.message
 
 
+@pytest.mark.parametrize("options", [(), ("--local",)], ids=["distributed", "local"])
+def test_a_run_that_is_interrupted_is_plotted_up_to_there(place: Place, options: tuple[str, ...]) -> None:
+    config = write_config(place.folder, stop_time=FAR_S)
+    plot = place.folder / "run.png"
+    launched = place.start("launch", config, *options, "--plot", plot)
+    wait_until(lambda: row_count(config.with_suffix(".csv")) > 1000, "1000 rows")
+
+    launched.signal(signal.SIGINT)
+
+    assert launched.wait() == 130
+    assert f"plot: {plot}" in launched.output
+    assert plot.read_bytes().startswith(b"\x89PNG")
+
+
 def test_ctrl_c_while_the_command_is_being_loaded_is_told_like_any_other() -> None:
     program = [sys.executable, "-c", _INTERRUPTED_WHILE_LOADING]
 

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import importlib.util
 import math
+import os
 import shutil
 import subprocess
 import sys
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -15,10 +17,12 @@ from matplotlib import image
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
+from fmu_mesh.cli.drawing import Results, figure_of, reduced
 from fmu_mesh.cli.main import main
-from fmu_mesh.cli.plotting import plot_results, read_results, reduced
-from fmu_mesh.errors import ConfigurationError
+from fmu_mesh.cli.plotting import plot_results, plotted_where_it_ends, read_results
+from fmu_mesh.errors import ConfigurationError, StepFailed
 from fmu_mesh.launch.preparing import prepare
+from fmu_mesh.model.plan import Plan
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 
@@ -127,7 +131,8 @@ def test_the_command_draws_beside_the_result_file(results: Path, capsys: pytest.
     picture = results.with_suffix(".png")
     assert capsys.readouterr().out == f"plot: {picture}\n"
     height, width, _ = pixels(picture).shape
-    assert (height, width) == (816, 1200)
+    assert height == 816  # two axes
+    assert width > 1008  # the axes, and the legend beside them
     assert len(np.unique(pixels(picture).reshape(-1, 4), axis=0)) > 10
 
 
@@ -154,9 +159,9 @@ def test_with_a_plan_every_unit_has_axes_of_its_own(tmp_path: Path) -> None:
     plot_results(result, picture, plan)
     plot_results(result, text, plan)
 
-    assert pixels(picture).shape[0] == 1488  # rad, rad/s, rad/s2 and no unit
+    assert pixels(picture).shape[0] == 1488  # rad, rad/s, rad/s2 and none
     drawn = text.read_text(encoding="utf-8")
-    for words in ("chain8", "value in rad", "value in rad/s2", "value, no unit", "time in s", *names):
+    for words in ("chain8", "value in rad", "value in rad/s2", "value", "time in s", *names):
         assert f"<!-- {words} -->" in drawn
 
 
@@ -199,3 +204,133 @@ def test_the_plot_of_a_finished_plan_may_lie_in_a_new_folder(results: Path, tmp_
     plan = replace(plan, system=replace(plan.system, recorded=()))
     plot_results(results, tmp_path / "new" / "run.png", plan)
     assert (tmp_path / "new" / "run.png").exists()
+
+
+def plotted(plan: Plan, folder: Path) -> str:
+    """The text of the picture of a result file with two rows of ones."""
+    result, picture = folder / "result.csv", folder / "result.svg"
+    names = [".".join(recorded) for recorded in plan.system.recorded]
+    ones = ",1.0" * len(names)
+    result.write_text(f"time,{','.join(names)}\n0.0{ones}\n1.0{ones}\n", encoding="utf-8")
+    plot_results(result, picture, plan)
+    return picture.read_text(encoding="utf-8")
+
+
+def with_unit(plan: Plan, instance: str, name: str, unit: str) -> Plan:
+    """``plan``, in which one variable has another unit."""
+    own = plan.system.instances[instance]
+    variables = tuple(
+        replace(variable, unit=unit) if variable.name == name else variable for variable in own.description.variables
+    )
+    own = replace(own, description=replace(own.description, variables=variables))
+    return replace(plan, system=replace(plan.system, instances={**plan.system.instances, instance: own}))
+
+
+def test_what_an_fmu_only_passes_on_shares_the_axes_of_what_it_gets(tmp_path: Path) -> None:
+    drawn = plotted(prepare(CONFIGS / "pendulum_delay.yaml"), tmp_path)
+
+    assert drawn.count("<!-- value") == 1
+    for words in ("value in rad", "pendulum.a", "delay.y (no unit)"):
+        assert f"<!-- {words} -->" in drawn
+
+
+@pytest.mark.parametrize("unit", ["1", "-"])
+def test_a_unit_that_says_that_there_is_none_is_no_label(tmp_path: Path, unit: str) -> None:
+    plan = with_unit(prepare(CONFIGS / "pendulum_delay.yaml"), "delay", "y", unit)
+
+    drawn = plotted(plan, tmp_path)
+
+    assert drawn.count("<!-- value") == 2
+    assert "<!-- value -->" in drawn
+    assert "value in -" not in drawn
+    assert "value in 1" not in drawn
+
+
+def results_of(columns: Mapping[str, Sequence[float]]) -> Results:
+    """Results at 0, 1, 2 … s."""
+    arrays = {name: np.array(values, dtype=np.float64) for name, values in columns.items()}
+    return Results(np.arange(len(next(iter(arrays.values()))), dtype=np.float64), arrays, frozenset(), frozenset())
+
+
+def test_78_lines_can_be_told_apart_and_their_legend_covers_nothing() -> None:
+    names = [f"plant.subsystem.actuator[{number}].flange.angularVelocity" for number in range(78)]
+    figure = figure_of(results_of({name: [number, -number] for number, name in enumerate(names)}), "many", {})
+
+    figure.canvas.draw()  # lays it out; a layout for which there is no room is a warning, and so an error here
+
+    (axes,) = figure.axes
+    legend = axes.get_legend()
+    assert legend is not None
+    assert [text.get_text() for text in legend.get_texts()] == names
+    styles = [(line.get_color(), str(line._dash_pattern)) for line in legend.get_lines()]  # type: ignore[attr-defined]
+    assert len(set(styles)) == 78
+    of_axes, of_legend = axes.get_window_extent(), legend.get_window_extent()
+    assert of_axes.width > 7 * figure.dpi
+    assert of_legend.x0 > of_axes.x1
+    assert of_legend.x1 <= figure.bbox.x1
+    assert of_legend.y0 >= figure.bbox.y0
+
+
+def test_lines_that_lie_on_one_another_all_show() -> None:
+    wave = [0.0, 1.0, 0.0, -1.0]
+    columns = {"engine.a": wave, "fmu.a": wave, "other.a": [-value for value in wave], "third.a": wave}
+
+    (axes,) = figure_of(results_of(columns), "same", {}).axes
+
+    first, second, other, third = axes.lines
+    assert [line.is_dashed() for line in (first, second, other, third)] == [False, True, False, True]
+    assert second._dash_pattern != third._dash_pattern  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize(
+    ("heading", "row"),
+    [("_x.y,b.$a$,c.\u65e5", "1.0,2.0,3.0"), ("a.y,b.y,c.y", "1e308,-1e308,nan"), ("a." + "x" * 300, "1.0")],
+    ids=["names", "values", "a long name"],
+)
+def test_nothing_that_matplotlib_warns_of_reaches_the_user(tmp_path: Path, heading: str, row: str) -> None:
+    path = tmp_path / "run.csv"
+    path.write_text(f"time,{heading}\n0.0,{row}\n1.0,{row}\n2.0,{row}\n", encoding="utf-8")
+    without_cache = {**os.environ, "MPLCONFIGDIR": str(path)}  # not a folder
+
+    done = subprocess.run(
+        [sys.executable, "-m", "fmu_mesh", "plot", str(path)],
+        capture_output=True,
+        text=True,
+        check=False,
+        env=without_cache,
+    )
+
+    assert (done.returncode, done.stdout, done.stderr) == (0, f"plot: {path.with_suffix('.png')}\n", "")
+
+
+@pytest.mark.parametrize(
+    ("wanted", "says"),
+    [
+        (["y"], "has no variable 'y'. Did you mean 'a.y'?"),
+        (["coumt"], "has no variable 'coumt'. Did you mean 'b.count'?"),
+        (["y", "on"], "has no variable 'y' or 'on'. Did you mean 'a.y' or 'b.on'?"),
+        (["zzz"], "has no variable 'zzz'. There are: a.y, a.der(x,2), b.on, b.count."),
+    ],
+)
+def test_a_variable_without_its_instance_is_told_with_it(
+    results: Path, capsys: pytest.CaptureFixture[str], wanted: list[str], says: str
+) -> None:
+    assert main(["plot", str(results), "--variables", *wanted]) == 2
+    assert says in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("wrote", [False, True])
+def test_of_a_run_that_failed_only_what_it_recorded_itself_is_plotted(results: Path, *, wrote: bool) -> None:
+    plan = prepare(CONFIGS / "pendulum_delay.yaml")
+    plan = replace(plan, system=replace(plan.system, recorded=(), result_file=str(results)))
+    plot = results.with_suffix(".png")
+
+    def fail() -> None:
+        if wrote:
+            results.write_text("time,a.y\n0.0,1.5\n", encoding="utf-8")
+        raise StepFailed("no")
+
+    with pytest.raises(StepFailed), plotted_where_it_ends(plan, plot):
+        fail()
+
+    assert plot.exists() == wrote
