@@ -133,7 +133,7 @@ class Finding(msgspec.Struct, frozen=True):
         file: the file it stands in.
         path: the place in the file, such as `connections[2].to`; empty for the file as a whole.
         found: what stands there.
-        expected: what would be right.
+        expected: what would be right; empty where what was found says it.
         suggestion: the nearest right name, if there is one.
         line: the line in the file, counted from 1, if known.
     """
@@ -148,12 +148,15 @@ class Finding(msgspec.Struct, frozen=True):
     def __str__(self) -> str:
         place = f"{self.file}:{self.line}" if self.line is not None else self.file
         text = f"{place}: {self.path}: " if self.path else f"{place}: "
-        text += f"{self.found}; expected {self.expected}"
+        text += f"{self.found}; expected {self.expected}" if self.expected else self.found
         return f"{text}. Did you mean '{self.suggestion}'?" if self.suggestion else text
 
 
 class ConfigurationError(FmuMeshError):
-    """A file, an option or a command is wrong. Carries every finding, not only the first."""
+    """A file, an option or a command is wrong. Carries every finding, not only the first.
+
+    A single finding is the message; more of them are listed below it.
+    """
 
     exit_code = 2
 
@@ -162,7 +165,8 @@ class ConfigurationError(FmuMeshError):
         self.findings = findings
 
     def __str__(self) -> str:
-        return "\n".join([super().__str__(), *(f"  - {finding}" for finding in self.findings)])
+        listed = self.findings if len(self.findings) > 1 else ()
+        return "\n".join([super().__str__(), *(f"  - {finding}" for finding in listed)])
 
 
 class CallRefused(FmuMeshError, ValueError):

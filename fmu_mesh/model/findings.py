@@ -77,9 +77,9 @@ class Findings:
             ConfigurationError: there is at least one finding.
         """
         if self._items:
-            count = f"{len(self._items)} problems" if len(self._items) > 1 else "1 problem"
             by_line = sorted(self._items, key=lambda finding: (finding.line is None, finding.line or 0))
-            raise ConfigurationError(f"{self._file}: {count}", findings=tuple(by_line))
+            text = f"{self._file}: {len(by_line)} problems" if len(by_line) > 1 else str(by_line[0])
+            raise ConfigurationError(text, findings=tuple(by_line))
 
 
 def locate(lines: Mapping[str, int], path: str) -> int | None:

@@ -136,7 +136,7 @@ def _text(path: Path, findings: Findings) -> str:
         with path.open("rb") as file:
             data = file.read(MAXIMUM_BYTES + 1)
     except FileNotFoundError:
-        findings.add("", "no such file", "an existing configuration file", nearest_file(path))
+        findings.add("", "no such file", "", nearest_file(path))
         return ""
     except IsADirectoryError:
         findings.add("", "a folder", "a configuration file")

@@ -206,7 +206,8 @@ def make_plan(
     loops = [loop for loop in strongly_connected(system.instances, instant) if _is_cycle(loop, instant)]
     if loops:
         findings = tuple(_algebraic_loop(loop, connections, file) for loop in loops)
-        raise ConfigurationError(f"{file}: the system has an algebraic loop", findings=findings)
+        text = f"{file}: {len(findings)} algebraic loops" if len(findings) > 1 else str(findings[0])
+        raise ConfigurationError(text, findings=findings)
     edges = [(c.source_instance, c.target_instance) for c in connections]
     order = topological_order(system.instances, instant)
     cycles = tuple(tuple(part) for part in strongly_connected(system.instances, edges) if _is_cycle(part, edges))
@@ -283,7 +284,7 @@ def _algebraic_loop(loop: list[str], connections: tuple[Connection, ...], file: 
     return Finding(
         file=file,
         path=first.path,
-        found=f"every connection on the cycle {' -> '.join(walk)} has delay 0",
+        found=f"an algebraic loop: every connection on the cycle {' -> '.join(walk)} has delay 0",
         expected="at least one connection with delay 1 (set `delay: 1`, or leave the delays to the algorithm)",
     )
 

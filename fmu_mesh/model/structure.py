@@ -57,7 +57,8 @@ def check(value: Plain, kind: inspect.Type, path: str, findings: Findings) -> No
                 check(item, kind.item_type, f"{path}[{index}]", findings)
         case _ if not _fits(value, kind):
             suggestion = nearest(value, _words(kind)) if isinstance(value, str) else None
-            findings.add(path, shown(value), describe(kind), suggestion)
+            items = ", each item after '- '" if isinstance(kind, inspect.ListType) and isinstance(value, str) else ""
+            findings.add(path, shown(value), describe(kind) + items, suggestion)
 
 
 def describe(kind: inspect.Type) -> str:
@@ -101,11 +102,11 @@ def _check_struct(value: dict[str, Plain], kind: inspect.StructType, path: str, 
             continue
         suggestion = nearest(key, absent) or nearest(key, fields)
         meant.add(suggestion)
-        findings.add(place, f"the unknown key '{key}'", f"one of {listed(list(fields))}", suggestion)
+        findings.add(place, "an unknown key" if key else "an empty key", f"one of {listed(list(fields))}", suggestion)
     for name in absent:
         if fields[name].required and name not in meant:
             place = f"{path}.{name}" if path else name
-            findings.add(place, f"no key '{name}'", describe(fields[name].type))
+            findings.add(place, "missing", describe(fields[name].type))
 
 
 def _check_mapping(value: dict[str, Plain], kind: inspect.DictType, path: str, findings: Findings) -> None:

@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from typing import NoReturn
 
 from ruamel.yaml import YAML
-from ruamel.yaml.error import MarkedYAMLError, YAMLError
+from ruamel.yaml.error import YAMLError
 from ruamel.yaml.events import (
     AliasEvent,
     DocumentStartEvent,
@@ -27,6 +27,7 @@ from ruamel.yaml.events import (
 )
 
 from fmu_mesh.model.findings import Findings, shown
+from fmu_mesh.model.yaml_errors import in_words
 
 __all__ = ["MAXIMUM_DEPTH", "MAXIMUM_VALUES", "Plain", "read"]
 
@@ -44,16 +45,9 @@ _WORDS: dict[str, bool | None] = {
     **dict.fromkeys(("true", "True", "TRUE"), True),
     **dict.fromkeys(("false", "False", "FALSE"), False),
 }
-_INDENTED = "lines that belong together in one column, what belongs to them further to the right"
-_IN_WORDS = {
-    "'\\t' that cannot start": ("a tab at the beginning", "blanks: YAML takes no tabs there"),
-    "but found '<block mapping start>'": ("a line that begins in another column than those above it", _INDENTED),
-    "but found '-'": ("an item of a list ('- ...') among keys", f"`key: value` there, or {_INDENTED}"),
-    "mapping values are not allowed": ("a second ':' in one line, or a line too far to the right", _INDENTED),
-    "could not find expected ':'": ("a line without ':'", "`key: value`, with a blank after the colon"),
-}
-"""What the most frequent errors of syntax are called in words: what is there, and what is expected."""
-
+_NO_BLANK = re.compile(r"[^:]+:[^:]+")
+_CORE_TAGS = "tag:yaml.org,2002:"
+"""What the parser makes of `!!`."""
 _LONGEST_INTEGER = 40  # characters; leading zeros are rare
 _INTEGERS = range(-(2**63), 2**64)  # of 64 bits; what is beyond is a float, and text in another base
 
@@ -71,15 +65,10 @@ def read(text: str, findings: Findings, lines: dict[str, int]) -> Plain:
         return _Reader(text, findings, lines).document()
     except _Refused:
         return None
-    except MarkedYAMLError as error:
-        mark = error.problem_mark or error.context_mark
-        context = f" {error.context}" if error.context else ""
-        lines[""] = mark.line + 1 if mark is not None else 1
-        problem = f"{error.problem or 'a syntax error'}{context}"
-        found, expected = next((words for part, words in _IN_WORDS.items() if part in problem), (problem, "YAML 1.2"))
-        findings.add("", found, expected)
     except YAMLError as error:
-        findings.add("", " ".join(str(error).split()), "YAML 1.2")
+        problem = in_words(error, text)
+        lines[""] = problem.line
+        findings.add("", problem.found, problem.expected)
     except (ValueError, OverflowError):  # ruamel.yaml lets those of `chr` through
         findings.add("", "an escape sequence that is no character", "YAML 1.2")
     return None
@@ -134,7 +123,8 @@ class _Reader:
         before = self._count
         self._grow(1, path)
         if event.tag is not None:
-            self._findings.add(path, f"the tag {shown(str(event.tag))}", "a value without a tag")
+            tag = str(event.tag).replace(_CORE_TAGS, "!!")
+            self._findings.add(path, f"the tag {shown(tag)}", "a value without a tag")
         if depth > MAXIMUM_DEPTH:
             self._refuse(path, f"more than {MAXIMUM_DEPTH} nested levels", "a flatter structure")
         value: Plain
@@ -160,25 +150,30 @@ class _Reader:
         values: dict[str, Plain] = {}
         while not isinstance(event := next(self._events), MappingEndEvent):
             key = self._key(event, path, depth)
+            if key is None:  # told, and so is nothing that follows from it
+                self._value(next(self._events), path, depth + 1)
+                continue
             place = f"{path}.{key}" if path else key
             line = event.start_mark.line + 1
             if key in values:
                 first = self._lines.get(place)
                 self._lines[place] = line
-                self._findings.add(
-                    place, f"the key '{key}' a second time, first in line {first}", "every key at most once"
-                )
+                self._findings.add(place, f"a second time, first in line {first}", "every key at most once")
             self._lines[place] = line
-            values[key] = self._value(next(self._events), place, depth + 1)
+            value = self._value(next(self._events), place, depth + 1)
+            if value is None and _NO_BLANK.fullmatch(key):
+                self._findings.add(place, f"'{key}' without a value", "a blank after the colon")
+                continue
+            values[key] = value
         return values
 
-    def _key(self, event: Event, path: str, depth: int) -> str:
+    def _key(self, event: Event, path: str, depth: int) -> str | None:
         if isinstance(event, ScalarEvent):
             return self._text(event, path)
         place = f"{path}.?" if path else "?"
         self._value(event, place, depth + 1)
         self._findings.add(place, "a key that is no text", "a name as the key")
-        return "?"
+        return None
 
     def _text(self, event: ScalarEvent, path: str) -> str:
         text = str(event.value)
