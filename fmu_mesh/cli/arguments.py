@@ -1,4 +1,4 @@
-"""What the commands have in common: how one is added, and numbers that say what is wrong with them.
+"""What the commands have in common: how one is added, and arguments that say what is wrong with them.
 
 A name of a function that stands as `type=` shows in argparse's own message for a text that is no number, so these have
 messages of their own.
@@ -9,18 +9,59 @@ from __future__ import annotations
 import argparse
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NoReturn
 
 from ..errors import ConfigurationError, LoadFailed
 from ..model.config import MAX_WINDOW
 from ..model.config_base import ENDPOINT_PATTERN
-from ..model.findings import nearest_file
+from ..model.findings import listed, nearest, nearest_file
 
-__all__ = ["add_command", "add_window", "count", "endpoint", "no_fmu", "number", "positive_seconds"]
+__all__ = ["CommandParser", "add_command", "add_window", "count", "endpoint", "no_fmu", "number", "positive_seconds"]
 
 Parsers = Sequence[argparse.ArgumentParser]
+
+
+class CommandParser(argparse.ArgumentParser):
+    """A parser whose errors are one sentence, as all others: a page of options hides what is wrong."""
+
+    def error(self, message: str) -> NoReturn:
+        """End with exit code 2 and with what is wrong."""
+        name, _, what = message.removeprefix("argument ").partition(": ")
+        hint = None
+        if name == "the following arguments are required":
+            # argparse names those that may be left out, too, if they come last.
+            free = [str(action.metavar) for action in self._get_positional_actions() if action.nargs in ("*", "?")]
+            needed = " and ".join(one for one in what.split(", ") if one not in free)
+            text, hint = f"`{self.prog}` needs {needed}", f"`{self.prog} --help` tells more."
+        elif what.startswith("expected") and (option := self._option_string_actions.get(name)) is not None:
+            text = f"{name} needs a value, as in `{name} {option.metavar}`"
+        else:
+            text = f"{name}: {what}" if what else name
+        problem = ConfigurationError(text, hint=hint)
+        self.exit(problem.exit_code, f"fmu-mesh: {problem}\n")
+
+    def unknown(self, argument: str, others: Mapping[str, CommandParser]) -> ConfigurationError:
+        """What to say to an argument that this command does not have; ``others`` are all commands."""
+        if not argument.startswith("-"):
+            return ConfigurationError(f"`{self.prog}` takes no '{argument}'", hint=f"`{self.prog} --help` tells more.")
+        name = argument.partition("=")[0]
+        own = self.option_names
+        near = nearest(name, own)
+        elsewhere = [command for command, parser in others.items() if name in parser.option_names]
+        if name in own:
+            hint = f"It comes after the command: `{self.prog} {name}`."
+        elif elsewhere and near is None:
+            hint = f"It is an option of {listed([f'`{command}`' for command in elsewhere])}."
+        else:
+            hint = f"Did you mean '{near}'?" if near is not None else f"`{self.prog} --help` lists them."
+        return ConfigurationError(f"`{self.prog}` has no option '{name}'", hint=hint)
+
+    @property
+    def option_names(self) -> list[str]:
+        """The options that its help shows."""
+        return [name for name, action in self._option_string_actions.items() if action.help != argparse.SUPPRESS]
 
 
 def add_command(

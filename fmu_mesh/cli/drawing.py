@@ -114,7 +114,8 @@ def draw(results: Results, output: Path, *, title: str, curves: Mapping[str, Cur
         with replaced(output) as draft:
             draft.write_bytes(picture.getvalue())
     except (OSError, ValueError) as error:  # a ValueError names the formats there are
-        raise ConfigurationError(f"the plot '{output}' cannot be written: {error}.") from error
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise ConfigurationError(f"the plot '{output}' cannot be written: {reason}.") from error
 
 
 def figure_of(results: Results, title: str, curves: Mapping[str, Curve]) -> Figure:

@@ -6,13 +6,14 @@ import argparse
 import logging
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
 from .. import __version__
 from ..errors import ConfigurationError, FmuMeshError, Interrupted
 from ..model.findings import nearest
 from . import checking, free_running, inspecting, looking, playing, plotting, running, top
+from .arguments import CommandParser
 
 __all__ = ["command_parser", "main"]
 
@@ -21,12 +22,11 @@ Command = Callable[[argparse.Namespace], int]
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code (design, section 7)."""
-    parser, names = command_parser()
-    given = sys.argv[1:] if arguments is None else arguments
-    if given and not given[0].startswith("-") and given[0] not in names:
-        print(f"fmu-mesh: {_unknown(given[0], names)}", file=sys.stderr)
-        return ConfigurationError.exit_code
-    options = parser.parse_args(given)
+    parser, commands = command_parser()
+    options = _parsed(sys.argv[1:] if arguments is None else arguments, parser, commands)
+    if isinstance(options, ConfigurationError):
+        print(f"fmu-mesh: {options}", file=sys.stderr)
+        return options.exit_code
     if options.command is None:
         parser.print_help()
         return ConfigurationError.exit_code
@@ -52,7 +52,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0
 
 
-def _unknown(name: str, commands: Sequence[str]) -> ConfigurationError:
+def _parsed(
+    given: Sequence[str], parser: CommandParser, commands: Mapping[str, CommandParser]
+) -> argparse.Namespace | ConfigurationError:
+    """The command and its arguments, or what is wrong with them."""
+    if given and not given[0].startswith("-") and given[0] not in commands:
+        return _unknown(given[0], commands)
+    options, others = parser.parse_known_args(given)
+    if not others:
+        return options
+    wrong = next((other for other in others if other.startswith("-")), others[0])
+    return commands.get(options.command, parser).unknown(wrong, commands)
+
+
+def _unknown(name: str, commands: Iterable[str]) -> ConfigurationError:
     """What to say to something that is no command, such as a file that something is to be done with."""
     suffix = Path(name).suffix
     near = nearest(name, commands)
@@ -63,9 +76,9 @@ def _unknown(name: str, commands: Sequence[str]) -> ConfigurationError:
     return ConfigurationError(f"there is no command '{name}'.", hint=hint)
 
 
-def command_parser() -> tuple[argparse.ArgumentParser, list[str]]:
-    """The parser, and the names of all commands."""
-    parser = argparse.ArgumentParser(
+def command_parser() -> tuple[CommandParser, Mapping[str, CommandParser]]:
+    """The parser, and those of all commands by their names."""
+    parser = CommandParser(
         prog="fmu-mesh",
         description="A service mesh for co-simulation: FMUs as Zenoh nodes under one master.",
         epilog="Exit codes: 0 done, 1 internal error, 2 wrong usage or configuration, 3 an FMU failed, "
@@ -75,7 +88,7 @@ def command_parser() -> tuple[argparse.ArgumentParser, list[str]]:
     common = argparse.ArgumentParser(add_help=False)
     common.add_argument("--debug", action="store_true", help="show the traceback of an error")
     parser.set_defaults(debug=False)
-    commands = parser.add_subparsers(dest="command", metavar="COMMAND")
+    commands: argparse._SubParsersAction[CommandParser] = parser.add_subparsers(dest="command", metavar="COMMAND")
     for module in (running, free_running, checking, inspecting, looking, top, playing, plotting):
         module.add_commands(commands, common)
-    return parser, [*commands.choices]
+    return parser, commands.choices

@@ -107,6 +107,7 @@ def _with_options(loaded: LoadedConfig, options: Options) -> LoadedConfig:
         loaded = replace(loaded, overrides={**loaded.overrides, **overrides})
     if options.output is not None:
         config = replace(config, record=replace(config.record, file=str(options.output.absolute())))
+        loaded = replace(loaded, overrides={**loaded.overrides, "record.file": f"--output {options.output}"})
     return replace(loaded, config=config)
 
 

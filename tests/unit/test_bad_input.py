@@ -243,6 +243,21 @@ def test_a_wrong_option_is_told_as_it_was_written(
         (["run", "Gian.fmu"], "'Gian.fmu' does not exist. Did you mean 'Gain.fmu'?"),
         (["run", "Gain.fmu", "--name", "my gain"], "'my gain' is not a name"),
         (["run", "Gain.fmu", "--set", "kk=2"], "--set kk=2: the unknown variable 'kk'"),
+        (["lanch", "mesh.yaml"], "there is no command 'lanch'. Did you mean 'launch'?"),
+        (
+            ["launch", "mesh.yaml", "--plto", "x.png"],
+            "`fmu-mesh launch` has no option '--plto'. Did you mean '--plot'?",
+        ),
+        (["launch", "mesh.yaml", "--windw=3"], "`fmu-mesh launch` has no option '--windw'. Did you mean '--window'?"),
+        (
+            ["check", "mesh.yaml", "--plot", "x.png"],
+            "`fmu-mesh check` has no option '--plot'. It is an option of `launch`",
+        ),
+        (["--plot", "launch", "mesh.yaml"], "It comes after the command: `fmu-mesh launch --plot`."),
+        (["launch", "mesh.yaml", "more.yaml"], "`fmu-mesh launch` takes no 'more.yaml'. `fmu-mesh launch --help`"),
+        (["--versoin"], "`fmu-mesh` has no option '--versoin'. Did you mean '--version'?"),
+        (["launch", "mesh.yaml", "--output", "folder"], "mesh.yaml: --output folder: the folder '"),
+        (["check", "nothing.yaml"], "fmu-mesh: nothing.yaml: no such file\n"),
         (["launch", "mesh.yaml", "--plot", "plot.xyz"], "a plot cannot be written as 'plot.xyz'"),
         (["launch", "mesh.yaml", "--plot", "plot.png", "--output", "x.mcap"], "plots are drawn from CSV"),
         (["launch", "mesh.yaml", "--real-time-factor", "-1"], "--real-time-factor -1"),
@@ -261,6 +276,7 @@ def test_the_wrong_thing_for_a_command_is_told_with_the_right_one(
 ) -> None:
     (tmp_path / "mesh.yaml").write_text(GOOD, encoding="utf-8")
     (tmp_path / "Gain.fmu").symlink_to(FMUS / "Gain.fmu")
+    (tmp_path / "folder").mkdir()
     monkeypatch.chdir(tmp_path)
 
     assert main(arguments) == 2
@@ -279,7 +295,11 @@ def test_the_wrong_thing_for_a_command_is_told_with_the_right_one(
         (["check", "mesh.yaml", "--window", "9999999"], "'9999999' is no window: auto, or from 1 to 1000000 points"),
         (["step", "pair", "some"], "'some' is not a whole number of 1 or more"),
         (["top", "--interval", "often"], "'often' is no number"),
-        (["run", "Gain.fmu", "--step-size", "small"], "'small' is no number"),
+        (["run", "Gain.fmu", "--step-size", "small"], "fmu-mesh: --step-size: 'small' is no number\n"),
+        (["launch", "mesh.yaml", "--window"], "fmu-mesh: --window needs a value, as in `--window N`\n"),
+        (["set", "Gain.k"], "fmu-mesh: `fmu-mesh set` needs VALUE. `fmu-mesh set --help` tells more.\n"),
+        (["set"], "fmu-mesh: `fmu-mesh set` needs KEY and VALUE. "),
+        (["inspect"], "fmu-mesh: `fmu-mesh inspect` needs MODEL.fmu. "),
     ],
 )
 def test_a_wrong_value_of_an_option_is_told_in_words(
@@ -288,7 +308,9 @@ def test_a_wrong_value_of_an_option_is_told_in_words(
     with pytest.raises(SystemExit, match="2"):
         main(arguments)
 
-    assert says in capsys.readouterr().err
+    message = capsys.readouterr().err
+    assert says in message
+    assert "usage:" not in message
 
 
 def test_a_path_from_the_working_folder_is_told_to_be_relative_to_the_file(

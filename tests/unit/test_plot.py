@@ -262,7 +262,7 @@ def test_78_lines_can_be_told_apart_and_their_legend_covers_nothing() -> None:
     legend = axes.get_legend()
     assert legend is not None
     assert [text.get_text() for text in legend.get_texts()] == names
-    styles = [(line.get_color(), str(line._dash_pattern)) for line in legend.get_lines()]  # type: ignore[attr-defined]
+    styles = [(line.get_color(), str(line._dash_pattern)) for line in legend.get_lines()]  # type: ignore[attr-defined] # no public name
     assert len(set(styles)) == 78
     of_axes, of_legend = axes.get_window_extent(), legend.get_window_extent()
     assert of_axes.width > 7 * figure.dpi
@@ -279,7 +279,7 @@ def test_lines_that_lie_on_one_another_all_show() -> None:
 
     first, second, other, third = axes.lines
     assert [line.is_dashed() for line in (first, second, other, third)] == [False, True, False, True]
-    assert second._dash_pattern != third._dash_pattern  # type: ignore[attr-defined]
+    assert second._dash_pattern != third._dash_pattern  # type: ignore[attr-defined] # no public name
 
 
 @pytest.mark.parametrize(
