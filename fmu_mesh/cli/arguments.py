@@ -22,9 +22,15 @@ __all__ = ["CommandParser", "add_command", "add_window", "count", "endpoint", "n
 
 Parsers = Sequence[argparse.ArgumentParser]
 
+_NEGATIVE = re.compile(r"-(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?$|-\.?(?:inf|Inf|INF)$")
+
 
 class CommandParser(argparse.ArgumentParser):
     """A parser whose errors are one sentence, as all others: a page of options hides what is wrong."""
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:  # noqa: ANN401 those of argparse
+        super().__init__(*arguments, **options)
+        self._negative_number_matcher = _NEGATIVE  # argparse takes -1e-3 and -inf for options
 
     def error(self, message: str) -> NoReturn:
         """End with exit code 2 and with what is wrong."""

@@ -23,7 +23,7 @@ from ..model.findings import listed, nearest
 from .keys import Keys
 from .messages import decode_json
 from .readings import Keeper, Reading, Target, latecomers, reading_of
-from .session import matches
+from .session import matches, reason_of
 from .values import json_encoding
 from .views import (
     Command,
@@ -289,7 +289,8 @@ def key_expression(text: str) -> zenoh.KeyExpr:
     try:
         return zenoh.KeyExpr(text)
     except zenoh.ZError as error:
-        raise ConfigurationError(f"'{text}' is no key expression: {error}.") from error
+        reason = reason_of(error).rpartition("`: ")[2].removesuffix(".")
+        raise ConfigurationError(f"'{text}' is no key expression: {reason}") from error
 
 
 def _answers(replies: Any) -> list[zenoh.Sample] | None:  # noqa: ANN401 a Zenoh handler

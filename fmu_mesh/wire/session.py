@@ -89,12 +89,15 @@ def open_session(wiring: Wiring) -> zenoh.Session:
     try:
         return zenoh.open(_configuration(wiring))
     except zenoh.ZError as error:
-        raise _cannot_open(wiring, str(error)) from error
+        raise _cannot_open(wiring, reason_of(error)) from error
+
+
+def reason_of(error: zenoh.ZError) -> str:
+    """What an error of Zenoh says, without the places in its own sources."""
+    return _OWN_SOURCE.sub("", str(error))
 
 
 def _cannot_open(wiring: Wiring, reason: str) -> ConfigurationError:
-    """Why there is no session, without the places in Zenoh's own sources."""
-    reason = _OWN_SOURCE.sub("", reason)
     endpoint = next((endpoint for endpoint in wiring.listen if endpoint in reason), None)
     if endpoint is None:
         endpoints = ", ".join((*wiring.listen, *wiring.connect)) or "no endpoints"
@@ -109,7 +112,7 @@ def _configuration(wiring: Wiring) -> zenoh.Config:
     try:
         config = zenoh.Config.from_file(wiring.config) if wiring.config is not None else zenoh.Config()
     except zenoh.ZError as error:
-        raise ConfigurationError(f"'{wiring.config}' is no Zenoh configuration: {error}") from error
+        raise ConfigurationError(f"'{wiring.config}' is no Zenoh configuration: {reason_of(error)}") from error
     settings: dict[str, Any] = {
         "mode": wiring.mode,
         # Nothing on the network unless the user asked for it: no multicast, and gossip only between hosts.

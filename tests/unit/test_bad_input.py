@@ -255,6 +255,8 @@ def test_a_wrong_option_is_told_as_it_was_written(
         ),
         (["--plot", "launch", "mesh.yaml"], "It comes after the command: `fmu-mesh launch --plot`."),
         (["launch", "mesh.yaml", "more.yaml"], "`fmu-mesh launch` takes no 'more.yaml'. `fmu-mesh launch --help`"),
+        (["set", "Gain.u", "-1e-3"], "no mesh is running here"),
+        (["set", "Gain.u", "-inf"], "no mesh is running here"),
         (["--versoin"], "`fmu-mesh` has no option '--versoin'. Did you mean '--version'?"),
         (["launch", "mesh.yaml", "--output", "folder"], "mesh.yaml: --output folder: the folder '"),
         (["check", "nothing.yaml"], "fmu-mesh: nothing.yaml: no such file\n"),
@@ -277,6 +279,7 @@ def test_the_wrong_thing_for_a_command_is_told_with_the_right_one(
     (tmp_path / "mesh.yaml").write_text(GOOD, encoding="utf-8")
     (tmp_path / "Gain.fmu").symlink_to(FMUS / "Gain.fmu")
     (tmp_path / "folder").mkdir()
+    monkeypatch.setenv("FMU_MESH_RUNTIME_DIR", str(tmp_path / "folder"))
     monkeypatch.chdir(tmp_path)
 
     assert main(arguments) == 2

@@ -9,7 +9,8 @@ from typing import cast
 import pytest
 import zenoh
 
-from fmu_mesh.errors import MeshLost
+from fmu_mesh.errors import ConfigurationError, MeshLost
+from fmu_mesh.wire.client import key_expression
 from fmu_mesh.wire.session import Wiring, ask, close_session, open_session
 from tests.helpers import DEADLINE_S
 
@@ -54,3 +55,11 @@ def test_a_question_that_nobody_wants_answered_any_more_ends() -> None:
         ask(session, "nobody/there", b"", 10 * DEADLINE_S, "nobody", over=lambda: True)
 
     close_session(session)
+
+
+def test_what_is_no_key_expression_is_told_without_places_in_the_sources_of_zenoh() -> None:
+    with pytest.raises(ConfigurationError) as caught:
+        key_expression("a//b")
+
+    reason = "empty chunks are forbidden, as well as leading and trailing slashes"
+    assert str(caught.value) == f"'a//b' is no key expression: {reason}"
