@@ -14,6 +14,7 @@ from ..errors import ConfigurationError, FmuMeshError, Interrupted
 from ..model.findings import nearest
 from . import checking, free_running, inspecting, looking, playing, plotting, running, top
 from .arguments import CommandParser
+from .limits import check_address_space, needed_mib, out_of_memory
 
 __all__ = ["command_parser", "main"]
 
@@ -34,9 +35,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         level=os.environ.get("FMU_MESH_LOG", "WARNING").upper(), format="%(name)s: %(levelname)s: %(message)s"
     )
     logging.getLogger("matplotlib").setLevel(logging.ERROR)  # a folder of its own that it misses is nobody's concern
-    run: Command = options.run_command
     try:
-        return run(options)
+        return _run(options)
     except FmuMeshError as error:
         if options.debug:
             raise
@@ -50,6 +50,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # The reader of our output is gone, as in `fmu-mesh watch … | head`.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
+
+
+def _run(options: argparse.Namespace) -> int:
+    """Run the command; where there was no memory, that is a problem of this host, and no internal one."""
+    check_address_space(needed_mib(options.command, local=getattr(options, "local", False)))
+    run: Command = options.run_command
+    try:
+        return run(options)
+    except (MemoryError, OSError, RuntimeError, ImportError) as error:
+        problem = out_of_memory(error)
+        if problem is None:
+            raise
+        raise problem from error
 
 
 def _parsed(

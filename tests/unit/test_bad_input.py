@@ -278,7 +278,7 @@ def test_the_wrong_thing_for_a_command_is_told_with_the_right_one(
 ) -> None:
     (tmp_path / "mesh.yaml").write_text(GOOD, encoding="utf-8")
     (tmp_path / "Gain.fmu").symlink_to(FMUS / "Gain.fmu")
-    (tmp_path / "folder").mkdir()
+    (tmp_path / "folder").mkdir(mode=0o700)
     monkeypatch.setenv("FMU_MESH_RUNTIME_DIR", str(tmp_path / "folder"))
     monkeypatch.chdir(tmp_path)
 
