@@ -76,7 +76,13 @@ Host = Annotated[str | None, Meta(description="Host the node is meant to run on;
 class InstanceConfig(Base, frozen=True, kw_only=True, tag_field=KIND, tag="fmu"):
     """One instance of an FMU."""
 
-    fmu: Annotated[str, Meta(description="Path of the .fmu file, or of an unpacked one, relative to this file.")]
+    fmu: Annotated[
+        str,
+        Meta(
+            title="the path of an FMU",
+            description="Path of the .fmu file, or of an unpacked one, relative to this file.",
+        ),
+    ]
     kind: Annotated[
         Literal["auto", "co_simulation", "model_exchange"],
         Meta(description="Which kind of the FMU to use; auto: co-simulation if it has both."),

@@ -180,6 +180,11 @@ STRUCTURE = [
         id="an instance name with a dot",
     ),
     pytest.param(
+        changed("{fmu: delay.fmu}", "{start_values: {d: 1}}"),
+        "mesh.yaml:5: instances.delay.fmu: missing; expected the path of an FMU",
+        id="no FMU",
+    ),
+    pytest.param(
         changed("{fmu: delay.fmu}", "delay.fmu"),
         "mesh.yaml:5: instances.delay: 'delay.fmu'; expected a mapping with fmu, kind, solver, tolerance, "
         "retry_discarded_steps, start_values, step_size, group and 4 more",
