@@ -37,7 +37,10 @@ _IN_WORDS = {
     r"found '}'": ("a '}' that closes nothing", "a '{' before it, or no '}'"),
     r"found '\]'": ("a ']' that closes nothing", "a '[' before it, or no ']'"),
     r"found ','": ("a ',' outside of { } and [ ]", "one value; quotes around text with a comma in it"),
-    r"found '<scalar>' while parsing a block mapping": ("text after a value", "one value; quotes around all of it"),
+    r"found '(?:[{\[]|<.*>)' while parsing a block mapping": (
+        "text after a value",
+        "one value; quotes around all of it",
+    ),
     r"found '(\?|<scalar>|<block .*)' while parsing a block collection": (
         "a line without '- ' among the items of a list",
         f"'- ' before each item, and {_INDENTED}",
@@ -47,7 +50,12 @@ _IN_WORDS = {
     r"unknown escape character '(.)'": (r"'\\\1' between double quotes", r"single quotes, or '\\' for a backslash"),
     r"escape sequence": ("an escape sequence that is not complete", "as many digits as it takes, or single quotes"),
     r"while scanning an (?:alias|anchor)": ("a '*' or '&' without a name after it", _QUOTED),
-    r"while (?:parsing|scanning) a tag|tag handle": ("a value that begins with '!'", _QUOTED),
+    r"sequence entries are not allowed": (
+        "a '- ' where no list can begin",
+        "each item in a line of its own, below its key",
+    ),
+    r"mapping keys are not allowed": ("a '? ' where no key can be", _QUOTED),
+    r"while (?:parsing|scanning) an? tag|tag handle": ("a value that begins with '!'", _QUOTED),
     r"while scanning a block scalar": ("text after '|' or '>'", f"the text in the lines below, or {_QUOTED}"),
     r"'<document start>'|directive": ("a line that begins with '%'", "none; quotes around a name that begins with it"),
     r"incompatible YAML": ("another version of YAML", _YAML),
