@@ -31,10 +31,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.command is None:
         parser.print_help()
         return ConfigurationError.exit_code
-    logging.basicConfig(
-        level=os.environ.get("FMU_MESH_LOG", "WARNING").upper(), format="%(name)s: %(levelname)s: %(message)s"
-    )
-    logging.getLogger("matplotlib").setLevel(logging.ERROR)  # a folder of its own that it misses is nobody's concern
     try:
         return _run(options)
     except FmuMeshError as error:
@@ -54,6 +50,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(options: argparse.Namespace) -> int:
     """Run the command; where there was no memory, that is a problem of this host, and no internal one."""
+    _start_logging(os.environ.get("FMU_MESH_LOG") or "WARNING")
     check_address_space(needed_mib(options.command, local=getattr(options, "local", False)))
     run: Command = options.run_command
     try:
@@ -63,6 +60,17 @@ def _run(options: argparse.Namespace) -> int:
         if problem is None:
             raise
         raise problem from error
+
+
+def _start_logging(level: str) -> None:
+    """What the modules log goes to standard error, from this level on."""
+    names = logging.getLevelNamesMapping()
+    if level.upper() not in names:
+        raise ConfigurationError(
+            f"FMU_MESH_LOG is '{level}', which is no level.", hint="There are DEBUG, INFO, WARNING, ERROR and CRITICAL."
+        )
+    logging.basicConfig(level=names[level.upper()], format="%(name)s: %(levelname)s: %(message)s")
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)  # a folder of its own that it misses is nobody's concern
 
 
 def _parsed(

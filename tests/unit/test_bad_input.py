@@ -377,3 +377,14 @@ def test_the_command_itself_ends_with_exit_code_2_and_no_traceback(tmp_path: Pat
     assert ended.stdout == ""
     assert "Did you mean 'step_size'?" in ended.stderr
     assert "Traceback" not in ended.stderr
+
+
+def test_a_level_of_logging_that_there_is_not_is_refused(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("FMU_MESH_LOG", "loud")
+
+    assert main(["schema"]) == 2
+    assert capsys.readouterr().err == (
+        "fmu-mesh: FMU_MESH_LOG is 'loud', which is no level. There are DEBUG, INFO, WARNING, ERROR and CRITICAL.\n"
+    )
