@@ -74,13 +74,10 @@ def look_into(path: Path, terms: Terms = Terms()) -> Contents:  # noqa: B008 a f
         _refuse_large_description(path, sizes, terms.limits)
         return Contents(names, {name: (path / name).read_bytes() for name in sizes})
     with _opened(path, terms) as archive:
-        entries = {entry.filename: entry for entry in archive.infolist()}
+        entries = {_name(entry): entry for entry in archive.infolist() if not entry.is_dir()}
         present = [name for name in _XML_FILES if name in entries]
         _refuse_large_description(path, {name: entries[name].file_size for name in present}, terms.limits)
-        return Contents(
-            frozenset(name for name, entry in entries.items() if not entry.is_dir()),
-            {name: archive.read(name) for name in present},
-        )
+        return Contents(frozenset(entries), {name: archive.read(entries[name]) for name in present})
 
 
 def sha256_of(path: Path) -> str | None:
@@ -179,9 +176,10 @@ def _check(path: Path, archive: zipfile.ZipFile, limits: LimitsConfig) -> None:
     names: set[str] = set()
     for entry in entries:
         _check_entry(path, entry)
-        if entry.filename in names:
-            raise LoadFailed(f"'{path}' has two entries with one name: '{entry.filename}'.")
-        names.add(entry.filename)
+        name = _name(entry)
+        if name in names and not entry.is_dir():
+            raise LoadFailed(f"'{path}' has two entries with one name: '{name}'.")
+        names.add(name)
     unpacked = sum(entry.file_size for entry in entries)
     if unpacked > limits.unpacked_bytes:
         text = f"'{path}' has {unpacked} bytes when it is unpacked; the limit is {limits.unpacked_bytes}."
@@ -192,10 +190,17 @@ def _check(path: Path, archive: zipfile.ZipFile, limits: LimitsConfig) -> None:
         raise LoadFailed(text, hint=hint)
 
 
+def _name(entry: zipfile.ZipInfo) -> str:
+    """The name of an entry, without the `./` that some tools write before it, or for the folder of the FMU itself."""
+    return str(PurePosixPath(entry.filename))
+
+
 def _check_entry(path: Path, entry: zipfile.ZipInfo) -> None:
     name = entry.filename
-    parts = PurePosixPath(name)
-    if not name or parts.is_absolute() or ".." in parts.parts or ":" in parts.parts[0]:
+    relative = PurePosixPath(name)
+    has_drive = any(":" in part for part in relative.parts[:1])
+    has_name = bool(relative.parts) or entry.is_dir()
+    if not has_name or relative.is_absolute() or ".." in relative.parts or has_drive:
         raise LoadFailed(f"'{path}' has an entry outside its own folder: '{name}'.")
     if "\\" in name:
         raise LoadFailed(

@@ -7,8 +7,10 @@ odd: problems that a strict validator finds are kept in `ModelDescription.proble
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
+from io import BytesIO
 from pathlib import Path
 from typing import Any, Final, Literal, cast
+from zipfile import ZipFile
 
 import fmpy
 from fmpy.model_description import ModelDescription as FmpyDescription
@@ -17,7 +19,7 @@ from fmpy.model_description import read_model_description
 
 from ..errors import LoadFailed
 from ..model.description import Causality, Clock, DefaultExperiment, Kind, ModelDescription
-from .archive import Terms
+from .archive import Contents, Terms
 from .examining import examine, require_library
 from .variables import variables_of
 
@@ -46,12 +48,12 @@ def read_description(
         LoadFailed: it is no FMU, or one that cannot run here; the message says which and what would help.
     """
     contents = examine(path, terms)
-    source, problems = _parse(path)
+    source, problems = _parse(path, contents)
     version = source.fmiVersion or ""
     if not version.startswith(_VERSIONS) or "-" in version:  # 3.0-beta.1 is another interface than 3.0
         raise LoadFailed(f"'{path}' is an FMI {version} FMU; FMI 1.0, 2.0 and 3.0 are what can run.")
     kind = _kind(source, kind, path)
-    platforms = tuple(fmpy.supported_platforms(str(path)))
+    platforms = tuple(fmpy.supported_platforms(_readable(path, contents)))
     if to_run:
         others = [_interface(source, other) for other in _WORDS if other != kind]
         identifiers = [one.modelIdentifier or "" for one in (_interface(source, kind), *others) if one is not None]
@@ -81,16 +83,29 @@ def _interface(source: FmpyDescription, kind: Kind) -> Any:  # noqa: ANN401 FMPy
     return source.coSimulation if kind == "co_simulation" else source.modelExchange
 
 
-def _parse(path: Path) -> tuple[FmpyDescription, tuple[str, ...]]:
+def _readable(path: Path, contents: Contents) -> str | BytesIO:
+    """What FMPy reads an FMU from: the folder, or an archive whose names have no `./` before them, which it minds."""
+    if path.is_dir():
+        return str(path)
+    archive = BytesIO()
+    with ZipFile(archive, "w") as file:
+        for name in contents.names:
+            if name in contents.xml or name.startswith(("binaries/", "sources/")):
+                file.writestr(name, contents.xml.get(name, b""))
+    return archive
+
+
+def _parse(path: Path, contents: Contents) -> tuple[FmpyDescription, tuple[str, ...]]:
     """FMPy's model description, and what a strict validation of it finds."""
+    source = _readable(path, contents)
     try:
-        return read_model_description(str(path), validate=True), ()
+        return read_model_description(source, validate=True), ()
     except FmpyValidationError as error:
         problems = tuple(str(problem) for problem in error.problems)
     except Exception as error:  # noqa: BLE001 FMPy and lxml raise whatever the XML provokes in them
         problems = (str(error),)
     try:
-        return read_model_description(str(path), validate=False), problems
+        return read_model_description(source, validate=False), problems
     except Exception as error:
         raise LoadFailed(f"the modelDescription.xml of '{path}' cannot be read: {error}") from error
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import logging
 import os
+import posixpath
 import re
 import shlex
 import shutil
@@ -151,14 +152,13 @@ def _build(path: Path, description: FmpyDescription, names: Sequence[str], kind:
     identifier = str(unit.modelIdentifier)
     fitting = [one for one in description.buildConfigurations if one.modelIdentifier in (identifier, None)]
     sets = fitting[0].sourceFileSets if fitting else []
-    sources = listed or [name for one in sets for name in one.sourceFiles]
+    sources = [_inside(path, name) for name in listed or [name for one in sets for name in one.sourceFiles]]
+    # OpenModelica lists `./`, too: a folder is nothing to compile.
+    folders = {str(folder) for name in names for folder in PurePosixPath(name.removeprefix("sources/")).parents}
+    sources = [name for name in dict.fromkeys(sources) if name not in folders]
     if not sources:
         sources = [name.removeprefix("sources/") for name in source_names(names) if name.count("/") == 1]
-    includes = [name for one in sets for name in one.includeDirectories]
-    for name in [*sources, *includes]:
-        parts = PurePosixPath(name)
-        if parts.is_absolute() or ".." in parts.parts:
-            raise LoadFailed(f"'{path}' lists a source outside its own folder: '{name}'.")
+    includes = [_inside(path, name) for one in sets for name in one.includeDirectories]
     missing = [name for name in sources if f"sources/{name}" not in names]
     if missing:
         raise LoadFailed(f"'{path}' lists the source '{missing[0]}', but does not contain it.")
@@ -175,6 +175,14 @@ def _build(path: Path, description: FmpyDescription, names: Sequence[str], kind:
         if re.fullmatch(r"C(\+\+)?\d\d", language):
             options.append(f"-std={language.lower().replace('c', 'gnu', 1)}")
     return _Build(identifier, tuple(sources), tuple(includes), tuple(options))
+
+
+def _inside(path: Path, name: str) -> str:
+    """A path that a description lists, relative to the folder `sources`, in its plain form: `./a.c` is `a.c`."""
+    plain = posixpath.normpath(name)
+    if plain == ".." or plain.startswith(("/", "../")):
+        raise LoadFailed(f"'{path}' lists a source outside its own folder: '{name}'.")
+    return plain
 
 
 def _compiled(path: Path, sources: Path, build: _Build, tell: Callable[[str], None]) -> Path:

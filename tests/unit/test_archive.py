@@ -7,15 +7,16 @@ import os
 import stat
 import zipfile
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 
 import pytest
 
 from fmu_mesh.errors import LoadFailed
-from fmu_mesh.fmu import Terms, read_description, sha256_of
+from fmu_mesh.fmu import Terms, open_instance, read_description, sha256_of
 from fmu_mesh.fmu.sources import extract
 from fmu_mesh.model.config import LimitsConfig
-from tests.fmus.helpers import FMUS
+from tests.fmus.helpers import FMUS, find_fmu
 from tests.fmus.packing import repacked, unpacked
 
 GAIN = FMUS / "Gain.fmu"
@@ -54,6 +55,8 @@ HOSTILE: list[object] = [
     pytest.param(entry("resources/../../evil"), "outside its own folder", id="a parent folder on the way"),
     pytest.param(entry("/tmp/fmu_mesh_evil"), "outside its own folder", id="an absolute path"),  # noqa: S108 refused
     pytest.param(entry("C:/evil"), "outside its own folder", id="a drive"),
+    pytest.param(entry("./../evil"), "outside its own folder", id="a parent folder of the folder itself"),
+    pytest.param(entry("."), "outside its own folder: '.'", id="a file in the place of the folder itself"),
     pytest.param(entry("resources\\evil"), "a backslash in its name", id="a backslash"),
     pytest.param(entry("resources/link", stat.S_IFLNK | 0o777), "a symbolic link inside", id="a link"),
     pytest.param(entry("resources/fifo", stat.S_IFIFO | 0o644), "neither a file nor a folder", id="a fifo"),
@@ -77,9 +80,38 @@ def test_an_entry_that_would_leave_the_folder_is_refused_before_anything_is_writ
     assert not Path("/tmp/fmu_mesh_evil").exists()  # noqa: S108 that it is not written is the point
 
 
+@pytest.mark.parametrize("before", ["", "./"], ids=["for the folder itself", "before every name, too"])
+@pytest.mark.parametrize("fmu", ["Gain", "AllTypes3"])
+def test_an_fmu_whose_tool_wrote_a_dot_as_a_folder_is_the_same_fmu_and_runs(
+    fmu: str, before: str, tmp_path: Path
+) -> None:
+    """`zip -r model.fmu .` and the tool of Vico write such entries."""
+    plain = find_fmu(fmu, tmp_path / "built")
+    path = tmp_path / "dotted.fmu"
+    with zipfile.ZipFile(plain) as old, zipfile.ZipFile(path, "w") as new:
+        for name in ("./", "resources/", "./resources/"):
+            new.writestr(entry(name, stat.S_IFDIR | 0o755), b"")
+        for name in old.namelist():
+            new.writestr(entry(f"{before}{name}"), old.read(name))
+
+    description = read_description(path)
+
+    assert description == read_description(plain)
+    with closing(open_instance(path, "dotted", description, tmp_path)) as instance:
+        instance.enter_initialization(0.0, 1.0, {})
+        instance.exit_initialization()
+
+
 @pytest.mark.filterwarnings("ignore:Duplicate name")
 def test_two_entries_with_one_name_are_refused(tmp_path: Path) -> None:
     path = repacked(tmp_path / "twice.fmu", add={entry("modelDescription.xml"): b"<another/>"})
+
+    with pytest.raises(LoadFailed, match=r"two entries with one name: 'modelDescription\.xml'"):
+        read_description(path)
+
+
+def test_two_spellings_of_one_name_are_refused_as_well(tmp_path: Path) -> None:
+    path = repacked(tmp_path / "twice.fmu", add={entry("./modelDescription.xml"): b"<another/>"})
 
     with pytest.raises(LoadFailed, match=r"two entries with one name: 'modelDescription\.xml'"):
         read_description(path)

@@ -137,13 +137,37 @@ def test_without_a_list_all_sources_at_the_root_are_compiled(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize(
+    "listed",
+    [
+        '<File name="./"/><File name="Gain.c"/>',
+        '<File name="./Gain.c"/>',
+        '<File name="."/><File name="more"/><File name="more/"/><File name="more/../Gain.c"/><File name="Gain.c"/>',
+    ],
+    ids=["its own folder, too", "a dot before the name", "folders and a detour"],
+)
+def test_sources_are_listed_as_openmodelica_does_it(listed: str, tmp_path: Path) -> None:
+    sources = without_binaries(tmp_path / "sources.fmu")
+    path = repacked(
+        tmp_path / "listed.fmu",
+        source=sources,
+        description=lambda text: text.replace('<File name="Gain.c"/>', listed),
+        add={"sources/more/unused.h": b""},
+    )
+    with zipfile.ZipFile(path) as archive:
+        assert listed in archive.read("modelDescription.xml").decode()
+
+    assert (extract(path, tmp_path / "parent") / "binaries/linux64/Gain.so").is_file()
+
+
+@pytest.mark.parametrize(
     ("change", "says"),
     [
         (('<File name="Gain.c"/>', '<File name="Missing.c"/>'), "lists the source 'Missing.c', but does not contain"),
         (('<File name="Gain.c"/>', '<File name="../../x.c"/>'), "lists a source outside its own folder: '../../x.c'"),
+        (('<File name="Gain.c"/>', '<File name="a/../../x.c"/>'), "lists a source outside its own folder: 'a/../../x"),
         (('<File name="Gain.c"/>', ""), "do not compile: .*model"),
     ],
-    ids=["a missing file", "a file outside", "an undefined symbol"],
+    ids=["a missing file", "a file outside", "a file outside on a detour", "an undefined symbol"],
 )
 def test_sources_that_do_not_compile_are_told_with_the_reason_and_leave_nothing(
     change: tuple[str, str], says: str, tmp_path: Path, cache: Path
