@@ -1,7 +1,9 @@
-"""The callbacks that FMUs of FMI 1.0 and 2.0 get: one set for the process, because there is one proxy for messages.
+"""The callbacks that FMUs of FMI 1.0 and 2.0 get, and the way of a message to its instance.
 
-FMPy's proxy, which formats the variadic messages of an FMU, has one logger only; so messages find their instance by its
-name, which is unique in a process.
+FMPy's proxy, which formats the variadic messages of an FMU, has one logger for the whole process. So a message is given
+to the instance whose address comes with it: the environment that the instance was made with (FMI 2.0, 2.1.5), or the
+component (FMI 1.0, 2.3). Some FMUs pass neither; then the instance name decides. Some have another name of their own as
+well; then every instance gets the message, because it may be the reason why a call fails.
 """
 
 from __future__ import annotations
@@ -24,7 +26,7 @@ from fmpy.fmi2 import (
 )
 from fmpy.logging import addLoggerProxy
 
-__all__ = ["FMI1_CALLBACKS", "FMI2_CALLBACKS", "register", "unregister"]
+__all__ = ["FMI1_CALLBACKS", "fmi2_callbacks", "register", "register_component", "unregister"]
 
 
 class Logged(Protocol):
@@ -35,7 +37,8 @@ class Logged(Protocol):
         ...
 
 
-_instances: dict[bytes, Logged] = {}
+_by_address: dict[int, Logged] = {}
+_by_name: dict[bytes, Logged] = {}
 
 
 def register(name: str, instance: Logged) -> None:
@@ -44,21 +47,36 @@ def register(name: str, instance: Logged) -> None:
     Raises:
         ValueError: the name is taken.
     """
-    if name.encode() in _instances:
+    if name.encode() in _by_name:
         msg = f"two instances of one process have the name '{name}'"
         raise ValueError(msg)
-    _instances[name.encode()] = instance
+    _by_name[name.encode()] = instance
+    _by_address[id(instance)] = instance
 
 
-def unregister(name: str, instance: Logged) -> None:
+def register_component(component: int, instance: Logged) -> None:
+    """Messages that come with the address ``component`` go to ``instance`` as well."""
+    _by_address[component] = instance
+
+
+def unregister(instance: Logged) -> None:
     """Messages of ``instance`` go nowhere any more."""
-    if _instances.get(name.encode()) is instance:
-        del _instances[name.encode()]
+    for name in [name for name, one in _by_name.items() if one is instance]:
+        del _by_name[name]
+    for address in [address for address, one in _by_address.items() if one is instance]:
+        del _by_address[address]
 
 
-def _log(_environment: int | None, name: bytes, status: int, category: bytes, message: bytes) -> None:
-    instance = _instances.get(name or b"")
-    if instance is not None:
+def fmi2_callbacks(instance: Logged) -> fmi2CallbackFunctions:
+    """The callbacks for a registered instance of FMI 2.0; they must live as long as it does."""
+    callbacks = fmi2CallbackFunctions.from_buffer_copy(_FMI2_CALLBACKS)
+    callbacks.componentEnvironment = id(instance)
+    return callbacks
+
+
+def _log(address: int | None, name: bytes | None, status: int, category: bytes | None, message: bytes | None) -> None:
+    found = _by_address.get(address or 0) or _by_name.get(name or b"")
+    for instance in (found,) if found is not None else tuple(_by_name.values()):
         instance.logged(status, category or b"", message or b"")
 
 
@@ -74,12 +92,12 @@ def _fmi2_callbacks() -> fmi2CallbackFunctions:
 def _fmi1_callbacks() -> fmi1CallbackFunctions:
     """As for FMI 2.0, whose logger has the same arguments; the proxy must not be added a second time."""
     callbacks = fmi1CallbackFunctions()
-    callbacks.logger = ctypes.cast(FMI2_CALLBACKS.logger, fmi1CallbackLoggerTYPE)
+    callbacks.logger = ctypes.cast(_FMI2_CALLBACKS.logger, fmi1CallbackLoggerTYPE)
     callbacks.allocateMemory = fmi1CallbackAllocateMemoryTYPE(fmpy.calloc)
     callbacks.freeMemory = fmi1CallbackFreeMemoryTYPE(fmpy.free)
     callbacks.stepFinished = None
     return callbacks
 
 
-FMI2_CALLBACKS = _fmi2_callbacks()
+_FMI2_CALLBACKS = _fmi2_callbacks()
 FMI1_CALLBACKS = _fmi1_callbacks()

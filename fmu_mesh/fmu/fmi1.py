@@ -20,7 +20,7 @@ from ..model.description import Variable
 from ..model.ring import Part
 from ..model.types import Value, VariableType
 from .buffers import Buffer, NumberBuffer, StringBuffer
-from .callbacks import FMI1_CALLBACKS, register, unregister
+from .callbacks import FMI1_CALLBACKS, register, register_component, unregister
 from .calls import Function, Pointer, hot
 from .instance import STATUS_NAMES, WARNING, FmuInstance, Verb
 from .step_status import PENDING, SMALLER_STEPS, StepStatus, discarded
@@ -153,7 +153,7 @@ class Fmi1Instance(FmuInstance):
     def close(self) -> None:
         """Terminate if allowed, free the instance and remove its files. Never raises; may be called twice."""
         super().close()
-        unregister(self.name, self)
+        unregister(self)
 
     def _instantiate(self, folder: Path) -> None:
         register(self.name, self)
@@ -169,6 +169,7 @@ class Fmi1Instance(FmuInstance):
             raise RuntimeError("fmiInstantiateSlave returned no instance")
         self._fmu = fmu
         self._component = fmu.component
+        register_component(self._component, self)
         self._do_step = hot(getattr(fmu.dll, self._prefixed("DoStep")), _DO_STEP)
         self._step_status = StepStatus(fmu.dll, fmu.component, self._prefixed(""))
         if self._options.linear_inputs:

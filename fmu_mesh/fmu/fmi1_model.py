@@ -11,7 +11,7 @@ from pathlib import Path
 from fmpy.fmi1 import FMU1Model
 
 from ..model.types import Value
-from .callbacks import FMI1_CALLBACKS, register
+from .callbacks import FMI1_CALLBACKS, register, register_component
 from .continuous import ContinuousInstance
 from .fmi1 import Fmi1Instance
 from .model_calls import Fmi1Calls, ModelCalls
@@ -34,6 +34,7 @@ class Fmi1ModelInstance(ContinuousInstance, Fmi1Instance):
         )
         self._fmu.instantiate(functions=FMI1_CALLBACKS, loggingOn=False)
         self._component = self._fmu.component
+        register_component(self._component, self)
         self._calls = Fmi1Calls(self._fmu, description.continuous_states, description.event_indicators)
 
     def _enter_initialization(self, start_time: float, stop_time: float | None, start_values: dict[str, Value]) -> None:

@@ -21,7 +21,7 @@ from ..model.ring import Part, Ring
 from ..model.types import Value, VariableType
 from ..simtime import TimeGrid
 from .buffers import Buffer, NumberBuffer, StringBuffer
-from .callbacks import FMI2_CALLBACKS, register, unregister
+from .callbacks import fmi2_callbacks, register, register_component, unregister
 from .calls import Function, Pointer, hot
 from .fmi2_steps import RetriedSteps
 from .fused import DOING, GETTING, STATUS_BITS, STEPPING, Fused, fmi2_step, fuse
@@ -55,7 +55,7 @@ class Fmi2Values(FmuInstance):
     def close(self) -> None:
         """Terminate if allowed, free the instance and remove its files. Never raises; may be called twice."""
         super().close()
-        unregister(self.name, self)
+        unregister(self)
 
     def _instantiate(self, folder: Path) -> None:
         register(self.name, self)
@@ -65,9 +65,10 @@ class Fmi2Values(FmuInstance):
             unzipDirectory=str(folder),
             instanceName=self.name,
         )
-        fmu.instantiate(callbacks=FMI2_CALLBACKS, loggingOn=False)
+        fmu.instantiate(callbacks=fmi2_callbacks(self), loggingOn=False)
         self._fmu = fmu
         self._component = fmu.component
+        register_component(self._component, self)
 
     def _enter_initialization(self, start_time: float, stop_time: float | None, start_values: dict[str, Value]) -> None:
         """FMI 2.0, 2.1.6 and 4.2.1."""

@@ -1,0 +1,141 @@
+"""Messages of FMUs: which instance they are told of, whatever name and address the FMU gives its logger."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Literal
+
+import pytest
+import yaml
+
+from fmu_mesh.cli.main import main
+from fmu_mesh.errors import StepFailed
+from fmu_mesh.fmu import FmuInstance, LogMessage, open_instance, read_description
+from fmu_mesh.fmu.sources import extract
+from tests.fmus.event_fmus import SOURCES, event_source_fmu
+from tests.fmus.helpers import NO_COMPILER, find_fmu
+from tests.fmus.packing import repacked, without_binaries
+
+pytestmark = pytest.mark.skipif(NO_COMPILER is not None, reason=str(NO_COMPILER))
+
+SAYS = "the step is too long"
+OWN_2, OWN_1 = "instance->environment, instance->name,", "m->logger(NULL, m->name, Discard"
+
+Version = Literal[1, 2]
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A cache of the test's own."""
+    monkeypatch.setenv("FMU_MESH_CACHE_DIR", str(tmp_path / "cache"))
+
+
+def logging_fmu(version: Version, address: str, name: str, folder: Path) -> Path:
+    """An FMU that discards steps longer than `longest_step`, and calls its logger with this address and name (in C)."""
+    target = folder / "logging.fmu"
+    if version == 2:
+        code = (SOURCES / "fmi2.c").read_text()
+        assert OWN_2 in code
+        return event_source_fmu("Stairs", 2, target, add={"sources/fmi2.c": code.replace(OWN_2, f"{address}, {name},")})
+    sources = without_binaries(folder / "sources.fmu", source=find_fmu("Steps1", folder))
+    folder_of_sources = extract(sources, folder / "sources") / "sources"
+    code = (folder_of_sources / "steps.h").read_text()
+    assert OWN_1 in code
+    changed = code.replace(OWN_1, f"m->logger({address}, {name}, Discard").encode()
+    return repacked(
+        target,
+        source=sources,
+        description=lambda text: text.replace('canRejectSteps="true"', 'canRejectSteps="false"'),
+        keep=lambda one: one != "sources/steps.h",
+        add={"sources/steps.h": changed},
+    )
+
+
+class Pair:
+    """Two instances of one FMU in one process, with what is told of each."""
+
+    def __init__(self, fmu: Path, folder: Path, stack: ExitStack) -> None:
+        self.told: dict[str, list[LogMessage]] = {"first": [], "second": []}
+        description = read_description(fmu)
+        self.instances: dict[str, FmuInstance] = {}
+        for name, told in self.told.items():
+            instance = open_instance(fmu, name, description, folder, told.append)
+            stack.callback(instance.close)
+            instance.enter_initialization(0.0, 1.0, {"longest_step": 0.2})
+            instance.exit_initialization()
+            self.instances[name] = instance
+
+
+@pytest.fixture
+def stack() -> Iterator[ExitStack]:
+    with ExitStack() as stack:
+        yield stack
+
+
+@pytest.mark.parametrize(
+    ("version", "address", "name"),
+    [
+        pytest.param(2, "instance->environment", '"20-sim"', id="FMI 2, the environment and another name"),
+        pytest.param(2, "instance->environment", '"first"', id="FMI 2, the environment and the name of the other"),
+        pytest.param(2, "instance", '"20-sim"', id="FMI 2, the component and another name"),
+        pytest.param(2, "NULL", "instance->name", id="FMI 2, the name only"),
+        pytest.param(2, "(void *)4711", "instance->name", id="FMI 2, nobody's address and the name"),
+        pytest.param(1, "m", '"20-sim"', id="FMI 1, the component and another name"),
+        pytest.param(1, "m", "NULL", id="FMI 1, the component only"),
+        pytest.param(1, "NULL", "m->name", id="FMI 1, the name only"),
+    ],
+)
+def test_a_message_is_told_of_the_instance_that_it_comes_from(
+    version: Version, address: str, name: str, tmp_path: Path, stack: ExitStack
+) -> None:
+    pair = Pair(logging_fmu(version, address, name, tmp_path), tmp_path, stack)
+
+    with pytest.raises(StepFailed, match=f"DoStep returned discard; .*the FMU says: {SAYS}"):
+        pair.instances["second"].advance(0.0, 0.25)
+
+    assert [(one.instance, one.message) for one in pair.told["second"]] == [("second", SAYS)]
+    assert pair.told["first"] == []
+
+
+@pytest.mark.parametrize("version", [1, 2])
+@pytest.mark.parametrize("name", ['"20-sim"', "NULL"])
+def test_a_message_of_nobody_is_told_of_every_instance(
+    name: str, version: Version, tmp_path: Path, stack: ExitStack
+) -> None:
+    pair = Pair(logging_fmu(version, "NULL", name, tmp_path), tmp_path, stack)
+
+    with pytest.raises(StepFailed, match=f"the FMU says: {SAYS}"):
+        pair.instances["second"].advance(0.0, 0.25)
+
+    for own, told in pair.told.items():
+        assert [(one.instance, one.message) for one in told] == [(own, SAYS)]
+
+
+def test_a_closed_instance_gets_no_messages_any_more(tmp_path: Path, stack: ExitStack) -> None:
+    pair = Pair(logging_fmu(2, "NULL", '"20-sim"', tmp_path), tmp_path, stack)
+    pair.instances["first"].close()
+
+    with pytest.raises(StepFailed, match=f"the FMU says: {SAYS}"):
+        pair.instances["second"].advance(0.0, 0.25)
+
+    assert pair.told["first"] == []
+
+
+def test_a_run_says_what_an_fmu_says_under_another_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    fmu = logging_fmu(2, "NULL", '"20-sim"', tmp_path)
+    content = {
+        "mesh": "one",
+        "simulation": {"stop_time": 1, "step_size": 0.25},
+        "instances": {"stairs": {"fmu": fmu.name, "start_values": {"longest_step": 0.2}}},
+        "record": {"file": None},
+    }
+    config = tmp_path / "one.yaml"
+    config.write_text(yaml.safe_dump(content), encoding="utf-8")
+
+    assert main(["launch", "--local", str(config)]) == 3
+
+    said = capsys.readouterr().err
+    assert f"the FMU says: {SAYS}" in said
+    assert f"stairs at point 0: {SAYS}" in said
