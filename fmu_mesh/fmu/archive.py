@@ -67,12 +67,12 @@ def look_into(path: Path, terms: Terms = Terms()) -> Contents:  # noqa: B008 a f
     Raises:
         LoadFailed: there is no FMU, or it breaks the terms.
     """
-    if path.is_dir():
+    if files.is_folder(path):
         _refuse_sha256_of_folder(path, terms)
-        names = _names_in(path)
-        sizes = {name: (path / name).stat().st_size for name in _XML_FILES if name in names}
-        _refuse_large_description(path, sizes, terms.limits)
-        return Contents(names, {name: (path / name).read_bytes() for name in sizes})
+        try:
+            return _look_into_folder(path, terms.limits)
+        except OSError as error:
+            raise LoadFailed(f"'{path}' cannot be read: {error.strerror}.") from error
     with _opened(path, terms) as archive:
         entries = {_name(entry): entry for entry in archive.infolist() if not entry.is_dir()}
         present = [name for name in _XML_FILES if name in entries]
@@ -82,12 +82,12 @@ def look_into(path: Path, terms: Terms = Terms()) -> Contents:  # noqa: B008 a f
 
 def sha256_of(path: Path) -> str | None:
     """The SHA-256 of an archive as hexadecimal digits; None for a folder."""
-    return None if path.is_dir() else files.sha256_of(path)
+    return None if files.is_folder(path) else files.sha256_of(path)
 
 
 def content_of(path: Path) -> str:
     """A SHA-256 that tells an FMU from any other: of its archive, or of the names and contents of a folder's files."""
-    if not path.is_dir():
+    if not files.is_folder(path):
         return files.sha256_of(path)
     digest = hashlib.sha256()
     for name in sorted(_names_in(path)):
@@ -111,7 +111,7 @@ def unpack(path: Path, parent: Path, terms: Terms = Terms()) -> Iterator[Path]: 
     except OSError as error:
         raise LoadFailed(f"'{path}' cannot be extracted into '{parent}': {error.strerror}") from error
     try:
-        if path.is_dir():
+        if files.is_folder(path):
             _refuse_sha256_of_folder(path, terms)
             _link_folder(path, partial)
         else:
@@ -141,7 +141,7 @@ def _opened(path: Path, terms: Terms) -> Iterator[zipfile.ZipFile]:
     except FileNotFoundError as error:
         raise LoadFailed(f"'{path}' does not exist.") from error
     except zipfile.BadZipFile as error:
-        is_zip = path.is_file() and zipfile.is_zipfile(path)
+        is_zip = files.is_file(path) and zipfile.is_zipfile(path)
         what = f"is a damaged ZIP archive: {error}" if is_zip else "is no ZIP archive, so it is no FMU."
         raise LoadFailed(f"'{path}' {what}") from error
     except (zlib.error, lzma.LZMAError, EOFError) as error:
@@ -239,6 +239,13 @@ def _refuse_large_description(path: Path, sizes: dict[str, int], limits: LimitsC
 
 
 # --- a folder
+
+
+def _look_into_folder(path: Path, limits: LimitsConfig) -> Contents:
+    names = _names_in(path)
+    sizes = {name: (path / name).stat().st_size for name in _XML_FILES if name in names}
+    _refuse_large_description(path, sizes, limits)
+    return Contents(names, {name: (path / name).read_bytes() for name in sizes})
 
 
 def _names_in(path: Path) -> frozenset[str]:

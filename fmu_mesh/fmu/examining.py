@@ -18,9 +18,10 @@ from lxml import etree
 from ..errors import LoadFailed
 from .archive import Contents, Terms, look_into
 
-__all__ = ["examine", "library_names", "require_library", "safe_xml", "source_names"]
+__all__ = ["examine", "find_library", "library_name", "safe_xml", "source_names"]
 
 _SHOWN: Final = 3
+_SUFFIX: Final = str(fmpy.sharedLibraryExtension)
 _SCHEMA_FILES: Final = {
     "1": "fmi1/fmiModelDescription.xsd",
     "2": "fmi2/fmi2ModelDescription.xsd",
@@ -89,10 +90,10 @@ def safe_xml(data: bytes, what: str) -> Any:  # noqa: ANN401 lxml ships no types
         raise LoadFailed(f"{what} cannot be read: {error.msg}") from error
 
 
-def library_names(identifier: str, fmi_version: str) -> tuple[str, ...]:
+def library_name(identifier: str, fmi_version: str) -> str:
     """Where an FMU has its library for this platform (FMI 1.0, 2.3; 2.0, 2.3; 3.0, 2.5.1)."""
-    platforms = (fmpy.platform_tuple,) if fmi_version.startswith("3") else (fmpy.platform,)
-    return tuple(f"binaries/{platform}/{identifier}{fmpy.sharedLibraryExtension}" for platform in platforms)
+    platform = fmpy.platform_tuple if fmi_version.startswith("3") else fmpy.platform
+    return f"binaries/{platform}/{identifier}{_SUFFIX}"
 
 
 def source_names(names: Iterable[str]) -> list[str]:
@@ -100,8 +101,8 @@ def source_names(names: Iterable[str]) -> list[str]:
     return sorted(name for name in names if re.fullmatch(r"sources/.*\.(c|cc|cpp|cxx)", name))
 
 
-def require_library(path: Path, names: Collection[str], identifiers: Sequence[str], fmi_version: str) -> None:
-    """Whether an FMU has a library for this platform, or sources to make one from.
+def find_library(path: Path, names: Collection[str], identifiers: Sequence[str], fmi_version: str) -> str | None:
+    """The library of an FMU for this platform: that of its name, or else the only one that there is.
 
     Args:
         path: the FMU.
@@ -109,39 +110,45 @@ def require_library(path: Path, names: Collection[str], identifiers: Sequence[st
         identifiers: the model identifier of the kind to use, then that of the other kind if there is one.
         fmi_version: of it.
 
+    Returns:
+        The name of its file; None if there are sources to make it from.
+
     Raises:
-        LoadFailed: it can run elsewhere only, or its library has another name; the message says what it has.
+        LoadFailed: it can run elsewhere only, or which library it is cannot be told; the message says what it has.
     """
     identifier, *others_of_it = identifiers
-    if not identifier or "/" in identifier or "\\" in identifier or identifier.startswith("."):
+    if "/" in identifier or "\\" in identifier or identifier.startswith("."):
         raise LoadFailed(f"'{path}' has the model identifier '{identifier}', which cannot be the name of a library.")
-    wanted = library_names(identifier, fmi_version)
-    if any(name in names for name in wanted):
-        return
-    folder = wanted[0].rpartition("/")[0]
-    there = sorted(name for name in names if name.startswith(f"{folder}/") and name.endswith(_SUFFIX))
-    known = [name for one in others_of_it for name in library_names(one, fmi_version) if name in there]
-    if others := [name for name in there if name not in known]:
+    wanted = library_name(identifier, fmi_version)
+    if identifier and wanted in names:
+        return wanted
+    folder = wanted.rpartition("/")[0]
+    there = sorted(name for name in names if name.rpartition("/")[0] == folder and name.endswith(_SUFFIX))
+    known = [name for one in others_of_it if (name := library_name(one, fmi_version)) in there]
+    others = [name for name in there if name not in known]
+    if len(others) == 1:
+        return others[0]
+    what = f"'{path}' has no '{wanted}'" if identifier else f"'{path}' has no model identifier to find its library by"
+    if others:
         raise LoadFailed(
-            f"'{path}' has no '{wanted[0]}', although its model identifier is '{identifier}'; it has "
-            f"'{others[0]}' (FMI 2.0, 2.3: the library must have that name)."
+            f"{what}; it has {' and '.join(map(repr, others))}, and which of them to load cannot be told.",
+            hint="The library must have the name of the model identifier (FMI 2.0, 2.3).",
         )
-    if source_names(names):
-        return
+    if identifier and source_names(names):
+        return None
     if known:
         raise LoadFailed(
-            f"'{path}' has no '{wanted[0]}'; it has only '{known[0]}', the library of its other kind.",
+            f"{what}; it has only '{known[0]}', the library of its other kind.",
             hint="Leave `kind` to the other one, or export it with both libraries.",
         )
-    there = sorted({name.split("/")[1] for name in names if re.fullmatch(r"binaries/[^/]+/.+", name)})
+    if not identifier:
+        raise LoadFailed(f"{what}, nor a library for this platform.", hint="Its tool has to be told.")
+    platforms = sorted({name.split("/")[1] for name in names if re.fullmatch(r"binaries/[^/]+/.+", name)})
     raise LoadFailed(
         f"'{path}' has no binary for this platform ({folder.rpartition('/')[2]}); it has: "
-        f"{', '.join(there) or 'no platform at all'}.",
+        f"{', '.join(platforms) or 'no platform at all'}.",
         hint="Export it for this platform, or with its sources.",
     )
-
-
-_SUFFIX = str(fmpy.sharedLibraryExtension)
 
 
 class _DocumentTypeError(Exception):

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import xml.etree.ElementTree as ET
 from io import BytesIO
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, Final, Literal, cast
 from zipfile import ZipFile
 
@@ -16,11 +16,13 @@ import fmpy
 from fmpy.model_description import ModelDescription as FmpyDescription
 from fmpy.model_description import ValidationError as FmpyValidationError
 from fmpy.model_description import read_model_description
+from msgspec.structs import replace
 
+from .. import files
 from ..errors import LoadFailed
 from ..model.description import Causality, Clock, DefaultExperiment, Kind, ModelDescription
 from .archive import Contents, Terms
-from .examining import examine, require_library
+from .examining import examine, find_library, library_name
 from .variables import variables_of
 
 __all__ = ["read_description"]
@@ -54,15 +56,21 @@ def read_description(
         raise LoadFailed(f"'{path}' is an FMI {version} FMU; FMI 1.0, 2.0 and 3.0 are what can run.")
     kind = _kind(source, kind, path)
     platforms = tuple(fmpy.supported_platforms(_readable(path, contents)))
-    if to_run:
-        others = [_interface(source, other) for other in _WORDS if other != kind]
-        identifiers = [one.modelIdentifier or "" for one in (_interface(source, kind), *others) if one is not None]
-        require_library(path, contents.names, identifiers, version)
+    interfaces = [_interface(source, kind), *(_interface(source, other) for other in _WORDS if other != kind)]
+    identifiers = [one.modelIdentifier or "" for one in interfaces if one is not None]
+    library = find_library(path, contents.names, identifiers, version) if to_run else None
+    if library is not None and library != (wanted := library_name(identifiers[0], version)):
+        what = (
+            f"is not named as FMI demands, '{wanted}'" if identifiers[0] else "is all that tells the model identifier"
+        )
+        problems = (*problems, f"the library '{library}' {what}")
     root = ET.fromstring(contents.xml["modelDescription.xml"])  # noqa: S314 - `examine` has found it safe
     try:
-        return _convert(source, kind, root, platforms, problems)
+        description = _convert(source, kind, root, platforms, problems)
     except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
         raise LoadFailed(f"the modelDescription.xml of '{path}' has a value that cannot be: {error}") from error
+    identifier = identifiers[0] or (PurePosixPath(library).stem if library is not None else "")
+    return replace(description, model_identifier=identifier, library=library)
 
 
 def _kind(source: FmpyDescription, wanted: str, path: Path) -> Kind:
@@ -73,6 +81,12 @@ def _kind(source: FmpyDescription, wanted: str, path: Path) -> Kind:
             return kind
     has = _WORDS[there[0]] if there else "scheduled execution"
     missed = next((words for kind, words in _WORDS.items() if kind == wanted), "co-simulation or model exchange")
+    if not there and source.scheduledExecution is None:
+        raise LoadFailed(
+            f"the modelDescription.xml of '{path}' declares no kind of FMU: it has neither a <CoSimulation> nor a "
+            "<ModelExchange>.",
+            hint="Export it again as an FMU for co-simulation.",
+        )
     raise LoadFailed(
         f"'{path}' is for {has} only, not for {missed}.",
         hint="`kind: auto` takes what there is." if there else None,
@@ -85,7 +99,7 @@ def _interface(source: FmpyDescription, kind: Kind) -> Any:  # noqa: ANN401 FMPy
 
 def _readable(path: Path, contents: Contents) -> str | BytesIO:
     """What FMPy reads an FMU from: the folder, or an archive whose names have no `./` before them, which it minds."""
-    if path.is_dir():
+    if files.is_folder(path):
         return str(path)
     archive = BytesIO()
     with ZipFile(archive, "w") as file:
@@ -124,7 +138,7 @@ def _convert(
 
     return ModelDescription(
         model_name=source.modelName or "",
-        model_identifier=interface.modelIdentifier,
+        model_identifier=interface.modelIdentifier or "",
         fmi_version=source.fmiVersion or "",
         kind=kind,
         guid=source.guid or "",

@@ -16,7 +16,7 @@ import shutil
 import subprocess
 import tempfile
 import xml.etree.ElementTree as ET
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Final
 
@@ -27,8 +27,8 @@ from fmpy.model_description import read_model_description
 
 from ..errors import LoadFailed
 from ..model.description import ModelDescription
-from .archive import Terms, look_into, unpack
-from .examining import library_names, source_names
+from .archive import Terms, unpack
+from .examining import library_name, source_names
 
 __all__ = ["cache_folder", "compile_sources", "extract"]
 
@@ -76,8 +76,9 @@ def extract(
         LoadFailed: the archive is broken or breaks ``terms``, or the sources do not compile; nothing is left behind.
     """
     with unpack(path, parent, terms) as folder:
-        libraries = {file.relative_to(folder).as_posix() for file in folder.glob(f"binaries/*/*{_SUFFIX}")}
-        if not (_own(libraries) if model is None else _has_library(libraries, model)):
+        if model is not None and model.library is not None:
+            _name_library(folder, model, folder / model.library)
+        elif model is not None or not _has_binaries(folder):
             _add_library(path, folder, model, tell)
     return folder.with_suffix("")
 
@@ -90,7 +91,7 @@ def compile_sources(path: Path, model: ModelDescription, terms: Terms, tell: Cal
     Raises:
         LoadFailed: there is no compiler, or they do not compile; the message has the compiler's first lines.
     """
-    if _has_library(look_into(path, terms).names, model):
+    if model.library is not None:
         return
     with tempfile.TemporaryDirectory(prefix="fmu_mesh-") as folder:
         extract(path, Path(folder), terms, tell, model)
@@ -104,16 +105,16 @@ def cache_folder() -> Path:
     return (Path(base) if base else Path.home() / ".cache") / "fmu_mesh"
 
 
-def _has_library(names: Collection[str], model: ModelDescription) -> bool:
-    """Whether the library of a kind of an FMU is among the names of its files."""
-    return any(name in names for name in library_names(model.model_identifier, model.fmi_version))
+def _has_binaries(folder: Path) -> bool:
+    """Whether an unpacked FMU has a library for this platform."""
+    return any(any(folder.glob(f"binaries/{name}/*{_SUFFIX}")) for name in (fmpy.platform, fmpy.platform_tuple))
 
 
-def _own(names: set[str]) -> set[str]:
-    """Those of ``names`` that are for this platform."""
-    return {
-        name for name in names if name.startswith((f"binaries/{fmpy.platform}/", f"binaries/{fmpy.platform_tuple}/"))
-    }
+def _name_library(folder: Path, model: ModelDescription, library: Path) -> None:
+    """Give a library the name that it is loaded by, beside its own, by which libraries around it may know it."""
+    named = folder / library_name(model.model_identifier, model.fmi_version)
+    if not named.exists():
+        named.symlink_to(library.name)
 
 
 def _add_library(path: Path, folder: Path, model: ModelDescription | None, tell: Callable[[str], None]) -> None:
@@ -125,7 +126,7 @@ def _add_library(path: Path, folder: Path, model: ModelDescription | None, tell:
     kind = model.kind if model is not None else "co_simulation" if description.coSimulation else "model_exchange"
     build = _build(path, description, names, kind, _listed_files(folder / "modelDescription.xml", kind))
     library = _compiled(path, folder / "sources", build, tell)
-    target = folder / library_names(build.identifier, description.fmiVersion)[0]
+    target = folder / library_name(build.identifier, description.fmiVersion)
     target.parent.mkdir(parents=True, exist_ok=True)
     shutil.copyfile(library, target)
 

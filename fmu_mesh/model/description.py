@@ -135,7 +135,11 @@ class Clock(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class ModelDescription(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A model description (FMI 2.0, 2.2) as far as the mesh needs it."""
+    """A model description (FMI 2.0, 2.2) as far as the mesh needs it.
+
+    Attributes:
+        library: the file of the FMU that is loaded on this platform; None if it is compiled, or nothing is loaded.
+    """
 
     model_name: str
     model_identifier: str
@@ -161,6 +165,7 @@ class ModelDescription(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     platforms: tuple[str, ...] = ()
     kinds: tuple[Kind, ...] = ()
     problems: tuple[str, ...] = ()
+    library: str | None = None
 
     def variable(self, name: str) -> Variable | None:
         """The variable with this name, or None."""
