@@ -30,7 +30,7 @@ from .errors import ConfigurationError
 if TYPE_CHECKING:
     from _typeshed import ReadableBuffer
 
-__all__ = ["Kept", "OwnFile", "open_alone", "replaced", "sha256_of"]
+__all__ = ["Kept", "OwnFile", "exists", "is_file", "is_folder", "open_alone", "replaced", "sha256_of"]
 
 _DRAFT = ".starting"
 _TRIES = 10
@@ -42,6 +42,25 @@ class Kept(NamedTuple):
 
     rows: int = 0
     size: int = 0
+
+
+def exists(path: Path) -> bool:
+    """Whether something is there.
+
+    Unlike `Path.exists`, this and the two below say no where nobody can look, because a name is too long or a folder
+    is closed to this user; who then opens the path is told why.
+    """
+    return os.path.exists(path)  # noqa: PTH110 see above
+
+
+def is_file(path: Path) -> bool:
+    """Whether a file is there."""
+    return os.path.isfile(path)  # noqa: PTH113 see `exists`
+
+
+def is_folder(path: Path) -> bool:
+    """Whether a folder is there."""
+    return os.path.isdir(path)  # noqa: PTH112 see `exists`
 
 
 def open_alone(path: Path) -> OwnFile:

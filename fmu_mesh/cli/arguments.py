@@ -13,6 +13,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NoReturn
 
+from .. import files
 from ..errors import ConfigurationError, LoadFailed
 from ..model.config import MAX_WINDOW
 from ..model.config_base import ENDPOINT_PATTERN
@@ -119,7 +120,7 @@ def endpoint(text: str) -> str:
 def no_fmu(path: Path, error: LoadFailed) -> ConfigurationError:
     """What to say where an FMU was asked for, and something else, or nothing, is there."""
     hint = error.hint
-    if not path.exists():
+    if not files.exists(path):
         near = nearest_file(path)
         hint = f"Did you mean '{near}'?" if near is not None else hint
     elif path.suffix in (".yaml", ".yml"):

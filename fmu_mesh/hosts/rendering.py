@@ -17,6 +17,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final, Protocol
 
+from .. import files
 from ..errors import ConfigurationError, LoadFailed
 from .mujoco_model import engine
 
@@ -62,7 +63,7 @@ def check_film(path: Path) -> None:
     """
     if path.suffix not in FILM_RATES:
         raise ConfigurationError(f"--video {path}: a film is one of {', '.join(FILM_RATES)}")
-    if path.is_dir():
+    if files.is_folder(path):
         raise ConfigurationError(f"--video {path}: a folder, not a file")
     if importlib.util.find_spec("imageio") is None:
         raise ConfigurationError("films need imageio.", hint="Install it with `pip install 'fmu-mesh[physics]'`.")

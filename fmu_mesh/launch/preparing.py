@@ -9,6 +9,7 @@ from typing import Literal
 import msgspec
 from msgspec.structs import replace
 
+from .. import files
 from ..errors import Finding, LoadFailed
 from ..fmu import Terms
 from ..model.config import AnyInstanceConfig, GazeboClassicConfig, InstanceConfig, MujocoConfig, PidConfig, ZenohConfig
@@ -139,7 +140,7 @@ def _descriptions(
             text = found.message.rstrip(".") + (f" ({found.hint.rstrip('.')})" if found.hint else "")
             place = f"instances.{name}.{_key_of_path(instance)}"
             expected = expected_model(instance)
-            if not path.exists() and Path(instance.path).exists():
+            if not files.exists(path) and files.exists(Path(instance.path)):
                 expected += "; paths are relative to the configuration file"
             findings.append(loaded.finding(place, text, expected, _similar(path)))
         else:
@@ -173,4 +174,4 @@ def _key_of_path(instance: AnyInstanceConfig) -> str:
 
 def _similar(path: Path) -> str | None:
     """The nearest existing file name, if there is no such file."""
-    return None if path.exists() else nearest_file(path)
+    return None if files.exists(path) else nearest_file(path)

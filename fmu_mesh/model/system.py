@@ -12,6 +12,7 @@ from collections.abc import Iterable, Mapping
 import msgspec
 from msgspec.structs import replace
 
+from fmu_mesh import files
 from fmu_mesh.errors import Finding
 from fmu_mesh.model.config import AnyInstanceConfig, Config, HostConfig, InstanceConfig
 from fmu_mesh.model.connection import (
@@ -280,7 +281,12 @@ def _result_file(loaded: LoadedConfig, findings: Findings) -> str | None:
     if text is None:
         return None
     path = loaded.resolve(text.replace("{mesh}", loaded.config.mesh))
-    if path.is_dir():
+    try:
+        is_folder = path.is_dir()
+    except OSError as error:  # its name is too long, or it is in a folder of somebody else
+        findings.add("record.file", f"{shown(text)} ({error.strerror})", "a file that can be written")
+        return None
+    if is_folder:
         findings.add("record.file", f"the folder '{text}'", "a file, or null to record nothing")
     elif path.suffix.lower() in _OTHER_FORMATS:
         findings.add(
@@ -293,6 +299,6 @@ def _check_zenoh(loaded: LoadedConfig, findings: Findings) -> None:
     zenoh = loaded.config.zenoh
     if zenoh.mode == "client" and not zenoh.connect and zenoh.config is None:
         findings.add("zenoh.mode", "client without a router", "an endpoint in zenoh.connect")
-    if zenoh.config is not None and not (path := loaded.resolve(zenoh.config)).is_file():
+    if zenoh.config is not None and not files.is_file(path := loaded.resolve(zenoh.config)):
         found = f"no such file '{zenoh.config}'"
         findings.add("zenoh.config", found, "an existing Zenoh configuration", nearest_file(path))

@@ -14,6 +14,7 @@ import msgspec
 import numpy as np
 from msgspec.structs import replace
 
+from .. import files
 from ..errors import ConfigurationError
 from ..model.config import RosConfig, RosTopicConfig
 from ..model.description import Value
@@ -70,12 +71,12 @@ class Bag:
                 "reading a bag needs the package rosbags", hint="Install it: pip install 'fmu-mesh[ros]'."
             ) from error
         self.path = path
-        if not path.exists():
+        if not files.exists(path):
             near = nearest_file(path)
             raise ConfigurationError(
                 f"the bag '{path}' does not exist.", hint=f"Did you mean '{near}'?" if near is not None else None
             )
-        if path.is_dir() and not (path / "metadata.yaml").is_file():
+        if files.is_folder(path) and not (path / "metadata.yaml").is_file():
             raise ConfigurationError(
                 f"the folder '{path}' is no bag: it has no metadata.yaml.",
                 hint="Name the folder that `ros2 bag record` made, or an .mcap file.",

@@ -39,6 +39,8 @@ __all__ = [
 ]
 
 _SOCKET_PATH_LIMIT = 100
+_NAME_LIMIT = 40
+"""Characters of a mesh's name in that of its folder; of a longer one the beginning, and a hash to tell it by."""
 
 _held: dict[Path, TextIO] = {}
 """The open notes of this process by the folder of their run; they hold their locks."""
@@ -81,7 +83,10 @@ def run_folder(mesh: str, run: str) -> Path:
     Raises:
         ConfigurationError: it cannot be made, or others can get into it.
     """
-    folder = _private(runtime_folder() / f"{mesh}.{run}")
+    name = mesh
+    if len(mesh) > _NAME_LIMIT:  # FMUs have long names, and the path of a socket must be short
+        name = f"{mesh[: _NAME_LIMIT - 9]}-{hashlib.sha256(mesh.encode()).hexdigest()[:8]}"
+    folder = _private(runtime_folder() / f"{name}.{run}")
     (folder / "fmus").mkdir(exist_ok=True)
     return folder
 
