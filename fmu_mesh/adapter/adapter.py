@@ -24,6 +24,7 @@ from ..errors import FmuError
 from ..fmu import FmuInstance, LogMessage, open_instance, read_description
 from ..fmu.guard import floating_point_changed, kept_state, restore_floating_point
 from ..model.description import ModelDescription, Value
+from ..model.start_values import forbidden
 from ..model.trajectory import Trajectory
 from ..model.types import is_float
 from .arguments import Arguments
@@ -172,12 +173,17 @@ class FMIAdapter:
     def set_initial_value(self, name: str, value: Value) -> None:
         """Set a parameter, an input or the initial value of another variable.
 
+        A variable that FMI forbids to set, such as an output with initial 'calculated', is set with a warning in the
+        log: some FMUs take it.
+
         Raises:
             CallRefused: the mode, the name or the type is wrong, or the variable cannot be set before the start.
-            InitializationFailed: the FMU refuses it.
+            InitializationFailed: the FMU refuses it, here or in `exit_initialization_mode`.
         """
         self._demand("initialization", "set_initial_value")
         variable = self._arguments.settable(name)
+        if not variable.settable_before_start:
+            log.warning("start_value instance=%s: %s", self._arguments.instance, forbidden(variable, self._description))
         converted = self._arguments.value(variable, value)
         if not self._entered:
             self._start_values[name] = converted

@@ -55,6 +55,9 @@ class Arguments:
 
     def settable(self, name: str) -> Variable:
         """The variable called ``name``, which can be set before the start."""
+        known = self.all.get(name)
+        if known is not None and known.may_take_start_value:
+            return known  # what FMI forbids of these is up to the FMU
         return self._find(name, self._settable, "settable before the start")
 
     def value(self, variable: Variable, value: Value) -> Value:

@@ -22,9 +22,11 @@ from ..launch.wiring import is_socket, leaves_host
 from ..model.plan import Plan
 from ..wire.views import LogLine, MeshStatus
 
-__all__ = ["Display", "say", "stdout_as_stderr", "summary"]
+__all__ = ["Display", "say", "stdout_as_stderr", "summary", "warn"]
 
 _SHOWN_TIMES: Final = 5
+_WARNINGS: Final = 5
+"""How many warnings are told before a run."""
 _COUNTED: Final = 1000
 """How many different messages are counted."""
 _STYLES = {"ok": "dim", "warning": "yellow", "discard": "yellow", "error": "red", "fatal": "red"}
@@ -128,6 +130,14 @@ class Display:
 def say(text: str) -> None:
     """Tell what takes its time before a run, on standard error."""
     print(f"fmu-mesh: {text}", file=sys.stderr, flush=True)
+
+
+def warn(plan: Plan) -> None:
+    """Tell on standard error what is odd in a system that is about to run; of many warnings the first ones."""
+    for warning in plan.system.warnings[:_WARNINGS]:
+        say(f"warning: {warning}")
+    if (rest := len(plan.system.warnings) - _WARNINGS) > 0:
+        say(f"warning: and {rest} more, which `fmu-mesh check` shows")
 
 
 @contextmanager

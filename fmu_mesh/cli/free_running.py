@@ -24,7 +24,7 @@ from ..model.loading import LoadedConfig, parse
 from ..model.plan import Plan
 from ..wire.runtime import remove_run_folder, run_folder
 from .arguments import add_command, endpoint, no_fmu, number
-from .display import Display
+from .display import Display, warn
 from .running import close, run_launcher
 
 __all__ = ["add_commands"]
@@ -104,6 +104,7 @@ def _run(arguments: argparse.Namespace) -> int:
     text = msgspec.json.encode(_configuration(arguments, name, description)).decode()
     loaded = _named_by_options(parse(text, arguments.fmu, options.start_values), name, arguments)
     plan = planned(loaded, loaded.findings(), options)
+    warn(plan)
     file = run_folder(plan.system.config.mesh, str(os.getpid())) / "run.yaml"
     try:
         file.write_text(text, encoding="utf-8")

@@ -29,7 +29,7 @@ from ..wire.router import run_router
 from ..wire.runtime import enter_run_folder, fmu_folder, leave_run_folder, remove_stale_folders, run_folder
 from ..wire.views import LogLine
 from .arguments import add_command, add_window, count, endpoint, number
-from .display import Display, say, stdout_as_stderr, summary
+from .display import Display, say, stdout_as_stderr, summary, warn
 from .plotting import check_plot, plot_results, plotted_where_it_ends
 from .profiling import add_profile, show_profile
 
@@ -171,6 +171,7 @@ def _launch(arguments: argparse.Namespace) -> int:
         other = "--local" if arguments.local else "--paused"
         raise ConfigurationError(f"--restarts and {other} do not go together", hint="Leave one of them out.")
     plan = prepare(arguments.config, options, say)
+    warn(plan)
     if arguments.plot is not None:
         check_plot(arguments.plot, plan.system.result_file)
     profile: MeshProfile | None = None
@@ -282,6 +283,7 @@ def _master(arguments: argparse.Namespace) -> int:
             return error.exit_code  # the launcher has the event, and tells
         return 0
     plan = prepare(arguments.config, options, say)
+    warn(plan)
     if arguments.plot is not None:
         check_plot(arguments.plot, plan.system.result_file)
     ends: list[End] = []

@@ -325,7 +325,11 @@ class FmuInstance(KeepsFmuState, ABC):
         if status > WARNING:
             names = [variable.name for variable in variables]
             what = f"{self._function_name(verb, type_)} of {', '.join(names)} returned {STATUS_NAMES[status]}"
-            raise self._failed(what, variable=names[0] if len(names) == 1 else None)
+            odd = next((v for v in variables if verb == "Set" and not v.settable_before_start), None)
+            hint = None
+            if odd is not None:
+                hint = f"FMI does not allow setting '{odd.name}', {odd.role}: leave its start value out."
+            raise self._failed(what, variable=names[0] if len(names) == 1 else None, hint=hint)
 
     @abstractmethod
     def _function_name(self, verb: Verb, type_: VariableType) -> str:

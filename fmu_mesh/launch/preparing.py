@@ -155,8 +155,7 @@ def _strict_findings(
     """The problems of an FMU, where the configuration says that they are errors."""
     if not isinstance(instance, InstanceConfig):
         return
-    strict = instance.strict if instance.strict is not None else loaded.config.strict
-    for problem in description.problems if strict else ():
+    for problem in description.problems if loaded.config.is_strict(instance) else ():
         text = " ".join(problem.split())
         yield loaded.finding(f"instances.{name}.fmu", text, "an FMU without problems, or `strict: false`")
 

@@ -319,7 +319,14 @@ class Config(Base, frozen=True, kw_only=True):
     limits: LimitsConfig = LimitsConfig()
     strict: Annotated[
         bool,
-        Meta(description="Whether problems that a strict validation finds in an FMU are errors instead of warnings."),
+        Meta(
+            description="Whether what FMI forbids is an error instead of a warning: problems that a strict validation "
+            "finds in an FMU, and start values of variables that have none."
+        ),
     ] = False
     ros: Annotated[RosConfig | None, Meta(description="Topics for ROS 2; null: none.")] = None
     version: Annotated[Literal[1], Meta(description="Version of this file format.")] = 1
+
+    def is_strict(self, instance: InstanceConfig) -> bool:
+        """Whether what FMI forbids is an error for an instance of this mesh."""
+        return instance.strict if instance.strict is not None else self.strict

@@ -98,9 +98,23 @@ class Variable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     @property
     def settable_before_start(self) -> bool:
         """Whether a start value may be given (FMI 2.0, 2.2.7: initial is exact or approx, or it is an input)."""
-        if self.variability == "constant" or self.causality == "independent":
+        if not self.may_take_start_value:
             return False
         return self.causality in ("input", "structuralParameter") or self.initial in ("exact", "approx")
+
+    @property
+    def may_take_start_value(self) -> bool:
+        """Whether an FMU can be asked to take a start value; some take one where the standard forbids it."""
+        return self.variability != "constant" and self.causality != "independent"
+
+    @property
+    def role(self) -> str:
+        """What it is for somebody who wants to set it, in the words of FMI: `an output with initial 'calculated'`."""
+        if self.variability == "constant":
+            return "a constant"
+        article = "an" if self.causality[0] in "aeiou" else "a"
+        initial = f" with initial '{self.initial}'" if self.initial is not None else ""
+        return f"{article} {self.causality}{initial}"
 
 
 class DefaultExperiment(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

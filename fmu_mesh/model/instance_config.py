@@ -121,7 +121,7 @@ class InstanceConfig(Base, frozen=True, kw_only=True, tag_field=KIND, tag="fmu")
     ] = None
     strict: Annotated[
         bool | None,
-        Meta(description="Whether problems that a strict validation finds in the FMU are errors (default: top level)."),
+        Meta(description="Whether what FMI forbids is an error for this FMU (default: top level)."),
     ] = None
 
     @property

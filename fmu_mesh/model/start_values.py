@@ -1,20 +1,24 @@
 """Start values of the configuration to values of the variables' types.
 
-Owns what may be set before the start (FMI 2.0, 2.2.7). Knows one instance at a time; which plain value stands for which
-value is `fmu_mesh.model.values`.
+Owns what may be set before the start (FMI 2.0, 2.2.7), and what an FMU is handed although the standard forbids it.
+Which plain value stands for which value is `fmu_mesh.model.values`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Final
 
-from fmu_mesh.model.config import AnyInstanceConfig
+from fmu_mesh.model.config import AnyInstanceConfig, Config, InstanceConfig
 from fmu_mesh.model.description import ModelDescription, Value, Variable
 from fmu_mesh.model.findings import Findings, listed, nearest, shown
 from fmu_mesh.model.types import MAX_ELEMENTS
 from fmu_mesh.model.values import ValueRefused, to_value
 
-__all__ = ["resolve_start_values", "sized"]
+__all__ = ["forbidden", "forbidden_start_values", "resolve_start_values", "sized"]
+
+_SOURCES: Final = {"1": "FMI 1.0 (ME 3.3)", "2": "FMI 2.0 (2.2.7)", "3": "FMI 3.0 (2.4.7)"}
+"""What says which variables may have a start value, by the version of FMI."""
 
 
 def sized(name: str, description: ModelDescription, config: AnyInstanceConfig, findings: Findings) -> ModelDescription:
@@ -52,6 +56,7 @@ def resolve_start_values(
         variables: its variables by name.
         findings: where unknown names and impossible values go; they are left out of the result.
     """
+    is_fmu = isinstance(config, InstanceConfig)
     settable = [variable.name for variable in variables.values() if variable.settable_before_start]
     values: dict[str, Value] = {}
     for variable_name, value in config.start_values.items():
@@ -60,8 +65,8 @@ def resolve_start_values(
         if variable is None:
             found = f"the unknown variable '{variable_name}' of instance '{name}'"
             findings.add(path, found, f"one of {listed(settable)}", nearest(variable_name, settable))
-        elif not variable.settable_before_start:
-            found = f"'{variable_name}', {_role(variable)} that cannot be set before the start"
+        elif not (variable.may_take_start_value if is_fmu else variable.settable_before_start):
+            found = f"'{variable_name}', {variable.role} that cannot be set before the start"
             findings.add(path, found, f"one of {listed(settable)}")
         else:
             try:
@@ -74,10 +79,33 @@ def resolve_start_values(
     return values
 
 
-def _role(variable: Variable) -> str:
-    """Why a variable cannot be set, in FMI words."""
-    if variable.variability == "constant":
-        return "a constant"
-    article = "an" if variable.causality[0] in "aeiou" else "a"
-    initial = f" with initial '{variable.initial}'" if variable.initial is not None else ""
-    return f"{article} {variable.causality}{initial}"
+def forbidden_start_values(
+    config: Config, descriptions: Mapping[str, ModelDescription], findings: Findings, *, strict: bool
+) -> None:
+    """Note the start values that FMI forbids, and that the FMUs are handed all the same: some take them.
+
+    Args:
+        config: the configuration.
+        descriptions: the model descriptions by instance name.
+        findings: where they go.
+        strict: whether to look at the instances where they are errors, or at those where they are warnings.
+    """
+    for name, instance in config.instances.items():
+        if not isinstance(instance, InstanceConfig) or name not in descriptions or config.is_strict(instance) != strict:
+            continue
+        variables = {variable.name: variable for variable in descriptions[name].variables}
+        settable = [variable.name for variable in variables.values() if variable.settable_before_start]
+        for variable_name, value in instance.start_values.items():
+            variable = variables.get(variable_name)
+            if variable is None or variable.settable_before_start or not variable.may_take_start_value:
+                continue  # it is right, or `resolve_start_values` refuses it
+            found = f"{shown(value)} for {forbidden(variable, descriptions[name])}"
+            expected = f"one of {listed(settable)}" + ("; `strict: false` leaves it to the FMU" if strict else "")
+            findings.add(f"instances.{name}.start_values.{variable_name}", found, expected)
+
+
+def forbidden(variable: Variable, description: ModelDescription) -> str:
+    """In words why a start value of a variable may have no effect, to follow what it is set to."""
+    source = _SOURCES[description.fmi_version[0]]
+    what = f"'{variable.name}', {variable.role}"
+    return f"{what}: {source} does not allow setting it; whether it takes effect is up to the FMU"

@@ -28,7 +28,7 @@ from fmu_mesh.model.findings import Findings, nearest_file, shown
 from fmu_mesh.model.grouping import automatic_nodes
 from fmu_mesh.model.instance import StepOptions
 from fmu_mesh.model.loading import LoadedConfig
-from fmu_mesh.model.start_values import resolve_start_values, sized
+from fmu_mesh.model.start_values import forbidden_start_values, resolve_start_values, sized
 from fmu_mesh.model.step_options import capability_warnings, check_extrapolation, resolve_step_options
 from fmu_mesh.model.types import element_name, is_text
 from fmu_mesh.simtime import ENDLESS, TimeGrid, steps_between
@@ -115,6 +115,7 @@ def build(
     }
     grid = _grid(config, collected)
     instances = _instances(loaded, descriptions, variables, collected)
+    forbidden_start_values(config, descriptions, collected, strict=True)
     _check_nodes(config, descriptions, collected)
     connections = resolve_connections(config.connections, variables, collected)
     check_extrapolation(connections, config.instances, descriptions, collected)
@@ -133,6 +134,7 @@ def build(
         nodes = automatic_nodes(config, edges, descriptions)
         instances = {name: replace(own, node=nodes.get(name, own.node)) for name, own in instances.items()}
     warnings = loaded.findings()
+    forbidden_start_values(config, descriptions, warnings, strict=False)
     unit_warnings(connections, descriptions, warnings)
     capability_warnings(config.instances, descriptions, warnings)
     return System(config, grid, instances, connections, recorded, result_file, tuple(warnings))

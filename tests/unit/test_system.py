@@ -215,8 +215,6 @@ START_VALUES = [
     ("LABEL: x",
      ("LABEL: the unknown variable 'LABEL' of instance 'pendulum'; expected one of a, l, n, on, label, kind. "
                  "Did you mean 'label'?")),
-    ("'der(a,2)': 1", ("der(a,2): 'der(a,2)', an output with initial 'calculated' that cannot be set before the start; "
-                      "expected one of a, l, n, on, label, kind")),
     ("pi: 3", "pi: 'pi', a constant that cannot be set before the start; expected one of a, l, n, on, label, kind"),
     ("time: 3", ("time: 'time', an independent that cannot be set before the start; "
                 "expected one of a, l, n, on, label, kind")),
