@@ -1,7 +1,8 @@
-"""`python -m benchmarks.scale`: what a point costs with more and more instances, start-up included.
+"""`python -m benchmarks.scale`: what a point costs with more and more instances, and what a plan costs before it.
 
 A chain `Integrator -> Gain -> Gain -> …`, each instance in a process of its own, or in groups; recorded is the last
 output. Sizes are interleaved, figures are medians. Every result is compared with that of `launch --local`, row by row.
+A second table tells what a connection costs before the run (`benchmarks.connections`); `--connections` is that alone.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from benchmarks.connections import measured
 from benchmarks.contestants.entry import FMUS
 from benchmarks.environment import loads, machine
 
@@ -109,20 +111,25 @@ def main() -> int:
     """Measure all sizes."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.scale", description=__doc__)
     parser.add_argument("--repeat", type=int, default=3, metavar="N", help="interleaved rounds (3)")
+    parser.add_argument("--connections", action="store_true", help="only what a connection costs before the run")
     options = parser.parse_args()
     before = loads()
     with tempfile.TemporaryDirectory(prefix="scale-") as folder:
-        for number in range(options.repeat):
+        for number in range(0 if options.connections else options.repeat):
             for size in SIZES:
                 print(f"round {number + 1}: {size.instances} instances, {size.nodes} nodes", file=sys.stderr)
                 measure(size, Path(folder))
+        connections = measured(options.repeat, Path(folder))
     print(
         f"median of {options.repeat} interleaved rounds; {machine()}; load average before {before}, after {loads()}\n"
     )
-    print(_HEADER)
-    print("|" + "---:|" * (_HEADER.count("|") - 1))
-    for size in SIZES:
-        print(size.row())
+    if not options.connections:
+        print(_HEADER)
+        print("|" + "---:|" * (_HEADER.count("|") - 1))
+        for size in SIZES:
+            print(size.row())
+        print()
+    print(connections)
     return 0
 
 

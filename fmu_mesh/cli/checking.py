@@ -128,10 +128,11 @@ def _start_values(instance: SystemInstance) -> str:
 
 
 def _connections(plan: Plan) -> list[str]:
+    closing_ones = {str(c) for c in plan.closing}
     rows = []
     for c in plan.connections:
         what = "value at the start of the step" if c.delay else "value at the end of the step"
-        closing = "closes a cycle" if c in plan.closing else ""
+        closing = "closes a cycle" if str(c) in closing_ones else ""
         if c.extrapolation == "linear":
             what = "goes on linearly in the step" if c.delay else "changes linearly in the step"
         rows.append([str(c), f"delay {c.delay}", what, _arithmetic(c), closing, c.units])

@@ -247,11 +247,11 @@ def _causality_is_right(connection: Connection, variables: Variables, findings: 
         found = f"the wrong way round: '{source_name}' is an input and '{target_name}' an output"
         findings.add(connection.path, found, "output -> input", f"{target_name} -> {source_name}")
         return False
-    outputs = _names_of(connection.source_instance, "output", variables)
-    inputs = _names_of(connection.target_instance, "input", variables)
     if source.causality != "output":
+        outputs = _names_of(connection.source_instance, "output", variables)
         findings.add(f"{connection.path}.from", f"'{source_name}' is {_a(source.causality)}", f"an output{outputs}")
     if target.causality != "input":
+        inputs = _names_of(connection.target_instance, "input", variables)
         findings.add(f"{connection.path}.to", f"'{target_name}' is {_a(target.causality)}", f"an input{inputs}")
     return source.causality == "output" and target.causality == "input"
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from functools import cached_property
 from typing import Literal
 
 import msgspec
@@ -148,7 +149,7 @@ class Clock(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return f"{self.name} ({self.causality}, {self.interval_variability}{every})"
 
 
-class ModelDescription(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class ModelDescription(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict=True):
     """A model description (FMI 2.0, 2.2) as far as the mesh needs it.
 
     Attributes:
@@ -183,7 +184,11 @@ class ModelDescription(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def variable(self, name: str) -> Variable | None:
         """The variable with this name, or None."""
-        return next((variable for variable in self.variables if variable.name == name), None)
+        return self._by_name.get(name)
+
+    @cached_property
+    def _by_name(self) -> dict[str, Variable]:
+        return {variable.name: variable for variable in self.variables}
 
     def variable_of(self, name: str) -> Variable | None:
         """The variable that ``name`` means, where ``name`` may also be that of an element of an array, as `y[1,2]`."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from typing import TypeVar
 
@@ -44,7 +45,7 @@ def strongly_connected(vertices: Iterable[V], edges: Iterable[tuple[V, V]]) -> l
                     parent = work[-1][0]
                     low[parent] = min(low[parent], low[vertex])
                 if low[vertex] == index[vertex]:
-                    cut = stack.index(vertex)
+                    cut = bisect_left(stack, index[vertex], key=index.__getitem__)  # the stack is in their order
                     component = stack[cut:]
                     del stack[cut:]
                     on_stack.difference_update(component)
@@ -83,20 +84,20 @@ def feedback_edges(vertices: Iterable[V], edges: Sequence[tuple[V, V, bool]]) ->
     The edges that must stay are laid first, then the others in their order; one that would lead back to its own source
     is taken. So it is the connection written last that closes a cycle. Cycles made only of edges that must stay remain.
     """
-    successors: dict[V, list[V]] = {vertex: [] for vertex in vertices}
+    successors: dict[V, dict[V, None]] = {vertex: {} for vertex in vertices}  # many edges may go the same way
     for source, target, free in edges:
         if not free:
-            successors[source].append(target)
+            successors[source][target] = None
     taken = []
     for index, (source, target, free) in enumerate(edges):
         if free and reaches(successors, target, source):
             taken.append(index)
         elif free:
-            successors[source].append(target)
+            successors[source][target] = None
     return taken
 
 
-def reaches(successors: Mapping[V, Sequence[V]], start: V, goal: V) -> bool:
+def reaches(successors: Mapping[V, Iterable[V]], start: V, goal: V) -> bool:
     """Whether a way leads from ``start`` to ``goal``; from every vertex one leads to itself."""
     seen = {start}
     stack = [start]

@@ -8,7 +8,8 @@ the torn graph, and these levels are gone through until the torn connections bri
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from operator import itemgetter
 
 import msgspec
 
@@ -83,18 +84,24 @@ def plan_initialization(system: System, connections: Sequence[Connection]) -> In
     outputs = tuple(dict.fromkeys((c.source_instance, c.source.name) for c in connections))
     reached = _reached(connections)
     edges = [(_source(c), target) for c in connections for target in reached[id(c)]]
+    on_themselves = {source for source, target in edges if source == target}
+    place = {key: number for number, key in enumerate(outputs)}
+    leaving: dict[Key, list[tuple[int, Connection]]] = {}
+    for number, c in enumerate(connections):
+        leaving.setdefault(_source(c), []).append((number, c))
     levels: dict[Key, int] = {}
     loops: list[Loop] = []
     level = 0
     for parts in _by_depth(outputs, edges):
-        single = [part[0] for part in parts if not _is_loop(part, edges)]
+        single = [part[0] for part in parts if len(part) == 1 and part[0] not in on_themselves]
         levels.update(dict.fromkeys(single, level))
         level += bool(single)
         for part in parts:
-            if _is_loop(part, edges):
-                members = [key for key in outputs if key in set(part)]
-                torn, kept = _torn(members, connections, reached)
-                depths = {key: depth for depth, own in enumerate(_by_depth(members, kept)) for (key,) in own}
+            if len(part) > 1 or part[0] in on_themselves:
+                members = sorted(part, key=place.__getitem__)
+                own = [c for _, c in sorted((pair for key in part for pair in leaving[key]), key=itemgetter(0))]
+                torn, kept = _torn(members, own, reached)
+                depths = {key: depth for depth, deep in enumerate(_by_depth(members, kept)) for (key,) in deep}
                 levels.update({key: level + depth for key, depth in depths.items()})
                 last = level + max(depths.values())
                 ordered = tuple(sorted(members, key=depths.__getitem__))
@@ -107,7 +114,7 @@ def plan_initialization(system: System, connections: Sequence[Connection]) -> In
 def _torn(
     members: Sequence[Key], connections: Sequence[Connection], reached: Mapping[int, Sequence[Key]]
 ) -> tuple[list[Connection], list[tuple[Key, Key]]]:
-    """The connections at which a loop is torn, in the order of the file, and the edges that are left.
+    """The ones of the connections out of a loop at which it is torn, and the edges that are left.
 
     As with the delays of Gauss-Seidel, it is the connection written last that closes a cycle.
     """
@@ -117,12 +124,12 @@ def _torn(
     successors: dict[Key, list[Key]] = {key: [] for key in members}
     for connection in sorted(connections, key=lambda c: c.delay or 0):
         source = _source(connection)
-        targets = [key for key in reached[id(connection)] if key in own] if source in own else []
+        targets = [key for key in reached[id(connection)] if key in own]
         if any(reaches(successors, target, source) for target in targets):
             torn.add(id(connection))
         else:
             kept += [(source, target) for target in targets]
-            successors.get(source, []).extend(targets)
+            successors[source].extend(targets)
     return [c for c in connections if id(c) in torn], kept
 
 
@@ -149,17 +156,33 @@ def _tear(system: System, connection: Connection) -> Tear:
 
 def _reached(connections: Sequence[Connection]) -> dict[int, list[Key]]:
     """By the id of each connection: the connected outputs that depend on its target."""
-    own: dict[str, dict[str, Variable]] = {}
+    outputs: dict[str, dict[str, Variable]] = {}
     for c in connections:
-        own.setdefault(c.source_instance, {})[c.source.name] = c.source
+        outputs.setdefault(c.source_instance, {})[c.source.name] = c.source
+    dependents = {instance: _Dependents(own.values()) for instance, own in outputs.items()}
     return {
-        id(c): [
-            (c.target_instance, name)
-            for name, output in own.get(c.target_instance, {}).items()
-            if output.dependencies is None or c.target.name in output.dependencies
-        ]
+        id(c): [(c.target_instance, name) for name in dependents[c.target_instance].of(c.target.name)]
+        if c.target_instance in dependents
+        else []
         for c in connections
     }
+
+
+class _Dependents:
+    """Which of the outputs of an instance depend on an input, in the order of the outputs."""
+
+    def __init__(self, outputs: Iterable[Variable]) -> None:
+        self._on_all: list[tuple[int, str]] = []
+        self._on: dict[str, list[tuple[int, str]]] = {}
+        for number, output in enumerate(outputs):
+            if output.dependencies is None:
+                self._on_all.append((number, output.name))
+            for known in dict.fromkeys(output.dependencies or ()):
+                self._on.setdefault(known, []).append((number, output.name))
+
+    def of(self, known: str) -> list[str]:
+        """The names of the outputs that depend on ``known``."""
+        return [name for _, name in sorted(self._on_all + self._on.get(known, []))]
 
 
 def _by_depth(vertices: Sequence[Key], edges: Sequence[tuple[Key, Key]]) -> list[list[list[Key]]]:
@@ -173,15 +196,11 @@ def _by_depth(vertices: Sequence[Key], edges: Sequence[tuple[Key, Key]]) -> list
     depths: list[int] = []
     for others in before:  # sources stand before their targets
         depths.append(1 + max((depths[other] for other in others), default=-1))
-    return [
-        [part for part, own in zip(parts, depths, strict=True) if own == depth]
-        for depth in range(max(depths, default=-1) + 1)
-    ]
+    by_depth: list[list[list[Key]]] = [[] for _ in range(max(depths, default=-1) + 1)]
+    for part, depth in zip(parts, depths, strict=True):
+        by_depth[depth].append(part)
+    return by_depth
 
 
 def _source(connection: Connection) -> Key:
     return connection.source_instance, connection.source.name
-
-
-def _is_loop(part: Sequence[Key], edges: Sequence[tuple[Key, Key]]) -> bool:
-    return len(part) > 1 or (part[0], part[0]) in edges
