@@ -10,7 +10,7 @@ import xml.etree.ElementTree as ET
 from io import BytesIO
 from pathlib import Path, PurePosixPath
 from typing import Any, Final, Literal, cast
-from zipfile import ZipFile
+from zipfile import ZipFile, ZipInfo
 
 import fmpy
 from fmpy.model_description import ModelDescription as FmpyDescription
@@ -105,7 +105,7 @@ def _readable(path: Path, contents: Contents) -> str | BytesIO:
     with ZipFile(archive, "w") as file:
         for name in contents.names:
             if name in contents.xml or name.startswith(("binaries/", "sources/")):
-                file.writestr(name, contents.xml.get(name, b""))
+                file.writestr(ZipInfo(name), contents.xml.get(name, b""))
     return archive
 
 
