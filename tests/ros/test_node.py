@@ -23,6 +23,7 @@ from fmu_mesh import FMIAdapter
 from fmu_mesh.fmu import Fmi2Instance
 from fmu_mesh.ros.names import ros_name
 from tests.fmus.helpers import find_fmu
+from tests.fmus.packing import repacked
 from tests.helpers import DEADLINE_S, FMUS
 from tests.ros.ros_peer import Ros, ros_or_skip
 
@@ -131,6 +132,26 @@ def test_every_variable_is_a_parameter_and_those_that_are_set_initialize_the_fmu
     assert node.get_parameter("g").value is None
     driver = node.managed._driver
     assert [driver.get_value(name) for name in ("l", "d", "a", "g")] == [2.0, 0.001, 1.3, 9.81]
+
+
+def test_a_parameter_that_fmi_forbids_to_set_is_set_with_a_warning(
+    ros: Ros, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The pendulum of fmi_adapter declares its angle as an output with initial 'calculated'; ours takes it as well."""
+
+    def calculated(text: str) -> str:
+        name = text.index('name="a"')
+        own = text[name:].replace('initial="exact"', 'initial="calculated"', 1).replace(' start="1.5"', "", 1)
+        return text[:name] + own
+
+    fmu = repacked(tmp_path / "pendulum.fmu", source=FMUS / "DampedPendulum.fmu", description=calculated)
+    node = ros.fmu(fmu_path=str(fmu), a=1.3)
+
+    node.trigger_configure()
+
+    assert state_of(node) == "inactive"
+    assert node.managed._driver.get_value("a") == 1.3
+    assert "'a', an output with initial 'calculated': FMI 2.0 (2.2.7) does not allow setting it" in caplog.text
 
 
 def test_the_parameters_of_the_node_have_the_defaults_of_fmi_adapter(ros: Ros) -> None:
