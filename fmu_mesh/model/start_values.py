@@ -100,7 +100,7 @@ def forbidden_start_values(
             if variable is None or variable.settable_before_start or not variable.may_take_start_value:
                 continue  # it is right, or `resolve_start_values` refuses it
             found = f"{shown(value)} for {forbidden(variable, descriptions[name])}"
-            expected = f"one of {listed(settable)}" + ("; `strict: false` leaves it to the FMU" if strict else "")
+            expected = f"one of {listed(settable)}; `strict: false` leaves it to the FMU" if strict else ""
             findings.add(f"instances.{name}.start_values.{variable_name}", found, expected)
 
 

@@ -99,7 +99,7 @@ def test_an_output_with_initial_calculated_takes_a_start_value_as_one_with_initi
     assert main(["launch", "--no-progress", *options, str(odd)]) == 0
 
     assert f"fmu-mesh: warning: {odd}:" in (said := capsys.readouterr().err)
-    assert f"instances.ball.start_values.h: 2.5 for {ROLES[version]}; expected one of " in said
+    assert f"instances.ball.start_values.h: 2.5 for {ROLES[version]}\n" in said
     result = odd.with_suffix(".csv").read_text()
     assert result == allowed.with_suffix(".csv").read_text()
     assert result.splitlines()[1].startswith("0.0,2.5,")
@@ -222,7 +222,7 @@ def test_where_the_configuration_is_strict_it_is_refused(
     assert main(["launch", str(config)]) == 2
 
     said = capsys.readouterr().err
-    assert ": 1 problem\n" in said
+    assert "  - " not in said
     assert f"instances.ball.start_values.h: 2.5 for {ROLES[2]}; expected one of h, " not in said
     assert f"instances.ball.start_values.h: 2.5 for {ROLES[2]}; expected one of v, " in said
     assert "`strict: false` leaves it to the FMU" in said
