@@ -195,6 +195,8 @@ class Gateway:
 
     def _went_on(self, watch: _Watch, point: int) -> None:
         """Everything up to a point that no watched variable is behind has been published."""
+        if watch.point < 0 and self._clock is not None:
+            self._clock.begin(point)
         was_last = watch.holds_until <= self._complete
         watch.point = point
         self._reached = max(self._reached, point)
@@ -336,20 +338,28 @@ class _Clock:
         self._codec = Codec(types, CLOCK)
         self._stride = stride
         self._grid = grid
-        self._next = 0
+        self._next: int | None = None
+        self._last: int | None = None
         self._moved = False
+
+    def begin(self, point: int) -> None:
+        """A first value has come, of this point: what was before it, nobody was there to publish."""
+        if self._last is None:
+            first = -(-point // self._stride) * self._stride
+            self._next = first if self._next is None else min(first, self._next)
 
     def advance(self, point: int) -> None:
         """Everything up to ``point`` has been published."""
-        while self._next <= point:
+        while self._next is not None and self._next <= point:
             self._publish(self._next)
+            self._last = self._next
             self._next += self._stride
             self._moved = True
 
     def repeat(self) -> None:
         """Tell the time to those who came while it stood still."""
-        if self._next and not self._moved:
-            self._publish(self._next - self._stride)
+        if self._last is not None and not self._moved:
+            self._publish(self._last)
         self._moved = False
 
     def _publish(self, point: int) -> None:
