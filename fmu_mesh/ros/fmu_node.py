@@ -14,6 +14,7 @@ from typing import Any, ParamSpec, TypeVar
 
 from ..errors import CallRefused, ConfigurationError, DeadlineExceeded, FmuError, FmuMeshError
 from ..model.description import Value, Variable
+from .clock_watch import CLOCK_TOPIC, ClockWatch
 from .driving import DriveSettings, FmuDriver, Turn
 from .node_parameters import (
     RosNode,
@@ -62,6 +63,7 @@ class FmuNode:
         self._publishers: list[tuple[Topic, Any, Any]] = []
         self._subscriptions: list[Any] = []
         self._clock_publisher: Any = None
+        self._clock_watch: ClockWatch | None = None
         self._checking: Any = None
         self._timer: Any = None
         self._turn: Future[Turn] | None = None
@@ -132,6 +134,9 @@ class FmuNode:
                 driver.remove_files()
         for _, publisher, _ in self._publishers:
             self._node.destroy_publisher(publisher)
+        if self._clock_watch is not None:
+            self._clock_watch.close()
+            self._clock_watch = None
         if self._clock_publisher is not None:
             self._node.destroy_publisher(self._clock_publisher)
         undeclare_parameters(self._node, self._declared)
@@ -168,7 +173,8 @@ class FmuNode:
             self._open(topic)
         if settings.publish_clock:
             kind = message_class("rosgraph_msgs/msg/Clock")
-            self._clock_publisher = self._node.create_publisher(kind, "/clock", 10)
+            self._clock_publisher = self._node.create_publisher(kind, CLOCK_TOPIC, 10)
+            self._clock_watch = ClockWatch(self._node, "publish_clock: false")
         self._checking = self._check_parameters
         self._node.add_on_set_parameters_callback(self._checking)
         self._tell(driver, settings.drive, topics)

@@ -15,12 +15,14 @@ from typing import Any
 import msgspec
 from msgspec.structs import replace
 
-from ..errors import ConfigurationError, FmuMeshError
+from ..errors import ConfigurationError, FmuMeshError, MeshLost
 from ..model.config import RosConfig
 from ..model.loading import load
 from ..wire.client import MeshClient
 from ..wire.reaching import Meshes
 from ..wire.readings import Target
+from ..wire.session import tokens
+from .clock_watch import ClockWatch
 from .gateway import Gateway
 from .mapping import message_types, resolve
 from .node_parameters import RosNode
@@ -93,9 +95,8 @@ class GatewayNode:
         self._plan: RosPlan | None = None
         self._types: MessageTypes | None = None
         self._targets: dict[str, Target] = {}
-        self._gateway: Gateway | None = None
-        self._thread: threading.Thread | None = None
-        self._timer: Any = None
+        self._run = ""
+        self._active = ExitStack()
 
     def configure(self) -> None:
         """Find the mesh, resolve its topics, and declare its parameters.
@@ -113,41 +114,23 @@ class GatewayNode:
         """Let topics flow.
 
         Raises:
-            FmuMeshError: a topic cannot be opened.
+            FmuMeshError: a topic cannot be opened, or the mesh has ended; nothing is left of this attempt.
         """
-        client, plan, types = self._client, self._plan, self._types
-        if client is None or plan is None or types is None:
-            raise ConfigurationError("the gateway has no mesh yet.", hint="Configure it first.")
-        profile: Profile = RclpyProfile(self._node)
-        names = {topic.profile for topic in plan.topics} or {"ros2dds"}
-        profiles = dict.fromkeys(map(str, sorted(names)), profile)
-        grid = grid_of(client.info())
-        gateway = Gateway(plan, types, client.session, client.keys, grid, profiles, _TIMEOUT_S)
-        self._gateway = gateway
-        gateway.open()
-        self._thread = threading.Thread(target=gateway.run, name="gateway", daemon=True)
-        self._thread.start()
-        clock = ros_module("rclpy.clock")
-        steady = clock.Clock(clock_type=clock.ClockType.STEADY_TIME)
-        self._timer = self._node.create_timer(_LOOK_S, self._look, clock=steady)
+        try:
+            self._activate()
+        except BaseException:
+            self.deactivate()
+            raise
 
     def deactivate(self) -> None:
         """Let nothing flow any more; what has come from the mesh is published before."""
-        if self._timer is not None:
-            self._node.destroy_timer(self._timer)
-            self._timer = None
-        gateway, self._gateway = self._gateway, None
-        if gateway is not None:
-            gateway.end()
-            if self._thread is not None:
-                self._thread.join(_TIMEOUT_S)
-            gateway.close()
+        self._active.close()
 
     def cleanup(self) -> None:
         """Leave the mesh, and take its parameters back. Never raises."""
         self.deactivate()
         self._stack.close()
-        self._client = None
+        self._client, self._plan, self._types, self._targets = None, None, None, {}
 
     def close(self) -> bool:
         """`cleanup`; returns that nothing is left running."""
@@ -161,7 +144,9 @@ class GatewayNode:
         endpoints = [endpoint for endpoint in self._node.get_parameter("connect").value if endpoint]
         meshes = self._stack.enter_context(Meshes(endpoints, _TIMEOUT_S))
         client = self._client = meshes.named(loaded.config.mesh)
-        infos = {name: client.instance_info(name) for name in client.info().instances}
+        info = client.info()
+        self._run = info.run
+        infos = {name: client.instance_info(name) for name in info.instances}
         findings = loaded.findings()
         self._types = message_types(loaded, findings)
         plan = self._plan = resolve(loaded, descriptions_of(infos), findings)
@@ -169,6 +154,33 @@ class GatewayNode:
         if plan is not None:
             self._declare_parameters(client, plan)
         self._log.info(f"gateway of mesh '{loaded.config.mesh}' with {len(plan.topics) if plan else 0} topics")
+
+    def _activate(self) -> None:
+        client, plan, types = self._client, self._plan, self._types
+        if client is None or plan is None or types is None:
+            raise ConfigurationError("the gateway has no mesh yet.", hint="Configure it first.")
+        if not tokens(client.session, client.keys.master) or (info := client.info()).run != self._run:
+            raise MeshLost(
+                f"the run of mesh '{client.keys.mesh}' for which this node was configured has ended",
+                hint="Clean the node up, and configure it again when the mesh runs.",
+            )
+        profile = RclpyProfile(self._node)
+        self._active.callback(profile.close)
+        names = {topic.profile for topic in plan.topics} or {"ros2dds"}
+        profiles: dict[str, Profile] = dict.fromkeys(map(str, sorted(names)), profile)
+        gateway = Gateway(plan, types, client.session, client.keys, grid_of(info), profiles, _TIMEOUT_S)
+        self._active.callback(gateway.close)
+        gateway.open()
+        thread = threading.Thread(target=gateway.run, name="gateway", daemon=True)
+        thread.start()
+        self._active.callback(thread.join, _TIMEOUT_S)
+        self._active.callback(gateway.end)
+        clock = ros_module("rclpy.clock")
+        steady = clock.Clock(clock_type=clock.ClockType.STEADY_TIME)
+        timer = self._node.create_timer(_LOOK_S, lambda: self._look(thread), clock=steady)
+        self._active.callback(self._node.destroy_timer, timer)
+        if plan.clock_points is not None:
+            self._active.callback(ClockWatch(self._node, "`clock_rate: null` in the section `ros`").close)
 
     def _declare_parameters(self, client: MeshClient, plan: RosPlan) -> None:
         """The parameters of the mesh as those of the node, with their current values."""
@@ -181,10 +193,10 @@ class GatewayNode:
         for name, target in self._targets.items():
             view = target.variable
             about = f"{target.instance}.{view.name}: {view.description or view.causality}"
-            about += f" ({view.type}{f' in {view.unit}' if view.unit else ''})"
-            read_only = view.variability != "tunable"
+            about += f" ({view.variability} {view.type}{f' in {view.unit}' if view.unit else ''})"
+            # ROS never lets go of a read-only parameter, and the next run has others: the mesh refuses what is fixed.
             self._node.declare_parameter(
-                name, values.get(target.key), descriptor(description=about, read_only=read_only, dynamic_typing=True)
+                name, values.get(target.key), descriptor(description=about, dynamic_typing=True)
             )
             self._stack.callback(self._node.undeclare_parameter, name)
         self._node.add_on_set_parameters_callback(self._set_parameters)
@@ -203,8 +215,8 @@ class GatewayNode:
                 return result(successful=False, reason=str(error))
         return result(successful=True)
 
-    def _look(self) -> None:
-        if self._thread is not None and not self._thread.is_alive():
+    def _look(self, carrying: threading.Thread) -> None:
+        if not carrying.is_alive():
             self._log.info("the mesh has ended")
             self._node.trigger_deactivate()
 
