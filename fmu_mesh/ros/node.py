@@ -8,12 +8,14 @@ its executor: `create_node`.
 from __future__ import annotations
 
 import os
+import signal
 import sys
 import threading
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
-from ..errors import ConfigurationError, FmuMeshError
+from ..errors import ConfigurationError, FmuMeshError, Interrupted
+from .autostart import Autostart
 from .fmu_node import FmuNode
 from .gateway_node import GatewayNode
 from .node_parameters import RosNode
@@ -31,6 +33,7 @@ _MORE_PARAMETERS: dict[str, tuple[Any, str]] = {
     "config": ("", "Configuration of a running mesh, instead of an FMU: the node is its gateway."),
     "connect": ([""], "With config: Zenoh endpoints of the mesh; default: the meshes of this user on this host."),
     "autostart": (False, "Whether the node configures and activates itself."),
+    "autostart_timeout": (60.0, "With autostart and config: how long to wait for the mesh, in s; 0.0: not at all."),
 }
 
 
@@ -141,13 +144,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         rclpy.try_shutdown()
         return ConfigurationError.exit_code
     try:
-        done = ros_module("rclpy.lifecycle").TransitionCallbackReturn.SUCCESS
-        if node.get_parameter("autostart").value and node.trigger_configure() == done:
-            node.trigger_activate()
-        rclpy.spin(node)
+        executor = executors.SingleThreadedExecutor()
+        with Autostart(node, executor):
+            rclpy.spin(node, executor)
     except (KeyboardInterrupt, executors.ExternalShutdownException):
         pass
     finally:
+        # Whoever presses Ctrl-C again does not wait for the rest, and is shown no traceback either.
+        signal.signal(signal.SIGINT, lambda *_: os._exit(Interrupted.exit_code))
         managed: Managed = node.managed
         # Neither an FMU that hangs nor the middleware's own shutdown may keep this process for ever.
         end = threading.Timer(_END_S, os._exit, (3,))

@@ -30,7 +30,13 @@ PARAMETERS: dict[str, tuple[Any, str]] = {
 }
 """The parameters of the node itself, which it has before an FMU is there: default and description."""
 
-RESERVED = frozenset({*PARAMETERS, "autostart", "config", "connect", "use_sim_time", "start_type_description_service"})
+RESERVED = frozenset(
+    {
+        *PARAMETERS,
+        *("autostart", "autostart_timeout", "config", "connect"),
+        *("use_sim_time", "start_type_description_service"),
+    }
+)
 """Names of parameters that a node has without its FMU."""
 
 
