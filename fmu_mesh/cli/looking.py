@@ -19,7 +19,7 @@ from ..errors import ConfigurationError, Interrupted
 from ..wire.client import MeshClient
 from ..wire.reaching import Meshes
 from ..wire.readings import Target
-from ..wire.views import Command, InstanceInfo, InstanceStatus, MeshInfo, MeshStatus
+from ..wire.views import Command, InstanceInfo, InstanceStatus, MeshInfo, MeshStatus, RosView
 from .arguments import add_command, count, endpoint, positive_seconds
 from .pages import (
     cells,
@@ -158,20 +158,20 @@ def _status(arguments: argparse.Namespace, meshes: Meshes) -> int:
     clients = [meshes.one(arguments.key)] if arguments.key is not None else meshes.all()
     instance = clients[0].instance_in(arguments.key) if arguments.key is not None else None
 
-    def view_of(client: MeshClient) -> tuple[MeshStatus | InstanceStatus, list[InstanceStatus]]:
+    def view_of(client: MeshClient) -> tuple[MeshStatus | InstanceStatus, list[InstanceStatus], list[RosView]]:
         if instance is not None:
-            return client.instance_status(instance), []
-        return client.status(), [] if arguments.json else _statuses(client)
+            return client.instance_status(instance), [], []
+        return client.status(), [] if arguments.json else _statuses(client), client.ros()
 
-    for number, (_, (view, statuses)) in enumerate(meshes.answers(clients, view_of)):
+    for number, (_, (view, statuses, ros)) in enumerate(meshes.answers(clients, view_of)):
         if arguments.json:
-            _print_json(view)
+            _print_json({**msgspec.structs.asdict(view), "ros": ros} if isinstance(view, MeshStatus) else view)
             continue
         if number:
             print()
         match view:
             case MeshStatus():
-                _print(mesh_status(view))
+                _print(mesh_status(view, ros))
                 _print(["", *instances(statuses)])
             case InstanceStatus():
                 _print(instance_status(view))

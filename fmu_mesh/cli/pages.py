@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import msgspec
 
 from ..simtime import ENDLESS
 from ..wire.readings import Reading
-from ..wire.views import InstanceInfo, InstanceStatus, MeshInfo, MeshStatus, VariableView
+from ..wire.views import InstanceInfo, InstanceStatus, MeshInfo, MeshStatus, RosView, VariableView
 from .tables import pairs, table
 
 __all__ = [
@@ -42,8 +42,8 @@ def instances(statuses: Iterable[InstanceStatus]) -> list[str]:
     return table(rows, heading=["instance", "state", "point", "time", "step time", "activity"])
 
 
-def mesh_status(status: MeshStatus) -> list[str]:
-    """How far a mesh is."""
+def mesh_status(status: MeshStatus, ros: Sequence[RosView] = ()) -> list[str]:
+    """How far a mesh is, and what its gateways to ROS reach."""
     return pairs(
         [
             ("mesh", status.mesh),
@@ -52,6 +52,8 @@ def mesh_status(status: MeshStatus) -> list[str]:
             ("time", seconds(status.time)),
             ("speed", f"{status.points_per_second:.0f} points/s, real-time factor {status.real_time_factor:.3g}"),
             ("overruns", str(status.overruns or "")),
+            *(("ROS", view.activity) for view in ros),
+            *(("ROS", f"{other} publishes /clock, too") for view in ros for other in view.other_clocks),
             ("error", status.error.message if status.error is not None else ""),
         ]
     )

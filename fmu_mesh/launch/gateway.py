@@ -10,6 +10,7 @@ from ..errors import ConfigurationError, Interrupted
 from ..model.loading import LoadedConfig, load
 from ..model.plan import Plan
 from ..ros.gateway import Gateway
+from ..ros.link import RosLink
 from ..ros.mapping import message_types, resolve
 from ..ros.serving import open_profiles, parameter_services
 from ..ros.topics import RosPlan
@@ -75,6 +76,9 @@ def run_gateway(config_file: Path, options: Options, emit: Callable[[Event], Non
         keys = Keys(loaded.config.zenoh.key_prefix, loaded.config.mesh)
         profiles = stack.enter_context(open_profiles(section, ros, types, ros_plan))
         stack.enter_context(parameter_services(ros_plan, types, mesh, keys, profiles))
+        link = RosLink(section, ros, mesh, keys, clock=ros_plan.clock_points is not None)
+        stack.callback(link.close)
+        link.open()
         patience_s = loaded.config.timeouts.start
         gateway = Gateway(ros_plan, types, mesh, keys, plan.grid, profiles, patience_s)
         stack.callback(gateway.close)

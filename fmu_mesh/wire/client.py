@@ -32,6 +32,7 @@ from .views import (
     InstanceStatus,
     MeshInfo,
     MeshStatus,
+    RosView,
     SetAnswer,
 )
 
@@ -75,6 +76,15 @@ class MeshClient:
     def status(self) -> MeshStatus:
         """How far the mesh is."""
         return self._view(self.keys.mesh_key("status"), MeshStatus, f"mesh '{self.keys.mesh}'")
+
+    def ros(self) -> list[RosView]:
+        """What the gateways to ROS reach; none where the mesh has none."""
+        # A get: a mesh without a gateway has nobody to wait for.
+        replies = self._session.get(f"{self.keys.mesh_key('ros')}/*", timeout=self._timeout_s)
+        try:
+            return [decode_json(sample.payload.to_bytes(), RosView) for sample in _answers(replies) or ()]
+        except MessageRefused as error:
+            raise _not_understood(f"the gateway of mesh '{self.keys.mesh}'", error) from error
 
     def instance_info(self, instance: str) -> InstanceInfo:
         """What an instance is: model description, connections, process. Waits while its FMU is being loaded."""

@@ -58,8 +58,8 @@ class Keys(msgspec.Struct, frozen=True):
         """Value of one variable."""
         return f"{self.root}/{instance}/{kind}/{escape(variable)}"
 
-    def mesh_key(self, what: Literal["info", "status", "plan", "command"]) -> str:
-        """A queryable of the master."""
+    def mesh_key(self, what: Literal["info", "status", "plan", "command", "ros"]) -> str:
+        """A queryable of the master; `ros` begins the keys of the gateways to ROS."""
         return f"{self.root}/mesh/{what}"
 
     @property

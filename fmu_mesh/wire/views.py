@@ -21,6 +21,7 @@ __all__ = [
     "MeshInfo",
     "MeshState",
     "MeshStatus",
+    "RosView",
     "SetAnswer",
     "VariableView",
 ]
@@ -172,6 +173,23 @@ class MeshStatus(msgspec.Struct, frozen=True):
     error: ErrorReport | None = None
     overruns: int = 0
     refused: int = 0
+
+
+class RosView(msgspec.Struct, frozen=True):
+    """Answer of `…/mesh/ros/<id>`: what a gateway to ROS reaches.
+
+    Attributes:
+        endpoints: where it looks for ROS, and where it listens.
+        connected: whether somebody is there.
+        activity: the same in words, such as `nobody answers at tcp/127.0.0.1:7447`.
+        other_clocks: who else publishes `/clock` there, in words.
+    """
+
+    profile: str
+    endpoints: tuple[str, ...]
+    connected: bool
+    activity: str
+    other_clocks: tuple[str, ...] = ()
 
 
 class Command(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -11,7 +11,7 @@ import socket
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Any, Self
@@ -152,12 +152,13 @@ class Peer:
 
 
 @contextlib.contextmanager
-def bridge(folder: Path, port: int) -> Iterator[None]:
+def bridge(folder: Path, port: int, connect: Sequence[str] = ()) -> Iterator[None]:
     """The real bridge, listening on a loopback port, with a DDS that stays on this host."""
     config = folder / "bridge.json5"
     settings = {
         "mode": "router",
         "listen": {"endpoints": [f"tcp/127.0.0.1:{port}"]},
+        "connect": {"endpoints": list(connect)},
         "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
         "plugins": {"ros2dds": {"domain": domain(), "ros_automatic_discovery_range": "LOCALHOST"}},
     }
