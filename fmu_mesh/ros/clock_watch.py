@@ -1,6 +1,6 @@
 """Two sources of `/clock` in one ROS domain: a node of rclpy that is one of them looks for others, and warns.
 
-Whoever runs with `use_sim_time` takes every message on `/clock`: with two sources its time jumps to and fro.
+Whoever runs with `use_sim_time` takes every message on `/clock`: with two sources its time jumps back and forth.
 """
 
 from __future__ import annotations
