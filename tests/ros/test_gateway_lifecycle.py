@@ -15,6 +15,8 @@ from typing import IO
 
 import pytest
 
+from fmu_mesh.ros.gateway_node import RclpyProfile
+from fmu_mesh.ros.topics import Topic
 from tests.helpers import DEADLINE_S, FMUS, Place, write_config
 from tests.ros.ros_peer import Ros, ros_or_skip
 
@@ -180,6 +182,27 @@ def test_ctrl_c_ends_it_in_every_state_with_exit_code_0_and_no_traceback(
 
     assert "Traceback" not in node.errors
     assert "rror" not in node.errors
+
+
+@pytest.mark.usefixtures("ros")
+def test_a_sample_that_comes_after_ros_was_shut_down_is_dropped_without_a_word() -> None:
+    import rclpy  # noqa: PLC0415 only where ROS is installed
+    from rclpy.serialization import serialize_message  # noqa: PLC0415 as above
+    from std_msgs.msg import Float64  # noqa: PLC0415 as above
+
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    node = rclpy.create_node("own", context=context)
+    topic = Topic(
+        "/y", "std_msgs/msg/Float64", "out", (), "ros2dds", stamped=False, frame_id="", reliability="reliable"
+    )
+    put = RclpyProfile(node).publish(topic)
+    put(serialize_message(Float64(data=1.0)), 0.0)
+    rclpy.shutdown(context=context)
+
+    put(serialize_message(Float64(data=2.0)), 0.0)
+
+    node.destroy_node()
 
 
 def test_one_gateway_serves_one_run_after_another_and_another_mesh(ros: Ros, place: Place) -> None:
