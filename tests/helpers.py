@@ -141,6 +141,7 @@ class Place:
 
     Attributes:
         folder: for the test's own files; its path is short, because that of a socket in it is limited.
+        environment: of all that is started there.
     """
 
     def __init__(self) -> None:
@@ -149,7 +150,7 @@ class Place:
         self._runtime = self.folder / "run"
         self._temporary = self.folder / "tmp"
         self._temporary.mkdir()
-        self._environment = os.environ | {
+        self.environment = os.environ | {
             "FMU_MESH_RUNTIME_DIR": str(self._runtime),
             "TMPDIR": str(self._temporary),
             "COLUMNS": "1000",
@@ -174,7 +175,7 @@ class Place:
 
     def start_command(self, command: Sequence[str]) -> Launched:
         """Start any command here as a process of its own."""
-        launched = Launched(command, self._environment, self.folder)
+        launched = Launched(command, self.environment, self.folder)
         self._started.append(launched)
         return launched
 

@@ -1,12 +1,12 @@
-"""What a person sees during a run: one progress line, log messages above it, and a summary at the end."""
+"""What a person sees during a run: log messages, one progress line below them, and a summary at the end."""
 
 from __future__ import annotations
 
 import ctypes
 import os
 import sys
-from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections import Counter, deque
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
@@ -14,13 +14,13 @@ from typing import Final, Self
 
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, Progress, TextColumn
 
 from ..errors import ErrorReport, FmuMeshError, from_report
 from ..launch.events import End, Event, Log, Ready, Status
 from ..launch.wiring import is_socket, leaves_host
 from ..model.plan import Plan
 from ..wire.views import LogLine, MeshStatus
+from .progress import ProgressLine
 
 __all__ = ["Display", "say", "stdout_as_stderr", "summary", "warn"]
 
@@ -29,6 +29,8 @@ _WARNINGS: Final = 5
 """How many warnings are told before a run."""
 _COUNTED: Final = 1000
 """How many different messages are counted."""
+_HELD: Final = 100
+"""How many messages of FMUs that may be about to fail are held back."""
 _STYLES = {"ok": "dim", "warning": "yellow", "discard": "yellow", "error": "red", "fatal": "red"}
 
 
@@ -38,22 +40,18 @@ class Display:
     Args:
         plan: what runs.
         show_progress: whether to draw the bar; never drawn where standard error is no terminal.
+        waits_for_nodes: whether the address is shown when all nodes are there, so that whoever uses it gets answers;
+            where they are started by hand, they need it before.
     """
 
-    def __init__(self, plan: Plan, *, show_progress: bool) -> None:
+    def __init__(self, plan: Plan, *, show_progress: bool, waits_for_nodes: bool = True) -> None:
         self._plan = plan
         self._console = Console(stderr=True, highlight=False)
-        self._progress = Progress(
-            TextColumn("[bold]{task.description}"),
-            BarColumn(bar_width=None),
-            TextColumn("{task.fields[text]}"),
-            console=self._console,
-            disable=not show_progress or not self._console.is_terminal,
-            transient=True,
-        )
+        self._progress = ProgressLine(plan, self._console, show=show_progress)
+        self._waits_for_nodes = waits_for_nodes
         self._times: Counter[tuple[str, str]] = Counter()
-        total = plan.grid.last_point if plan.grid.stop_time is not None else None
-        self._task = self._progress.add_task(plan.system.config.mesh, total=total, text="starting")
+        self._held: deque[LogLine] = deque()
+        self._endpoints: Sequence[str] = ()
 
     def __enter__(self) -> Self:
         self._progress.start()
@@ -63,6 +61,7 @@ class Display:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._progress.stop()
+        self.flush(str(error or ""))
         for (instance, message), times in self._times.items():
             if times > _SHOWN_TIMES:
                 more = f"{times - _SHOWN_TIMES} more {'times' if times > _SHOWN_TIMES + 1 else 'time'}"
@@ -72,7 +71,10 @@ class Display:
         """Show one event of the master."""
         match event:
             case Ready(endpoints):
-                self._ready(endpoints)
+                self._endpoints = endpoints
+                self._warn()
+                if not self._waits_for_nodes:
+                    self._show_address()
             case Status(status):
                 self._status(status)
             case Log(line):
@@ -82,12 +84,15 @@ class Display:
             case End():
                 pass
 
-    def _ready(self, endpoints: Sequence[str]) -> None:
-        """Show where the mesh can be reached: where it was asked to listen, or else its socket; and who can."""
+    def _show_address(self) -> None:
+        """Show where the mesh can be reached: where it was asked to listen, or else its socket."""
+        if shown := ", ".join([one for one in self._endpoints if not is_socket(one)] or self._endpoints):
+            self._console.print(escape(f"mesh '{self._plan.system.config.mesh}' at {shown}"), soft_wrap=True)
+        self._endpoints = ()
+
+    def _warn(self) -> None:
+        """Show who else can reach it."""
         config = self._plan.system.config
-        shown = ", ".join([one for one in endpoints if not is_socket(one)] or endpoints)
-        if shown:
-            self._console.print(escape(f"mesh '{config.mesh}' at {shown}"), soft_wrap=True)
         if config.zenoh.mode == "peer" and (wide := ", ".join(filter(leaves_host, config.zenoh.listen))):
             text = f"warning: whoever can reach this host at {wide} can read, set and end this mesh"
             self._console.print(f"[yellow]{escape(text)}[/]", soft_wrap=True)
@@ -98,10 +103,37 @@ class Display:
 
     def progress(self, point: int) -> None:
         """Show the point of a run in this process."""
-        self._progress.update(self._task, completed=point, text=f"t = {self._plan.grid.time(point):.6g} s")
+        self._progress.point(point)
+        self._release(lambda line: point > line.point)
 
     def log(self, line: LogLine) -> None:
-        """Show one log message of an FMU; the same text is shown a few times, and then only counted."""
+        """Show one log message of an FMU; the same text is shown a few times, and then only counted.
+
+        One that may tell why the FMU fails is held back until it has gone on: the error would tell the same once more.
+        """
+        if line.status == "ok":
+            self._show(line)
+            return
+        self._held.append(line)
+        if len(self._held) > _HELD:
+            self._show(self._held.popleft())
+
+    def flush(self, error: str = "") -> None:
+        """Show what is held back, but for what an error tells."""
+        told = error.partition("the FMU says: ")[2]
+        self._held = deque(line for line in self._held if line.message not in told)
+        self._release(lambda _line: True)
+
+    def _release(self, may_go: Callable[[LogLine], bool]) -> None:
+        """Show the messages that were held back without a need."""
+        held, self._held = self._held, deque()
+        for line in held:
+            if may_go(line):
+                self._show(line)
+            else:
+                self._held.append(line)
+
+    def _show(self, line: LogLine) -> None:
         key = line.instance, line.message
         if key in self._times or len(self._times) < _COUNTED:
             self._times[key] += 1
@@ -118,13 +150,13 @@ class Display:
             self._console.print(f"[dim]{escape(name)} |[/] {escape(shown)}")
 
     def _status(self, status: MeshStatus) -> None:
-        text: str = status.state
-        if status.state in ("running", "paused", "stopping"):
-            text = (
-                f"t = {status.time:.6g} s  {status.points_per_second:,.0f} points/s  "
-                f"real-time factor {status.real_time_factor:.3g}" + ("  paused" if status.state == "paused" else "")
-            )
-        self._progress.update(self._task, completed=status.point, text=text)
+        self._progress.status(status)
+        if status.state in ("running", "paused", "stopping", "done"):
+            self._show_address()
+        if status.state == "paused":
+            self._release(lambda _line: True)
+        elif self._held:
+            self._release(lambda line: status.progress[self._plan.node_of(line.instance)] > line.point)
 
 
 def say(text: str) -> None:

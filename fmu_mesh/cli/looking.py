@@ -1,4 +1,4 @@
-"""`ls`, `status`, `info`, `get`, `set`, `watch`, `pause`, `resume`, `step` and `stop`: looking into a running mesh.
+"""`ls`, `status`, `info`, `get`, `set`, `watch`, `wait`, `pause`, `resume`, `step` and `stop`: looking into a mesh.
 
 Owns what these commands print; what they ask is `fmu_mesh.wire.client`.
 """
@@ -11,15 +11,16 @@ import sys
 from collections.abc import Callable
 from functools import partial
 from itertools import islice
-from typing import Any
+from typing import Any, get_args
 
 import msgspec
 
-from ..errors import ConfigurationError, Interrupted
+from ..errors import ConfigurationError, FmuMeshError, Interrupted
 from ..wire.client import MeshClient
 from ..wire.reaching import Meshes
 from ..wire.readings import Target
-from ..wire.views import Command, InstanceInfo, InstanceStatus, MeshInfo, MeshStatus, RosView
+from ..wire.views import Command, InstanceInfo, InstanceStatus, MeshInfo, MeshState, MeshStatus, RosView
+from ..wire.waiting import rest, wait_for
 from .arguments import add_command, count, endpoint, positive_seconds
 from .pages import (
     cells,
@@ -37,6 +38,7 @@ from .tables import table
 __all__ = ["add_commands", "reaching"]
 
 _TIMEOUT_S = 5.0
+_WAIT_S = 60.0
 _REFERENCE = "`instance.variable` (with `*` for any characters), or a key (with the wildcards of Zenoh)"
 
 Run = Callable[[argparse.Namespace, Meshes], int]
@@ -45,10 +47,9 @@ Run = Callable[[argparse.Namespace, Meshes], int]
 def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.ArgumentParser) -> None:
     """Add the commands of this module."""
 
-    def add(name: str, run: Run, text: str, *, json: bool = True) -> argparse.ArgumentParser:
+    def add(name: str, run: Run, text: str) -> argparse.ArgumentParser:
         parser = add_command(commands, name, text, [common, reaching()])
-        if json:
-            parser.add_argument("--json", action="store_true", help="JSON, one object per line")
+        parser.add_argument("--json", action="store_true", help="JSON, one object per line")
         parser.set_defaults(run_command=lambda arguments: _with_meshes(arguments, run))
         return parser
 
@@ -69,6 +70,11 @@ def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.Arg
     watch = add("watch", _watch, "show every value of variables until the mesh ends")
     watch.add_argument("key", nargs="+", metavar="KEY", help=_REFERENCE)
     watch.add_argument("--count", type=count, metavar="N", help="end after N values")
+    wait = add_command(commands, "wait", "wait until a mesh runs, or is in another state", [common, reaching(_WAIT_S)])
+    wait.add_argument("mesh", nargs="?", metavar="MESH", help="name or key of the mesh; default: the only one")
+    wait.add_argument("--state", choices=get_args(MeshState), default="running", help="as `status` names it (running)")
+    wait.add_argument("--json", action="store_true", help="JSON, as `status` prints it")
+    wait.set_defaults(run_command=_wait)
     for name, text in (
         ("pause", "hold a mesh at a point"),
         ("resume", "let a paused mesh run on"),
@@ -81,8 +87,8 @@ def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.Arg
             parser.add_argument("points", nargs="?", type=count, default=1, metavar="N", help="points (1)")
 
 
-def reaching() -> argparse.ArgumentParser:
-    """The options of all commands that reach running meshes."""
+def reaching(timeout_s: float = _TIMEOUT_S) -> argparse.ArgumentParser:
+    """The options of all commands that reach running meshes; ``timeout_s`` is the deadline of a question in s."""
     options = argparse.ArgumentParser(add_help=False)
     options.add_argument(
         "--connect",
@@ -93,7 +99,11 @@ def reaching() -> argparse.ArgumentParser:
         help="Zenoh endpoint of a mesh or a router; repeatable; default: the meshes of this user on this host",
     )
     options.add_argument(
-        "--timeout", type=positive_seconds, default=_TIMEOUT_S, metavar="S", help="deadline of every question in s (5)"
+        "--timeout",
+        type=positive_seconds,
+        default=timeout_s,
+        metavar="S",
+        help=f"deadline of every question in s ({timeout_s:g})",
     )
     return options
 
@@ -111,9 +121,9 @@ def _with_meshes(arguments: argparse.Namespace, run: Run) -> int:
 
 
 def _ls(arguments: argparse.Namespace, meshes: Meshes) -> int:
-    clients = meshes.all()
-    if arguments.name is not None:
-        clients = [meshes.one(arguments.name)]
+    if arguments.name is None and (absence := meshes.absence) is not None:
+        return _ls_nothing(absence, as_json=arguments.json)
+    clients = [meshes.one(arguments.name)] if arguments.name is not None else meshes.all()
     instance = clients[0].instance_in(arguments.name) if arguments.name is not None else None
     if arguments.json:
 
@@ -142,6 +152,14 @@ def _ls(arguments: argparse.Namespace, meshes: Meshes) -> int:
                     f"\n{client.keys.instance(item.instance)}" if instance is None else client.keys.instance(instance)
                 )
                 _print(variables(item))
+    return 0
+
+
+def _ls_nothing(absence: FmuMeshError, *, as_json: bool) -> int:
+    """No mesh is an answer, too: the hint does not mix with it."""
+    if as_json:
+        print("[]")
+    print(f"fmu-mesh: {absence}", file=sys.stderr)
     return 0
 
 
@@ -251,18 +269,25 @@ def _selected(references: list[str], meshes: Meshes) -> list[tuple[MeshClient, l
 
 def _command(arguments: argparse.Namespace, meshes: Meshes) -> int:
     client = meshes.named(arguments.mesh)
-    answer = client.command(Command(arguments.command, getattr(arguments, "points", 1)))
+    command = Command(arguments.command, getattr(arguments, "points", 1))
+    answer = rest(client, command) if command.command in ("pause", "step") else client.command(command)
     if arguments.json:
         _print_json(answer)
         return 0
-    match answer.command:
-        case "stop":
-            what = "is told to end"
-        case "step":
-            what = f"goes {arguments.points} points on and stays there, starting"
-        case _:
-            what = f"is {answer.state}"
+    what = "is told to end, and was" if answer.command == "stop" else f"is {answer.state}"
     print(f"mesh '{client.keys.mesh}' {what} at point {answer.point}")
+    return 0
+
+
+def _wait(arguments: argparse.Namespace) -> int:
+    # A mesh that has a note is there, or about to go; an endpoint may come later.
+    patience_s = arguments.timeout if arguments.connect else min(arguments.timeout, _TIMEOUT_S)
+    with Meshes(arguments.connect, patience_s) as meshes:
+        status = wait_for(meshes, arguments.mesh, arguments.state, arguments.timeout)
+    if arguments.json:
+        _print_json(status)
+    else:
+        print(f"mesh '{status.mesh}' is {status.state} at point {status.point}")
     return 0
 
 

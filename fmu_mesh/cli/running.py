@@ -233,6 +233,7 @@ def _run_local(plan: Plan, config: Path, display: Display, showing: Showing) -> 
     def end(error: FmuError) -> None:
         """The thread in the FMU cannot be got back."""
         clean_up()
+        display.flush(str(error))
         print(f"fmu-mesh: {error}", file=sys.stderr, flush=True)
         os._exit(error.exit_code)
 
@@ -295,7 +296,7 @@ def _master(arguments: argparse.Namespace) -> int:
 
     with (
         plotted_where_it_ends(plan, arguments.plot),
-        Display(plan, show_progress=not arguments.no_progress) as display,
+        Display(plan, show_progress=not arguments.no_progress, waits_for_nodes=False) as display,
     ):
         run_master(arguments.config, options, show, plan=plan)
     if ends[0].profile is not None:

@@ -1,12 +1,13 @@
-"""Tables as plain text: columns in line, no colours, no dependence on the width of a terminal."""
+"""Tables as plain text: columns in line, no colours; where a width is given, no line is longer."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-__all__ = ["pairs", "table"]
+__all__ = ["pairs", "shortened", "table", "width_of"]
 
 _GAP = "  "
+_ELLIPSIS = "\N{HORIZONTAL ELLIPSIS}"
 
 
 def table(rows: Iterable[Sequence[str]], *, heading: Sequence[str] | None = None, indent: int = 0) -> list[str]:
@@ -17,6 +18,19 @@ def table(rows: Iterable[Sequence[str]], *, heading: Sequence[str] | None = None
         cells.insert(0, list(heading))
     widths = {column: max(len(row[column]) for row in cells) for column in shown}
     return [" " * indent + _GAP.join(row[column].ljust(widths[column]) for column in shown).rstrip() for row in cells]
+
+
+def width_of(rows: Iterable[Sequence[str]], heading: Sequence[str]) -> int:
+    """How many columns of a terminal a table takes."""
+    return max(map(len, table(rows, heading=heading)), default=0)
+
+
+def shortened(name: str, width: int) -> str:
+    """A name in ``width`` columns at most; what is left out is in its middle, because names differ at their ends."""
+    if len(name) <= width:
+        return name
+    kept = max(width - len(_ELLIPSIS), 0)
+    return f"{name[: kept - kept // 2]}{_ELLIPSIS}{name[len(name) - kept // 2 :]}"
 
 
 def pairs(items: Iterable[tuple[str, str]], *, indent: int = 0) -> list[str]:

@@ -1,18 +1,18 @@
 """`top`: a live table of all instances of a mesh.
 
 Owns what changes from one look to the next: rates and shares are those of the time between two looks, and those since
-the first point where there was only one.
+the first point where there was only one; and what of the table fits into a terminal.
 """
 
 from __future__ import annotations
 
 import argparse
-from typing import Any
+import shutil
+import sys
+from collections.abc import Sequence
+from typing import Any, Final
 
 import msgspec
-from rich.console import Console
-from rich.live import Live
-from rich.text import Text
 
 from ..errors import DeadlineExceeded, Interrupted
 from ..wire.client import MeshClient
@@ -21,12 +21,17 @@ from ..wire.views import InstanceStatus, MeshStatus
 from .arguments import add_command, positive_seconds
 from .looking import reaching
 from .pages import progress, seconds
-from .tables import table
+from .screen import Screen
+from .tables import shortened, table, width_of
 
 __all__ = ["add_commands", "page"]
 
 _INTERVAL_S = 1.0
 _HEADING = ["instance", "state", "point", "time", "step time", "wait", "points/s", "factor", "restarts", "activity"]
+_LEAST_NAME: Final = 12
+_LEAST_ACTIVITY: Final = 20
+_DISPENSABLE: Final = ("time", "factor", "restarts", "state")
+"""Columns that are left out where there is no room, in this order: the head line tells of times and of the state."""
 
 Look = tuple[MeshStatus, dict[str, InstanceStatus]]
 
@@ -50,62 +55,102 @@ def _top(arguments: argparse.Namespace) -> int:
             _show_once(client.all_status(), as_json=arguments.json)
             return 0
         try:
-            _follow(client, arguments.interval, as_json=arguments.json)
+            return _follow(client, arguments.interval, as_json=arguments.json)
         except KeyboardInterrupt:
             return Interrupted.exit_code
-    return 0
 
 
 def _show_once(look: Look, *, as_json: bool) -> None:
     if as_json:
         print(msgspec.json.encode({"mesh": look[0], "instances": list(look[1].values())}).decode(), flush=True)
     else:
-        print("\n".join(page(look)), flush=True)
+        width = shutil.get_terminal_size().columns if sys.stdout.isatty() else None
+        print("\n".join(page(look, width=width)), flush=True)
 
 
-def _follow(client: MeshClient, interval_s: float, *, as_json: bool) -> None:
-    """Look again and again until the mesh ends; where there is no terminal, one table after the other."""
-    console = Console()
-    live = Live(console=console, auto_refresh=False, screen=False) if console.is_terminal and not as_json else None
-    before: Look | None = None
-    with client.until_end() as ended:
-        if live is not None:
-            live.start()
-        try:
-            while not ended.is_set():
-                try:
-                    look = client.all_status()
-                except DeadlineExceeded:
-                    if ended.is_set():
-                        break
-                    raise
-                if live is not None:
-                    live.update(Text("\n".join(page(look, before)), no_wrap=True, overflow="ellipsis"), refresh=True)
-                else:
-                    _show_once(look, as_json=as_json)
-                before = look
-                ended.wait(interval_s)
-        finally:
-            if live is not None:
-                live.stop()
+def _follow(client: MeshClient, interval_s: float, *, as_json: bool) -> int:
+    """Look again and again until the mesh ends, or `q`; where there is no terminal, one table after the other."""
+    with Screen(drawn=sys.stdout.isatty() and not as_json) as screen, client.until_end(screen.wake) as ended:
+        before: Look | None = None
+        while not ended.is_set():
+            try:
+                look = client.all_status()
+            except DeadlineExceeded:
+                if ended.is_set():
+                    break
+                raise
+            if screen.drawn:
+                screen.show(page(look, before, width=screen.width))
+            else:
+                _show_once(look, as_json=as_json)
+            before = look
+            if screen.quits_within(interval_s):
+                return 0
     if not as_json:
         print(f"mesh '{client.keys.mesh}' has ended")
+    return 0
 
 
-def page(look: Look, before: Look | None = None) -> list[str]:
-    """The lines of one look; with the one before it, what happened since then."""
+def page(look: Look, before: Look | None = None, *, width: int | None = None) -> list[str]:
+    """The lines of one look; with the one before it, what happened since then.
+
+    Args:
+        look: what was seen.
+        before: what was seen the last time.
+        width: columns that a line may have; None: as many as it takes.
+    """
     status, instances = look
     step_size = status.real_time_factor / status.points_per_second if status.points_per_second else 0.0
-    rate, factor = f"{status.points_per_second:.0f} points/s", f"real-time factor {status.real_time_factor:.3g}"
-    overruns = f", {status.overruns} overruns" if status.overruns else ""
-    head = (
-        f"{status.mesh}: {status.state}, point {progress(status)}, {seconds(status.time)}, {rate}, {factor}{overruns}"
-    )
+    head = [
+        f"{status.mesh}: {status.state}",
+        f"point {progress(status)}",
+        seconds(status.time),
+        f"{status.points_per_second:.0f} points/s",
+        f"real-time factor {status.real_time_factor:.3g}",
+        *([f"{status.overruns} overruns"] if status.overruns else []),
+    ]
     rows = [
         _row(own, before[1].get(own.instance) if before is not None else None, step_size)
         for _, own in sorted(instances.items())
     ]
-    return [head, "", *table(rows, heading=_HEADING)]
+    if width is None:
+        return [", ".join(head), "", *table(rows, heading=_HEADING)]
+    head[0] = f"{shortened(status.mesh, width // 2)}: {status.state}"
+    return [*_lines(head, width), "", *_fitted(rows, width)]
+
+
+def _lines(parts: Sequence[str], width: int) -> list[str]:
+    """Parts with commas between them, in as many lines as it takes."""
+    lines = [parts[0]]
+    for part in parts[1:]:
+        if len(lines[-1]) + len(part) + 3 > width:
+            lines[-1] += ","
+            lines.append(part)
+        else:
+            lines[-1] += f", {part}"
+    return lines
+
+
+def _fitted(rows: list[list[str]], width: int) -> list[str]:
+    """The table in ``width`` columns: without what can be done without, with short names, the activity as it fits."""
+    heading = list(_HEADING)
+    rows = [list(row) for row in rows]
+    longest = max((len(row[0]) for row in rows), default=0)
+    for name in _DISPENSABLE:
+        room = width - width_of([row[1:-1] for row in rows], heading[1:-1]) - 4
+        if room >= min(longest, _LEAST_NAME) + _LEAST_ACTIVITY:
+            break
+        column = heading.index(name)
+        for cells in (heading, *rows):
+            del cells[column]
+    room = width - width_of([row[1:-1] for row in rows], heading[1:-1]) - 4
+    activity = max(_LEAST_ACTIVITY, room - longest)
+    for row in rows:
+        row[0] = shortened(row[0], max(len(heading[0]), room - activity))
+    return [
+        line[:width] if len(line) <= width else f"{line[: width - 1]}\N{HORIZONTAL ELLIPSIS}"
+        for line in table(rows, heading=heading)
+    ]
 
 
 def _row(own: InstanceStatus, before: InstanceStatus | None, step_size: float) -> list[str]:
@@ -124,5 +169,5 @@ def _row(own: InstanceStatus, before: InstanceStatus | None, step_size: float) -
         f"{rate:.0f}",
         f"{rate * step_size:.3g}",
         str(own.restarts),
-        own.activity,
+        own.activity.replace(f" at point {own.point}", "", 1),
     ]

@@ -44,7 +44,7 @@ class End(msgspec.Struct, frozen=True, tag="end"):
         seconds: wall-clock time from the first grant to the last point in s.
         rows: rows in the result file.
         profile: where the time went, if that was asked for.
-        ended_by: which FMU asked to end the simulation before its last point, if one did.
+        ended_by: what ended the simulation before its last point although nothing failed, if something did.
         signal: by which signal the process of the master was asked to end, if it was.
     """
 

@@ -68,7 +68,8 @@ class Master:
 
     Attributes:
         watch: set it before `run` for a profile: then nodes measure themselves, and this sums up what holds the grant.
-        ended_by: which FMU asked to end the simulation before its last point, if one did.
+        ended_by: what ended the simulation before its last point although nothing failed: an FMU that asked for it, or
+            `stop` where there is no stop time.
 
     Call `claim`, then `run` once, from the main thread, then `wait_for_followers` if it went well, then `close`.
     """
@@ -108,7 +109,6 @@ class Master:
         self._state: MeshState = "starting"
         self._grant = 0
         self._hold: int | None = None
-        self._stop_asked = False
         self.watch: GrantWatch | None = None
         self.starts_paused = False
         self._pacer = Pacer(plan, config.simulation.real_time_factor)
@@ -130,7 +130,7 @@ class Master:
         self._publish_status = self._server.publish_status
 
     def claim(self) -> None:
-        """Be the master of this mesh, which is to be done before anything else of it can be seen.
+        """Be the master of this mesh, and let it be seen; from now on questions wait until `run` answers them.
 
         Raises:
             ConfigurationError: another process is, there where this session connects to; it notices nothing.
@@ -144,6 +144,8 @@ class Master:
                 f"mesh '{self._keys.mesh}' runs already where this one connects to",
                 hint="Stop it first, or give this mesh another name or another `zenoh.key_prefix`.",
             )
+        self._declare()
+        self._mesh_token = self._session.liveliness().declare_token(self._keys.master)
 
     def run(self) -> None:
         """Run the mesh to its last point.
@@ -151,14 +153,12 @@ class Master:
         Raises:
             FmuMeshError: what ended the run early; all nodes have been told.
         """
-        self._declare()
-        token = self._session.liveliness().declare_token(self._keys.master)
         try:
             self._wait_for_nodes()
-            self._state = "initializing"
+            self._enter("initializing")
             self._wait_for(lambda: self._slowest >= 0, self._timeouts.initialize, "Initialization Mode is not over in")
             self._grant_to_the_end()
-            self._state = "stopping"
+            self._enter("stopping")
             self._send(FINISH, 0)
             self._wait_for(
                 lambda: len(self._reports) == len(self._nodes),
@@ -173,8 +173,8 @@ class Master:
             raise
         finally:
             self._clock.stop()
-            self._publish_status(final=True)
-            token.undeclare()
+            self._publish_status(at_once=True)
+            self._mesh_token.undeclare()
             self._token.undeclare()
 
     def wait_for_followers(self) -> None:
@@ -211,6 +211,11 @@ class Master:
 
     # --- phases
 
+    def _enter(self, state: MeshState) -> None:
+        """Be in another state; those who wait for it are told at once."""
+        self._state = state
+        self._publish_status(at_once=True)
+
     def _wait_for_nodes(self) -> None:
         deadline = time.monotonic() + self._timeouts.start
         while not self._members.complete:
@@ -221,15 +226,15 @@ class Master:
 
     def _grant_to_the_end(self) -> None:
         if self.starts_paused:
-            self._state, self._hold = "paused", 0
+            self._hold = 0
         else:
-            self._state = "running"
             self._clock.start()
+        self._enter("paused" if self.starts_paused else "running")
         self._pacer.start(0)
         self._moved = time.monotonic()
         # Each of them has its own deadline for a step; the instances of a group take theirs one after the other.
         patience_s = 3 * self._timeouts.step * self._most_instances
-        while self._slowest < self._last_point and not self._stop_asked:
+        while self._slowest < self._last_point:
             self._turn(self._publish_grant())
             if self._hold is not None and self._slowest >= self._hold:
                 self._clock.stop()
@@ -242,9 +247,6 @@ class Master:
                     time=self._plan.grid.time(self._slowest),
                 )
         self._clock.stop()
-        if self._stop_asked and self._slowest < self._last_point:
-            point = self._slowest
-            raise Interrupted("stopped by a command", point=point, time=self._plan.grid.time(point))
 
     def _publish_grant(self) -> float:
         """Publish the grant if it may grow; returns how long to wait for the next look, in s."""
@@ -284,7 +286,7 @@ class Master:
 
     @property
     def _last_point(self) -> int:
-        """The last point, or the one at which an FMU asked to end the simulation."""
+        """The last point, or the one at which the simulation ends early."""
         ended = self.ended_by.point if self.ended_by is not None else None
         return self._plan.grid.last_point if ended is None else ended
 
@@ -432,11 +434,21 @@ class Master:
                 self._clock.start()
                 self._pacer.start(self._slowest)
             case "stop":
-                self._stop_asked = True
+                self._stop()
         self._moved = time.monotonic()
         answer = CommandAnswer(command.command, self._state, self._slowest, self._hold)
         query.reply(self._keys.mesh_key("command"), msgspec.json.encode(answer), encoding=json_encoding)
         query.drop()
+
+    def _stop(self) -> None:
+        """End the run: at the point that is granted where it has no other end, and otherwise as an interruption."""
+        grid, self._hold = self._plan.grid, None
+        if grid.stop_time is not None:
+            text = f"stopped by a command before its stop time of {grid.stop_time:.12g} s"
+            self._fail(Interrupted(text, point=self._slowest, time=grid.time(self._slowest)))
+        elif self.ended_by is None:
+            text = "stopped by a command, the normal end of a run without a stop time"
+            self.ended_by = TerminationRequested(text, point=self._grant, time=grid.time(self._grant))
 
     # --- views
 

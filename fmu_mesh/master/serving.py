@@ -119,10 +119,10 @@ class Server:
                 raise MessageRefused("it is not the log of an instance of this mesh")
             self._events.log(line)
 
-    def publish_status(self, *, final: bool = False) -> None:
-        """Publish the status if it is time to."""
+    def publish_status(self, *, at_once: bool = False) -> None:
+        """Publish the status if it is time to, or ``at_once``."""
         now = time.monotonic()
-        if not final and now - self._status_published < STATUS_S:
+        if not at_once and now - self._status_published < STATUS_S:
             return
         self._status_published = now
         status = self._status()

@@ -17,7 +17,7 @@ __all__ = ["instance_info"]
 
 def instance_info(plan: NodePlan, runner: Runner) -> InstanceInfo:
     """What `info` answers for an instance of this process."""
-    description = runner.instance.description
+    description, start_values = runner.instance.description, runner.plan.start_values
     return InstanceInfo(
         instance=runner.name,
         model_name=description.model_name,
@@ -45,7 +45,7 @@ def instance_info(plan: NodePlan, runner: Runner) -> InstanceInfo:
                 v.causality,
                 v.variability,
                 v.unit,
-                to_plain(v.start) if v.start is not None else None,
+                start_values.get(v.name, to_plain(v.start) if v.start is not None else None),
                 v.description,
                 v.shape,
             )

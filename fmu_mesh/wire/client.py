@@ -7,12 +7,11 @@ can do (docs/key-space.md), with deadlines and with names instead of keys.
 
 from __future__ import annotations
 
-import queue
 import re
 import threading
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from typing import Any, TypeVar
 
 import msgspec
@@ -20,10 +19,11 @@ import zenoh
 
 from ..errors import ConfigurationError, DeadlineExceeded, MessageRefused
 from ..model.findings import listed, nearest
+from .following import Follower
 from .keys import Keys
 from .messages import decode_json
-from .readings import Keeper, Reading, Target, latecomers, reading_of
-from .session import matches, reason_of
+from .readings import Keeper, Reading, Target, reading_of
+from .session import matches, reason_of, tokens
 from .values import json_encoding
 from .views import (
     Command,
@@ -109,12 +109,14 @@ class MeshClient:
         return status, {view.instance: view for view in views}
 
     @contextmanager
-    def until_end(self) -> Iterator[threading.Event]:
-        """An event that is set when the mesh ends, or is gone."""
+    def until_end(self, tell: Callable[[], None] = lambda: None) -> Iterator[threading.Event]:
+        """An event that is set when the mesh ends, or is gone; ``tell`` is called then, on a foreign thread."""
         there, ended = threading.Event(), threading.Event()
 
         def changed(sample: zenoh.Sample) -> None:
             (there if sample.kind == zenoh.SampleKind.PUT else ended).set()
+            if ended.is_set():
+                tell()
 
         token = self._session.liveliness().declare_subscriber(self.keys.master, changed, history=True)
         try:
@@ -187,9 +189,30 @@ class MeshClient:
         return self._view(target.key, SetAnswer, f"'{target.instance}.{target.variable.name}'", payload)
 
     def command(self, command: Command) -> CommandAnswer:
-        """Pause, resume, step or stop the mesh; the answer comes before the points of a step are done."""
+        """Pause, resume, step or stop the mesh; the answer comes before the mesh rests where it is told to."""
         payload = msgspec.json.encode(command)
         return self._view(self.keys.mesh_key("command"), CommandAnswer, f"mesh '{self.keys.mesh}'", payload)
+
+    @contextmanager
+    def statuses(self, timeout_s: float | None = None) -> Iterator[Iterator[MeshStatus]]:
+        """The status of the mesh from now on, ten times a second, to its last; none if the mesh is gone already.
+
+        After ``timeout_s`` seconds, by default those of a question, the iterator raises `DeadlineExceeded`.
+        """
+        timeout_s = timeout_s if timeout_s is not None else self._timeout_s
+        deadline = time.monotonic() + timeout_s
+        # Asked before the follower is there: the answer would reach that one as a second token.
+        if not tokens(self._session, self.keys.master):
+            yield iter(())
+            return
+        with Follower[MeshStatus](self._session, self.keys) as follower:
+
+            def take(sample: zenoh.Sample) -> None:
+                with suppress(MessageRefused):
+                    follower.arrived.put(decode_json(sample.payload.to_bytes(), MeshStatus))
+
+            follower.subscribe(self.keys.mesh_key("status"), take)
+            yield follower.to_the_last(deadline) if follower.there.wait(timeout_s) else iter(())
 
     @contextmanager
     def watch(self, targets: Sequence[Target]) -> Iterator[Iterator[Reading]]:
@@ -197,22 +220,10 @@ class MeshClient:
 
         A reader that falls far behind loses the newest samples; the points tell which.
         """
-        arrived: queue.SimpleQueue[Reading | None] = queue.SimpleQueue()
-        with ExitStack() as stack:
-            there = threading.Event()
-
-            def changed(sample: zenoh.Sample) -> None:
-                if sample.kind == zenoh.SampleKind.PUT and not there.is_set():
-                    there.set()
-                else:
-                    arrived.put(None)
-
-            token = self._session.liveliness().declare_subscriber(self.keys.master, changed, history=True)
-            stack.callback(token.undeclare)
+        with Follower[Reading](self._session, self.keys) as follower:
             for target in targets:
-                subscriber = self._session.declare_subscriber(target.key, Keeper(target, arrived).keep)
-                stack.callback(subscriber.undeclare)
-            yield _to_the_last(arrived) if there.wait(self._timeout_s) else iter(())
+                follower.subscribe(target.key, Keeper(target, follower.arrived).keep)
+            yield follower.to_the_last() if follower.there.wait(self._timeout_s) else iter(())
 
     # --- names
 
@@ -333,15 +344,6 @@ def _not_understood(who: str, error: MessageRefused) -> ConfigurationError:
     return ConfigurationError(
         f"the answer of {who} is not understood: {error}.", hint="Is it another version of fmu_mesh?"
     )
-
-
-def _to_the_last(arrived: queue.SimpleQueue[Reading | None]) -> Iterator[Reading]:
-    """What arrives until the mesh has ended, which None says, and what comes behind that, unless it starts again."""
-    yield from iter(arrived.get, None)
-    for reading in latecomers(arrived):
-        if reading is None:
-            return
-        yield reading
 
 
 def _unknown(message: str, name: str, names: Sequence[str]) -> ConfigurationError:

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from types import TracebackType
 from typing import NamedTuple, Self, TypeVar
 
@@ -26,6 +27,9 @@ __all__ = ["Meshes"]
 Answer = TypeVar("Answer")
 
 _GRACE_S = 1.0
+_LOOK_S = 0.05
+_TOKENS = "**/mesh"
+_NOBODY = "nobody answered"
 
 
 class Meshes:
@@ -47,7 +51,7 @@ class Meshes:
         self._endpoints = tuple(endpoints)
         self._timeout_s = timeout_s
         self._found: list[_Found] = []
-        self._openings: list[_Opening] = []
+        self._openings: dict[tuple[str, ...], _Opening] = {}
 
     def __enter__(self) -> Self:
         """Connect.
@@ -56,22 +60,52 @@ class Meshes:
             DeadlineExceeded: an endpoint does not answer.
         """
         try:
-            if self._endpoints:
-                self._connect()
-            else:
-                for note in meshes():
-                    opening = self._open(note.endpoints, f"mesh '{note.mesh}' did not answer")
-                    self._found.append(_Found(Keys(note.key_prefix, note.mesh), note.endpoints, opening))
+            self.look()
         except BaseException:
             self._close()
             raise
-        self._found.sort(key=lambda found: found.keys.mesh)
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._close()
+
+    def look(self) -> None:
+        """Look which meshes there are now.
+
+        Raises:
+            DeadlineExceeded: an endpoint does not answer.
+        """
+        self._found = [*(self._shown() if self._endpoints else self._noted())]
+        self._found.sort(key=lambda found: found.keys.mesh)
+
+    @contextmanager
+    def changes(self) -> Iterator[Callable[[float], None]]:
+        """While inside, a function that waits until there may be other meshes, for some seconds at most."""
+        changed = threading.Event()
+
+        def wait(left_s: float) -> None:
+            changed.wait(left_s if self._endpoints else min(left_s, _LOOK_S))  # nobody tells of a note
+            changed.clear()
+
+        with ExitStack() as stack:
+            if self._endpoints:
+                liveliness = self._open(self._endpoints, _NOBODY).session().liveliness()
+                tokens = liveliness.declare_subscriber(_TOKENS, lambda _token: changed.set(), history=True)
+                stack.callback(tokens.undeclare)
+            yield wait
+
+    def appeared(self, mesh: str | None) -> MeshClient | None:
+        """The mesh with this name or key, or the only one; None if there is none.
+
+        Raises:
+            ConfigurationError: there are several.
+            DeadlineExceeded: it does not answer.
+        """
+        if mesh is None:
+            return self.one(None) if self._found else None
+        return self.named(mesh) if any(found.is_called(mesh) for found in self._found) else None
 
     def all(self) -> list[MeshClient]:
         """All meshes that answer, at least one.
@@ -143,7 +177,7 @@ class Meshes:
             DeadlineExceeded: it does not answer.
         """
         running = self._running()
-        named = [found for found in running if mesh in (found.keys.mesh, found.keys.root)]
+        named = [found for found in running if found.is_called(mesh)]
         if len(named) == 1:
             return self._client(named[0])
         if named:
@@ -159,32 +193,45 @@ class Meshes:
         Raises:
             ConfigurationError: there is none.
         """
+        if (absence := self.absence) is not None:
+            raise absence
+        return self._found
+
+    @property
+    def absence(self) -> ConfigurationError | None:
+        """What to say where no mesh was found; None if one was."""
         if self._found:
-            return self._found
+            return None
         if self._endpoints:
-            raise ConfigurationError(f"no mesh can be reached at {', '.join(self._endpoints)}.")
-        raise ConfigurationError(
+            return ConfigurationError(f"no mesh can be reached at {', '.join(self._endpoints)}.")
+        return ConfigurationError(
             "no mesh is running here.", hint="Start one with `fmu-mesh launch CONFIG`, or reach another with --connect."
         )
 
-    def _connect(self) -> None:
+    def _noted(self) -> Iterator[_Found]:
+        """Every mesh of this user on this host."""
+        for note in meshes():
+            opening = self._open(note.endpoints, f"mesh '{note.mesh}' did not answer")
+            yield _Found(Keys(note.key_prefix, note.mesh), note.endpoints, opening)
+
+    def _shown(self) -> Iterator[_Found]:
         """Every mesh whose master shows at the endpoints."""
-        opening = self._open(self._endpoints, "nobody answered")
-        for reply in opening.session().liveliness().get("**/mesh", timeout=self._timeout_s):
+        opening = self._open(self._endpoints, _NOBODY)
+        for reply in opening.session().liveliness().get(_TOKENS, timeout=self._timeout_s):
             if reply.ok is not None:
                 *prefix, mesh, _ = str(reply.ok.key_expr).split("/")
                 if prefix:  # otherwise it is a token of something else
-                    self._found.append(_Found(Keys("/".join(prefix), mesh), self._endpoints, opening))
+                    yield _Found(Keys("/".join(prefix), mesh), self._endpoints, opening)
 
-    def _open(self, endpoints: Sequence[str], else_: str) -> _Opening:
-        self._openings.append(_Opening(endpoints, else_, self._timeout_s))
-        return self._openings[-1]
+    def _open(self, endpoints: tuple[str, ...], else_: str) -> _Opening:
+        """The session with these endpoints; there is one, however often it is asked for."""
+        return self._openings.setdefault(endpoints, _Opening(endpoints, else_, self._timeout_s))
 
     def _client(self, found: _Found) -> MeshClient:
         return MeshClient(found.opening.session(), found.keys, found.endpoints, self._timeout_s)
 
     def _close(self) -> None:
-        for opening in self._openings:
+        for opening in self._openings.values():
             opening.close()
 
 
@@ -260,6 +307,10 @@ class _Found(NamedTuple):
     keys: Keys
     endpoints: tuple[str, ...]
     opening: _Opening
+
+    def is_called(self, mesh: str) -> bool:
+        """Whether this is its name, or its key."""
+        return mesh in (self.keys.mesh, self.keys.root)
 
 
 def _means(keys: Keys, reference: str) -> bool:

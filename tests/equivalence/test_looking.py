@@ -223,6 +223,14 @@ def test_status_and_info_name_meshes_and_instances_in_every_form(call: Call) -> 
     assert "state      running\n" in call("status", "gain")[1]
 
 
+def test_start_values_are_those_in_effect(call: Call) -> None:
+    for command in (("info", "gain"), ("ls", "gain"), ("ls", "-l")):
+        assert "\n  param/k   Real  tunable      2.0    Gain\n" in call(*command)[1]
+    views = json.loads(call("info", "pendulum", "--json")[1])["variables"]
+    starts = {view["name"]: view.get("start") for view in views}
+    assert starts == {"a": 1.3, "der(a)": 0.0, "der(a,2)": None, "l": 1.0, "d": 0.1, "g": 9.81}
+
+
 def test_get_takes_names_keys_and_wildcards(call: Call) -> None:
     code, out, _ = call("get", "pendulum.l", f"{ROOT}/pendulum/out/der(a,2)")
     assert code == 0
@@ -297,12 +305,13 @@ def test_a_paused_mesh_steps_answers_and_runs_on(call: Call, session: zenoh.Sess
         return status["state"], min(status["progress"].values())
 
     try:
-        assert json.loads(call("pause", "looked_at", "--json")[1])["state"] == "paused"
+        paused = json.loads(call("pause", "looked_at", "--json")[1])
+        assert paused["state"] == "paused"
         assert call("set", "free.k", "1")[0] == 0
         held = json.loads(call("get", "free.y", "--json")[1])["point"]
         code, out, _ = call("step", "looked_at", "7")
-        assert code == 0
-        assert "goes 7 points on and stays there" in out
+        assert (code, held) == (0, paused["point"])
+        assert out == f"mesh 'looked_at' is paused at point {held + 7}\n"
         statuses.until(lambda sample: decoded(sample)[1] >= held + 7)
         assert json.loads(call("status", "--json")[1])["state"] == "paused"
     finally:
@@ -340,10 +349,22 @@ def test_without_a_mesh_the_error_says_how_to_start_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("FMU_MESH_RUNTIME_DIR", str(tmp_path))
-    assert main(["ls"]) == 2
+    assert main(["status"]) == 2
     assert "no mesh is running here. Start one with `fmu-mesh launch CONFIG`" in capsys.readouterr().err
     assert main(["ls", "--connect", "tcp/127.0.0.1:9", "--timeout", "0.2"]) == 4
     assert "nobody answered at tcp/127.0.0.1:9 within 0.2 s" in capsys.readouterr().err
+
+
+def test_without_a_mesh_ls_has_an_empty_answer_and_a_hint_beside_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("FMU_MESH_RUNTIME_DIR", str(tmp_path))
+    for options, answer in (((), ""), (("--json",), "[]\n"), (("-l",), "")):
+        assert main(["ls", *options]) == 0
+        shown = capsys.readouterr()
+        assert shown.out == answer
+        assert "no mesh is running here. Start one with" in shown.err
+    assert main(["ls", "gain"]) == 2
 
 
 def test_several_meshes_are_listed_and_a_key_chooses(mesh: Mesh, call: Call) -> None:
@@ -381,7 +402,7 @@ def test_watch_ends_with_the_mesh_and_with_ctrl_c() -> None:
         watchers[1].communicate(timeout=DEADLINE_S)
 
         assert [watcher.returncode for watcher in watchers] == [130, 0]
-        assert "mesh 'looked_at' is told to end at point " in stopped.stdout
+        assert "mesh 'looked_at' is told to end, and was at point " in stopped.stdout
         assert mesh.end() == 130, mesh.lines
 
 

@@ -64,7 +64,7 @@ def test_a_failed_step_is_told_with_instance_point_time_and_the_message_of_the_f
         f"fmu-mesh: instance faulty, point 1000, t = 1 s: fmi2DoStep returned {status}; the FMU says: {says}"
         f"What was recorded up to then ({len(rows)} rows) is in '{config.with_suffix('.csv')}'."
     )
-    assert f"faulty at point 1000: {says.partition('.')[0]}" in launched.errors  # as it came, too
+    assert launched.errors.count(says.partition(".")[0]) == 1
     assert "Traceback" not in launched.errors
     assert [row[0] for row in rows] == [point * 0.001 for point in range(1001)]
     place.assert_nothing_left()

@@ -1,0 +1,107 @@
+"""A terminal that one page after the other is drawn on, until a key is pressed.
+
+Owns what has to be put back as it was: the mode in which keys are read, and what the terminal showed before. It is put
+back however the block ends, at SIGTERM, too.
+"""
+
+from __future__ import annotations
+
+import os
+import select
+import shutil
+import signal
+import sys
+import termios
+import time
+import tty
+from collections.abc import Sequence
+from contextlib import ExitStack, suppress
+from types import FrameType, TracebackType
+from typing import Final, Self
+
+__all__ = ["Screen"]
+
+_OTHER_SCREEN: Final = "\x1b[?1049h\x1b[?25l"
+_FIRST_SCREEN: Final = "\x1b[?25h\x1b[?1049l"
+_HOME: Final = "\x1b[H"
+_END_OF_LINE: Final = "\x1b[K"
+_REST: Final = "\x1b[J"
+_QUIT: Final = b"qQ"
+
+
+class Screen:
+    """The terminal of standard output, as long as the `with` block lasts.
+
+    Args:
+        drawn: whether there is one to draw on; where there is none this only waits.
+    """
+
+    def __init__(self, *, drawn: bool) -> None:
+        self.drawn = drawn
+        self._keys = sys.stdin.fileno() if drawn and sys.stdin is not None and sys.stdin.isatty() else None
+        self._woken, self._waker = os.pipe()
+        self._stack = ExitStack()
+
+    def __enter__(self) -> Self:
+        if self.drawn:
+            self._stack.callback(signal.signal, signal.SIGTERM, signal.signal(signal.SIGTERM, _end))
+            if self._keys is not None:
+                self._stack.callback(termios.tcsetattr, self._keys, termios.TCSADRAIN, termios.tcgetattr(self._keys))
+                tty.setcbreak(self._keys)  # Ctrl-C stays what it is
+            self._stack.callback(self._write, _FIRST_SCREEN)
+            self._write(_OTHER_SCREEN)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stack.close()
+        os.close(self._woken)
+        os.close(self._waker)
+
+    @property
+    def width(self) -> int:
+        """Columns, as many as there are now."""
+        return shutil.get_terminal_size().columns
+
+    def show(self, lines: Sequence[str]) -> None:
+        """Draw a page; of one that is too long for the terminal the beginning, and how much more there is."""
+        height = shutil.get_terminal_size().lines
+        if len(lines) > height:
+            lines = [*lines[: height - 1], f"({len(lines) - height + 1} more lines)"]
+        # The page before is erased ahead of each line: behind a full one the cursor is still on its last sign.
+        text = "\r\n".join(_END_OF_LINE + "".join(map(_printable, line)) for line in lines)
+        self._write(_HOME + text + ("\r\n" + _REST if len(lines) < height else ""))
+
+    def quits_within(self, seconds: float) -> bool:
+        """Wait so long, or until somebody wakes this; whether `q` was pressed."""
+        end = time.monotonic() + seconds
+        watched = [self._woken, *([self._keys] if self._keys is not None else [])]
+        while (left := end - time.monotonic()) > 0:
+            ready, _, _ = select.select(watched, [], [], left)
+            if self._woken in ready:
+                return False
+            if self._keys in ready:
+                pressed = os.read(self._keys, 64) if self._keys is not None else b""
+                if not pressed:  # the terminal is gone
+                    return True
+                if any(key in _QUIT for key in pressed):
+                    return True
+        return False
+
+    def wake(self) -> None:
+        """From any thread: let `quits_within` come back, from now on at once."""
+        with suppress(OSError):
+            os.write(self._waker, b".")
+
+    def _write(self, text: str) -> None:
+        sys.stdout.write(text)
+        sys.stdout.flush()
+
+
+def _printable(sign: str) -> str:
+    return sign if sign.isprintable() else "\N{REPLACEMENT CHARACTER}"
+
+
+def _end(_number: int, _frame: FrameType | None) -> None:
+    sys.exit(128 + signal.SIGTERM)
