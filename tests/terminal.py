@@ -82,6 +82,12 @@ class Terminal:
             lines.pop()
         return lines
 
+    @property
+    def shows_cursor(self) -> bool:
+        """Whether there is a cursor on the screen."""
+        with self._lock:
+            return all(not screen.cursor.hidden for screen in self._screens)
+
     def modes(self) -> list[Any]:
         """How the terminal treats what is typed."""
         return termios.tcgetattr(self._other)

@@ -72,7 +72,13 @@ def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.Arg
     watch.add_argument("--count", type=count, metavar="N", help="end after N values")
     wait = add_command(commands, "wait", "wait until a mesh runs, or is in another state", [common, reaching(_WAIT_S)])
     wait.add_argument("mesh", nargs="?", metavar="MESH", help="name or key of the mesh; default: the only one")
-    wait.add_argument("--state", choices=get_args(MeshState), default="running", help="as `status` names it (running)")
+    wait.add_argument(
+        "--state",
+        choices=get_args(MeshState),
+        default="running",
+        metavar="STATE",
+        help=f"{', '.join(get_args(MeshState))} (running)",
+    )
     wait.add_argument("--json", action="store_true", help="JSON, as `status` prints it")
     wait.set_defaults(run_command=_wait)
     for name, text in (

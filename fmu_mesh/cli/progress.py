@@ -24,6 +24,8 @@ __all__ = ["ProgressLine", "progress_parts"]
 _LEAST_BAR: Final = 8
 _MOST_NAME: Final = 20
 _GAP: Final = "  "
+_ECHO: Final = 3
+"""Columns for the `^C` that a terminal shows: it would begin another line, and this one could not be taken back."""
 
 
 class ProgressLine:
@@ -69,10 +71,11 @@ class ProgressLine:
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         """Rich asks for it ten times a second."""
-        width = options.max_width
+        width = max(options.max_width - _ECHO, 1)
         name = shortened(self._name, min(_MOST_NAME, width // 4))
         parts = progress_parts(self._grid, self._status, width - len(name) - len(_GAP) - _LEAST_BAR - len(_GAP))
-        line = Table.grid(padding=(0, len(_GAP), 0, 0), expand=True, pad_edge=False)
+        line = Table.grid(padding=(0, len(_GAP), 0, 0), pad_edge=False)
+        line.width = width
         line.add_column(no_wrap=True)
         line.add_column(ratio=1, no_wrap=True)
         line.add_column(no_wrap=True)

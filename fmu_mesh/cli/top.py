@@ -29,6 +29,8 @@ __all__ = ["add_commands", "page"]
 _INTERVAL_S = 1.0
 _HEADING = ["instance", "state", "point", "time", "step time", "wait", "points/s", "factor", "restarts", "activity"]
 _LEAST_NAME: Final = 12
+_GOOD_NAME: Final = 32
+"""A name of this length is worth more than the columns that can be left out, but for the state."""
 _LEAST_ACTIVITY: Final = 20
 _DISPENSABLE: Final = ("time", "factor", "restarts", "state")
 """Columns that are left out where there is no room, in this order: the head line tells of times and of the state."""
@@ -135,22 +137,22 @@ def _fitted(rows: list[list[str]], width: int) -> list[str]:
     """The table in ``width`` columns: without what can be done without, with short names, the activity as it fits."""
     heading = list(_HEADING)
     rows = [list(row) for row in rows]
-    longest = max((len(row[0]) for row in rows), default=0)
+    longest = max(len(row[0]) for row in (heading, *rows))
+
+    def room() -> int:
+        """Columns for the name and the activity."""
+        return width - width_of([row[1:-1] for row in rows], heading[1:-1]) - 4  # two gaps
+
     for name in _DISPENSABLE:
-        room = width - width_of([row[1:-1] for row in rows], heading[1:-1]) - 4
-        if room >= min(longest, _LEAST_NAME) + _LEAST_ACTIVITY:
+        if room() >= min(longest, _LEAST_NAME if name == "state" else _GOOD_NAME) + _LEAST_ACTIVITY:
             break
         column = heading.index(name)
         for cells in (heading, *rows):
             del cells[column]
-    room = width - width_of([row[1:-1] for row in rows], heading[1:-1]) - 4
-    activity = max(_LEAST_ACTIVITY, room - longest)
     for row in rows:
-        row[0] = shortened(row[0], max(len(heading[0]), room - activity))
-    return [
-        line[:width] if len(line) <= width else f"{line[: width - 1]}\N{HORIZONTAL ELLIPSIS}"
-        for line in table(rows, heading=heading)
-    ]
+        row[0] = shortened(row[0], max(len(heading[0]), room() - _LEAST_ACTIVITY))
+    lines = table(rows, heading=heading)
+    return [line if len(line) <= width else f"{line[: width - 1]}\N{HORIZONTAL ELLIPSIS}" for line in lines]
 
 
 def _row(own: InstanceStatus, before: InstanceStatus | None, step_size: float) -> list[str]:

@@ -1,0 +1,179 @@
+"""What `top` and `launch` draw on a real terminal, and what they leave behind there."""
+
+from __future__ import annotations
+
+import re
+import signal
+from pathlib import Path
+
+import pytest
+
+from tests.helpers import FMUS, Place, wait_until, write_config
+from tests.terminal import Terminal
+
+PACED = {"real_time_factor": 1.0, "step_size": 0.01}
+LONG = "the_left_wheel_of_the_front_axle_with_its_own_long_name"
+MESH = "mesh_of_a_test_with_long_names"
+
+
+def start_long_names(place: Place) -> Path:
+    """A mesh whose names are longer than there is room, running by the wall clock; its configuration."""
+    instances = {
+        f"{LONG}_{number}": {"fmu": str(FMUS / f"{fmu}.fmu")} for number, fmu in ((1, "DampedPendulum"), (2, "Gain"))
+    }
+    config = write_config(
+        place.folder,
+        name=MESH,
+        instances=instances,
+        connections=[f"{LONG}_1.a -> {LONG}_2.u"],
+        stop_time=3600.0,
+        simulation=PACED,
+    )
+    place.start("launch", config, "--no-progress")
+    assert place.run("wait").wait() == 0
+    return config
+
+
+def start_pair(place: Place) -> None:
+    place.start("launch", write_config(place.folder, stop_time=3600.0, simulation=PACED), "--no-progress")
+    assert place.run("wait").wait() == 0
+
+
+# --- top
+
+
+@pytest.mark.parametrize("columns", [80, 100, 200])
+def test_top_fits_its_terminal_and_has_one_head_line(place: Place, columns: int) -> None:
+    start_pair(place)
+
+    with Terminal(place, "top", "--interval", "0.05", columns=columns) as top:
+        first = top.wait_for("pendulum")
+        later = wait_until(
+            lambda: shown if (shown := top.shown)[:1] != first[:1] and len(shown) == 5 else None, "a look"
+        )
+
+    for shown in (first, later):
+        assert [line.partition(":")[0] for line in shown if line.startswith("pair")] == ["pair"]
+        assert [line.split()[0] for line in shown[2:]] == ["instance", "delay", "pendulum"]
+        assert shown[3].endswith("which feeds 'delay.x'") == (columns > 100)
+        assert max(map(len, shown)) <= columns
+        assert ("factor" in shown[2].split()) == (columns > 80)
+
+
+@pytest.mark.parametrize("columns", [80, 200])
+def test_top_shortens_long_names_in_the_middle_where_they_do_not_fit(place: Place, columns: int) -> None:
+    start_long_names(place)
+
+    with Terminal(place, "top", columns=columns) as top:
+        shown = top.wait_for("instance")
+        rows = [line.split() for line in shown if re.search(r"_[12] ", line)]
+
+    assert len(rows) == 2
+    assert rows[0][0] != rows[1][0]
+    assert [row[0].startswith("the_") for row in rows] == [True, True]
+    assert (f"{LONG}_1" == rows[0][0]) == (columns > 80)
+    assert "points/s" in "".join(shown)
+
+
+@pytest.mark.parametrize(
+    ("how", "code", "last"),
+    [
+        ("q", 0, ""),
+        ("\x03", 130, ""),
+        ("end", 0, "mesh 'pair' has ended"),
+        (signal.SIGTERM, 143, ""),
+        ("error", 4, "no answer"),
+    ],
+    ids=["q", "Ctrl-C", "end", "SIGTERM", "error"],
+)
+def test_top_puts_the_terminal_back_as_it_was(place: Place, how: str | signal.Signals, code: int, last: str) -> None:
+    start_pair(place)
+
+    with Terminal(place, "top", "--interval", "0.1" if how == "error" else "60", "--timeout", "1") as top:
+        top.wait_for("pendulum")
+        assert top.modes() != top.modes_before
+        if how == "end":
+            place.run("stop", "pair")
+        elif how == "error":
+            for process in place.processes():
+                if "master" in process.cmdline():
+                    process.suspend()
+        elif isinstance(how, signal.Signals):
+            top.signal(how)
+        else:
+            top.press(how)
+
+        assert top.wait() == code
+        assert top.modes() == top.modes_before
+        assert bool(top.shown) == bool(last)
+        assert last in "".join(top.shown)
+        assert "instance  state" not in "".join(top.shown)
+        assert top.shows_cursor
+
+
+def test_top_tells_how_many_lines_do_not_fit(place: Place) -> None:
+    start_pair(place)
+
+    with Terminal(place, "top", lines=4) as top:
+        shown = top.wait_for("more lines")
+
+    assert shown[-1] == "(2 more lines)"
+    assert shown[0].startswith("pair: running")
+
+
+# --- the progress line
+
+
+@pytest.mark.parametrize("options", [[], ["--local"]], ids=["distributed", "local"])
+def test_the_progress_line_fits_and_tells_percent_stop_time_and_time_left(place: Place, options: list[str]) -> None:
+    config = write_config(place.folder, stop_time=3600.0, simulation=PACED)
+
+    with Terminal(place, "launch", config, *options) as launch:
+        shown = launch.wait_for("left")
+        line = shown[-1]
+        launch.press("\x03")
+        assert launch.wait() == 130
+        assert not any("left" in rest for rest in launch.shown)
+
+    assert line.startswith("pair  ")
+    assert re.search(r"  0 %  [0-9.]+ of 3600 s  \d+:\d\d(:\d\d)? left(  [0-9,]+ points/s|$)", line), line
+    assert [row for row in shown if "%" in row] == [line]
+
+
+def test_without_a_stop_time_the_progress_line_tells_what_is_known(place: Place) -> None:
+    with Terminal(place, "run", FMUS / "Gain.fmu") as run:
+        line = run.wait_for("factor")[-1]
+
+    assert re.search(r"^Gain  .*  [0-9.]+ s  [0-9,]+ points/s  factor [0-9.]+$", line), line
+    assert "%" not in line
+    assert "left" not in line
+
+
+@pytest.mark.parametrize("columns", [40, 80])
+def test_the_progress_line_of_long_names_is_one_line(place: Place, columns: int) -> None:
+    start_long_names(place)
+    config = place.folder / f"{MESH}.yaml"
+    other = place.folder / "other.csv"
+
+    with Terminal(place, "launch", config, "--output", other, "--local", columns=columns) as launch:
+        launch.wait_for(" % ")
+        for _ in range(3):
+            before = launch.shown
+            shown = wait_until(lambda: now if (now := launch.shown) != before else None, "another point")  # noqa: B023 it is called within the turn
+            assert len([line for line in shown if "%" in line]) == 1
+            assert shown[-1].startswith("mesh")
+
+
+@pytest.mark.parametrize("environment", [{}, {"FORCE_COLOR": "1"}], ids=["plain", "forced"])
+def test_there_is_no_progress_line_where_standard_error_is_no_terminal(
+    place: Place, environment: dict[str, str]
+) -> None:
+    place.environment |= environment
+    config = write_config(place.folder, stop_time=0.5, simulation=PACED)
+
+    launched = place.run("launch", config)
+
+    assert launched.wait() == 0
+    assert "%" not in launched.errors
+    assert "points/s" not in launched.errors
+    assert [line.partition(" at ")[0] for line in launched.errors.splitlines()] == ["mesh 'pair'"]
