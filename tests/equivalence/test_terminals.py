@@ -149,7 +149,7 @@ def test_without_a_stop_time_the_progress_line_tells_what_is_known(place: Place)
     assert "left" not in line
 
 
-@pytest.mark.parametrize("columns", [40, 80])
+@pytest.mark.parametrize("columns", [60, 80])
 def test_the_progress_line_of_long_names_is_one_line(place: Place, columns: int) -> None:
     start_long_names(place)
     config = place.folder / f"{MESH}.yaml"
