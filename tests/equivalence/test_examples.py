@@ -172,19 +172,6 @@ def test_in_real_time_the_integrated_node_stops_when_it_is_told_and_keeps_its_ro
     assert integrated_node.run(stop=stop) == example[:1]
 
 
-def test_the_code_on_the_page_about_the_library_prints_what_the_page_says(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    page = (ROOT / "docs" / "library.md").read_text(encoding="utf-8")
-    blocks = re.findall(r"^```python\n(.*?)^```\n\n```text\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
-    monkeypatch.chdir(ROOT)
-
-    assert len(blocks) == page.count("```python") == 1
-    for code, text in blocks:
-        exec(compile(code, "docs/library.md", "exec"), {})  # noqa: S102 our own page
-        assert [line.rstrip() for line in capsys.readouterr().out.splitlines()] == text.splitlines()
-
-
 def test_every_name_on_the_page_about_the_library_exists() -> None:
     page = (ROOT / "docs" / "library.md").read_text(encoding="utf-8")
     table = page[page.index("| C++") : page.index("The same:")]

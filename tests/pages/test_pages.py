@@ -1,0 +1,279 @@
+"""Every YAML, shell and Python block of every page runs, or its page says why not.
+
+The blocks of a page run in order, in a folder that looks like a clone: what one of them writes or starts is there for
+the next one. Numbers in the output of a run differ from machine to machine and are not compared; the words are.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import io
+import json
+import os
+import re
+import shutil
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from itertools import pairwise
+from pathlib import Path
+from typing import Self
+
+import pytest
+import yaml
+import zenoh
+
+from tests.helpers import Launched, Place, wait_until
+from tests.pages.blocks import LANGUAGES, PAGES, ROOT, Block, Command, blocks_of
+from tests.ros.ros_peer import environment
+
+BLOCKS = {str(page.relative_to(ROOT)): blocks_of(page) for page in PAGES}
+
+MODEL_EXCHANGE = "docs/model-exchange-and-events.md"
+WHOLE: dict[str, dict[str, str]] = {
+    "docs/bags.md": {"pendulum": "DampedPendulum", "delay": "TransportDelay"},
+    "docs/connections.md": {
+        "pendulum": "DampedPendulum",
+        "gain": "Gain",
+        "motor": "SimpleElectricalActuator",
+        "vehicle": "ActiveShuttle",
+    },
+    MODEL_EXCHANGE: {"gain": "Gain", "oscillator": "oscillator"},
+    "docs/ros.md": {
+        "pendulum": "DampedPendulum",
+        "delay": "TransportDelay",
+        "gain": "Gain",
+        "path_filter": "PathFilter",
+    },
+}
+"""Instances, by their FMUs, of the file that the fragments of a page are part of."""
+
+UNTIL_CTRL_C = re.compile(r"fmu-mesh (top|watch (?!.*--count))")
+SOCKET = re.compile(r"unixsock-stream//run/user/\d+/fmu_mesh/\w+\.\d+/\w+\.sock")
+
+
+class PageRun:
+    """A folder that looks like a clone, in which the blocks of one page run.
+
+    Use it as a context manager: what goes on in the background is interrupted at its end, and has to end well.
+    """
+
+    def __init__(self, page: str, place: Place) -> None:
+        self._page = page
+        self._place = place
+        self._folder = place.folder
+        self._exports = ""
+        self._meanwhile: list[Launched] = []
+        self._names: dict[str, object] = {"__name__": "__main__"}
+        self._printed = io.StringIO()
+        for name in ("configs", "examples", "fmus"):
+            shutil.copytree(ROOT / name, self._folder / name)
+        (self._folder / ".venv").symlink_to(sys.prefix)
+        for block in (block for blocks in BLOCKS.values() for block in blocks if block.note == "file"):
+            (self._folder / block.detail).write_text(block.text, encoding="utf-8")
+
+    def __enter__(self) -> Self:
+        self._stdout = contextlib.redirect_stdout(self._printed)
+        self._stdout.__enter__()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *rest: object) -> None:
+        self._stdout.__exit__(None, None, None)
+        for session in (value for value in self._names.values() if isinstance(value, zenoh.Session)):
+            session.close()
+        for process in self._meanwhile:
+            if process.running:
+                process.signal(signal.SIGINT)
+            code = process.wait()
+            # The signal itself ends a program that is through with all of its own.
+            assert kind is not None or code in {0, 130, -signal.SIGINT}, process.story()
+            assert kind is not None or "Traceback" not in process.errors, process.story()
+
+    def run(self, block: Block, shown: str | None) -> None:
+        """Run a block; ``shown`` is what the page shows as its output."""
+        match block.language:
+            case "yaml":
+                self._run_yaml(block)
+            case "sh" | "console":
+                for command in block.commands(shown):
+                    self._run_command(command, in_background=block.note == "meanwhile")
+            case "python" if block.note == "needs":  # a program of its own
+                (self._folder / "program.py").write_text(block.text, encoding="utf-8")
+                self._run_command(Command("python3 program.py"), in_background=False)
+            case "python":
+                self._run_python(block, shown)
+            case "json":
+                json.loads(block.text)
+
+    def _run_yaml(self, block: Block) -> None:
+        content = yaml.safe_load(block.text)
+        if not content.keys() & {"instances", "connections", "record", "ros"}:
+            return  # a file for somebody else, such as parameters of a ROS node, which a command of the page names
+        if "mesh" not in content:
+            instances = {name: {"fmu": f"../fmus/{fmu}.fmu"} for name, fmu in WHOLE.get(self._page, {}).items()}
+            frame = {"mesh": "block", "simulation": {"stop_time": 0.1, "step_size": 0.002}}
+            content = frame | content | {"instances": instances | content.get("instances", {})}
+        file = self._folder / (block.detail if block.note == "file" else "configs/block.yaml")
+        file.write_text(yaml.safe_dump(content), encoding="utf-8")
+        for words in ("check", "launch --local --no-progress --real-time-factor 0"):
+            done = self._place.run(*words.split(), file)
+            assert done.wait() == 0, f"{block.place}\n{done.story()}"
+
+    def _run_command(self, command: Command, *, in_background: bool) -> None:
+        line = command.line.removesuffix("&").rstrip()
+        if line.startswith("export "):
+            self._exports += f"{line}\n"
+            return
+        process = self._place.start_command(["bash", "-euo", "pipefail", "-c", self._exports + line])
+        if in_background or command.line.endswith("&"):
+            self._meanwhile.append(process)
+            wait_until(lambda: process.errors or not process.running, f"something that '{line}' tells")
+            return
+        if UNTIL_CTRL_C.match(line):
+            wait_until(lambda: process.output or not process.running, f"something that '{line}' shows")
+            process.signal(signal.SIGINT)
+        code = process.wait()
+        refused = any(text.startswith("fmu-mesh: ") for text in command.output)
+        assert (code in {0, 130}) == (not refused), process.story()
+        missing = {*masked("\n".join(command.output))} - {*masked(process.output + process.errors)}
+        assert not missing, f"{missing} is not in\n{process.story()}"
+
+    def _run_python(self, block: Block, shown: str | None) -> None:
+        running = any(process.running for process in self._meanwhile)
+        code = SOCKET.sub(lambda _: self._place.note().endpoints[0], block.text)
+        before = len(self._printed.getvalue())
+        with contextlib.chdir(self._folder):
+            exec(compile(code, block.place, "exec"), self._names)  # noqa: S102 our own page
+        if shown is None:
+            return
+        if running:
+            what = f"{block.place} prints what the page shows"
+            wait_until(lambda: {*masked(shown)} <= {*masked(self._printed.getvalue()[before:])}, what)
+        else:
+            printed = self._printed.getvalue()[before:]
+            assert [line.rstrip() for line in printed.splitlines()] == shown.splitlines()
+
+
+def masked(text: str) -> list[str]:
+    """The lines of an output without what differs from run to run: numbers, and how columns are filled up."""
+    text = re.sub(r"unixsock-stream/\S+", "SOCKET", text)
+    text = re.sub(r"-?\d+(\.\d+)?(e[-+]?\d+)?\b", "#", text)
+    return [" ".join(line.split()) for line in text.splitlines() if line.strip()]
+
+
+@pytest.fixture
+def folder_of_a_clone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Place]:
+    """A place for processes where `fmu-mesh` and `python3` are ours, as in a terminal with the environment active."""
+    for name, value in environment(tmp_path).items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setenv("PATH", f"{Path(sys.executable).parent}:{os.environ['PATH']}")
+    with Place() as place:
+        yield place
+
+
+@pytest.mark.parametrize("page", [page for page, blocks in BLOCKS.items() if blocks])
+def test_the_blocks_of_a_page_run_as_they_are_shown(
+    page: str, folder_of_a_clone: Place, event_fmu: Callable[..., Path]
+) -> None:
+    blocks = [block for block in BLOCKS[page] if block.note != "not run"]
+    with PageRun(page, folder_of_a_clone) as run:
+        if page == MODEL_EXCHANGE:
+            for name in ("Ball", "Oscillator"):
+                shutil.copy(event_fmu(name, 2), folder_of_a_clone.folder / "fmus" / f"{name.lower()}.fmu")
+        for block, after in pairwise([*blocks, None]):
+            assert block is not None
+            if block.note == "needs" and importlib.util.find_spec(block.detail) is None:
+                continue
+            run.run(block, after.text if after is not None and after.language == "text" else None)
+
+
+def test_every_block_says_what_it_is_and_every_note_belongs_to_one() -> None:
+    unknown = [block.place for blocks in BLOCKS.values() for block in blocks if block.language not in LANGUAGES]
+    notes = {page: (ROOT / page).read_text(encoding="utf-8") for page in BLOCKS}
+    lost = [
+        page
+        for page, text in notes.items()
+        if len(re.findall(r"^<!-- (?:not run|needs|meanwhile|file)", text, re.MULTILINE))
+        != sum(block.note is not None for block in BLOCKS[page])
+    ]
+
+    assert unknown == []
+    assert lost == []
+
+
+def test_these_blocks_are_not_run_and_say_why() -> None:
+    not_run = [
+        (block.place.partition(":")[0], block.text.splitlines()[0].partition("  ")[0], block.detail)
+        for blocks in BLOCKS.values()
+        for block in blocks
+        if block.note == "not run"
+    ]
+
+    assert not_run == NOT_RUN
+
+
+def test_what_runs_instead_of_a_block_exists() -> None:
+    named = {name for _, _, reason in NOT_RUN for name in re.findall(r"tests/[\w/]+\.py|\.ci/\w+", reason)}
+
+    assert named
+    assert [name for name in sorted(named) if not (ROOT / name).is_file()] == []
+
+
+NOT_RUN = [
+    ("README.md", "make demo", ".ci/run runs both; this test is part of the second"),
+    (
+        "README.md",
+        "fmu-mesh master CONFIG --connect tcp/router:7447",
+        "CONFIG and router are yours; tests/faults/test_by_hand.py starts these parts",
+    ),
+    ("bridges/ros2dds/README.md", "./build", ".ci/long builds it, and tests/ros/test_bridge.py runs it"),
+    (
+        "docs/commands.md",
+        "$ fmu-mesh launch configs/pendulum_delay.yaml --real-time-factor 1 --restarts 3",
+        "somebody kills a process there; tests/faults/test_lost_processes.py does",
+    ),
+    (
+        "docs/gazebo.md",
+        "instances:",
+        "it needs Gazebo classic 11; tests/physics/test_gazebo_classic.py runs such a file",
+    ),
+    (
+        "docs/gazebo.md",
+        "make -C bridges/gazebo_classic",
+        "it needs the headers of Gazebo classic 11; .ci/long builds it",
+    ),
+    (
+        "docs/gazebo.md",
+        "sudo bridges/gazebo_classic/setup.sh /opt/gazebo_classic",
+        "it takes 15 minutes; .ci/long runs it",
+    ),
+    ("docs/performance.md", "make bench", "it takes 20 minutes, and figures of a busy machine mean nothing"),
+    (
+        "docs/ros-node.md",
+        "source /opt/ros/jazzy/setup.bash",
+        "it needs a ROS with its commands; tests/ros/test_node.py starts this node and switches it",
+    ),
+    (
+        "docs/ros-node.md",
+        "ros2 lifecycle set /fmi_adapter_node cleanup",
+        "`ros2` is not on PyPI; tests/ros/test_gateway_lifecycle.py calls these services",
+    ),
+    ("docs/ros.md", "$ ros2 topic list", "`ros2` is not on PyPI; tests/ros/test_bridge.py looks with rclpy"),
+    (
+        "docs/ros.md",
+        "$ fmu-mesh status pendulum_ros",
+        "the run takes 2 s; tests/ros/test_link.py reads this line",
+    ),
+    (
+        "docs/ros.md",
+        "$ ros2 param get /pendulum_ros gain.k",
+        "`ros2` is not on PyPI; tests/ros/test_rmw_zenoh.py calls these services",
+    ),
+    (
+        "examples/gazebo/README.md",
+        "export PYTHONPATH=$PWD/examples/gazebo",
+        "there is no package of gz-sim here; tests/equivalence/test_gazebo_example.py runs mesh_actuator.py",
+    ),
+]
+"""All blocks that are not run: page, beginning, reason."""
