@@ -2,20 +2,19 @@
 
 import sys
 
-from .errors import FmuMeshError, Interrupted
-
 
 def main() -> int:
-    """Load the command, which takes half a second, and run it; returns the exit code."""
+    """Load the command, which takes memory and half a second, and run it; returns the exit code."""
     try:
-        from .cli.limits import FEWEST_MIB, check_address_space  # noqa: PLC0415 an interrupt must find us here
+        from .cli.limits import FEWEST_MIB, address_space_problem  # noqa: PLC0415 an interrupt must find us here
 
-        check_address_space(FEWEST_MIB)
-        from .cli.main import main as command  # noqa: PLC0415 needs memory, and half a second
-    except FmuMeshError as error:
-        print(f"fmu-mesh: {error}", file=sys.stderr)
-        return error.exit_code
+        if (problem := address_space_problem(FEWEST_MIB)) is not None:
+            print(f"fmu-mesh: {problem}", file=sys.stderr)
+            return problem.exit_code
+        from .cli.main import main as command  # noqa: PLC0415 as above
     except KeyboardInterrupt:
+        from .errors import Interrupted  # noqa: PLC0415 as above
+
         print("fmu-mesh: interrupted", file=sys.stderr)
         return Interrupted.exit_code
     return command()

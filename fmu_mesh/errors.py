@@ -155,7 +155,7 @@ class Finding(msgspec.Struct, frozen=True):
 class ConfigurationError(FmuMeshError):
     """A file, an option or a command is wrong. Carries every finding, not only the first.
 
-    A single finding is the message; more of them are listed below it.
+    A single finding may be the message; others are listed below it.
     """
 
     exit_code = 2
@@ -165,7 +165,7 @@ class ConfigurationError(FmuMeshError):
         self.findings = findings
 
     def __str__(self) -> str:
-        listed = self.findings if len(self.findings) > 1 else ()
+        listed = [str(finding) for finding in self.findings if str(finding) != self.message]
         return "\n".join([super().__str__(), *(f"  - {finding}" for finding in listed)])
 
 

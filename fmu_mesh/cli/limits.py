@@ -11,7 +11,7 @@ import resource
 
 from ..errors import ConfigurationError
 
-__all__ = ["FEWEST_MIB", "check_address_space", "needed_mib", "out_of_memory"]
+__all__ = ["FEWEST_MIB", "address_space_problem", "needed_mib", "out_of_memory"]
 
 FEWEST_MIB = 300
 """What any command needs in MiB: `check` reserves 200 where it was measured (two processors), `plot` 270."""
@@ -36,18 +36,15 @@ def needed_mib(command: str, *, local: bool) -> int:
     return _SESSION_MIB
 
 
-def check_address_space(mib: int) -> None:
-    """Make sure that a process may have so much address space.
-
-    Raises:
-        ConfigurationError: it may not; says where the limit is and what to do.
-    """
+def address_space_problem(mib: int) -> ConfigurationError | None:
+    """What to say where a process may not have so much address space: where the limit is, and what to do."""
     limit = _limit()
-    if limit is not None and limit < mib << 20:
-        raise ConfigurationError(
-            f"{_limited(limit)}, and this command needs {_gigabytes(mib << 20)} of it, most of which it never uses",
-            hint=_WAY_OUT,
-        )
+    if limit is None or limit >= mib << 20:
+        return None
+    return ConfigurationError(
+        f"{_limited(limit)}, and this command needs {_gigabytes(mib << 20)} of it, most of which it never uses",
+        hint=_WAY_OUT,
+    )
 
 
 def out_of_memory(error: BaseException) -> ConfigurationError | None:

@@ -14,7 +14,7 @@ from ..errors import ConfigurationError, FmuMeshError, Interrupted
 from ..model.findings import nearest
 from . import checking, free_running, inspecting, looking, playing, plotting, running, top
 from .arguments import CommandParser
-from .limits import check_address_space, needed_mib, out_of_memory
+from .limits import address_space_problem, needed_mib, out_of_memory
 
 __all__ = ["command_parser", "main"]
 
@@ -51,7 +51,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _run(options: argparse.Namespace) -> int:
     """Run the command; where there was no memory, that is a problem of this host, and no internal one."""
     _start_logging(os.environ.get("FMU_MESH_LOG") or "WARNING")
-    check_address_space(needed_mib(options.command, local=getattr(options, "local", False)))
+    if (lack := address_space_problem(needed_mib(options.command, local=getattr(options, "local", False)))) is not None:
+        raise lack
     run: Command = options.run_command
     try:
         return run(options)

@@ -11,7 +11,7 @@ from pathlib import Path
 import msgspec
 
 from .. import files
-from ..errors import ConfigurationError, Finding, LoadFailed
+from ..errors import ConfigurationError, LoadFailed
 from ..fmu import FmuInstance, LogMessage, Terms, compile_sources, content_of, read_description
 from ..fmu import open_instance as open_fmu
 from ..fmu import stepped as stepped_fmu
@@ -30,7 +30,7 @@ from ..hosts import (
 )
 from ..model.config import AnyInstanceConfig, GazeboClassicConfig, MujocoConfig, PidConfig
 from ..model.description import ModelDescription
-from ..model.findings import listed
+from ..model.findings import Findings, listed
 from ..model.instance import Instance
 from ..model.plan import InstancePlan
 from ..model.system import System
@@ -170,8 +170,10 @@ def check_engines(system: System, file: str) -> None:
             check_gazebo_classic()
     except LoadFailed as error:
         expected = f"an engine that runs here, or the `host` of the instance. {error.hint}"
-        findings = (Finding(file, f"instances.{name}.gazebo_classic", error.message, expected) for name in here)
-        raise ConfigurationError(f"{file}: an engine is missing on this host", findings=tuple(findings)) from error
+        findings = Findings(file)
+        for name in here:
+            findings.add(f"instances.{name}.gazebo_classic", error.message, expected)
+        findings.raise_any()
 
 
 def check_showing(system: System, showing: Showing) -> None:

@@ -40,6 +40,7 @@ class Follower(Generic[Item]):
         self._session = session
         self._keys = keys
         self._stack = ExitStack()
+        self._over = False
         self.arrived: queue.SimpleQueue[Item | None] = queue.SimpleQueue()
         self.there = threading.Event()
 
@@ -79,7 +80,8 @@ class Follower(Generic[Item]):
             raise DeadlineExceeded(f"mesh '{self._keys.mesh}' says nothing more in time") from None
 
     def _token_changed(self, sample: zenoh.Sample) -> None:
-        if sample.kind == zenoh.SampleKind.PUT and not self.there.is_set():
-            self.there.set()
+        if sample.kind == zenoh.SampleKind.PUT and not self._over:
+            self.there.set()  # Zenoh may say so twice, as where somebody else of this session asks for tokens
         else:
+            self._over = True
             self.arrived.put(None)

@@ -35,14 +35,15 @@ def rest(client: MeshClient, command: Command) -> CommandAnswer:
         MeshLost: it ends or is resumed before, or does not rest in time.
         FmuMeshError: it has failed before.
     """
-    answer = client.command(command)
     mesh, what, last = client.keys.mesh, "come to rest", None
-    with client.statuses() as statuses:
+    with client.statuses() as statuses:  # from before the command, so that the last one of a short run is not missed
+        answer, holds = client.command(command), False
         try:
             for last in statuses:
-                if last.state != "paused":
+                holds = holds or last.state == "paused"
+                if last.state in ("stopping", "done", "failed") or (holds and last.state != "paused"):
                     raise _ended(last, what)
-                if answer.hold is None or last.point >= answer.hold:
+                if holds and (answer.hold is None or last.point >= answer.hold):
                     return replace(answer, point=last.point)
         except DeadlineExceeded:
             at = (last or answer).point

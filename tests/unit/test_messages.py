@@ -138,4 +138,4 @@ def test_a_run_says_what_an_fmu_says_under_another_name(tmp_path: Path, capsys: 
 
     said = capsys.readouterr().err
     assert f"the FMU says: {SAYS}" in said
-    assert f"stairs at point 0: {SAYS}" in said
+    assert said.count(SAYS) == 1
