@@ -23,7 +23,7 @@ from .following import Follower
 from .keys import Keys
 from .messages import decode_json
 from .readings import Keeper, Reading, Target, reading_of
-from .session import matches, reason_of, tokens
+from .session import matches, reason_of
 from .values import json_encoding
 from .views import (
     Command,
@@ -201,10 +201,6 @@ class MeshClient:
         """
         timeout_s = timeout_s if timeout_s is not None else self._timeout_s
         deadline = time.monotonic() + timeout_s
-        # Asked before the follower is there: the answer would reach that one as a second token.
-        if not tokens(self._session, self.keys.master):
-            yield iter(())
-            return
         with Follower[MeshStatus](self._session, self.keys) as follower:
 
             def take(sample: zenoh.Sample) -> None:
@@ -212,7 +208,8 @@ class MeshClient:
                     follower.arrived.put(decode_json(sample.payload.to_bytes(), MeshStatus))
 
             follower.subscribe(self.keys.mesh_key("status"), take)
-            yield follower.to_the_last(deadline) if follower.there.wait(timeout_s) else iter(())
+            there = follower.there.wait(min(timeout_s, self._timeout_s))
+            yield follower.to_the_last(deadline) if there else iter(())
 
     @contextmanager
     def watch(self, targets: Sequence[Target]) -> Iterator[Iterator[Reading]]:

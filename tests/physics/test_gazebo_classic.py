@@ -79,10 +79,17 @@ def test_a_pendulum_that_the_engine_damps_is_that_with_the_damper_fmu_in_every_f
 
 
 @pytest.mark.parametrize(
-    ("engine", "apart"), [("ode", "0.00e+00"), ("bullet", "0.00e+00"), ("simbody", "3.46e-04"), ("dart", "1.39e-03")]
+    ("engine", "apart"),
+    [
+        ("ode", 0.0),
+        ("bullet", 0.0),
+        ("simbody", pytest.approx(3.46e-4, abs=0.005e-4)),  # the digits that the page shows
+        # Gazebo 11 with DART does not compute the same each time: 1.39e-3 in 18 of 20 runs, 1.37e-3 and 1.43e-3 in the others.
+        ("dart", pytest.approx(1.39e-3, abs=0.1e-3)),
+    ],
 )
 def test_the_pendulums_of_each_engine_are_as_far_apart_as_the_pages_say(
-    engine: str, apart: str, tmp_path: Path
+    engine: str, apart: float, tmp_path: Path
 ) -> None:
     config = with_gazebo("damped_pendulum", tmp_path)
     world = (CONFIGS / "worlds" / "damped_pendulum.sdf").read_text(encoding="utf-8")
@@ -95,7 +102,7 @@ def test_the_pendulums_of_each_engine_are_as_far_apart_as_the_pages_say(
     result = columns(config, tmp_path / "gazebo.csv")
 
     difference = np.abs(result["world.engine.position"] - result["world.fmu.position"]).max()
-    assert f"{difference:.2e}" == apart
+    assert difference == apart
 
 
 def test_a_cube_is_braked_by_the_drag_and_a_free_one_is_not(tmp_path: Path) -> None:
