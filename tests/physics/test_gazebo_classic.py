@@ -84,7 +84,7 @@ def test_a_pendulum_that_the_engine_damps_is_that_with_the_damper_fmu_in_every_f
         ("ode", 0.0),
         ("bullet", 0.0),
         ("simbody", pytest.approx(3.46e-4, abs=0.005e-4)),  # the digits that the page shows
-        # Gazebo 11 with DART does not compute the same each time: 1.39e-3 in 18 of 20 runs, 1.37e-3 and 1.43e-3 in the others.
+        # Gazebo 11 with DART is not the same each time: 1.39e-3 in 18 of 20 runs, 1.37e-3 and 1.43e-3 in the others.
         ("dart", pytest.approx(1.39e-3, abs=0.1e-3)),
     ],
 )
