@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import csv
-import fcntl
 import signal
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+import psutil
 import pytest
 
 from fmus.build import build
@@ -32,15 +32,16 @@ def kept_bytes(file: Path) -> bytes | None:
     return file.read_bytes() if file.exists() else None
 
 
-def is_held(file: Path) -> bool:
-    """Whether a run has this result file, or the name that it has until its first point."""
-    for path in (file, file.with_name(f"{file.name}.starting")):
-        if path.exists():
-            with path.open("rb") as opened:
-                try:
-                    fcntl.flock(opened, fcntl.LOCK_SH | fcntl.LOCK_NB)
-                except BlockingIOError:
-                    return True
+def is_held(place: Place, file: Path) -> bool:
+    """Whether a run has this result file open to write, or the name that it has until its first point.
+
+    Its lock is not tried: who tries it holds it for a moment, and the run would be refused.
+    """
+    names = {str(file), f"{file}.starting"}
+    for process in place.processes():
+        with suppress(psutil.Error):
+            if any(opened.path in names and opened.mode != "r" for opened in process.open_files()):
+                return True
     return False
 
 
@@ -57,7 +58,7 @@ def hanging(place: Place, hostile: Path, *options: str, older: str | None) -> tu
     if older is not None:
         result.write_text(older)
     launched = place.start("launch", config, *options)
-    wait_until(lambda: is_held(result), "the result file to be opened")
+    wait_until(lambda: is_held(place, result), "the result file to be opened")
     return launched, result
 
 
