@@ -20,7 +20,7 @@ from ..model.findings import listed, nearest
 from .client import MeshClient, is_key, key_expression
 from .keys import Keys
 from .runtime import meshes
-from .session import Wiring, close_session, open_session
+from .session import Wiring, close_session, open_session, tokens
 
 __all__ = ["Meshes"]
 
@@ -28,6 +28,7 @@ Answer = TypeVar("Answer")
 
 _GRACE_S = 1.0
 _LOOK_S = 0.05
+_AGAIN_S = 1.0
 _TOKENS = "**/mesh"
 _NOBODY = "nobody answered"
 
@@ -86,14 +87,15 @@ class Meshes:
         changed = threading.Event()
 
         def wait(left_s: float) -> None:
-            changed.wait(left_s if self._endpoints else min(left_s, _LOOK_S))  # nobody tells of a note
+            # Nobody tells of a note; of a token somebody does, but an answer about it may still have been empty.
+            changed.wait(min(left_s, _AGAIN_S if self._endpoints else _LOOK_S))
             changed.clear()
 
         with ExitStack() as stack:
             if self._endpoints:
                 liveliness = self._open(self._endpoints, _NOBODY).session().liveliness()
-                tokens = liveliness.declare_subscriber(_TOKENS, lambda _token: changed.set(), history=True)
-                stack.callback(tokens.undeclare)
+                watcher = liveliness.declare_subscriber(_TOKENS, lambda _token: changed.set(), history=True)
+                stack.callback(watcher.undeclare)
             yield wait
 
     def appeared(self, mesh: str | None) -> MeshClient | None:
@@ -217,11 +219,10 @@ class Meshes:
     def _shown(self) -> Iterator[_Found]:
         """Every mesh whose master shows at the endpoints."""
         opening = self._open(self._endpoints, _NOBODY)
-        for reply in opening.session().liveliness().get(_TOKENS, timeout=self._timeout_s):
-            if reply.ok is not None:
-                *prefix, mesh, _ = str(reply.ok.key_expr).split("/")
-                if prefix:  # otherwise it is a token of something else
-                    yield _Found(Keys("/".join(prefix), mesh), self._endpoints, opening)
+        for key in tokens(opening.session(), _TOKENS, self._timeout_s):
+            *prefix, mesh, _ = key.split("/")
+            if prefix:  # otherwise it is a token of something else
+                yield _Found(Keys("/".join(prefix), mesh), self._endpoints, opening)
 
     def _open(self, endpoints: tuple[str, ...], else_: str) -> _Opening:
         """The session with these endpoints; there is one, however often it is asked for."""

@@ -168,7 +168,7 @@ def matches(entity: zenoh.Publisher | zenoh.Querier) -> bool:
     return bool(entity.matching_status.matching)  # type: ignore[attr-defined]  # the stub is wrong
 
 
-def tokens(session: zenoh.Session, key: str) -> list[str]:
+def tokens(session: zenoh.Session, key: str, timeout_s: float = _TOKENS_S) -> list[str]:
     """The keys of the liveliness tokens that match ``key``; for a thread that may wait, and no callback of Zenoh.
 
     A subscriber is told that a token is gone although another session still holds one with this key; this is the truth.
@@ -176,7 +176,7 @@ def tokens(session: zenoh.Session, key: str) -> list[str]:
     an empty answer now and then (1 of 30 with zenoh 1.10.2, 1 of 4 while the subscriber is new).
     """
     for _ in range(_TOKENS_TRIES):
-        replies = session.liveliness().get(key, timeout=_TOKENS_S)
+        replies = session.liveliness().get(key, timeout=timeout_s)
         if found := [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]:
             return found
     return []
