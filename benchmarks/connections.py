@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from benchmarks.contestants.entry import FMUS
-from fmu_mesh.launch.preparing import prepare
+from fmu_mesh.run.preparing import prepare
 
 __all__ = ["measured"]
 

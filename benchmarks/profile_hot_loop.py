@@ -20,18 +20,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
-import fmu_mesh.launch.roles as roles_module
 import fmu_mesh.node.node as node_module
+import fmu_mesh.run.roles as roles_module
 from benchmarks.contestants.fmu_mesh_launch import configuration
 from benchmarks.environment import ROOT, loads
 from benchmarks.jobs import JOBS, OURS
 from benchmarks.task import Task
 from fmu_mesh.cli.main import main as fmu_mesh_main
-from fmu_mesh.fmu import Fmi2Instance
-from fmu_mesh.model.plan import Link
-from fmu_mesh.model.ring import Ring
+from fmu_mesh.instances.fmi import Fmi2Instance
 from fmu_mesh.node.links import OutLink
 from fmu_mesh.node.node import Node
+from fmu_mesh.rings.ring import Ring
+from fmu_mesh.system.plan import Link
 from fmu_mesh.wire.inbox import Inbox, Message
 
 __all__: list[str] = []

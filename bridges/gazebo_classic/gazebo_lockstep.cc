@@ -3,7 +3,7 @@
 // Gazebo classic 11 in lock-step with the program at the other end of its standard input and output.
 //
 // Owns the engine: one world, stepped when it is told to and never otherwise. It knows nothing of the mesh; what the
-// numbers mean there is fmu_mesh/hosts/gazebo_classic.py. All is text, one command or answer per line, and numbers have
+// numbers mean there is fmu_mesh/instances/gazebo/gazebo_classic.py. All is text, one command or answer per line, and numbers have
 // 17 digits, so that they arrive as they were sent:
 //
 //   > world <bytes>                         and then so many bytes of SDF

@@ -21,13 +21,13 @@ from types import TracebackType
 from typing import Any, Literal, Self
 
 from ..errors import FmuError
-from ..fmu import FmuInstance, LogMessage, open_instance, read_description
-from ..fmu.guard import floating_point_changed, kept_state, restore_floating_point
-from ..model.description import ModelDescription, Value
-from ..model.start_values import forbidden
-from ..model.trajectory import Trajectory
-from ..model.types import is_float
-from .arguments import Arguments
+from ..instances.call_guard import floating_point_changed, kept_state, restore_floating_point
+from ..instances.fmi import FmuInstance, LogMessage, open_instance, read_description
+from ..instances.input_trajectory import Trajectory
+from ..system.start_values import forbidden
+from ..variables.model_description import ModelDescription, Value
+from ..variables.value_types import is_float
+from .argument_checks import Arguments
 from .times import Clock, Instant, RosTime, SecondsClock, Time, clock_from
 
 __all__ = ["FMIAdapter"]

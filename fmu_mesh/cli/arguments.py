@@ -14,10 +14,10 @@ from pathlib import Path
 from typing import Any, Literal, NoReturn
 
 from .. import files
+from ..config.base import ENDPOINT_PATTERN
+from ..config.findings import listed, nearest, nearest_file
+from ..config.mesh import MAX_WINDOW
 from ..errors import ConfigurationError, LoadFailed
-from ..model.config import MAX_WINDOW
-from ..model.config_base import ENDPOINT_PATTERN
-from ..model.findings import listed, nearest, nearest_file
 
 __all__ = ["CommandParser", "add_command", "add_window", "count", "endpoint", "no_fmu", "number", "positive_seconds"]
 

@@ -7,18 +7,18 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from ..launch.opening import check_engines
-from ..launch.preparing import Options, prepare
-from ..model.description import Variable
-from ..model.findings import listed, shown
-from ..model.grouping import automatic_nodes
-from ..model.initialization import Loop
-from ..model.plan import Plan
-from ..model.schema import schema_text
-from ..model.system import Connection, SystemInstance
+from ..config.findings import listed, shown
+from ..config.schema import schema_text
+from ..instances.registry import check_engines
+from ..run.preparing import Options, prepare
+from ..system.grouping import automatic_nodes
+from ..system.initialization_plan import Loop
+from ..system.plan import Plan
+from ..system.system import Connection, SystemInstance
+from ..variables.model_description import Variable
 from .arguments import add_command, add_window
-from .display import say
-from .tables import pairs, table
+from .output.display import say
+from .output.tables import pairs, table
 
 __all__ = ["add_commands", "plan_page"]
 

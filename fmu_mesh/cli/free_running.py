@@ -14,17 +14,17 @@ from typing import Any
 import msgspec
 from msgspec.structs import replace
 
+from ..config.base import NAME_PATTERN
+from ..config.loading import LoadedConfig, parse
 from ..errors import ConfigurationError, LoadFailed
-from ..fmu import read_description
-from ..launch.launcher import Launcher
-from ..launch.preparing import Options, planned
-from ..model.config_base import NAME_PATTERN
-from ..model.description import ModelDescription
-from ..model.loading import LoadedConfig, parse
-from ..model.plan import Plan
+from ..instances.fmi import read_description
+from ..run.launcher import Launcher
+from ..run.preparing import Options, planned
+from ..system.plan import Plan
+from ..variables.model_description import ModelDescription
 from ..wire.runtime import remove_run_folder, run_folder
 from .arguments import add_command, endpoint, no_fmu, number
-from .display import Display, warn
+from .output.display import Display, warn
 from .running import close, run_launcher
 
 __all__ = ["add_commands"]

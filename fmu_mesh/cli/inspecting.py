@@ -14,12 +14,12 @@ from typing import Any, Final
 
 import msgspec
 
+from ..config.findings import nearest, shown
 from ..errors import ConfigurationError, LoadFailed
-from ..fmu import read_description, sha256_of
-from ..model.description import Causality, Kind, ModelDescription, Variable
-from ..model.findings import nearest, shown
+from ..instances.fmi import read_description, sha256_of
+from ..variables.model_description import Causality, Kind, ModelDescription, Variable
 from .arguments import add_command, no_fmu
-from .tables import pairs
+from .output.tables import pairs
 
 __all__ = ["Inspection", "add_commands", "inspect_fmu", "inspection_page"]
 

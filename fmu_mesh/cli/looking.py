@@ -1,6 +1,6 @@
 """`ls`, `status`, `info`, `get`, `set`, `watch`, `wait`, `pause`, `resume`, `step` and `stop`: looking into a mesh.
 
-Owns what these commands print; what they ask is `fmu_mesh.wire.client`.
+Owns what these commands print; what they ask is `fmu_mesh.wire.client.mesh_client`.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from typing import Any, get_args
 import msgspec
 
 from ..errors import ConfigurationError, FmuMeshError, Interrupted
-from ..wire.client import MeshClient
-from ..wire.reaching import Meshes
-from ..wire.readings import Target
+from ..wire.client.mesh_client import MeshClient
+from ..wire.client.reaching import Meshes
+from ..wire.client.readings import Target
+from ..wire.client.waiting import rest, wait_for
 from ..wire.views import Command, InstanceInfo, InstanceStatus, MeshInfo, MeshState, MeshStatus, RosView
-from ..wire.waiting import rest, wait_for
 from .arguments import add_command, count, endpoint, positive_seconds
-from .pages import (
+from .output.pages import (
     cells,
     instance_info,
     instance_status,
@@ -33,7 +33,7 @@ from .pages import (
     seconds,
     variables,
 )
-from .tables import table
+from .output.tables import table
 
 __all__ = ["add_commands", "reaching"]
 

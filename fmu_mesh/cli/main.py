@@ -10,9 +10,9 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
 from .. import __version__
+from ..config.findings import nearest
 from ..errors import ConfigurationError, FmuMeshError, Interrupted
-from ..model.findings import nearest
-from . import checking, free_running, inspecting, looking, playing, plotting, running, top
+from . import checking, free_running, inspecting, looking, play, plotting, running, top
 from .arguments import CommandParser
 from .limits import address_space_problem, needed_mib, out_of_memory
 
@@ -111,6 +111,6 @@ def command_parser() -> tuple[CommandParser, Mapping[str, CommandParser]]:
     common.add_argument("--debug", action="store_true", help="show the traceback of an error")
     parser.set_defaults(debug=False)
     commands: argparse._SubParsersAction[CommandParser] = parser.add_subparsers(dest="command", metavar="COMMAND")
-    for module in (running, free_running, checking, inspecting, looking, top, playing, plotting):
+    for module in (running, free_running, checking, inspecting, looking, top, play, plotting):
         module.add_commands(commands, common)
     return parser, commands.choices

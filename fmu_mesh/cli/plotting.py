@@ -14,14 +14,14 @@ from typing import Any, TextIO
 
 import numpy as np
 
+from ..config.findings import listed, nearest, nearest_file
 from ..errors import ConfigurationError, FmuMeshError
-from ..model.description import Variable
-from ..model.findings import listed, nearest, nearest_file
-from ..model.plan import Plan
-from ..model.system import System
-from ..model.types import is_float
+from ..system.plan import Plan
+from ..system.system import System
+from ..variables.model_description import Variable
+from ..variables.value_types import is_float
 from .arguments import add_command
-from .drawing import FLAGS, VALUE, Curve, Results, draw
+from .output.drawing import FLAGS, VALUE, Curve, Results, draw
 
 __all__ = ["add_commands", "check_plot", "plot_results", "plotted_where_it_ends", "read_results"]
 

@@ -12,26 +12,26 @@ from types import FrameType
 from typing import Any
 
 from ..errors import ConfigurationError, FmuError, FmuMeshError, MeshLost
-from ..fmu import LogMessage
-from ..hosts import check_film, check_window
-from ..launch.events import End, Event, EventWriter, Ready
-from ..launch.gateway import run_gateway
-from ..launch.launcher import Launcher
-from ..launch.local import LocalMesh
-from ..launch.opening import Showing
-from ..launch.preparing import Options, prepare
-from ..launch.process import ended_by_signals
-from ..launch.results import result_opener
-from ..launch.roles import BY_HAND, run_master, run_node
-from ..model.plan import Plan
-from ..wire.profile import MeshProfile
+from ..instances.fmi import LogMessage
+from ..instances.mujoco import check_film, check_window
+from ..instances.registry import Showing
+from ..run.events import End, Event, EventWriter, Ready
+from ..run.gateway_role import run_gateway
+from ..run.launcher import Launcher
+from ..run.local import LocalMesh
+from ..run.preparing import Options, prepare
+from ..run.process import ended_by_signals
+from ..run.results import result_opener
+from ..run.roles import BY_HAND, run_master, run_node
+from ..system.plan import Plan
 from ..wire.router import run_router
 from ..wire.runtime import enter_run_folder, fmu_folder, leave_run_folder, remove_stale_folders, run_folder
+from ..wire.time_profile import MeshProfile
 from ..wire.views import LogLine
 from .arguments import add_command, add_window, count, endpoint, number
-from .display import Display, say, stdout_as_stderr, summary, warn
+from .output.display import Display, say, stdout_as_stderr, summary, warn
+from .output.profile_table import add_profile, show_profile
 from .plotting import check_plot, plot_results, plotted_where_it_ends
-from .profiling import add_profile, show_profile
 
 __all__ = ["add_commands", "close", "run_launcher"]
 

@@ -15,14 +15,14 @@ from typing import Any, Final
 import msgspec
 
 from ..errors import DeadlineExceeded, Interrupted
-from ..wire.client import MeshClient
-from ..wire.reaching import Meshes
+from ..wire.client.mesh_client import MeshClient
+from ..wire.client.reaching import Meshes
 from ..wire.views import InstanceStatus, MeshStatus
 from .arguments import add_command, positive_seconds
 from .looking import reaching
-from .pages import progress, seconds
-from .screen import Screen
-from .tables import shortened, table, width_of
+from .output.pages import progress, seconds
+from .output.screen import Screen
+from .output.tables import shortened, table, width_of
 
 __all__ = ["add_commands", "page"]
 

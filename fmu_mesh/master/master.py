@@ -33,21 +33,21 @@ from ..errors import (
     TerminationRequested,
     from_report,
 )
-from ..model.plan import RECORDER, Plan
+from ..system.plan import RECORDER, Plan
 from ..wire.inbox import Inbox
 from ..wire.keys import MASTER, Keys, RunKeys
 from ..wire.messages import FINISH, GRANT, PROGRESS, NodeReport, decode_json
-from ..wire.profile import TIME_LINE_ENTRIES, MeshProfile
 from ..wire.refusals import payload_of
 from ..wire.session import RouterLink, tokens
 from ..wire.shared_memory import SharedInbox, available
+from ..wire.time_profile import TIME_LINE_ENTRIES, MeshProfile
 from ..wire.values import json_encoding
 from ..wire.views import GOING_ON, Command, CommandAnswer, MeshInfo, MeshState, MeshStatus
 from .followers import Followers
+from .grant_watch import CLOCK, PAUSE, GrantWatch
 from .members import Members, spoken
+from .mesh_server import STATUS_S, Events, Server, mesh_info
 from .pacing import Clock, Pacer, Reach
-from .profiling import CLOCK, PAUSE, GrantWatch
-from .serving import STATUS_S, Events, Server, mesh_info
 
 __all__ = ["Master"]
 

@@ -12,8 +12,8 @@ import msgspec
 import zenoh
 
 from ..errors import DeadlineExceeded, FmuMeshError, MessageRefused
-from ..model.digest import difference
-from ..model.plan import RECORDER, Plan
+from ..system.digest import difference
+from ..system.plan import RECORDER, Plan
 from ..wire.inbox import Inbox
 from ..wire.keys import MASTER, RunKeys, batched
 from ..wire.membership import Admission, Ready, Registration, Welcome

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 import time
 
-from ..model.plan import Plan
-from ..model.window import STEADY_POINTS
+from ..system.plan import Plan
+from ..system.window import STEADY_POINTS
 
 __all__ = ["Clock", "Pacer", "Reach"]
 

@@ -10,7 +10,7 @@ import time
 from collections.abc import Mapping
 
 from ..errors import FmuMeshError, StepFailed
-from ..model.plan import NodePlan
+from ..system.plan import NodePlan
 from ..wire.refusals import Refusals
 from ..wire.views import InstanceStatus
 from .stepping import Runner, Unit
@@ -86,7 +86,7 @@ class Activity:
 
         The burst that it belongs to is ended, and what came before it is sent if it takes longer than from one look to
         the next: others may wait for that, and it shall not be lost with this process. Other calls of an FMU are
-        watched by `fmu_mesh.fmu.guard.CallWatch`.
+        watched by `fmu_mesh.instances.call_guard.CallWatch`.
         """
         if (unit := self.advancing) is None or self.state != "running":
             self._under_way = None

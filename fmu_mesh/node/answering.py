@@ -13,8 +13,8 @@ from functools import partial
 import msgspec
 import zenoh
 
-from ..model.description import Value, Variable
-from ..model.plan import NodePlan
+from ..system.plan import NodePlan
+from ..variables.model_description import Value, Variable
 from ..wire.inbox import Inbox
 from ..wire.keys import Keys
 from ..wire.values import ValueRefused, attachment, encode_value, json_encoding

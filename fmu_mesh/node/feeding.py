@@ -8,8 +8,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from functools import partial
 
-from ..model.plan import NodePlan
-from ..model.transfer import Transfer
+from ..rings.transfer import Transfer
+from ..system.plan import NodePlan
 from ..wire.frames import FrameReceiver
 from .stepping import LocalFeed, RemoteFeed, Runner
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import os
 import socket
 
-from ..model.plan import NodePlan
-from ..model.values import to_plain
+from ..system.plan import NodePlan
+from ..variables.value_conversion import to_plain
 from ..wire.keys import escape
 from ..wire.views import ConnectionView, InstanceInfo, VariableView
 from .stepping import Runner

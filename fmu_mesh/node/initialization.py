@@ -10,12 +10,12 @@ import time
 from collections.abc import Callable, Collection, Sequence
 
 from ..errors import DeadlineExceeded
-from ..model.elements import element_of, merged, scaled
-from ..model.fixed_point import FixedPoint
-from ..model.initialization import Loop
-from ..model.plan import Link, NodePlan
-from ..model.ring import Column
-from ..model.types import Value, split_element
+from ..rings.array_elements import element_of, merged, scaled
+from ..rings.ring import Column
+from ..system.algebraic_loop import FixedPoint
+from ..system.initialization_plan import Loop
+from ..system.plan import Link, NodePlan
+from ..variables.value_types import Value, split_element
 from ..wire.frames import initial_values, needed_levels
 from .links import OutLink
 from .stepping import Runner

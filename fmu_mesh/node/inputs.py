@@ -10,13 +10,13 @@ import math
 from collections.abc import Sequence
 from typing import Literal
 
-from ..model.description import Value
-from ..model.instance import Instance
-from ..model.ring import Ring
-from ..model.trajectory import Trajectory
-from ..model.types import is_float
-from ..model.wrapping import AroundInstance
+from ..instances.contract import Instance
+from ..instances.input_trajectory import Trajectory
+from ..instances.instance_wrapper import AroundInstance
+from ..rings.ring import Ring
 from ..simtime import ENDLESS, TimeGrid
+from ..variables.model_description import Value
+from ..variables.value_types import is_float
 from ..wire.values import ValueRefused
 from .stepping import Runner
 

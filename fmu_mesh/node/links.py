@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 from ..errors import FmuMeshError
-from ..model.plan import RECORDER, Link
-from ..model.ring import Layout, Ring
-from ..model.types import Value
-from ..model.window import lazy_frame_rows
+from ..rings.ring import Layout, Ring
+from ..system.plan import RECORDER, Link
+from ..system.window import lazy_frame_rows
+from ..variables.value_types import Value
 from ..wire.messages import FRAME, HEADER, INITIAL, LAST
 from ..wire.rows import encode_frames, encode_rows
 

@@ -11,7 +11,7 @@ One step of a node, in pseudocode::
             send all frames, tell the master the progress, wait for the next message
 
 Owns the life of the process between `ready` and `done`. The FMUs are only called here, on the main thread; queries are
-served by `fmu_mesh.node.serving` from snapshots.
+served by `fmu_mesh.node.node_server` from snapshots.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ from ..errors import (
     TerminationRequested,
     from_report,
 )
-from ..model.instance import Instance
-from ..model.plan import NodePlan
+from ..instances.contract import Instance
+from ..system.plan import NodePlan
 from ..wire.frames import FrameReceiver
 from ..wire.inbox import Inbox, Message
 from ..wire.keys import MASTER
@@ -58,10 +58,10 @@ from .feeding import connect_feeds
 from .initialization import Initialization
 from .inputs import TimedInputs
 from .links import OutLink
-from .profiling import Profiler
-from .serving import Server
+from .node_server import Server
 from .stepping import LAZY_S, RemoteFeed, Runner, Unit
 from .streams import PRIORITY
+from .time_measurement import Profiler
 
 __all__ = ["Node"]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import msgspec
 
-from ..model.description import Value
+from ..variables.model_description import Value
 from ..wire.keys import unescape
 from ..wire.values import ValueRefused, decode_time, decode_value
 from .stepping import Runner

@@ -10,13 +10,13 @@ from collections.abc import Callable, Iterator, Sequence
 from threading import Lock
 from time import perf_counter
 
-from ..fmu.guard import DEFAULT_MODE, floating_point_changed, restore_floating_point
-from ..model.elements import fill_unconnected
-from ..model.instance import Instance
-from ..model.plan import InstancePlan
-from ..model.ring import Layout, Ring
-from ..model.transfer import Transfer
+from ..instances.call_guard import DEFAULT_MODE, floating_point_changed, restore_floating_point
+from ..instances.contract import Instance
+from ..rings.array_elements import fill_unconnected
+from ..rings.ring import Layout, Ring
+from ..rings.transfer import Transfer
 from ..simtime import TimeGrid
+from ..system.plan import InstancePlan
 from ..wire.frames import FrameReceiver
 from .links import OutLink
 

@@ -13,8 +13,8 @@ import numpy as np
 import zenoh
 from numpy.typing import NDArray
 
-from ..model.description import Variable
 from ..simtime import TimeGrid
+from ..variables.model_description import Variable
 from ..wire.keys import Keys, VariableKind
 from ..wire.session import matches, undeclare_all
 from ..wire.values import attachment, encode_value, json_encoding

@@ -8,9 +8,9 @@ from typing import Any
 from numpy.typing import NDArray
 
 from ..errors import FrameGap, MessageRefused, ProtocolBroken
-from ..model.plan import Link
-from ..model.ring import Ring, Rows
-from ..model.types import Value
+from ..rings.ring import Ring, Rows
+from ..system.plan import Link
+from ..variables.value_types import Value
 from .rows import decode_rows
 
 __all__ = ["FrameReceiver", "initial_values", "needed_levels"]

@@ -22,8 +22,8 @@ import msgspec
 import zenoh
 
 from ..errors import DeadlineExceeded, FmuMeshError, MeshLost, MessageRefused
-from ..model.plan import NodePlan
-from ..model.window import FRAME_OVERHEAD
+from ..system.plan import NodePlan
+from ..system.window import FRAME_OVERHEAD
 from .inbox import Inbox
 from .keys import MASTER, RUN_ID_BYTES, Keys, RunKeys
 from .messages import NodeReport, decode_json

@@ -14,7 +14,7 @@ from typing import Final, TypeVar
 import msgspec
 
 from ..errors import ErrorReport, MessageRefused
-from .profile import NodeProfile
+from .time_profile import NodeProfile
 
 __all__ = [
     "ABORT",

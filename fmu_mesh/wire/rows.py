@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FmuMeshError, MessageRefused
-from ..model.ring import Part, Rows
-from ..model.types import DTYPES, VariableType, is_text
+from ..rings.ring import Part, Rows
+from ..variables.value_types import DTYPES, VariableType, is_text
 from .messages import HEADER, MAX_MESSAGE_SIZE
 
 __all__ = ["decode_rows", "encode_frames", "encode_rows"]

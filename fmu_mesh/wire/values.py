@@ -9,9 +9,9 @@ import msgspec
 import zenoh
 
 from ..errors import MessageRefused
-from ..model.description import Value, Variable
-from ..model.values import MAX_TEXT_SIZE, ValueRefused, to_plain, to_value
 from ..simtime import ENDLESS
+from ..variables.model_description import Value, Variable
+from ..variables.value_conversion import MAX_TEXT_SIZE, ValueRefused, to_plain, to_value
 from .messages import decode_json
 
 __all__ = [

@@ -7,8 +7,8 @@ from typing import Annotated, Literal
 import msgspec
 
 from ..errors import ErrorReport
-from ..model.description import Clock, DefaultExperiment, PlainValue
 from ..simtime import ENDLESS
+from ..variables.model_description import Clock, DefaultExperiment, PlainValue
 
 __all__ = [
     "GOING_ON",

@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 import yaml
 
-from fmu_mesh.launch.local import LocalMesh
-from fmu_mesh.launch.preparing import Options, prepare
+from fmu_mesh.run.local import LocalMesh
+from fmu_mesh.run.preparing import Options, prepare
 from tests.equivalence.reference import Reference, as_bits, read_csv, reference_of, run_fmpy
 from tests.helpers import FMUS, Place
 

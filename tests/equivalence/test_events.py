@@ -13,8 +13,8 @@ from typing import Any
 import pytest
 import yaml
 
-from fmu_mesh.launch.local import LocalMesh
-from fmu_mesh.launch.preparing import Options, prepare
+from fmu_mesh.run.local import LocalMesh
+from fmu_mesh.run.preparing import Options, prepare
 from tests.fmus.event_fmus import Version
 from tests.helpers import Place
 

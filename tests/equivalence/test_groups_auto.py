@@ -10,11 +10,11 @@ import pytest
 from msgspec.structs import replace
 
 from fmu_mesh.cli.checking import plan_page
-from fmu_mesh.launch.preparing import prepare
-from fmu_mesh.model.description import ModelDescription
-from fmu_mesh.model.grouping import automatic_nodes
-from fmu_mesh.model.loading import load
-from fmu_mesh.model.plan import RECORDER, Plan
+from fmu_mesh.config.loading import load
+from fmu_mesh.run.preparing import prepare
+from fmu_mesh.system.grouping import automatic_nodes
+from fmu_mesh.system.plan import RECORDER, Plan
+from fmu_mesh.variables.model_description import ModelDescription
 from tests.helpers import Place, rows_of, write_config
 
 ADDER = {"fmu": "Adder"}

@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from fmu_mesh.errors import LoopNotConverged
-from fmu_mesh.launch.local import LocalMesh
-from fmu_mesh.launch.preparing import prepare
+from fmu_mesh.run.local import LocalMesh
+from fmu_mesh.run.preparing import prepare
 from tests.helpers import Place, rows_of, write_config
 
 CONNECTIONS = ("pendulum.a -> sum.u1", "sum.y -> a.u", "a.y -> b.u", "b.y -> sum.u2", "b.y -> end.u")

@@ -12,8 +12,8 @@ import msgspec
 import pytest
 
 from fmu_mesh.errors import StepFailed
-from fmu_mesh.launch.local import LocalMesh
-from fmu_mesh.model.plan import Plan
+from fmu_mesh.run.local import LocalMesh
+from fmu_mesh.system.plan import Plan
 from tests.helpers import Place, row_count, rows_of, wait_until, write_config
 from tests.scenarios.scenario import Counter, Scenario
 

@@ -10,7 +10,7 @@ import msgspec
 import pytest
 import yaml
 
-from fmu_mesh.launch.preparing import prepare
+from fmu_mesh.run.preparing import prepare
 from tests.equivalence.reference import as_bits, read_csv, reference_of, run_fmpy
 from tests.helpers import FMUS, Place
 

@@ -6,8 +6,8 @@ import itertools
 
 import pytest
 
-from fmu_mesh.launch.local import LocalMesh
-from fmu_mesh.launch.preparing import Options, prepare
+from fmu_mesh.run.local import LocalMesh
+from fmu_mesh.run.preparing import Options, prepare
 from tests.helpers import Place, write_config
 
 

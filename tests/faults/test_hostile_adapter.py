@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from fmu_mesh import FMIAdapter
-from fmu_mesh.fmu.guard import floating_point_changed, restore_floating_point
+from fmu_mesh.instances.call_guard import floating_point_changed, restore_floating_point
 from fmus.build import build
 from tests.fmus.helpers import NO_COMPILER
 from tests.fmus.packing import repacked

@@ -12,8 +12,8 @@ import psutil
 import pytest
 
 from fmu_mesh.cli.main import main
-from fmu_mesh.launch.child import StopWatch
-from fmu_mesh.model.window import AUTO_WINDOW_POINTS, lazy_frame_rows
+from fmu_mesh.run.child import StopWatch
+from fmu_mesh.system.window import AUTO_WINDOW_POINTS, lazy_frame_rows
 from tests.helpers import DEADLINE_S, Launched, Place, on_a_busy_machine, row_count, rows_of, wait_until, write_config
 
 FAST = pytest.param({}, 2000, id="as fast as possible")

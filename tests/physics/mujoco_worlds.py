@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from fmu_mesh.hosts import MujocoInstance, Picture
-from fmu_mesh.model.config import MujocoConfig
-from fmu_mesh.model.ring import Layout, Ring
+from fmu_mesh.config.mesh import MujocoConfig
+from fmu_mesh.instances.mujoco import MujocoInstance, Picture
+from fmu_mesh.rings.ring import Layout, Ring
 from fmu_mesh.simtime import TimeGrid
 
 __all__ = ["Driven", "body", "slider", "write_world"]

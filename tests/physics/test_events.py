@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 import yaml
 
-from fmu_mesh.launch.local import LocalMesh
-from fmu_mesh.launch.preparing import prepare
+from fmu_mesh.run.local import LocalMesh
+from fmu_mesh.run.preparing import prepare
 from tests.fmus.event_fmus import Version
 from tests.helpers import rows_of, write_config
 

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from fmu_mesh.hosts.gazebo_process import PROGRAM_VARIABLE, GazeboGone, find_program
-from fmu_mesh.launch.local import LocalMesh
-from fmu_mesh.launch.preparing import Options, prepare
+from fmu_mesh.instances.gazebo.gazebo_process import PROGRAM_VARIABLE, GazeboGone, find_program
+from fmu_mesh.run.local import LocalMesh
+from fmu_mesh.run.preparing import Options, prepare
 from tests.helpers import Place, rows_of
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"

@@ -14,13 +14,13 @@ from pathlib import Path
 import pytest
 
 from fmu_mesh.cli.main import main
+from fmu_mesh.config.mesh import ActuatorConfig, GazeboClassicConfig
 from fmu_mesh.errors import FmuError, InitializationFailed, LoadFailed, StepFailed
-from fmu_mesh.hosts import GazeboClassicInstance, describe_gazebo_world, gazebo_process
-from fmu_mesh.hosts.gazebo_world import load_gazebo_world
-from fmu_mesh.launch.local import LocalMesh
-from fmu_mesh.launch.preparing import Options, prepare
-from fmu_mesh.model.config import ActuatorConfig, GazeboClassicConfig
-from fmu_mesh.model.ring import Layout, Ring
+from fmu_mesh.instances.gazebo import GazeboClassicInstance, describe_gazebo_world, gazebo_process
+from fmu_mesh.instances.gazebo.gazebo_world import load_gazebo_world
+from fmu_mesh.rings.ring import Layout, Ring
+from fmu_mesh.run.local import LocalMesh
+from fmu_mesh.run.preparing import Options, prepare
 from fmu_mesh.simtime import TimeGrid
 from tests.helpers import FMUS
 

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from fmu_mesh.hosts.frames import relative_velocity, to_body, to_world, wrench_at_center
+from fmu_mesh.instances.body_axes import relative_velocity, to_body, to_world, wrench_at_center
 
 Floats = NDArray[np.float64]
 

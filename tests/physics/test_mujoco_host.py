@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fmu_mesh.config.mesh import ActuatorConfig, MujocoConfig
 from fmu_mesh.errors import LoadFailed, StepFailed
-from fmu_mesh.hosts import describe_world
-from fmu_mesh.model.config import ActuatorConfig, MujocoConfig
+from fmu_mesh.instances.mujoco import describe_world
 from tests.physics.mujoco_worlds import Driven, body, slider, write_world
 
 HINGE = (

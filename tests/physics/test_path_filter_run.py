@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from fmu_mesh.launch.local import LocalMesh
-from fmu_mesh.launch.preparing import Options, prepare
+from fmu_mesh.run.local import LocalMesh
+from fmu_mesh.run.preparing import Options, prepare
 
 CONFIG = Path(__file__).resolve().parents[2] / "configs" / "path_filter.yaml"
 

@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from fmu_mesh.launch.local import LocalMesh
-from fmu_mesh.launch.preparing import Options, prepare
-from fmu_mesh.model.plan import make_plan
+from fmu_mesh.run.local import LocalMesh
+from fmu_mesh.run.preparing import Options, prepare
+from fmu_mesh.system.plan import make_plan
 from tests.fmus.reference import Pendulum, angle_after
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"

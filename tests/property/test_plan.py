@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fmu_mesh.model.graph import cycle_through, feedback_edges, strongly_connected, topological_order
-from fmu_mesh.model.plan import RECORDER, NodePlan
+from fmu_mesh.system.graph import cycle_through, feedback_edges, strongly_connected, topological_order
+from fmu_mesh.system.plan import RECORDER, NodePlan
 from tests.property.test_random_systems import Drawn, planned, systems
 
 Edge = tuple[int, int]

@@ -18,15 +18,15 @@ from hypothesis import HealthCheck, event, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from fmu_mesh.config.mesh import KIND, Config
 from fmu_mesh.errors import LoopNotConverged
-from fmu_mesh.launch.local import LocalMesh
-from fmu_mesh.model.config import KIND, Config
-from fmu_mesh.model.connection import Connection
-from fmu_mesh.model.description import Causality, ModelDescription, Value, Variable, VariableType
-from fmu_mesh.model.plan import Plan, make_plan
-from fmu_mesh.model.ring import Ring
-from fmu_mesh.model.system import System, SystemInstance
+from fmu_mesh.rings.ring import Ring
+from fmu_mesh.run.local import LocalMesh
 from fmu_mesh.simtime import TimeGrid
+from fmu_mesh.system.connections import Connection
+from fmu_mesh.system.plan import Plan, make_plan
+from fmu_mesh.system.system import System, SystemInstance
+from fmu_mesh.variables.model_description import Causality, ModelDescription, Value, Variable, VariableType
 from tests.scenarios.simulated import SimulatedMesh
 
 STEP_SIZE = 0.1

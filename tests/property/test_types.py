@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fmu_mesh.model.types import DTYPES, INTEGERS, TYPES, VariableType, flattened, is_text, nested, takes
+from fmu_mesh.variables.value_types import DTYPES, INTEGERS, TYPES, VariableType, flattened, is_text, nested, takes
 
 NUMBERS = [type_ for type_ in TYPES if not is_text(type_)]
 

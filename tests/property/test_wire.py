@@ -18,11 +18,11 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from fmu_mesh.errors import ErrorReport, FmuMeshError, FrameGap, MessageRefused
-from fmu_mesh.model.description import Value, Variable, VariableType
-from fmu_mesh.model.plan import Link
-from fmu_mesh.model.ring import Layout, Ring, Rows
-from fmu_mesh.model.types import DTYPES, INTEGERS, TYPES, is_text, nested
-from fmu_mesh.record.csv_file import CsvFile
+from fmu_mesh.recorder.csv_file import CsvFile
+from fmu_mesh.rings.ring import Layout, Ring, Rows
+from fmu_mesh.system.plan import Link
+from fmu_mesh.variables.model_description import Value, Variable, VariableType
+from fmu_mesh.variables.value_types import DTYPES, INTEGERS, TYPES, is_text, nested
 from fmu_mesh.wire.frames import FrameReceiver
 from fmu_mesh.wire.keys import Keys, escape, unescape
 from fmu_mesh.wire.messages import FRAME, HEADER, decode_abort, encode_abort

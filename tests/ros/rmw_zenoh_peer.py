@@ -19,8 +19,8 @@ from typing import Any, TextIO
 import numpy as np
 import zenoh
 
-from fmu_mesh.ros.parameters import SERVICES
-from fmu_mesh.ros.types import MessageTypes
+from fmu_mesh.ros.gateway.parameters import SERVICES
+from fmu_mesh.ros.messages.definitions import MessageTypes
 
 
 def say(**what: object) -> None:

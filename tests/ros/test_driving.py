@@ -13,7 +13,7 @@ import pytest
 
 from fmu_mesh import FMIAdapter
 from fmu_mesh.errors import CallRefused
-from fmu_mesh.ros.driving import DriveSettings, FmuDriver
+from fmu_mesh.ros.node.driving import DriveSettings, FmuDriver
 from tests.helpers import FMUS
 
 UNIX_NS = 1_700_000_000_123_456_789

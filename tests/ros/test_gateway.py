@@ -16,8 +16,8 @@ import psutil
 import pytest
 import zenoh
 
-from fmu_mesh.ros.cdr import Codec
-from fmu_mesh.ros.types import MessageTypes, Nested
+from fmu_mesh.ros.messages.cdr import Codec
+from fmu_mesh.ros.messages.definitions import MessageTypes, Nested
 from tests.helpers import DEADLINE_S, Launched, Place, row_count, rows_of, wait_until, write_config
 from tests.ros.peers import free_port
 

@@ -9,8 +9,8 @@ from typing import Any, cast
 import pytest
 import zenoh
 
-from fmu_mesh.ros.gateway import Gateway
-from fmu_mesh.ros.topics import RosPlan
+from fmu_mesh.ros.gateway.gateway import Gateway
+from fmu_mesh.ros.gateway.topics import RosPlan
 from fmu_mesh.simtime import TimeGrid
 from fmu_mesh.wire.keys import Keys
 from tests.helpers import DEADLINE_S, wait_until

@@ -10,11 +10,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fmu_mesh.model.description import Variable, VariableType
-from fmu_mesh.ros.cdr import CdrError, Codec
-from fmu_mesh.ros.messages import Assembler, Disassembler
-from fmu_mesh.ros.topics import Port, Topic
-from fmu_mesh.ros.types import MessageTypes, Nested
+from fmu_mesh.ros.gateway.topics import Port, Topic
+from fmu_mesh.ros.messages.assembling import Assembler, Disassembler
+from fmu_mesh.ros.messages.cdr import CdrError, Codec
+from fmu_mesh.ros.messages.definitions import MessageTypes, Nested
+from fmu_mesh.variables.model_description import Variable, VariableType
 
 TYPES = MessageTypes("kilted")
 TWIST = "geometry_msgs/msg/TwistStamped"

@@ -7,12 +7,12 @@ from typing import Any
 
 import pytest
 
+from fmu_mesh.config.loading import load
 from fmu_mesh.errors import ConfigurationError
-from fmu_mesh.launch.preparing import prepare
-from fmu_mesh.model.description import ModelDescription, Variable
-from fmu_mesh.model.loading import load
-from fmu_mesh.ros.mapping import resolve
-from fmu_mesh.ros.topics import RosPlan
+from fmu_mesh.ros.gateway.mapping import resolve
+from fmu_mesh.ros.gateway.topics import RosPlan
+from fmu_mesh.run.preparing import prepare
+from fmu_mesh.variables.model_description import ModelDescription, Variable
 from tests.fmus.helpers import find_fmu
 from tests.helpers import FMUS, write_config
 

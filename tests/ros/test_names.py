@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fmu_mesh.ros.names import absolute, dds_type, name_problems, ros_name, topic_problem
-from fmu_mesh.ros.stamp import from_stamp, nanoseconds, to_stamp
+from fmu_mesh.ros.messages.ros_names import absolute, dds_type, name_problems, ros_name, topic_problem
+from fmu_mesh.ros.messages.stamp import from_stamp, nanoseconds, to_stamp
 
 
 @pytest.mark.parametrize(

@@ -20,8 +20,8 @@ from typing import Any
 import pytest
 
 from fmu_mesh import FMIAdapter
-from fmu_mesh.fmu import Fmi2Instance
-from fmu_mesh.ros.names import ros_name
+from fmu_mesh.instances.fmi import Fmi2Instance
+from fmu_mesh.ros.messages.ros_names import ros_name
 from tests.fmus.helpers import find_fmu
 from tests.fmus.packing import repacked
 from tests.helpers import DEADLINE_S, FMUS

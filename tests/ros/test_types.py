@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from fmu_mesh.errors import ConfigurationError
-from fmu_mesh.ros.types import Basic, MessageTypes, UnknownField, UnknownType, carries, default_type
+from fmu_mesh.ros.messages.definitions import Basic, MessageTypes, UnknownField, UnknownType, carries, default_type
 
 SHARE = Path(sys.prefix) / "share"
 """Where the packages of ROS from PyPI put what the generators of ROS have computed."""

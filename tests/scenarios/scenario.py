@@ -12,14 +12,14 @@ from dataclasses import dataclass, field
 
 import msgspec
 
-from fmu_mesh.launch.local import LocalMesh
-from fmu_mesh.model.config import KIND, Config
-from fmu_mesh.model.connection import Connection
-from fmu_mesh.model.description import ModelDescription, Value, Variable
-from fmu_mesh.model.plan import Plan, make_plan
-from fmu_mesh.model.ring import Ring
-from fmu_mesh.model.system import System, SystemInstance
+from fmu_mesh.config.mesh import KIND, Config
+from fmu_mesh.rings.ring import Ring
+from fmu_mesh.run.local import LocalMesh
 from fmu_mesh.simtime import TimeGrid
+from fmu_mesh.system.connections import Connection
+from fmu_mesh.system.plan import Plan, make_plan
+from fmu_mesh.system.system import System, SystemInstance
+from fmu_mesh.variables.model_description import ModelDescription, Value, Variable
 from tests.scenarios.simulated import SimulatedMesh
 
 __all__ = ["Counter", "Scenario", "text", "variable"]

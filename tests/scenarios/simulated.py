@@ -17,9 +17,9 @@ import numpy as np
 import zenoh
 from numpy.typing import NDArray
 
-from fmu_mesh.model.instance import Instance
-from fmu_mesh.model.plan import RECORDER, NodePlan, Plan
+from fmu_mesh.instances.contract import Instance
 from fmu_mesh.node.node import Node
+from fmu_mesh.system.plan import RECORDER, NodePlan, Plan
 from fmu_mesh.wire.frames import FrameReceiver
 from fmu_mesh.wire.keys import RunKeys
 from fmu_mesh.wire.membership import Membership, Welcome

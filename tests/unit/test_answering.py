@@ -5,9 +5,9 @@ from __future__ import annotations
 from types import SimpleNamespace
 from typing import Any, cast
 
-from fmu_mesh.model.ring import Layout, Ring
 from fmu_mesh.node.answering import Answers
 from fmu_mesh.node.stepping import Runner
+from fmu_mesh.rings.ring import Layout, Ring
 from tests.scenarios.scenario import variable
 
 ROWS = 8

@@ -12,10 +12,10 @@ from pathlib import Path
 
 import pytest
 
+from fmu_mesh.config.mesh import LimitsConfig
 from fmu_mesh.errors import LoadFailed
-from fmu_mesh.fmu import Terms, open_instance, read_description, sha256_of
-from fmu_mesh.fmu.sources import extract
-from fmu_mesh.model.config import LimitsConfig
+from fmu_mesh.instances.fmi import Terms, open_instance, read_description, sha256_of
+from fmu_mesh.instances.fmi.archive.sources import extract
 from tests.fmus.helpers import FMUS, find_fmu
 from tests.fmus.packing import repacked, unpacked
 

@@ -14,7 +14,7 @@ import pytest
 
 from fmu_mesh.cli.main import main
 from fmu_mesh.errors import ConfigurationError
-from fmu_mesh.record.csv_file import CsvFile
+from fmu_mesh.recorder.csv_file import CsvFile
 from tests.helpers import FMUS
 
 GOOD = f"""\
@@ -94,7 +94,7 @@ def nothing_is_spawned(monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(*_: object, **__: object) -> None:
         pytest.fail("a process was started before everything was checked")
 
-    monkeypatch.setattr("fmu_mesh.launch.child.subprocess.Popen", fail)
+    monkeypatch.setattr("fmu_mesh.run.child.subprocess.Popen", fail)
 
 
 @pytest.fixture(params=[("launch",), ("launch", "--local"), ("check",)], ids=["launch", "local", "check"])

@@ -12,9 +12,9 @@ from msgspec.structs import replace
 
 from fmu_mesh.cli.checking import plan_page
 from fmu_mesh.cli.main import main
+from fmu_mesh.config.schema import json_schema
 from fmu_mesh.errors import Finding
-from fmu_mesh.launch.preparing import prepare
-from fmu_mesh.model.schema import json_schema
+from fmu_mesh.run.preparing import prepare
 
 FMUS = Path(__file__).parents[2] / "fmus"
 

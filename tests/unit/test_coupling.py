@@ -6,12 +6,12 @@ from pathlib import Path
 
 import pytest
 
+from fmu_mesh.config.loading import examine, parse
 from fmu_mesh.errors import ConfigurationError
-from fmu_mesh.hosts import describe_pid
-from fmu_mesh.model.description import Causality, ModelDescription, Variable
-from fmu_mesh.model.loading import examine, parse
-from fmu_mesh.model.plan import Plan, make_plan
-from fmu_mesh.model.system import build
+from fmu_mesh.instances.position_pid import describe_pid
+from fmu_mesh.system.plan import Plan, make_plan
+from fmu_mesh.system.system import build
+from fmu_mesh.variables.model_description import Causality, ModelDescription, Variable
 
 FILE = Path("/models/configs/mesh.yaml")
 AXES = "xyz"

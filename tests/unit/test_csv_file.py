@@ -12,8 +12,8 @@ import pytest
 
 from fmu_mesh.errors import ConfigurationError
 from fmu_mesh.files import Kept
-from fmu_mesh.model.description import VariableType
-from fmu_mesh.record.csv_file import CsvFile, cut_after_last_row
+from fmu_mesh.recorder.csv_file import CsvFile, cut_after_last_row
+from fmu_mesh.variables.model_description import VariableType
 
 COLUMNS: list[tuple[str, VariableType]] = [
     ("p.a", "Float64"),

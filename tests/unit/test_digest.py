@@ -12,10 +12,10 @@ from typing import Any
 import pytest
 import yaml
 
-from fmu_mesh.launch.preparing import Options, prepare
-from fmu_mesh.model import digest
-from fmu_mesh.model.digest import difference
-from fmu_mesh.model.plan import Plan
+from fmu_mesh.run.preparing import Options, prepare
+from fmu_mesh.system import digest
+from fmu_mesh.system.digest import difference
+from fmu_mesh.system.plan import Plan
 from tests.fmus.packing import repacked, unpacked
 from tests.helpers import FMUS, write_config
 

@@ -6,7 +6,7 @@ import contextlib
 import os
 import threading
 
-from fmu_mesh.launch.events import End, Event, EventWriter, Status, decode_event
+from fmu_mesh.run.events import End, Event, EventWriter, Status, decode_event
 from fmu_mesh.wire.views import MeshStatus
 from tests.helpers import DEADLINE_S, wait_until
 

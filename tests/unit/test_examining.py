@@ -9,8 +9,8 @@ import pytest
 import yaml
 
 from fmu_mesh.errors import ConfigurationError, LoadFailed
-from fmu_mesh.fmu import read_description, sha256_of
-from fmu_mesh.launch.preparing import prepare
+from fmu_mesh.instances.fmi import read_description, sha256_of
+from fmu_mesh.run.preparing import prepare
 from tests.fmus.packing import repacked
 
 
@@ -42,7 +42,8 @@ def test_a_description_with_a_document_type_is_refused_before_it_is_read(
     change: Callable[[str], str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(
-        "fmu_mesh.fmu.reading.read_model_description", lambda *_, **__: pytest.fail("FMPy read what is not safe")
+        "fmu_mesh.instances.fmi.archive.reading.read_model_description",
+        lambda *_, **__: pytest.fail("FMPy read what is not safe"),
     )
     path = repacked(tmp_path / "hostile.fmu", description=change)
 

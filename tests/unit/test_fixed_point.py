@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fmu_mesh.config.mesh import InitializationConfig
 from fmu_mesh.errors import InitializationFailed, LoopNotConverged, from_report
-from fmu_mesh.model.config import InitializationConfig
-from fmu_mesh.model.description import PlainValue, VariableType
-from fmu_mesh.model.fixed_point import FixedPoint
-from fmu_mesh.model.initialization import Loop, Tear
+from fmu_mesh.system.algebraic_loop import FixedPoint
+from fmu_mesh.system.initialization_plan import Loop, Tear
+from fmu_mesh.variables.model_description import PlainValue, VariableType
 
 _TYPES: dict[type, VariableType] = {float: "Float64", int: "Int32", bool: "Boolean"}
 

@@ -11,7 +11,7 @@ import pytest
 import zenoh
 
 from fmu_mesh.errors import DeadlineExceeded
-from fmu_mesh.wire.following import Follower
+from fmu_mesh.wire.client.following import Follower
 from fmu_mesh.wire.keys import Keys
 from fmu_mesh.wire.session import Wiring, open_session
 from tests.helpers import DEADLINE_S

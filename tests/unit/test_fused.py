@@ -10,12 +10,21 @@ from typing import Any
 import pytest
 
 from fmu_mesh import compiled
-from fmu_mesh.fmu import open_instance, read_description
-from fmu_mesh.fmu.calls import DirectCall, Rows, hot, memory, pointer
-from fmu_mesh.fmu.fused import GETTING, SETTING, STATUS_BITS, STEPPING, Fused, fmi2_step, fmi3_step, fuse
-from fmu_mesh.model.ring import Layout, Ring
-from fmu_mesh.model.types import VariableType
+from fmu_mesh.instances.fmi import open_instance, read_description
+from fmu_mesh.instances.fmi.calls import DirectCall, Rows, hot, memory, pointer
+from fmu_mesh.instances.fmi.co_simulation.fused import (
+    GETTING,
+    SETTING,
+    STATUS_BITS,
+    STEPPING,
+    Fused,
+    fmi2_step,
+    fmi3_step,
+    fuse,
+)
+from fmu_mesh.rings.ring import Layout, Ring
 from fmu_mesh.simtime import TimeGrid
+from fmu_mesh.variables.value_types import VariableType
 from tests.fmus.helpers import find_fmu
 
 COMPONENT = 4711

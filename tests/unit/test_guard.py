@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from fmu_mesh.errors import FmuError, InitializationFailed, StepFailed
-from fmu_mesh.fmu.guard import CallWatch, floating_point_changed, kept_state, restore_floating_point
+from fmu_mesh.instances.call_guard import CallWatch, floating_point_changed, kept_state, restore_floating_point
 from tests.helpers import DEADLINE_S
 
 UPWARD, DOWNWARD, TOWARD_ZERO = 0x800, 0x400, 0xC00  # of x86; other processors have other numbers

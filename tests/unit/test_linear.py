@@ -12,13 +12,13 @@ from typing import Any
 import pytest
 
 from fmu_mesh.cli.checking import plan_page
-from fmu_mesh.model.config import ConnectionConfig
-from fmu_mesh.model.connection import resolve_connections
-from fmu_mesh.model.description import ModelDescription, Variable
-from fmu_mesh.model.findings import Findings
-from fmu_mesh.model.loading import parse
-from fmu_mesh.model.plan import make_plan
-from fmu_mesh.model.system import build
+from fmu_mesh.config.findings import Findings
+from fmu_mesh.config.loading import parse
+from fmu_mesh.config.mesh import ConnectionConfig
+from fmu_mesh.system.connections import resolve_connections
+from fmu_mesh.system.plan import make_plan
+from fmu_mesh.system.system import build
+from fmu_mesh.variables.model_description import ModelDescription, Variable
 
 FILE = Path("/models/mesh.yaml")
 FEW, MANY = 50, 400

@@ -9,8 +9,8 @@ import orjson
 import pytest
 
 from fmu_mesh import compiled
-from fmu_mesh.record import lines
-from fmu_mesh.record.lines import in_lines
+from fmu_mesh.recorder import lines
+from fmu_mesh.recorder.lines import in_lines
 
 
 @pytest.fixture(params=["compiled", "NumPy"])

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
+from fmu_mesh.config.loading import MAXIMUM_BYTES, LoadedConfig, load, parse
+from fmu_mesh.config.mesh import ConnectionConfig
+from fmu_mesh.config.yaml_text import MAXIMUM_DEPTH
 from fmu_mesh.errors import ConfigurationError, Finding
-from fmu_mesh.model.config import ConnectionConfig
-from fmu_mesh.model.loading import MAXIMUM_BYTES, LoadedConfig, load, parse
-from fmu_mesh.model.yaml_text import MAXIMUM_DEPTH
 
 CONFIGS = sorted((Path(__file__).parents[2] / "configs").glob("*.yaml"))
 

@@ -12,8 +12,8 @@ import yaml
 
 from fmu_mesh.cli.main import main
 from fmu_mesh.errors import StepFailed
-from fmu_mesh.fmu import FmuInstance, LogMessage, open_instance, read_description
-from fmu_mesh.fmu.sources import extract
+from fmu_mesh.instances.fmi import FmuInstance, LogMessage, open_instance, read_description
+from fmu_mesh.instances.fmi.archive.sources import extract
 from tests.fmus.event_fmus import SOURCES, event_source_fmu
 from tests.fmus.helpers import NO_COMPILER, find_fmu
 from tests.fmus.packing import repacked, without_binaries

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from fmu_mesh.launch.preparing import prepare
 from fmu_mesh.master import pacing
 from fmu_mesh.master.pacing import Pacer, Reach
+from fmu_mesh.run.preparing import prepare
 from tests.helpers import write_config
 
 STEP_SIZE = 0.5

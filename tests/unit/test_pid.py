@@ -7,8 +7,8 @@ import math
 import pytest
 
 from fmu_mesh.errors import StepFailed
-from fmu_mesh.hosts import PidInstance, describe_pid
-from fmu_mesh.model.ring import Layout, Ring
+from fmu_mesh.instances.position_pid import PidInstance, describe_pid
+from fmu_mesh.rings.ring import Layout, Ring
 from fmu_mesh.simtime import TimeGrid
 
 INPUTS = ("target", "position", "velocity")

@@ -17,12 +17,12 @@ from matplotlib import image
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from fmu_mesh.cli.drawing import Results, figure_of, reduced
 from fmu_mesh.cli.main import main
+from fmu_mesh.cli.output.drawing import Results, figure_of, reduced
 from fmu_mesh.cli.plotting import plot_results, plotted_where_it_ends, read_results
 from fmu_mesh.errors import ConfigurationError, StepFailed
-from fmu_mesh.launch.preparing import prepare
-from fmu_mesh.model.plan import Plan
+from fmu_mesh.run.preparing import prepare
+from fmu_mesh.system.plan import Plan
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 

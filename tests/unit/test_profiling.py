@@ -10,11 +10,11 @@ import msgspec
 import pytest
 
 from fmu_mesh.cli.main import main
-from fmu_mesh.cli.profiling import critical_path, profile_page, show_profile, trace
-from fmu_mesh.launch.preparing import prepare
-from fmu_mesh.master.profiling import GrantWatch
-from fmu_mesh.model.plan import RECORDER, Plan
-from fmu_mesh.wire.profile import GRANT, Burst, MeshProfile, NodeProfile, UnitProfile, Wait
+from fmu_mesh.cli.output.profile_table import critical_path, profile_page, show_profile, trace
+from fmu_mesh.master.grant_watch import GrantWatch
+from fmu_mesh.run.preparing import prepare
+from fmu_mesh.system.plan import RECORDER, Plan
+from fmu_mesh.wire.time_profile import GRANT, Burst, MeshProfile, NodeProfile, UnitProfile, Wait
 from tests.helpers import write_config
 
 GAIN = {"fmu": "Gain"}

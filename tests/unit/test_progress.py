@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from fmu_mesh.cli.progress import progress_parts
+from fmu_mesh.cli.output.progress import progress_parts
 from fmu_mesh.simtime import ENDLESS, TimeGrid
 from fmu_mesh.wire.views import MeshState, MeshStatus
 

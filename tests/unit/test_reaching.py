@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from fmu_mesh.errors import DeadlineExceeded
-from fmu_mesh.wire.reaching import Meshes
+from fmu_mesh.wire.client.reaching import Meshes
 
 
 def reachable(silent: frozenset[str]) -> tuple[Meshes, Any]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import queue
 import threading
 
-from fmu_mesh.wire.readings import latecomers
+from fmu_mesh.wire.client.readings import latecomers
 
 
 def test_what_comes_behind_the_end_is_taken_until_nothing_comes() -> None:

@@ -13,10 +13,10 @@ import pytest
 import zenoh
 
 from fmu_mesh.errors import MeshLost
-from fmu_mesh.model.plan import RECORDER, NodePlan
-from fmu_mesh.model.ring import Ring
-from fmu_mesh.record import recorder as module
-from fmu_mesh.record.recorder import Recorder
+from fmu_mesh.recorder import recorder as module
+from fmu_mesh.recorder.recorder import Recorder
+from fmu_mesh.rings.ring import Ring
+from fmu_mesh.system.plan import RECORDER, NodePlan
 from fmu_mesh.wire.keys import Keys, RunKeys
 from fmu_mesh.wire.membership import Admission, Welcome
 from fmu_mesh.wire.messages import FINISH, FRAME, HEADER, encode_abort

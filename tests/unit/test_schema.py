@@ -9,7 +9,7 @@ import pytest
 import yaml
 from jsonschema import Draft202012Validator
 
-from fmu_mesh.model.schema import json_schema, schema_text
+from fmu_mesh.config.schema import json_schema, schema_text
 
 FOLDER = Path(__file__).parents[2] / "configs"
 CONFIGS = sorted(FOLDER.glob("*.yaml"))

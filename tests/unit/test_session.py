@@ -10,7 +10,7 @@ import pytest
 import zenoh
 
 from fmu_mesh.errors import ConfigurationError, MeshLost
-from fmu_mesh.wire.client import key_expression
+from fmu_mesh.wire.client.mesh_client import key_expression
 from fmu_mesh.wire.session import Wiring, ask, close_session, open_session
 from tests.helpers import DEADLINE_S
 

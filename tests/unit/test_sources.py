@@ -17,9 +17,9 @@ import yaml
 
 from fmu_mesh.cli.main import main
 from fmu_mesh.errors import LoadFailed
-from fmu_mesh.fmu import open_instance, read_description
-from fmu_mesh.fmu.sources import extract
-from fmu_mesh.model.description import Kind
+from fmu_mesh.instances.fmi import open_instance, read_description
+from fmu_mesh.instances.fmi.archive.sources import extract
+from fmu_mesh.variables.model_description import Kind
 from tests.fmus import event_fmus
 from tests.fmus.event_fmus import Version, event_source_fmu
 from tests.fmus.helpers import FMUS, NO_COMPILER, find_fmu
@@ -319,7 +319,8 @@ def test_sources_of_fmi_1_need_not_bring_the_headers_of_the_standard(tmp_path: P
 
 def test_two_processes_at_once_compile_without_harm(tmp_path: Path, cache: Path) -> None:
     path = without_binaries(tmp_path / "sources.fmu")
-    program = "import sys, pathlib as p; from fmu_mesh.fmu.sources import extract; extract(*map(p.Path, sys.argv[1:]))"
+    module = "fmu_mesh.instances.fmi.archive.sources"
+    program = f"import sys, pathlib as p; from {module} import extract; extract(*map(p.Path, sys.argv[1:]))"
     command = [sys.executable, "-c", program, str(path), str(tmp_path / "parent")]
 
     processes = [subprocess.Popen(command) for _ in range(2)]

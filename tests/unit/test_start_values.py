@@ -19,9 +19,9 @@ import yaml
 from fmu_mesh import FMIAdapter
 from fmu_mesh.cli.main import main
 from fmu_mesh.errors import CallRefused, InitializationFailed
-from fmu_mesh.fmu import read_description
-from fmu_mesh.fmu.sources import extract
-from fmu_mesh.model.description import Kind
+from fmu_mesh.instances.fmi import read_description
+from fmu_mesh.instances.fmi.archive.sources import extract
+from fmu_mesh.variables.model_description import Kind
 from tests.fmus.event_fmus import Version, event_source_fmu
 from tests.fmus.helpers import FMUS, NO_COMPILER, find_fmu
 from tests.fmus.packing import repacked

@@ -11,9 +11,9 @@ import yaml
 
 from fmu_mesh.cli.checking import plan_page
 from fmu_mesh.errors import ConfigurationError
-from fmu_mesh.launch.local import LocalMesh
-from fmu_mesh.launch.preparing import prepare
-from fmu_mesh.model.plan import Plan
+from fmu_mesh.run.local import LocalMesh
+from fmu_mesh.run.preparing import prepare
+from fmu_mesh.system.plan import Plan
 from tests.fmus.event_fmus import Version
 from tests.fmus.helpers import find_fmu
 

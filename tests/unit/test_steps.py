@@ -13,15 +13,15 @@ from typing import cast
 import pytest
 
 from fmu_mesh.errors import StepFailed, TerminationRequested
-from fmu_mesh.fmu import FmuInstance, open_instance, read_description, stepped
-from fmu_mesh.fmu.extrapolation import LinearInputs
-from fmu_mesh.fmu.fmi3_steps import Fmi3Steps
-from fmu_mesh.fmu.substeps import DISCARD, SMALLEST, take_sub_steps
-from fmu_mesh.model.description import Kind, ModelDescription
-from fmu_mesh.model.instance import LinearInput, SolverSettings, StepOptions
-from fmu_mesh.model.ring import Layout, Ring
-from fmu_mesh.model.types import Value
+from fmu_mesh.instances.contract import LinearInput, SolverSettings, StepOptions
+from fmu_mesh.instances.fmi import FmuInstance, open_instance, read_description, stepped
+from fmu_mesh.instances.fmi.co_simulation.extrapolation import LinearInputs
+from fmu_mesh.instances.fmi.co_simulation.fmi3_steps import Fmi3Steps
+from fmu_mesh.instances.fmi.co_simulation.substeps import DISCARD, SMALLEST, take_sub_steps
+from fmu_mesh.rings.ring import Layout, Ring
 from fmu_mesh.simtime import TimeGrid
+from fmu_mesh.variables.model_description import Kind, ModelDescription
+from fmu_mesh.variables.value_types import Value
 from tests.fmus.event_fmus import Version
 from tests.fmus.helpers import NO_COMPILER, build_test_fmu
 

@@ -8,13 +8,13 @@ from typing import Literal
 
 import pytest
 
-from fmu_mesh.fmu import Fmi2Instance, read_description
-from fmu_mesh.model.instance import Instance
-from fmu_mesh.model.plan import InstancePlan
-from fmu_mesh.model.ring import Layout, Ring
+from fmu_mesh.instances.contract import Instance
+from fmu_mesh.instances.fmi import Fmi2Instance, read_description
 from fmu_mesh.node.inputs import TimedInputs, set_input
 from fmu_mesh.node.stepping import Runner
+from fmu_mesh.rings.ring import Layout, Ring
 from fmu_mesh.simtime import TimeGrid
+from fmu_mesh.system.plan import InstancePlan
 from fmu_mesh.wire.values import ValueRefused, decode_time
 from tests.helpers import FMUS
 

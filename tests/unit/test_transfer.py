@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fmu_mesh.model.plan import Feed
-from fmu_mesh.model.ring import Layout, Ring
-from fmu_mesh.model.transfer import Transfer
-from fmu_mesh.model.types import Value
+from fmu_mesh.rings.ring import Layout, Ring
+from fmu_mesh.rings.transfer import Transfer
+from fmu_mesh.system.plan import Feed
+from fmu_mesh.variables.value_types import Value
 
 RATES = [(source, target, delay) for source in range(1, 6) for target in range(1, 6) for delay in (0, 1)]
 SOURCE = Layout.of([("a", "Float64"), ("b", "Float64"), ("c", "Float64"), ("n", "Int32"), ("m", "Int32")])

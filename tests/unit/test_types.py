@@ -14,10 +14,10 @@ import pytest
 
 from fmu_mesh import FMIAdapter
 from fmu_mesh.errors import CallRefused, InitializationFailed, LoadFailed, StepFailed, TerminationRequested
-from fmu_mesh.fmu import FmuInstance, open_instance, read_description
-from fmu_mesh.model.ring import Layout, Ring
-from fmu_mesh.model.types import INTEGERS, VariableType
+from fmu_mesh.instances.fmi import FmuInstance, open_instance, read_description
+from fmu_mesh.rings.ring import Layout, Ring
 from fmu_mesh.simtime import TimeGrid
+from fmu_mesh.variables.value_types import INTEGERS, VariableType
 from tests.fmus.helpers import NO_COMPILER, build_test_fmu
 from tests.fmus.packing import repacked
 

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 
 from fmu_mesh.cli.checking import plan_page
 from fmu_mesh.errors import ConfigurationError
-from fmu_mesh.fmu import read_description
-from fmu_mesh.launch.preparing import prepare
-from fmu_mesh.model.units import BaseUnit, Linear, conversion
+from fmu_mesh.instances.fmi import read_description
+from fmu_mesh.run.preparing import prepare
+from fmu_mesh.variables.units import BaseUnit, Linear, conversion
 from tests.fmus.helpers import find_fmu
 from tests.fmus.packing import repacked
 from tests.helpers import FMUS, write_config

@@ -11,10 +11,10 @@ import pytest
 
 from fmu_mesh.cli.main import main
 from fmu_mesh.errors import StepFailed
-from fmu_mesh.fmu import open_instance, read_description, stepped
-from fmu_mesh.fmu.extrapolation import TakesDerivatives
-from fmu_mesh.model.instance import LinearInput, StepOptions
-from fmu_mesh.model.ring import Layout, Ring
+from fmu_mesh.instances.contract import LinearInput, StepOptions
+from fmu_mesh.instances.fmi import open_instance, read_description, stepped
+from fmu_mesh.instances.fmi.co_simulation.extrapolation import TakesDerivatives
+from fmu_mesh.rings.ring import Layout, Ring
 from fmu_mesh.simtime import TimeGrid
 from tests.fmus.helpers import find_fmu
 from tests.fmus.packing import repacked

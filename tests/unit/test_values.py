@@ -8,7 +8,7 @@ import msgspec
 import pytest
 
 from fmu_mesh.errors import MessageRefused
-from fmu_mesh.model.description import Value, Variable, VariableType
+from fmu_mesh.variables.model_description import Value, Variable, VariableType
 from fmu_mesh.wire.values import (
     MAX_VALUE_SIZE,
     Stamp,

@@ -1,0 +1,129 @@
+"""Checking what the caller hands over: names, values and seconds, before anything reaches the FMU.
+
+Owns the texts of `CallRefused` that are about an argument. Knows nothing of modes and of stepping.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+
+from ..config.findings import listed, nearest
+from ..errors import CallRefused
+from ..variables.model_description import Causality, ModelDescription, Value, Variable
+from ..variables.value_conversion import ValueRefused, to_value
+from .times import Instant, RosStamp, RosTime, Time, instant_of
+
+__all__ = ["Arguments"]
+
+
+class Arguments:
+    """The variables of one FMU by what can be done with them, and checks that end with `CallRefused`.
+
+    Args:
+        instance: instance name, for messages.
+        description: the model description.
+    """
+
+    def __init__(self, instance: str, description: ModelDescription) -> None:
+        self.instance = instance
+        self._description = description
+        self.all = {variable.name: variable for variable in description.variables}
+        self.inputs = self._having("input")
+        self.outputs = self._having("output")
+        self.parameters = self._having("parameter")
+        self._tunable = {v.name: v for v in self.parameters.values() if v.variability == "tunable"}
+        self._settable = {v.name: v for v in description.variables if v.settable_before_start}
+
+    def any(self, name: str) -> Variable:
+        """The variable called ``name``."""
+        return self._find(name, self.all, "a variable")
+
+    def input(self, name: str) -> Variable:
+        """The input called ``name``."""
+        return self._find(name, self.inputs, "an input")
+
+    def output(self, name: str) -> Variable:
+        """The output called ``name``."""
+        return self._find(name, self.outputs, "an output")
+
+    def tunable(self, name: str) -> Variable:
+        """The tunable parameter called ``name``."""
+        return self._find(name, self._tunable, "a tunable parameter")
+
+    def settable(self, name: str) -> Variable:
+        """The variable called ``name``, which can be set before the start."""
+        known = self.all.get(name)
+        if known is not None and known.may_take_start_value:
+            return known  # what FMI forbids of these is up to the FMU
+        return self._find(name, self._settable, "settable before the start")
+
+    def value(self, variable: Variable, value: Value) -> Value:
+        """``value`` as a value of the variable's type and within its range."""
+        try:
+            return to_value(value, variable)
+        except ValueRefused as refused:
+            if refused.out_of_range:
+                low, high = variable.minimum, variable.maximum
+                text = f"{value!r} is out of its range, {low} to {high}."
+            else:
+                kind = f"a value of type {variable.type_name}"
+                text = f"{value!r} cannot be its value; expected {kind}: {refused.expected}."
+            raise self.refusal(text, variable=variable.name) from refused
+
+    def time(self, value: Time) -> Instant:
+        """``value`` as a time in its exact form."""
+        return instant_of(value) if isinstance(value, RosTime | RosStamp) else self.seconds(value, "time")
+
+    def seconds(self, value: float | RosTime, what: str) -> float:
+        """``value``, which is called ``what``, as a finite number."""
+        number = value.nanoseconds / 1e9 if isinstance(value, RosTime) else _plain(value)
+        if isinstance(number, bool) or not isinstance(number, int | float) or not math.isfinite(number):
+            raise self.refusal(f"the {what} is {value!r}; expected a finite number of seconds.")
+        return float(number)
+
+    def step_size(self, value: float | RosTime | None) -> float:
+        """``value``, or else the default experiment's step size, as a number of seconds above 0."""
+        if value is None:
+            value = self._description.default_experiment.step_size
+            if value is None:
+                raise self.refusal("the FMU has no default step size.", "Give one: FMIAdapter(path, step_size).")
+        number = self.seconds(value, "step size")
+        if number <= 0.0:
+            raise self.refusal(f"the step size is {value!r} s; expected one above 0.")
+        return number
+
+    def other_step_size(self, value: float | RosTime, default: float) -> float:
+        """``value`` as the size of one step where the others are ``default`` seconds long."""
+        number = self.step_size(value)
+        if number != default and not self._description.can_handle_variable_step_size:
+            raise self.refusal(
+                f"a step of {value!r} s is not one of {default!r} s, and this FMU takes steps of one size only.",
+                "Give the step size to the constructor.",
+            )
+        return number
+
+    def refusal(self, message: str, hint: str | None = None, variable: str | None = None) -> CallRefused:
+        """An error that names this instance."""
+        return CallRefused(message, instance=self.instance, variable=variable, hint=hint)
+
+    def _having(self, causality: Causality) -> dict[str, Variable]:
+        return {variable.name: variable for variable in self._description.with_causality(causality)}
+
+    def _find(self, name: str, allowed: Mapping[str, Variable], role: str) -> Variable:
+        if name in allowed:
+            return allowed[name]
+        expected = f"Possible here: {listed(tuple(allowed))}."
+        known = self.all.get(name)
+        if known is not None:
+            kind = f"{known.variability} {known.causality}"
+            raise self.refusal(f"this {kind} is not {role}.", expected, name)
+        near = nearest(str(name), allowed)
+        raise self.refusal(f"there is no variable '{name}'.", f"Did you mean '{near}'?" if near else expected)
+
+
+def _plain(value: object) -> object:
+    """A scalar of numpy, which robot programs are full of, as the Python value it stands for."""
+    return value.item() if isinstance(value, np.generic) else value

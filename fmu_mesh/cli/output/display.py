@@ -1,0 +1,204 @@
+"""What a person sees during a run: log messages, one progress line below them, and a summary at the end."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import sys
+from collections import Counter, deque
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from types import TracebackType
+from typing import Final, Self
+
+from rich.console import Console
+from rich.markup import escape
+
+from ...errors import ErrorReport, FmuMeshError, from_report
+from ...run.events import End, Event, Log, Ready, Status
+from ...run.wiring import is_socket, leaves_host
+from ...system.plan import Plan
+from ...wire.views import LogLine, MeshStatus
+from .progress import ProgressLine
+
+__all__ = ["Display", "say", "stdout_as_stderr", "summary", "warn"]
+
+_SHOWN_TIMES: Final = 5
+_WARNINGS: Final = 5
+"""How many warnings are told before a run."""
+_COUNTED: Final = 1000
+"""How many different messages are counted."""
+_HELD: Final = 100
+"""How many messages of FMUs that may be about to fail are held back."""
+_STYLES = {"ok": "dim", "warning": "yellow", "discard": "yellow", "error": "red", "fatal": "red"}
+
+
+class Display:
+    """Shows events of a run on standard error.
+
+    Args:
+        plan: what runs.
+        show_progress: whether to draw the bar; never drawn where standard error is no terminal.
+        waits_for_nodes: whether the address is shown when all nodes are there, so that whoever uses it gets answers;
+            where they are started by hand, they need it before.
+    """
+
+    def __init__(self, plan: Plan, *, show_progress: bool, waits_for_nodes: bool = True) -> None:
+        self._plan = plan
+        self._console = Console(stderr=True, highlight=False)
+        self._progress = ProgressLine(plan, self._console, show=show_progress)
+        self._waits_for_nodes = waits_for_nodes
+        self._times: Counter[tuple[str, str]] = Counter()
+        self._held: deque[LogLine] = deque()
+        self._endpoints: Sequence[str] = ()
+
+    def __enter__(self) -> Self:
+        self._progress.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._progress.stop()
+        self.flush(str(error or ""))
+        for (instance, message), times in self._times.items():
+            if times > _SHOWN_TIMES:
+                more = f"{times - _SHOWN_TIMES} more {'times' if times > _SHOWN_TIMES + 1 else 'time'}"
+                self._console.print(f"[dim]{escape(instance)}: {escape(message)} ({more})[/]")
+
+    def event(self, event: Event) -> None:
+        """Show one event of the master."""
+        match event:
+            case Ready(endpoints):
+                self._endpoints = endpoints
+                self._warn()
+                if not self._waits_for_nodes:
+                    self._show_address()
+            case Status(status):
+                self._status(status)
+            case Log(line):
+                self.log(line)
+            case End(ended_by=ErrorReport() as report):
+                self.ended(from_report(report))
+            case End():
+                pass
+
+    def _show_address(self) -> None:
+        """Show where the mesh can be reached: where it was asked to listen, or else its socket."""
+        if shown := ", ".join([one for one in self._endpoints if not is_socket(one)] or self._endpoints):
+            self._console.print(escape(f"mesh '{self._plan.system.config.mesh}' at {shown}"), soft_wrap=True)
+        self._endpoints = ()
+
+    def _warn(self) -> None:
+        """Show who else can reach it."""
+        config = self._plan.system.config
+        if config.zenoh.mode == "peer" and (wide := ", ".join(filter(leaves_host, config.zenoh.listen))):
+            text = f"warning: whoever can reach this host at {wide} can read, set and end this mesh"
+            self._console.print(f"[yellow]{escape(text)}[/]", soft_wrap=True)
+
+    def ended(self, early: FmuMeshError) -> None:
+        """Show why a run ended before its last point although nothing failed."""
+        self._console.print(escape(str(early)))
+
+    def progress(self, point: int) -> None:
+        """Show the point of a run in this process."""
+        self._progress.point(point)
+        self._release(lambda line: point > line.point)
+
+    def log(self, line: LogLine) -> None:
+        """Show one log message of an FMU; the same text is shown a few times, and then only counted.
+
+        One that may tell why the FMU fails is held back until it has gone on: the error would tell the same once more.
+        """
+        if line.status == "ok":
+            self._show(line)
+            return
+        self._held.append(line)
+        if len(self._held) > _HELD:
+            self._show(self._held.popleft())
+
+    def flush(self, error: str = "") -> None:
+        """Show what is held back, but for what an error tells."""
+        told = error.partition("the FMU says: ")[2]
+        self._held = deque(line for line in self._held if line.message not in told)
+        self._release(lambda _line: True)
+
+    def _release(self, may_go: Callable[[LogLine], bool]) -> None:
+        """Show the messages that were held back without a need."""
+        held, self._held = self._held, deque()
+        for line in held:
+            if may_go(line):
+                self._show(line)
+            else:
+                self._held.append(line)
+
+    def _show(self, line: LogLine) -> None:
+        key = line.instance, line.message
+        if key in self._times or len(self._times) < _COUNTED:
+            self._times[key] += 1
+            if self._times[key] > _SHOWN_TIMES:
+                return
+        style = _STYLES.get(line.status, "dim")
+        where = f"{line.instance} at point {line.point}"
+        self._console.print(f"[{style}]{escape(where)}: {escape(line.message)}[/]")
+
+    def output(self, name: str, text: str) -> None:
+        """Show a line that a process wrote by itself."""
+        if text:
+            shown = "".join(c if c.isprintable() or c == "\t" else "\N{REPLACEMENT CHARACTER}" for c in text)
+            self._console.print(f"[dim]{escape(name)} |[/] {escape(shown)}")
+
+    def _status(self, status: MeshStatus) -> None:
+        self._progress.status(status)
+        if status.state in ("running", "paused", "stopping", "done"):
+            self._show_address()
+        if status.state == "paused":
+            self._release(lambda _line: True)
+        elif self._held:
+            self._release(lambda line: status.progress[self._plan.node_of(line.instance)] > line.point)
+
+
+def say(text: str) -> None:
+    """Tell what takes its time before a run, on standard error."""
+    print(f"fmu-mesh: {text}", file=sys.stderr, flush=True)
+
+
+def warn(plan: Plan) -> None:
+    """Tell on standard error what is odd in a system that is about to run; of many warnings the first ones."""
+    for warning in plan.system.warnings[:_WARNINGS]:
+        say(f"warning: {warning}")
+    if (rest := len(plan.system.warnings) - _WARNINGS) > 0:
+        say(f"warning: and {rest} more, which `fmu-mesh check` shows")
+
+
+@contextmanager
+def stdout_as_stderr() -> Iterator[None]:
+    """While inside, what an FMU in this process prints goes to standard error: standard output is for results."""
+    sys.stdout.flush()
+    stdout = os.dup(1)
+    os.dup2(2, 1)
+    try:
+        yield
+    finally:
+        ctypes.CDLL(None).fflush(None)  # what the FMU printed may still be in the buffer of the C library
+        os.dup2(stdout, 1)
+        os.close(stdout)
+
+
+def summary(plan: Plan, *, point: int, seconds: float, rows: int, result_file: str | None) -> list[str]:
+    """The closing lines of a run; the last one is `20000 points in 1.234 s: 16207 points/s, real-time factor 32.4`."""
+    lines = []
+    if result_file is not None:
+        lines.append(f"result: {_short(Path(result_file))} ({rows} rows)")
+    rate = point / seconds if seconds > 0 else 0.0
+    factor = rate * plan.grid.step_size
+    lines.append(f"{point} points in {seconds:.3f} s: {rate:.0f} points/s, real-time factor {factor:.3g}")
+    return lines
+
+
+def _short(path: Path) -> str:
+    try:
+        return str(path.relative_to(Path.cwd()))
+    except ValueError:
+        return str(path)

@@ -1,0 +1,255 @@
+"""Results as a picture: axes by unit, lines that can be told apart, and a legend that leaves them room.
+
+Owns how a picture looks. Where its values and units come from is `fmu_mesh.cli.plotting`. matplotlib is an extra, so it
+is imported when something is drawn.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Mapping, Sequence
+from io import BytesIO
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from ...errors import ConfigurationError
+from ...files import replaced
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from matplotlib.legend import Legend
+
+__all__ = ["FLAGS", "VALUE", "Curve", "Results", "draw", "figure_of", "reduced"]
+
+FLAGS = "true (1) or false (0)"
+"""What stands at the axis of Booleans."""
+VALUE = "value"
+"""What stands at the axis of numbers without a unit, and of those whose unit is not known."""
+
+_MAX_POINTS = 4000
+"""Points drawn per line: more than twice the pixels of the picture's width would show nothing new."""
+_COLOURS = 10
+_DASHES: tuple[Any, ...] = (
+    "solid",
+    (0, (5, 2)),
+    (0, (1, 1.2)),
+    (0, (7, 2, 1.2, 2)),
+    (0, (7, 2, 1.2, 2, 1.2, 2)),
+    (0, (2.5, 1.2)),
+    (0, (10, 3)),
+    (0, (3, 1.2, 1, 1.2)),
+)
+"""With each of ten colours: 80 lines that can be told apart."""
+_OVER = (4.0, 2.0, 1.0)
+"""How long the dashes are, each 8 apart, of lines that lie on another one, so that all of them show."""
+_SAME = 1 / 400
+"""Two lines are one on the picture if they are nowhere further apart than this part of the height of their axes."""
+_GREATEST = 1e300
+"""Greater values are drawn as this one: matplotlib adds and subtracts the ends of its axes."""
+_ROWS = 40
+"""Lines of a legend before it gets another column."""
+_NAMES = 100
+"""Names in one legend: nobody tells more lines apart, and a picture has an end."""
+_CHARACTERS = 60
+_AXES_INCHES = (8.4, 2.8)
+"""Width, and least height, of axes with their labels in inches."""
+_FEW_AXES = 40
+"""More axes than this are lower."""
+
+
+class Results(msgspec.Struct, frozen=True):
+    """The columns of a result file.
+
+    Attributes:
+        times: the times in s.
+        columns: the values by variable; true is 1 and false is 0.
+        flags: the variables that hold nothing but true and false.
+        whole: the variables that are Integer or Enumeration: a Real is never written without a point or an exponent.
+    """
+
+    times: NDArray[np.float64]
+    columns: dict[str, NDArray[np.float64]]
+    flags: frozenset[str]
+    whole: frozenset[str]
+
+
+class Curve(msgspec.Struct, frozen=True):
+    """How one variable is drawn.
+
+    Attributes:
+        axis: what stands at its axis; variables with the same share one.
+        note: what the legend adds to its name.
+    """
+
+    axis: str
+    note: str = ""
+
+
+def draw(results: Results, output: Path, *, title: str, curves: Mapping[str, Curve]) -> None:
+    """Draw results into a file whose suffix says its format.
+
+    Args:
+        results: what to draw.
+        output: the file; its folder is made.
+        title: the line above all axes.
+        curves: how to draw variables of which more is known than their values, by name.
+
+    Raises:
+        ConfigurationError: the file cannot be written.
+    """
+    try:
+        output.parent.mkdir(parents=True, exist_ok=True)
+        picture = BytesIO()  # a backend that cannot write fails in ways of its own
+        with warnings.catch_warnings():
+            # Such as a character that the font does not have: it is drawn as a box.
+            warnings.simplefilter("ignore")
+            figure_of(results, title, curves).savefig(picture, format=output.suffix.removeprefix(".") or None)
+        with replaced(output) as draft:
+            draft.write_bytes(picture.getvalue())
+    except (OSError, ValueError) as error:  # a ValueError names the formats there are
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise ConfigurationError(f"the plot '{output}' cannot be written: {reason}.") from error
+
+
+def figure_of(results: Results, title: str, curves: Mapping[str, Curve]) -> Figure:
+    """The picture as matplotlib has it: one axes below the other, each as high as its legend needs."""
+    # The object interface: no window, no global state of pyplot.
+    from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415  matplotlib is an extra, and slow to import
+    from matplotlib.figure import Figure  # noqa: PLC0415  matplotlib is an extra, and slow to import
+
+    groups: dict[str, list[str]] = {}
+    for name in results.columns:
+        curve = curves.get(name)
+        axis = curve.axis if curve is not None else FLAGS if name in results.flags else VALUE
+        groups.setdefault(axis, []).append(name)
+    groups = groups or {VALUE: []}
+    figure = Figure(dpi=120, layout="constrained")
+    FigureCanvasAgg(figure)
+    least = _AXES_INCHES[1] * min(1.0, _FEW_AXES / len(groups))
+    heights = [max(least, 0.4 + 0.18 * _legend_rows(len(names))) for names in groups.values()]
+    all_axes = figure.subplots(len(groups), 1, sharex=True, squeeze=False, height_ratios=heights)[:, 0]
+    all_axes[0].set_title(_short(title), fontweight="bold", parse_math=False)
+    legend_width = 0.0
+    for axes, (label, names) in zip(all_axes, groups.items(), strict=True):
+        _draw_axes(axes, results, names, label)
+        axes.label_outer()
+        if names:
+            legend = _add_legend(axes, [_short(name) + (curves[name].note if name in curves else "") for name in names])
+            legend_width = max(legend_width, legend.get_window_extent().width / figure.dpi)
+    all_axes[-1].set_xlabel("time in s")
+    figure.set_size_inches(_AXES_INCHES[0] + legend_width, 1.2 + sum(heights) + (1.0 if len(groups) == 1 else 0.0))
+    return figure
+
+
+def _draw_axes(axes: Axes, results: Results, names: Sequence[str], label: str) -> None:
+    lone = "o" if len(results.times) == 1 else None  # a line of one point would show nothing
+    for number, (name, below) in enumerate(zip(names, _lines_below(results, names), strict=True)):
+        times, values = reduced(results.times, results.columns[name], _MAX_POINTS)
+        values = np.clip(values, -_GREATEST, _GREATEST)
+        dashes = _DASHES[number // _COLOURS % len(_DASHES)]
+        if below:
+            on = _OVER[min(below, len(_OVER)) - 1]
+            dashes = (0, (on, 8.0 - on))
+        axes.plot(
+            times,
+            values,
+            color=f"C{number % _COLOURS}",
+            linestyle=dashes,
+            drawstyle="steps-post" if name in results.flags or name in results.whole else "default",
+            linewidth=1.8 if below else 1.4,
+            marker=lone,
+        )
+    axes.set_ylabel(_short(label), parse_math=False)
+    axes.grid(visible=True, alpha=0.35)
+    axes.margins(x=0.01)
+    if names and all(name in results.flags for name in names):
+        axes.set_yticks([0, 1])
+        axes.set_ylim(-0.1, 1.1)
+    if not len(results.times):
+        axes.text(0.5, 0.5, "no points were recorded", ha="center", va="center", transform=axes.transAxes)
+
+
+def _lines_below(results: Results, names: Sequence[str]) -> list[int]:
+    """Of each variable, how many of those before it are the same line on the picture.
+
+    Only where no dashes tell them apart anyway.
+    """
+    if not 1 < len(names) <= _COLOURS or len(results.times) < 2:
+        return [0] * len(names)
+    stride = 1 + len(results.times) // _MAX_POINTS
+    table = np.array([results.columns[name][::stride] for name in names]).clip(-_GREATEST, _GREATEST)
+    near = _SAME * float(np.nan_to_num(table).max() - np.nan_to_num(table).min())
+    return [
+        sum(np.allclose(table[before], row, rtol=0.0, atol=near, equal_nan=True) for before in range(number))
+        for number, row in enumerate(table)
+    ]
+
+
+def _legend_columns(count: int) -> int:
+    """How many columns the legend of so many names has."""
+    return math.ceil(min(count, _NAMES + 1) / _ROWS) or 1
+
+
+def _legend_rows(count: int) -> int:
+    return math.ceil(min(count, _NAMES + 1) / _legend_columns(count))
+
+
+def _add_legend(axes: Axes, labels: Sequence[str]) -> Legend:
+    """A legend beside the axes, where it hides no line."""
+    from matplotlib.lines import Line2D  # noqa: PLC0415  matplotlib is an extra, and slow to import
+
+    lines = list(axes.lines)[: len(labels)]
+    shown = list(labels)
+    if len(shown) > _NAMES:
+        lines, shown = (
+            [*lines[:_NAMES], Line2D([], [], linestyle="none")],
+            [*shown[:_NAMES], f"and {len(shown) - _NAMES} more"],
+        )
+    legend = axes.legend(
+        lines,
+        # matplotlib leaves out a name that begins with an underscore; a joiner without width before it does not show.
+        [f"\N{WORD JOINER}{text}" if text.startswith("_") else text for text in shown],
+        loc="upper left",
+        bbox_to_anchor=(1.005, 1.0),
+        borderaxespad=0.0,
+        frameon=False,
+        ncols=_legend_columns(len(labels)),
+        fontsize=9 if len(shown) > 2 * _COLOURS else 10,
+        labelspacing=0.35,
+        handlelength=2.6,
+    )
+    for text in legend.get_texts():
+        text.set_parse_math(False)  # a dollar in a name is one
+    return legend
+
+
+def _short(text: str) -> str:
+    """A name with its middle left out where it gets long: both ends of a structured name say something."""
+    half = _CHARACTERS // 2
+    return text if len(text) <= _CHARACTERS else f"{text[: half - 1]}…{text[-half:]}"
+
+
+def reduced(
+    times: NDArray[np.float64], values: NDArray[np.float64], most: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """About ``most`` points that look like all of them: the least and the greatest of every stretch."""
+    values = np.where(np.isinf(values), np.nan, values)
+    if len(times) <= most:
+        return times, values
+    edges = np.linspace(0, len(times), most // 2 + 1).astype(int)
+    kept = {0, len(times) - 1}
+    for first, end in pairwise(edges):
+        stretch = values[first:end]
+        if np.isnan(stretch).all():
+            kept.add(int(first))  # so that the gap shows
+        else:
+            kept.update((int(first + np.nanargmin(stretch)), int(first + np.nanargmax(stretch))))
+    picked = np.array(sorted(kept))
+    return times[picked], values[picked]

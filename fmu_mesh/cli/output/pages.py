@@ -1,0 +1,157 @@
+"""What the mesh answers, as lines of text for a person."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import msgspec
+
+from ...simtime import ENDLESS
+from ...wire.client.readings import Reading
+from ...wire.views import InstanceInfo, InstanceStatus, MeshInfo, MeshStatus, RosView, VariableView
+from .tables import pairs, table
+
+__all__ = [
+    "cells",
+    "instance_info",
+    "instance_status",
+    "instances",
+    "mesh_info",
+    "mesh_status",
+    "progress",
+    "seconds",
+    "variables",
+]
+
+
+def variables(info: InstanceInfo) -> list[str]:
+    """One line for each variable of an instance."""
+    rows = [
+        [v.key, _type(v), v.variability, v.unit or "", "" if v.start is None else _text(v.start), v.description or ""]
+        for v in info.variables
+    ]
+    return table(rows, heading=["variable", "type", "variability", "unit", "start", "description"], indent=2)
+
+
+def instances(statuses: Iterable[InstanceStatus]) -> list[str]:
+    """One line for each instance of a mesh."""
+    rows = [
+        [s.instance, s.state, str(s.point), seconds(s.time), f"{1e6 * s.step_time:.3g} us", s.activity]
+        for s in statuses
+    ]
+    return table(rows, heading=["instance", "state", "point", "time", "step time", "activity"])
+
+
+def mesh_status(status: MeshStatus, ros: Sequence[RosView] = ()) -> list[str]:
+    """How far a mesh is, and what its gateways to ROS reach."""
+    return pairs(
+        [
+            ("mesh", status.mesh),
+            ("state", status.state),
+            ("point", progress(status)),
+            ("time", seconds(status.time)),
+            ("speed", f"{status.points_per_second:.0f} points/s, real-time factor {status.real_time_factor:.3g}"),
+            ("overruns", str(status.overruns or "")),
+            *(("ROS", view.activity) for view in ros),
+            *(("ROS", f"{other} publishes /clock, too") for view in ros for other in view.other_clocks),
+            ("error", status.error.message if status.error is not None else ""),
+        ]
+    )
+
+
+def instance_status(status: InstanceStatus) -> list[str]:
+    """How far an instance is."""
+    return pairs(
+        [
+            ("instance", status.instance),
+            ("state", status.state),
+            ("activity", status.activity),
+            ("point", str(status.point)),
+            ("time", seconds(status.time)),
+            ("step time", f"{1e6 * status.step_time:.3g} us"),
+            ("wait time", f"{status.wait_time:.3g} s"),
+            ("overruns", str(status.overruns or "")),
+            ("restarts", str(status.restarts or "")),
+        ]
+    )
+
+
+_PARTS = {"@record": "the recorder", "@mesh": "the master"}
+
+
+def mesh_info(info: MeshInfo) -> list[str]:
+    """What a mesh is."""
+    return pairs(
+        [
+            ("mesh", info.mesh),
+            ("configuration", info.config),
+            (
+                "simulation",
+                f"{seconds(info.start_time)} to {_end(info.stop_time)} in steps of {seconds(info.step_size)}",
+            ),
+            ("algorithm", info.algorithm),
+            ("window", f"{info.window} points"),
+            ("real-time factor", f"{info.real_time_factor:g}" if info.real_time_factor else "as fast as possible"),
+            ("instances", ", ".join(info.instances)),
+            ("nodes", ", ".join(info.nodes)),
+            ("result file", info.result_file or "none"),
+            ("endpoints", ", ".join(info.endpoints)),
+            ("shared memory", ", ".join(_PARTS.get(name, name) for name in info.shared_memory) or "not used"),
+            ("master", f"process {info.pid} on {info.host}, fmu_mesh {info.version}"),
+        ]
+    )
+
+
+def instance_info(info: InstanceInfo) -> list[str]:
+    """What an instance is, with its variables."""
+    fmi = f"FMI {info.fmi_version}, " if info.fmi_version else ""
+    facts = pairs(
+        [
+            ("instance", info.instance),
+            ("model", f"{info.model_name} ({fmi}{info.kind})"),
+            ("description", info.description or ""),
+            ("made by", info.generation_tool or ""),
+            ("FMU" if fmi else "file", info.fmu),
+            ("step size", seconds(info.step_size)),
+            (
+                "can",
+                ", ".join(
+                    name.removeprefix("can_").replace("_", " ") for name, can in info.capabilities.items() if can
+                ),
+            ),
+            ("node", f"{info.node}, process {info.pid} on {info.host}"),
+            ("fed by", ", ".join(f"{c.source} -> {c.target}" for c in info.connections)),
+            ("clocks", ", ".join(map(str, info.clocks))),
+            ("problems", "; ".join(info.problems)),
+        ]
+    )
+    return [*facts, "", *variables(info)]
+
+
+def cells(reading: Reading) -> list[str]:
+    """A value as key, value, unit, and point with time."""
+    where = f"(point {reading.point}, t = {seconds(reading.time)})"
+    return [reading.key, _text(reading.value), reading.unit or "", where]
+
+
+def progress(status: MeshStatus) -> str:
+    """The point of a mesh, and the last one if there is one."""
+    return f"{status.point} of {status.last_point}" if status.last_point < ENDLESS else str(status.point)
+
+
+def seconds(time: float) -> str:
+    """A time in s."""
+    return f"{time:.12g} s"
+
+
+def _end(stop_time: float | None) -> str:
+    return seconds(stop_time) if stop_time is not None else "an open end"
+
+
+def _type(view: VariableView) -> str:
+    """The type, with the sizes of an array's dimensions."""
+    return f"{view.type}[{','.join(map(str, view.shape))}]" if view.shape else view.type
+
+
+def _text(value: object) -> str:
+    return value if isinstance(value, str) else msgspec.json.encode(value).decode()

@@ -1,0 +1,125 @@
+"""The progress line of a run: how far it is, how fast, and how long it still takes, in the width of the terminal.
+
+Owns what is left out where there is no room for it. Never wider than one line: a line that breaks cannot be taken back.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import Final
+
+from rich.console import Console, ConsoleOptions, RenderResult
+from rich.live import Live
+from rich.progress_bar import ProgressBar
+from rich.table import Table
+from rich.text import Text
+
+from ...simtime import TimeGrid
+from ...system.plan import Plan
+from ...wire.views import MeshStatus
+from .tables import shortened
+
+__all__ = ["ProgressLine", "progress_parts"]
+
+_LEAST_BAR: Final = 8
+_MOST_NAME: Final = 20
+_GAP: Final = "  "
+_ECHO: Final = 3
+"""Columns for the `^C` that a terminal shows: it would begin another line, and this one could not be taken back."""
+
+
+class ProgressLine:
+    """One line at the bottom of a terminal, while it is started.
+
+    Args:
+        plan: what runs.
+        console: where; nothing is drawn where that is no terminal.
+        show: whether to draw it at all.
+    """
+
+    def __init__(self, plan: Plan, console: Console, *, show: bool) -> None:
+        self._name = plan.system.config.mesh
+        self._grid = plan.grid
+        self._status: MeshStatus | None = None
+        self._started: float | None = None
+        drawn = show and console.is_terminal and not console.is_dumb_terminal and console.file.isatty()
+        self._live = Live(self, console=console, transient=True, refresh_per_second=10) if drawn else None
+
+    def start(self) -> None:
+        """Draw it from now on."""
+        if self._live is not None:
+            self._live.start()
+
+    def stop(self) -> None:
+        """Take it away."""
+        if self._live is not None:
+            self._live.stop()
+
+    def status(self, status: MeshStatus) -> None:
+        """Show how far the mesh is."""
+        self._status = status
+
+    def point(self, point: int) -> None:
+        """Show how far a run in this process is; its speed is measured from the first call on."""
+        now = time.monotonic()
+        self._started = now if self._started is None else self._started
+        elapsed = now - self._started
+        rate = point / elapsed if elapsed > 0.0 else 0.0
+        grid = self._grid
+        last, at = grid.last_point, grid.time(point)
+        self._status = MeshStatus(self._name, "running", point, last, at, rate, rate * grid.step_size, {})
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        """Rich asks for it ten times a second."""
+        width = max(options.max_width - _ECHO, 1)
+        name = shortened(self._name, min(_MOST_NAME, width // 4))
+        parts = progress_parts(self._grid, self._status, width - len(name) - len(_GAP) - _LEAST_BAR - len(_GAP))
+        line = Table.grid(padding=(0, len(_GAP), 0, 0), pad_edge=False)
+        line.width = width
+        line.add_column(no_wrap=True)
+        line.add_column(ratio=1, no_wrap=True)
+        line.add_column(no_wrap=True)
+        point = self._status.point if self._status is not None else 0
+        total = self._grid.last_point if self._grid.stop_time is not None else None
+        bar = ProgressBar(total=total, completed=point, pulse=total is None)
+        line.add_row(Text(name, style="bold"), bar, Text(_GAP.join(parts)))
+        yield line
+
+
+def progress_parts(grid: TimeGrid, status: MeshStatus | None, width: int) -> list[str]:
+    """What the line says besides the name, as far as ``width`` columns allow: the first parts matter most.
+
+    Args:
+        grid: the points of the run.
+        status: how far it is; None before anything is known.
+        width: room in columns.
+    """
+    if status is None or status.state in ("starting", "initializing"):
+        return [status.state if status is not None else "starting"]
+    rate, parts = status.points_per_second, []
+    if grid.stop_time is not None:
+        parts.append(f"{100 * status.point // max(grid.last_point, 1)} %")
+        parts.append(f"{status.time:.6g} of {grid.stop_time:.6g} s")
+    else:
+        parts.append(f"{status.time:.6g} s")
+    if status.state != "running":
+        parts.append(status.state)
+    elif grid.stop_time is not None and rate > 0.0:
+        parts.append(f"{_duration((grid.last_point - status.point) / rate)} left")
+    parts += [f"{rate:,.0f} points/s", f"factor {status.real_time_factor:.3g}"]
+    shown: list[str] = []
+    for part in parts:
+        if len(_GAP.join([*shown, part])) > width:
+            break
+        shown.append(part)
+    return shown
+
+
+def _duration(seconds: float) -> str:
+    """A time in the form that a clock has: minutes and seconds, and hours or days where there are some."""
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    days, hours = divmod(hours, 24)
+    if days:
+        return f"{days} d {hours} h"
+    return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"

@@ -1,0 +1,241 @@
+"""A configuration file to a `LoadedConfig`: its structure is right, or all that is wrong with it is told.
+
+Owns the reading of the file, the short form of connections and the options that override start values. What
+the names in the file mean is `fmu_mesh.system.system`.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import msgspec
+from msgspec import inspect
+
+from fmu_mesh.config.findings import Findings, listed, locate, nearest, nearest_file, shown
+from fmu_mesh.config.mesh import KIND, Config
+from fmu_mesh.config.salvage import salvage
+from fmu_mesh.config.structure import check
+from fmu_mesh.config.yaml_text import Plain, read
+from fmu_mesh.errors import Finding
+
+__all__ = ["MAXIMUM_BYTES", "LoadedConfig", "examine", "load", "parse"]
+
+MAXIMUM_BYTES = 4 * 1024 * 1024
+_ARCHIVE = b"PK\x03\x04"
+
+_ARROW = "->"
+_OTHER_ARROW = re.compile(r"\s*(?:-+>|=+>|→|⟶|~>|>)\s*")
+_SHORT_FORM = "'instance.output -> instance.input', or {from: instance.output, to: instance.input}"
+
+
+class LoadedConfig(msgspec.Struct, frozen=True):
+    """A configuration whose structure is right, and where its parts stand in the file.
+
+    Attributes:
+        config: the configuration, overrides included.
+        file: the file as the user named it.
+        lines: line numbers, counted from 1, by path in the file.
+        overrides: the option (`--set pendulum.l=2`) that took the place of what stands at a path.
+    """
+
+    config: Config
+    file: Path
+    lines: dict[str, int] = {}
+    overrides: dict[str, str] = {}
+
+    def findings(self) -> Findings:
+        """An empty collection of findings about this file."""
+        return Findings(str(self.file), self.lines, self.overrides)
+
+    def locate(self, path: str) -> int | None:
+        """The line of ``path``, or of the nearest place around it."""
+        return locate(self.lines, path)
+
+    def finding(self, path: str, found: str, expected: str, suggestion: str | None = None) -> Finding:
+        """A finding with the line of ``path``."""
+        return Finding(str(self.file), path, found, expected, suggestion, self.locate(path))
+
+    def resolve(self, relative: str) -> Path:
+        """The absolute path of a path that stands in the file.
+
+        The folder is resolved, the name is not: a link such as `/dev/stdout` stays what it is.
+        """
+        path = self.file.absolute().parent / relative
+        return path.parent.resolve() / path.name
+
+
+def load(path: Path, overrides: Sequence[str] = ()) -> LoadedConfig:
+    """Read a configuration file.
+
+    Args:
+        path: the YAML file.
+        overrides: start values of the command line, each `instance.variable=value` with a YAML scalar.
+
+    Raises:
+        ConfigurationError: the file cannot be read, or its structure is wrong; carries all findings.
+    """
+    loaded, findings = examine(path, overrides)
+    return _right(loaded, findings)
+
+
+def examine(path: Path, overrides: Sequence[str] = ()) -> tuple[LoadedConfig, Findings]:
+    """As `load`, but go on where the structure is wrong: give what is left, and the findings.
+
+    Hand both to `system.build`, which checks the meaning of what is left and raises one error with everything. With
+    findings the configuration holds placeholders (an empty `fmu`, a step size that is NaN) and must not be run.
+
+    Raises:
+        ConfigurationError: the file cannot be read, or too little of it is left.
+    """
+    findings = Findings(str(path))
+    text = _text(path, findings)
+    findings.raise_any()
+    return _examine(text, path, overrides)
+
+
+def parse(text: str, path: Path, overrides: Sequence[str] = ()) -> LoadedConfig:
+    """As `load`, with the text of the file at hand; ``path`` is what relative paths and errors refer to.
+
+    Raises:
+        ConfigurationError: the structure is wrong; carries all findings.
+    """
+    loaded, findings = _examine(text, path, overrides)
+    return _right(loaded, findings)
+
+
+def _right(loaded: LoadedConfig, findings: Findings) -> LoadedConfig:
+    findings.raise_any()
+    return loaded
+
+
+def _examine(text: str, path: Path, overrides: Sequence[str]) -> tuple[LoadedConfig, Findings]:
+    lines: dict[str, int] = {}
+    replaced: dict[str, str] = {}
+    findings = Findings(str(path), lines, replaced)
+    data = read(text, findings, lines)
+    if data is None:
+        if not len(findings):
+            findings.add("", "nothing (null)", "a mapping with mesh, simulation and instances")
+        findings.raise_any()
+    if isinstance(data, dict):
+        data = _with_long_connections(data, findings)
+        data = _with_kinds(_with_overrides(data, overrides, replaced, findings))
+    check(data, inspect.type_info(Config), "", findings)
+    config = salvage(data, findings.places) if len(findings) else msgspec.convert(data, Config)
+    if config is None:
+        findings.raise_any()
+    assert config is not None  # without a finding there is a configuration
+    return LoadedConfig(config, path, lines, replaced), findings
+
+
+def _text(path: Path, findings: Findings) -> str:
+    """The text of the file; empty after a finding."""
+    try:
+        with path.open("rb") as file:
+            data = file.read(MAXIMUM_BYTES + 1)
+    except FileNotFoundError:
+        findings.add("", "no such file", "", nearest_file(path))
+        return ""
+    except IsADirectoryError:
+        findings.add("", "a folder", "a configuration file")
+        return ""
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else str(error)
+        findings.add("", f"it cannot be read ({reason})", "a readable file")
+        return ""
+    if len(data) > MAXIMUM_BYTES:
+        findings.add("", f"more than {MAXIMUM_BYTES} bytes", "a smaller file")
+        return ""
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = data.count(b"\n", 0, error.start) + 1
+        found = f"the byte 0x{data[error.start]:02x} in line {line}", "text in UTF-8"
+        if data.startswith(_ARCHIVE):
+            found = "an archive, as FMUs are", f"a configuration file; `fmu-mesh run {path}` runs one FMU"
+        findings.add("", *found)
+        return ""
+
+
+def _with_long_connections(data: dict[str, Plain], findings: Findings) -> dict[str, Plain]:
+    """``data`` with every connection in its long form; what cannot be read is noted and has empty ends."""
+    connections = data.get("connections")
+    if not isinstance(connections, list):
+        return data
+    written: list[Plain] = []
+    for index, connection in enumerate(connections):
+        if isinstance(connection, dict):
+            written.append(connection)
+            continue
+        ends = [end.strip() for end in connection.split(_ARROW)] if isinstance(connection, str) else []
+        if len(ends) == 2 and all(ends):
+            written.append({"from": ends[0], "to": ends[1]})
+        else:
+            findings.add(f"connections[{index}]", shown(connection), _SHORT_FORM, _arrow_meant(connection))
+            written.append({"from": "", "to": ""})
+    return {**data, "connections": written}
+
+
+def _with_kinds(data: dict[str, Plain]) -> dict[str, Plain]:
+    """``data`` with the kind of every instance, as its keys say it: that of an FMU where they say nothing."""
+    instances = data.get("instances")
+    if not isinstance(instances, dict):
+        return data
+    written: dict[str, Plain] = {}
+    for name, instance in instances.items():
+        if isinstance(instance, dict):
+            kind = next((key for key in ("fmu", "mujoco", "gazebo_classic", "controller") if key in instance), "fmu")
+            written[name] = {**instance, KIND: kind}
+        else:
+            written[name] = instance
+    return {**data, "instances": written}
+
+
+def _arrow_meant(connection: Plain) -> str | None:
+    """The short form that somebody who wrote another arrow may have meant."""
+    if not isinstance(connection, str):
+        return None
+    forwards = [end.strip() for end in _OTHER_ARROW.split(connection)]
+    backwards = [end.strip() for end in reversed(re.split(r"<[-=]+|←", connection))]
+    for ends in (backwards, forwards):
+        if len(ends) == 2 and all(ends):
+            return f"{ends[0]} {_ARROW} {ends[1]}"
+    return None
+
+
+def _with_overrides(
+    data: dict[str, Plain], overrides: Sequence[str], replaced: dict[str, str], findings: Findings
+) -> dict[str, Plain]:
+    """``data`` with the start values of the command line; notes in ``replaced`` which option went where."""
+    instances = data.get("instances")
+    if not isinstance(instances, dict):
+        return data
+    instances = dict(instances)
+    for override in overrides:
+        option = f"--set {override}"
+        name, dot, rest = override.partition(".")
+        variable, equals, text = rest.partition("=")
+        if not (name and dot and variable and equals):
+            findings.add(option, "no start value", "instance.variable=value")
+            continue
+        if name not in instances:
+            expected = f"one of {listed(list(instances))}"
+            findings.add(option, f"the unknown instance '{name}'", expected, nearest(name, instances))
+            continue
+        value = read(text, ignored := Findings(option), {})
+        if len(ignored) or not isinstance(value, bool | int | float | str | list):
+            findings.add(option, f"the value {shown(text)}", "a number, text, true or false, or a list")
+            continue
+        _set_start_value(instances, name, variable, value)
+        replaced[f"instances.{name}.start_values.{variable}"] = option
+    return {**data, "instances": instances}
+
+
+def _set_start_value(instances: dict[str, Plain], name: str, variable: str, value: Plain) -> None:
+    instance = instances[name]
+    if isinstance(instance, dict):
+        values = instance.get("start_values", {})
+        if isinstance(values, dict):
+            instances[name] = {**instance, "start_values": {**values, variable: value}}

@@ -1,0 +1,100 @@
+"""The section `ros` of the configuration file: what ROS 2 sees of a mesh."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import msgspec
+from msgspec import Meta
+
+from fmu_mesh.config.base import POSITIVE, Base, Endpoint
+
+__all__ = ["RosConfig", "RosProfile", "RosTopicConfig", "RosTopicProfile"]
+
+RosTopicProfile = Literal["ros2dds", "rmw_zenoh"]
+RosProfile = Literal["ros2dds", "rmw_zenoh", "rclpy"]
+
+
+class RosTopicConfig(Base, frozen=True, kw_only=True):
+    """One ROS topic; outputs are published, unconnected inputs subscribed. The short form is `instance.variable`."""
+
+    topic: Annotated[
+        str | None,
+        Meta(description="Name of the topic; default: <instance>/<variable>, with _ for what ROS does not allow."),
+    ] = None
+    variable: Annotated[
+        str | None,
+        Meta(description="`instance.variable`, or `instance` for all of its outputs and unconnected inputs."),
+    ] = None
+    type: Annotated[
+        str | None,
+        Meta(
+            description="Message type; default: the one of std_msgs for the type of the variable.",
+            examples=["std_msgs/msg/Float64"],
+        ),
+    ] = None
+    fields: Annotated[
+        dict[str, str],
+        Meta(
+            description="Several variables in one message: `instance.variable` by the field that it goes into.",
+            examples=[{"twist.linear.x": "path_filter.v"}],
+        ),
+    ] = {}
+    constants: Annotated[
+        dict[str, str | float | int | bool],
+        Meta(
+            description="What every published message has besides, by field, such as the name of a frame.",
+            examples=[{"transforms[0].child_frame_id": "base_link"}],
+        ),
+    ] = {}
+    profile: Annotated[RosTopicProfile | None, Meta(description="Another profile than that of the mesh.")] = None
+    frame_id: Annotated[
+        str, Meta(description="frame_id of the header, where the message or one of its elements has one.")
+    ] = ""
+    reliability: Annotated[
+        Literal["reliable", "best_effort"],
+        Meta(description="Reliability in ROS; a best-effort publisher needs a best-effort subscription here."),
+    ] = "reliable"
+
+
+class RosConfig(Base, frozen=True, kw_only=True):
+    """What ROS 2 sees of the mesh, without ROS on this side."""
+
+    profile: Annotated[
+        RosProfile,
+        Meta(
+            description="ros2dds: as zenoh-bridge-ros2dds expects it, for ROS on DDS; rmw_zenoh: as ROS nodes on "
+            "rmw_zenoh expect it; rclpy: as topics of a ROS node, `python -m fmu_mesh.ros.node` with this file."
+        ),
+    ] = "ros2dds"
+    topics: Annotated[
+        list[str | RosTopicConfig] | None,
+        Meta(description="The topics; default: all outputs and all unconnected inputs of all instances."),
+    ] = None
+    connect: Annotated[list[Endpoint], Meta(description="Where the bridge or the router of rmw_zenoh is.")] = (
+        msgspec.field(default_factory=lambda: ["tcp/127.0.0.1:7447"])
+    )
+    listen: Annotated[
+        list[Endpoint], Meta(description="Endpoints where a bridge can connect to, instead of or beside `connect`.")
+    ] = []
+    node: Annotated[str | None, Meta(description="Name of the node in ROS; default: the name of the mesh.")] = None
+    namespace: Annotated[str, Meta(description="Namespace of the node and of its topics.")] = "/"
+    domain: Annotated[int, Meta(ge=0, le=232, description="ROS_DOMAIN_ID; used by rmw_zenoh.")] = 0
+    distribution: Annotated[
+        Literal["humble", "jazzy", "kilted", "lyrical"],
+        Meta(description="The ROS 2 distribution whose message definitions and hashes hold."),
+    ] = "jazzy"
+    clock_rate: Annotated[
+        float | None,
+        Meta(
+            description="/clock messages per second of simulation time, at most one per point; null: no /clock.",
+            extra_json_schema=POSITIVE,
+        ),
+    ] = 100.0
+    messages: Annotated[
+        dict[str, str],
+        Meta(
+            description="Custom message types: the path of the .msg file, relative to this file, by the full name.",
+            examples=[{"lab_msgs/msg/Wheel": "msg/Wheel.msg"}],
+        ),
+    ] = {}

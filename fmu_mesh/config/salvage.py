@@ -1,0 +1,109 @@
+"""What is left of a configuration when everything that is wrong with its structure is taken out.
+
+Owns the placeholders that stand for what was taken out, so that the meaning of the rest can be checked and one error
+can show all findings. Such a configuration is never run.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Set as AbstractSet
+
+import msgspec
+
+from fmu_mesh.config.mesh import KIND, Config
+from fmu_mesh.config.yaml_text import Plain
+
+__all__ = ["salvage"]
+
+_CONTAINERS = re.compile(
+    r"|simulation|connections|initialization|record|zenoh|timeouts|limits|instances(\.[^.]+(\.start_values)?)?"
+)
+_TIMES = ("start_time", "stop_time", "step_size")
+
+
+def salvage(data: Plain, wrong: AbstractSet[str]) -> Config | None:
+    """The configuration without what stands at the paths ``wrong``; None if too little is left.
+
+    A missing or wrong time is NaN, a missing FMU an empty path, a wrong connection has two empty ends.
+    """
+    if not isinstance(data, dict):
+        return None
+    rest = _without(data, wrong, "")
+    if not isinstance(rest, dict):
+        return None
+    try:
+        return msgspec.convert(
+            {
+                **rest,
+                "mesh": rest.get("mesh", "mesh"),
+                "simulation": _simulation(rest.get("simulation"), wrong),
+                "instances": _with_fmu(rest.get("instances")),
+                "connections": _with_ends(rest.get("connections", [])),
+            },
+            Config,
+        )
+    except msgspec.ValidationError:
+        return None
+
+
+def _without(value: Plain, wrong: AbstractSet[str], path: str) -> Plain:
+    """``value`` without its wrong entries; a wrong list item is null, so that the others keep their places."""
+    if isinstance(value, dict):
+        places = {key: f"{path}.{key}" if path else key for key in value}
+        return {
+            key: _without(item, wrong, places[key])
+            for key, item in value.items()
+            if places[key] not in wrong or (isinstance(item, dict | list) and _CONTAINERS.fullmatch(places[key]))
+        }
+    if isinstance(value, list):
+        places_of_items = [f"{path}[{index}]" for index in range(len(value))]
+        if path != "connections" and any(_is_wrong(place, wrong) for place in places_of_items):
+            return []
+        pairs = zip(value, places_of_items, strict=True)
+        return [None if place in wrong else _without(item, wrong, place) for item, place in pairs]
+    return value
+
+
+def _is_wrong(place: str, wrong: AbstractSet[str]) -> bool:
+    """Whether an item of a list, or anything in it, is wrong."""
+    return any(path == place or path.startswith(f"{place}.") for path in wrong)
+
+
+def _simulation(section: Plain, wrong: AbstractSet[str]) -> dict[str, Plain]:
+    times: dict[str, Plain] = {"stop_time": math.nan, "step_size": math.nan}
+    unknown: dict[str, Plain] = {name: math.nan for name in _TIMES if f"simulation.{name}" in wrong}
+    return {**times, **(section if isinstance(section, dict) else {}), **unknown}
+
+
+def _with_fmu(section: Plain) -> dict[str, Plain]:
+    instances = section if isinstance(section, dict) else {}
+    return {
+        name: _with_model(instance) if isinstance(instance, dict) else {KIND: "fmu", "fmu": ""}
+        for name, instance in instances.items()
+    }
+
+
+def _with_model(instance: dict[str, Plain]) -> dict[str, Plain]:
+    """``instance`` with an empty path where its model is missing; without a controller it is an FMU that is missing."""
+    match instance.get(KIND):
+        case "mujoco":
+            return {"mujoco": "", **instance}
+        case "gazebo_classic":
+            return {"gazebo_classic": "", **instance}
+        case "controller" if "controller" not in instance:
+            shared: dict[str, Plain] = {key: instance[key] for key in ("step_size", "group", "host") if key in instance}
+            return {KIND: "fmu", "fmu": "", **shared}
+        case "controller":
+            return instance
+        case _:
+            return {"fmu": "", **instance}
+
+
+def _with_ends(section: Plain) -> list[Plain]:
+    connections = section if isinstance(section, list) else []
+    return [
+        connection if isinstance(connection, dict) and {"from", "to"} <= connection.keys() else {"from": "", "to": ""}
+        for connection in connections
+    ]

@@ -1,0 +1,182 @@
+"""Plain values to frozen Structs, with every deviation found and not only the first.
+
+Owns the comparison of plain values with the types of msgspec Structs: unknown and missing keys, wrong types,
+patterns and ranges. Numbers are strict: neither text nor truth values, NaN and infinity are numbers. Knows
+nothing of what the values mean.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from types import NoneType
+
+from msgspec import inspect
+
+from fmu_mesh.config.findings import Findings, listed, nearest, shown
+from fmu_mesh.config.yaml_text import Plain
+
+__all__ = ["check", "describe"]
+
+_WORDS: dict[type[inspect.Type], str] = {
+    inspect.StrType: "text",
+    inspect.BoolType: "true or false",
+    inspect.NoneType: "null",
+    inspect.ListType: "a list",
+}
+_PYTHON_TYPES: dict[type[inspect.Type], type] = {
+    inspect.StrType: str,
+    inspect.BoolType: bool,
+    inspect.NoneType: NoneType,
+}
+
+
+def check(value: Plain, kind: inspect.Type, path: str, findings: Findings) -> None:
+    """Note every way in which ``value`` is not of the type ``kind``.
+
+    Args:
+        value: the plain value at ``path``.
+        kind: the type as `msgspec.inspect.type_info` gives it.
+        path: the place of the value in the file.
+        findings: where deviations go.
+    """
+    match kind:
+        case inspect.Metadata(type=inspect.StrType() as text) if not _fits(value, text):
+            findings.add(path, shown(value), describe(kind))
+        case inspect.Metadata():
+            check(value, kind.type, path, findings)
+        case inspect.UnionType():
+            _check_union(value, kind, path, findings)
+        case inspect.StructType() if isinstance(value, dict):
+            _check_struct(value, kind, path, findings)
+        case inspect.DictType() if isinstance(value, dict):
+            _check_mapping(value, kind, path, findings)
+        case inspect.ListType() if isinstance(value, list):
+            for index, item in enumerate(value):
+                check(item, kind.item_type, f"{path}[{index}]", findings)
+        case _ if not _fits(value, kind):
+            suggestion = nearest(value, _words(kind)) if isinstance(value, str) else None
+            items = ", each item after '- '" if isinstance(kind, inspect.ListType) and isinstance(value, str) else ""
+            findings.add(path, shown(value), describe(kind) + items, suggestion)
+
+
+def describe(kind: inspect.Type) -> str:
+    """What a value of the type ``kind`` is, in words."""
+    match kind:
+        case inspect.Metadata():
+            words = str((kind.extra_json_schema or {}).get("title") or describe(kind.type))
+        case inspect.UnionType(types=(inspect.StructType() as usual, *_)):
+            words = describe(usual)
+        case inspect.UnionType():
+            numbers = any(isinstance(option, inspect.FloatType) for option in kind.types)
+            options = [
+                describe(option)
+                for option in kind.types
+                if not (numbers and isinstance(option, inspect.IntType))  # a whole number is a number
+            ]
+            words = f"{', '.join(options[:-1])} or {options[-1]}"
+        case inspect.LiteralType():
+            words = " or ".join(str(value) for value in kind.values)
+        case inspect.FloatType() | inspect.IntType():
+            words = f"a {'finite' if isinstance(kind, inspect.FloatType) else 'whole'} number{_bounds(kind)}"
+        case inspect.StrType(pattern=str(pattern)):
+            words = f"text that matches {pattern}"
+        case inspect.StructType():
+            words = f"a mapping with {listed([field.encode_name for field in kind.fields])}"
+        case _:
+            words = _WORDS.get(type(kind), "a mapping")
+    return words
+
+
+def _check_struct(value: dict[str, Plain], kind: inspect.StructType, path: str, findings: Findings) -> None:
+    fields = {field.encode_name: field for field in kind.fields}
+    absent = [name for name in fields if name not in value]
+    meant: set[str | None] = set()
+    for key, item in value.items():
+        if key == kind.tag_field:
+            continue
+        place = f"{path}.{key}" if path else key
+        if key in fields:
+            check(item, fields[key].type, place, findings)
+            continue
+        suggestion = nearest(key, absent) or nearest(key, fields)
+        meant.add(suggestion)
+        findings.add(place, "an unknown key" if key else "an empty key", f"one of {listed(list(fields))}", suggestion)
+    for name in absent:
+        if fields[name].required and name not in meant:
+            place = f"{path}.{name}" if path else name
+            findings.add(place, "missing", describe(fields[name].type))
+
+
+def _check_mapping(value: dict[str, Plain], kind: inspect.DictType, path: str, findings: Findings) -> None:
+    if len(value) < (kind.min_length or 0):
+        findings.add(path, "an empty mapping", f"at least {kind.min_length} entry")
+    for key, item in value.items():
+        place = f"{path}.{key}"
+        check(key, kind.key_type, place, findings)
+        if item is None and key.count("(") > key.count(")"):  # {der(a,2): 0} without quotes
+            findings.add(place, f"'{key}' without a value", "quotes around a name with a comma inside { }")
+        else:
+            check(item, kind.value_type, place, findings)
+
+
+def _check_union(value: Plain, kind: inspect.UnionType, path: str, findings: Findings) -> None:
+    options = _options(kind)
+    if isinstance(value, dict):
+        options = [option for option in options if _is_of_kind(value, option)] or options
+    for option in options:
+        container = isinstance(option, inspect.StructType | inspect.DictType) and isinstance(value, dict)
+        if container or (isinstance(option, inspect.ListType) and isinstance(value, list)):
+            check(value, option, path, findings)
+            return
+    if not any(_fits(value, option) for option in options):
+        words = [word for option in options for word in _words(option)]
+        suggestion = nearest(value, words) if isinstance(value, str) else None
+        findings.add(path, shown(value), describe(kind), suggestion)
+
+
+def _is_of_kind(value: dict[str, Plain], option: inspect.Type) -> bool:
+    """Whether ``option`` is the Struct that a mapping of a tagged union says it is."""
+    return isinstance(option, inspect.StructType) and (
+        option.tag_field is not None and value.get(option.tag_field) == option.tag
+    )
+
+
+def _options(kind: inspect.UnionType) -> list[inspect.Type]:
+    return [option.type if isinstance(option, inspect.Metadata) else option for option in kind.types]
+
+
+def _words(kind: inspect.Type) -> Sequence[str]:
+    return [word for word in kind.values if isinstance(word, str)] if isinstance(kind, inspect.LiteralType) else ()
+
+
+def _fits(value: Plain, kind: inspect.Type) -> bool:
+    """Whether a value that is neither a mapping nor a list is of the type ``kind``."""
+    match kind:
+        case inspect.LiteralType():
+            fits = any(type(value) is type(word) and value == word for word in kind.values)
+        case inspect.FloatType():
+            number = type(value) is int or (isinstance(value, float) and math.isfinite(value))
+            fits = number and _within(value, kind)
+        case inspect.IntType():
+            fits = type(value) is int and _within(value, kind)
+        case inspect.AnyType():  # an element of a list of values, which may be a list itself
+            fits = isinstance(value, bool | int | float | str | list)
+        case inspect.StrType(pattern=str(pattern)):
+            fits = isinstance(value, str) and re.fullmatch(pattern, value) is not None
+        case _:
+            fits = isinstance(value, _PYTHON_TYPES.get(type(kind), ()))
+    return fits
+
+
+def _within(value: Plain, kind: inspect.FloatType | inspect.IntType) -> bool:
+    assert isinstance(value, int | float)
+    above = (kind.gt is None or value > kind.gt) and (kind.ge is None or value >= kind.ge)
+    return above and (kind.le is None or value <= kind.le)
+
+
+def _bounds(kind: inspect.FloatType | inspect.IntType) -> str:
+    limits = ((">", kind.gt), (">=", kind.ge), ("<=", kind.le))
+    words = [f"{sign} {limit:g}" for sign, limit in limits if limit is not None]
+    return f" {' and '.join(words)}" if words else ""

@@ -1,0 +1,1 @@
+"""The kinds of instances: one contract, one registry, and a folder for each kind."""

@@ -1,0 +1,1 @@
+"""The .fmu file: unpacking it, examining it, reading its model description, compiling its sources."""

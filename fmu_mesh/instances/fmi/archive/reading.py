@@ -1,0 +1,196 @@
+"""Reading the model description of an FMU into the mesh's own Structs, without extracting or loading it.
+
+Owns the judgement what can run (co-simulation of FMI 1.0, 2.0 and 3.0 with a binary for this platform) and what is only
+odd: problems that a strict validator finds are kept in `ModelDescription.problems`, and the FMU runs.
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from io import BytesIO
+from pathlib import Path, PurePosixPath
+from typing import Any, Final, Literal, cast
+from zipfile import ZipFile, ZipInfo
+
+import fmpy
+from fmpy.model_description import ModelDescription as FmpyDescription
+from fmpy.model_description import ValidationError as FmpyValidationError
+from fmpy.model_description import read_model_description
+from msgspec.structs import replace
+
+from .... import files
+from ....errors import LoadFailed
+from ....variables.model_description import Causality, Clock, DefaultExperiment, Kind, ModelDescription
+from .archive import Contents, Terms
+from .declared_variables import variables_of
+from .examining import examine, find_library, library_name
+
+__all__ = ["read_description"]
+
+_VERSIONS = ("1.0", "2.0", "3.0")
+_WORDS: Final[dict[Kind, str]] = {"co_simulation": "co-simulation", "model_exchange": "model exchange"}
+
+
+def read_description(
+    path: Path,
+    terms: Terms = Terms(),  # noqa: B008 a frozen Struct
+    kind: Literal["auto"] | Kind = "auto",
+    *,
+    to_run: bool = True,
+) -> ModelDescription:
+    """Read the model description of the FMU at ``path``.
+
+    Args:
+        path: the .fmu file, or the folder of an unpacked one.
+        terms: what it has to keep to.
+        kind: which kind of it is wanted; ``auto``: co-simulation if it has both.
+        to_run: whether it must be able to run on this platform.
+
+    Raises:
+        LoadFailed: it is no FMU, or one that cannot run here; the message says which and what would help.
+    """
+    contents = examine(path, terms)
+    source, problems = _parse(path, contents)
+    version = source.fmiVersion or ""
+    if not version.startswith(_VERSIONS) or "-" in version:  # 3.0-beta.1 is another interface than 3.0
+        raise LoadFailed(f"'{path}' is an FMI {version} FMU; FMI 1.0, 2.0 and 3.0 are what can run.")
+    kind = _kind(source, kind, path)
+    platforms = tuple(fmpy.supported_platforms(_readable(path, contents)))
+    interfaces = [_interface(source, kind), *(_interface(source, other) for other in _WORDS if other != kind)]
+    identifiers = [one.modelIdentifier or "" for one in interfaces if one is not None]
+    library = find_library(path, contents.names, identifiers, version) if to_run else None
+    if library is not None and library != (wanted := library_name(identifiers[0], version)):
+        what = (
+            f"is not named as FMI demands, '{wanted}'" if identifiers[0] else "is all that tells the model identifier"
+        )
+        problems = (*problems, f"the library '{library}' {what}")
+    root = ET.fromstring(contents.xml["modelDescription.xml"])  # noqa: S314 - `examine` has found it safe
+    try:
+        description = _convert(source, kind, root, platforms, problems)
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+        raise LoadFailed(f"the modelDescription.xml of '{path}' has a value that cannot be: {error}") from error
+    identifier = identifiers[0] or (PurePosixPath(library).stem if library is not None else "")
+    return replace(description, model_identifier=identifier, library=library)
+
+
+def _kind(source: FmpyDescription, wanted: str, path: Path) -> Kind:
+    """The kind to use: the wanted one, or the one that there is; co-simulation comes first."""
+    there = [kind for kind in _WORDS if _interface(source, kind) is not None]
+    for kind in there:
+        if wanted in ("auto", kind):
+            return kind
+    has = _WORDS[there[0]] if there else "scheduled execution"
+    missed = next((words for kind, words in _WORDS.items() if kind == wanted), "co-simulation or model exchange")
+    if not there and source.scheduledExecution is None:
+        raise LoadFailed(
+            f"the modelDescription.xml of '{path}' declares no kind of FMU: it has neither a <CoSimulation> nor a "
+            "<ModelExchange>.",
+            hint="Export it again as an FMU for co-simulation.",
+        )
+    raise LoadFailed(
+        f"'{path}' is for {has} only, not for {missed}.",
+        hint="`kind: auto` takes what there is." if there else None,
+    )
+
+
+def _interface(source: FmpyDescription, kind: Kind) -> Any:  # noqa: ANN401 FMPy is untyped
+    return source.coSimulation if kind == "co_simulation" else source.modelExchange
+
+
+def _readable(path: Path, contents: Contents) -> str | BytesIO:
+    """What FMPy reads an FMU from: the folder, or an archive whose names have no `./` before them, which it minds."""
+    if files.is_folder(path):
+        return str(path)
+    archive = BytesIO()
+    with ZipFile(archive, "w") as file:
+        for name in contents.names:
+            if name in contents.xml or name.startswith(("binaries/", "sources/")):
+                file.writestr(ZipInfo(name), contents.xml.get(name, b""))
+    return archive
+
+
+def _parse(path: Path, contents: Contents) -> tuple[FmpyDescription, tuple[str, ...]]:
+    """FMPy's model description, and what a strict validation of it finds."""
+    source = _readable(path, contents)
+    try:
+        return read_model_description(source, validate=True), ()
+    except FmpyValidationError as error:
+        problems = tuple(str(problem) for problem in error.problems)
+    except Exception as error:  # noqa: BLE001 FMPy and lxml raise whatever the XML provokes in them
+        problems = (str(error),)
+    try:
+        return read_model_description(source, validate=False), problems
+    except Exception as error:
+        raise LoadFailed(f"the modelDescription.xml of '{path}' cannot be read: {error}") from error
+
+
+def _convert(
+    source: FmpyDescription, kind: Kind, root: ET.Element, platforms: tuple[str, ...], problems: tuple[str, ...]
+) -> ModelDescription:
+    interface = _interface(source, kind)
+    experiment = source.defaultExperiment
+    capabilities = root.find("Implementation/*/Capabilities")  # of FMI 1.0, which FMPy does not read
+
+    def can(attribute: str) -> bool:
+        if capabilities is not None:
+            return capabilities.get(attribute) in ("true", "1")
+        return bool(getattr(interface, attribute, False))
+
+    return ModelDescription(
+        model_name=source.modelName or "",
+        model_identifier=interface.modelIdentifier or "",
+        fmi_version=source.fmiVersion or "",
+        kind=kind,
+        guid=source.guid or "",
+        variables=variables_of(source, root),
+        description=source.description,
+        generation_tool=source.generationTool,
+        default_experiment=DefaultExperiment(
+            start_time=_number(getattr(experiment, "startTime", None)),
+            stop_time=_number(getattr(experiment, "stopTime", None)),
+            step_size=_number(getattr(experiment, "stepSize", None)),
+            tolerance=_number(getattr(experiment, "tolerance", None)),
+        ),
+        can_handle_variable_step_size=can("canHandleVariableCommunicationStepSize"),
+        can_reject_steps=can("canRejectSteps"),
+        can_interpolate_inputs=can("canInterpolateInputs"),
+        has_event_mode=can("hasEventMode"),
+        can_get_and_set_state=bool(interface.canGetAndSetFMUstate),
+        can_serialize_state=bool(interface.canSerializeFMUstate),
+        only_once_per_process=can("canBeInstantiatedOnlyOncePerProcess"),
+        needs_execution_tool=bool(interface.needsExecutionTool)
+        or root.find("Implementation/CoSimulation_Tool") is not None,
+        # FMI 1.0 has no flag for it, and wants to be told.
+        tell_completed_steps=can("needsCompletedIntegratorStep") or (source.fmiVersion or "").startswith("1."),
+        continuous_states=int(source.numberOfContinuousStates),
+        event_indicators=int(source.numberOfEventIndicators),
+        clocks=tuple(map(_clock, root.iterfind("ModelVariables/Clock"))),
+        platforms=platforms,
+        kinds=tuple(one for one in _WORDS if _interface(source, one) is not None),
+        problems=problems,
+    )
+
+
+def _clock(element: ET.Element) -> Clock:
+    """A clock; one that has a fraction for an interval counts in units of its resolution (FMI 3.0, 2.2.8.4)."""
+    interval, shift = _number(element.get("intervalDecimal")), _number(element.get("shiftDecimal"))
+    counter, resolution = element.get("intervalCounter"), element.get("resolution")
+    if counter is not None and resolution is not None:
+        interval, shift = int(counter) / int(resolution), int(element.get("shiftCounter", 0)) / int(resolution)
+    return Clock(
+        name=element.attrib["name"],
+        value_reference=int(element.attrib["valueReference"]),
+        causality=cast("Causality", element.get("causality", "local")),
+        interval_variability=element.get("intervalVariability", "triggered"),
+        interval=interval,
+        shift=shift or 0.0,
+    )
+
+
+def _number(text: str | float | None) -> float | None:
+    if text is None:
+        return None
+    try:
+        return float(text)
+    except ValueError:
+        return None

@@ -1,0 +1,259 @@
+"""FMUs that bring C sources instead of a binary for this platform: compiled once, into the user's cache.
+
+Owns the cache and the command of the compiler. A compiled library is kept under the hash of all that it was made from,
+so it is never out of date, and moved into its place in one step, so that two processes at once do no harm.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+import posixpath
+import re
+import shlex
+import shutil
+import subprocess
+import tempfile
+import xml.etree.ElementTree as ET
+from collections.abc import Callable, Sequence
+from pathlib import Path, PurePosixPath
+from typing import Final
+
+import fmpy
+import msgspec
+from fmpy.model_description import ModelDescription as FmpyDescription
+from fmpy.model_description import read_model_description
+
+from ....errors import LoadFailed
+from ....variables.model_description import ModelDescription
+from .archive import Terms, unpack
+from .examining import library_name, source_names
+
+__all__ = ["cache_folder", "compile_sources", "extract"]
+
+log = logging.getLogger(__name__)
+
+COMPILE_S: Final = 600.0
+"""How long a compiler may take, in s."""
+
+_SHOWN_LINES: Final = 12
+_SUFFIX = str(fmpy.sharedLibraryExtension)
+_HEADERS = Path(fmpy.__file__).parent / "c-code"
+_OWN_HEADERS = Path(__file__).parent / "headers"
+"""Those of FMI 1.0 under its own names."""
+_FLAGS: Final = ("-O2", "-fPIC", "-ffp-contract=off", "-w")
+# -Bsymbolic: sources call their own functions, even if the C library or Python has one of that name, too.
+_LINK_FLAGS: Final = ("-shared", "-Wl,--no-undefined", "-Wl,-Bsymbolic", "-lm", "-ldl", "-lpthread")
+
+
+class _Build(msgspec.Struct, frozen=True):
+    """What the compiler has to do.
+
+    Attributes:
+        sources: paths in the folder `sources` of the FMU.
+    """
+
+    identifier: str
+    sources: tuple[str, ...]
+    includes: tuple[str, ...]
+    options: tuple[str, ...]
+
+
+def extract(
+    path: Path,
+    parent: Path,
+    terms: Terms = Terms(),  # noqa: B008 a frozen Struct
+    tell: Callable[[str], None] = log.info,
+    model: ModelDescription | None = None,
+) -> Path:
+    """Unpack the FMU at ``path`` into a new private folder below ``parent`` and return it, ready to be loaded.
+
+    Without a binary for this platform its sources are compiled, or what was compiled before is used again. With
+    ``model``, that is the library of its kind; else of co-simulation, or of model exchange if there is nothing else.
+
+    Raises:
+        LoadFailed: the archive is broken or breaks ``terms``, or the sources do not compile; nothing is left behind.
+    """
+    with unpack(path, parent, terms) as folder:
+        if model is not None and model.library is not None:
+            _name_library(folder, model, folder / model.library)
+        elif model is not None or not _has_binaries(folder):
+            _add_library(path, folder, model, tell)
+    return folder.with_suffix("")
+
+
+def compile_sources(path: Path, model: ModelDescription, terms: Terms, tell: Callable[[str], None]) -> None:
+    """Compile the sources of the FMU at ``path`` into the cache, if they are not there yet; ``tell`` before it begins.
+
+    Nothing happens if it has a binary of the kind of ``model`` for this platform.
+
+    Raises:
+        LoadFailed: there is no compiler, or they do not compile; the message has the compiler's first lines.
+    """
+    if model.library is not None:
+        return
+    with tempfile.TemporaryDirectory(prefix="fmu_mesh-") as folder:
+        extract(path, Path(folder), terms, tell, model)
+
+
+def cache_folder() -> Path:
+    """The user's own folder for what can be made again: ``$FMU_MESH_CACHE_DIR``, else below ``$XDG_CACHE_HOME``."""
+    if chosen := os.environ.get("FMU_MESH_CACHE_DIR"):
+        return Path(chosen)
+    base = os.environ.get("XDG_CACHE_HOME")
+    return (Path(base) if base else Path.home() / ".cache") / "fmu_mesh"
+
+
+def _has_binaries(folder: Path) -> bool:
+    """Whether an unpacked FMU has a library for this platform."""
+    return any(any(folder.glob(f"binaries/{name}/*{_SUFFIX}")) for name in (fmpy.platform, fmpy.platform_tuple))
+
+
+def _name_library(folder: Path, model: ModelDescription, library: Path) -> None:
+    """Give a library the name that it is loaded by, beside its own, by which libraries around it may know it."""
+    named = folder / library_name(model.model_identifier, model.fmi_version)
+    if not named.exists():
+        named.symlink_to(library.name)
+
+
+def _add_library(path: Path, folder: Path, model: ModelDescription | None, tell: Callable[[str], None]) -> None:
+    """Put the compiled library of an FMU where its binary would be."""
+    names = [file.relative_to(folder).as_posix() for file in folder.glob("sources/**/*") if file.is_file()]
+    if not source_names(names):
+        return  # loading it says what is missing
+    description = read_model_description(str(folder), validate=False)
+    kind = model.kind if model is not None else "co_simulation" if description.coSimulation else "model_exchange"
+    build = _build(path, description, names, kind, _listed_files(folder / "modelDescription.xml", kind))
+    library = _compiled(path, folder / "sources", build, tell)
+    target = folder / library_name(build.identifier, description.fmiVersion)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    shutil.copyfile(library, target)
+
+
+def _listed_files(file: Path, kind: str) -> list[str]:
+    """The source files that FMI 2.0 lists for a kind, or for the other one of the same library.
+
+    FMPy keeps the list of only one of them.
+    """
+    root = ET.parse(file).getroot()  # noqa: S314 `examine` has found it safe
+    own, other = ("CoSimulation", "ModelExchange")[:: 1 if kind == "co_simulation" else -1]
+    units = [unit for name in (own, other) for unit in root.findall(name)]
+    identifiers = [unit.get("modelIdentifier") for unit in units]
+    lists = [unit.findall("SourceFiles/File") for unit in units if unit.get("modelIdentifier") == identifiers[0]]
+    return [str(entry.get("name")) for entry in next(filter(None, lists), [])]
+
+
+def _build(path: Path, description: FmpyDescription, names: Sequence[str], kind: str, listed: list[str]) -> _Build:
+    """The files and options that a description lists (FMI 2.0, 2.2.3 SourceFiles; FMI 3.0, 2.5.1.4 buildDescription).
+
+    FMI 1.0 has no list, and some tools forget theirs; then all files at the root of `sources` are taken.
+    """
+    unit = description.coSimulation if kind == "co_simulation" else description.modelExchange
+    identifier = str(unit.modelIdentifier)
+    fitting = [one for one in description.buildConfigurations if one.modelIdentifier in (identifier, None)]
+    sets = fitting[0].sourceFileSets if fitting else []
+    sources = [_inside(path, name) for name in listed or [name for one in sets for name in one.sourceFiles]]
+    # OpenModelica lists `./`, too: a folder is nothing to compile.
+    folders = {str(folder) for name in names for folder in PurePosixPath(name.removeprefix("sources/")).parents}
+    sources = [name for name in dict.fromkeys(sources) if name not in folders]
+    if not sources:
+        sources = [name.removeprefix("sources/") for name in source_names(names) if name.count("/") == 1]
+    includes = [_inside(path, name) for one in sets for name in one.includeDirectories]
+    missing = [name for name in sources if f"sources/{name}" not in names]
+    if missing:
+        raise LoadFailed(f"'{path}' lists the source '{missing[0]}', but does not contain it.")
+    defined = [one for file_set in sets for one in file_set.preprocessorDefinitions if not one.optional]
+    options = [f"-D{one.name}={one.value}" if one.value else f"-D{one.name}" for one in defined]
+    # A library exports the plain names; sources ask for a prefix so that they can be linked statically, too.
+    if description.fmiVersion.startswith("2"):
+        options += ["-include", str(_HEADERS / "fmi2Functions.h")]
+    elif description.fmiVersion.startswith("3"):
+        options += ["-DFMI3_OVERRIDE_FUNCTION_PREFIX"]
+    languages = {one.language for one in sets if one.language}
+    if len(languages) == 1:
+        (language,) = languages
+        if re.fullmatch(r"C(\+\+)?\d\d", language):
+            options.append(f"-std={language.lower().replace('c', 'gnu', 1)}")
+    return _Build(identifier, tuple(sources), tuple(includes), tuple(options))
+
+
+def _inside(path: Path, name: str) -> str:
+    """A path that a description lists, relative to the folder `sources`, in its plain form: `./a.c` is `a.c`."""
+    plain = posixpath.normpath(name)
+    if plain == ".." or plain.startswith(("/", "../")):
+        raise LoadFailed(f"'{path}' lists a source outside its own folder: '{name}'.")
+    return plain
+
+
+def _compiled(path: Path, sources: Path, build: _Build, tell: Callable[[str], None]) -> Path:
+    """The library that was made of these sources, from the cache if it is there."""
+    plus = any(not name.endswith(".c") for name in build.sources)
+    compiler = _compiler(path, plus=plus)
+    own = [*compiler, *_FLAGS, *build.options]
+    target = cache_folder() / "sources" / _key(sources, build, own) / f"{build.identifier}{fmpy.sharedLibraryExtension}"
+    if target.is_file():
+        return target
+    tell(f"'{path}' has no binary for this platform ({fmpy.platform}): compiling its sources into '{target.parent}'")
+    try:
+        target.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix="build-", dir=target.parent) as scratch:
+            draft = Path(scratch) / target.name
+            folders = [sources, *(sources / name for name in build.includes), _OWN_HEADERS, _HEADERS]
+            files = [str(sources / name) for name in build.sources]
+            command = [*own, *(f"-I{folder}" for folder in folders), "-o", str(draft), *files, *_LINK_FLAGS]
+            _run(path, command, Path(scratch))
+            draft.chmod(0o600)
+            draft.replace(target)
+    except OSError as error:
+        raise LoadFailed(
+            f"the sources of '{path}' cannot be compiled into '{target.parent}': {error.strerror or error}",
+            hint="Set FMU_MESH_CACHE_DIR to a folder that can be written.",
+        ) from error
+    return target
+
+
+def _run(path: Path, command: Sequence[str], folder: Path) -> None:
+    try:
+        done = subprocess.run(
+            command, cwd=folder, stdin=subprocess.DEVNULL, capture_output=True, check=False, timeout=COMPILE_S
+        )
+    except subprocess.TimeoutExpired as error:
+        raise LoadFailed(f"the sources of '{path}' were not compiled within {COMPILE_S:g} s.") from error
+    if done.returncode != 0:
+        lines = done.stderr.decode(errors="replace").replace(f"{folder}/", "").splitlines()
+        said = " | ".join(line.strip() for line in lines if "error" in line or "undefined" in line) or " | ".join(lines)
+        raise LoadFailed(
+            f"the sources of '{path}' do not compile: {said[: _SHOWN_LINES * 80] or 'the compiler gave no message'}",
+            hint="Export it with a binary for this platform.",
+        )
+
+
+def _compiler(path: Path, *, plus: bool) -> list[str]:
+    """The command of the C (``plus``: C++) compiler: ``$CC`` (``$CXX``), or the first that there is.
+
+    Raises:
+        LoadFailed: there is none.
+    """
+    own = shlex.split(os.environ.get("CXX" if plus else "CC", ""))
+    candidates = [own] if own else [[name] for name in (("c++", "g++", "clang++") if plus else ("cc", "gcc", "clang"))]
+    for candidate in candidates:
+        if found := shutil.which(candidate[0]):
+            return [found, *candidate[1:]]
+    raise LoadFailed(
+        f"'{path}' has no binary for this platform ({fmpy.platform}) but sources, and there is no compiler "
+        f"(looked for {', '.join(candidate[0] for candidate in candidates)}).",
+        hint=f"Install one, name it in ${'CXX' if plus else 'CC'}, or export the FMU with a binary for this platform.",
+    )
+
+
+def _key(sources: Path, build: _Build, command: Sequence[str]) -> str:
+    """A hash of everything that a library is made from."""
+    digest = hashlib.sha256(msgspec.json.encode([build, command, fmpy.__version__, fmpy.platform_tuple]))
+    for folder in (sources, _OWN_HEADERS):
+        for file in sorted(folder.rglob("*")):
+            if file.is_file():
+                content = file.read_bytes()
+                digest.update(f"\0{file.relative_to(folder).as_posix()}\0{len(content)}\0".encode())
+                digest.update(content)
+    return digest.hexdigest()[:32]

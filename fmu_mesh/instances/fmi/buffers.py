@@ -1,0 +1,122 @@
+"""C memory that values of one type are handed over in, where it is not the memory of a ring itself.
+
+Owns the conversion between the elements of a row (numbers, `str`, `bytes`) and what a function of an FMU reads or
+writes. Knows no function of FMI.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+from ...variables.value_types import VariableType
+
+__all__ = ["BinaryBuffer", "Buffer", "NumberBuffer", "StringBuffer"]
+
+
+class Buffer(Protocol):
+    """Memory for a fixed number of elements: `load`, then a setter; or a getter, then `values`."""
+
+    @property
+    def address(self) -> int:
+        """Where the elements lie."""
+        ...
+
+    def load(self, elements: Sequence[Any] | NDArray[Any]) -> None:
+        """Put elements into the memory."""
+        ...
+
+    def values(self) -> Sequence[Any] | NDArray[Any]:
+        """The elements in the memory; text is a copy, because an FMU may free it with the next call."""
+        ...
+
+
+class NumberBuffer:
+    """Numbers of another size or kind than those of a row, such as the `int` that is a Boolean in FMI 2.0.
+
+    Args:
+        type_: the type of the elements.
+        dtype: the C type.
+        count: how many.
+        signs: -1 where an FMI 1.0 alias has the opposite sign, otherwise 1; None if there is none of that kind.
+    """
+
+    def __init__(
+        self, type_: VariableType, dtype: DTypeLike, count: int, signs: NDArray[np.int8] | None = None
+    ) -> None:
+        self._memory: NDArray[Any] = np.zeros(count, dtype=dtype)
+        self._is_boolean = type_ == "Boolean"
+        self._signs = signs
+        self.address: int = self._memory.ctypes.data
+
+    def load(self, elements: Sequence[Any] | NDArray[Any]) -> None:
+        """Put numbers into the memory.
+
+        Raises:
+            OverflowError: one of them, or its opposite, is none of the C type.
+        """
+        if self._signs is None:
+            self._memory[:] = elements
+            if not self._is_boolean and (self._memory != elements).any() and self._memory.dtype.kind == "i":
+                raise OverflowError(f"a value is out of the range of {self._memory.dtype}")
+        elif self._is_boolean:
+            self._memory[:] = np.asarray(elements, dtype=np.bool_) ^ (self._signs < 0)
+        else:
+            self._memory[:] = self._signed(np.asarray(elements, dtype=self._memory.dtype))
+
+    def values(self) -> NDArray[Any]:
+        """The numbers in the memory; a Boolean is true for every number but 0."""
+        if self._is_boolean:
+            truth: NDArray[np.bool_] = self._memory != 0
+            return truth if self._signs is None else truth ^ (self._signs < 0)
+        return self._memory if self._signs is None else self._signed(self._memory)
+
+    def _signed(self, numbers: NDArray[Any]) -> NDArray[Any]:
+        assert self._signs is not None
+        if numbers.dtype.kind == "i" and np.any(numbers[self._signs < 0] == np.iinfo(numbers.dtype).min):
+            raise OverflowError(f"{np.iinfo(numbers.dtype).min} has no opposite in its type")
+        signed: NDArray[Any] = np.where(self._signs < 0, -numbers, numbers)
+        return signed
+
+
+class StringBuffer:
+    """Pointers to text that ends with a 0, in UTF-8; what an FMU gives that is no UTF-8 is marked with U+FFFD."""
+
+    def __init__(self, count: int) -> None:
+        self._pointers = (ctypes.c_char_p * count)()
+        self.address: int = ctypes.addressof(self._pointers)
+
+    def load(self, elements: Sequence[Any] | NDArray[Any]) -> None:
+        """Point at copies of the texts; they live as long as this memory does."""
+        for place, text in enumerate(elements):
+            self._pointers[place] = text.encode()
+
+    def values(self) -> Sequence[str]:
+        """The texts; a missing one is empty."""
+        return [(text or b"").decode(errors="replace") for text in self._pointers]
+
+
+class BinaryBuffer:
+    """Pointers to bytes, and their sizes (FMI 3.0, 2.2.6.2)."""
+
+    def __init__(self, count: int) -> None:
+        self._pointers = (ctypes.c_void_p * count)()
+        self._sizes = (ctypes.c_size_t * count)()
+        self._loaded: list[ctypes.Array[ctypes.c_char]] = []
+        self.address: int = ctypes.addressof(self._pointers)
+        self.sizes_address: int = ctypes.addressof(self._sizes)
+
+    def load(self, elements: Sequence[Any] | NDArray[Any]) -> None:
+        """Point at copies of the bytes; they live as long as this memory does."""
+        self._loaded = [ctypes.create_string_buffer(data, max(len(data), 1)) for data in elements]
+        self._pointers[:] = [ctypes.addressof(data) for data in self._loaded]
+        self._sizes[:] = [len(data) for data in elements]
+
+    def values(self) -> Sequence[bytes]:
+        """The bytes; what has no address is empty."""
+        pairs = zip(self._pointers, self._sizes, strict=True)
+        return [ctypes.string_at(pointer, size) if pointer and size else b"" for pointer, size in pairs]

@@ -1,0 +1,142 @@
+"""Clocks of an FMI 3.0 instance: when its time-based input clocks tick, and which of its output clocks have ticked.
+
+Owns the arithmetic of intervals (FMI 3.0, 2.2.8): tick n of a periodic clock is at `start + shift + n * interval`, one
+multiplication. Event mode itself is entered by who steps the instance.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, Final
+
+from fmpy.fmi3 import fmi3Float64, fmi3IntervalQualifier, fmi3ValueReference
+
+from ...variables.model_description import Clock
+from .model_exchange.solver import resolvable
+
+__all__ = ["NO_CLOCKS", "Clocks"]
+
+_INTERVAL_CHANGED: Final = 2
+_PERIODIC: Final = ("constant", "fixed", "tunable")
+_APERIODIC: Final = ("changing", "countdown")
+
+
+class Clocks:
+    """The clocks of one instance.
+
+    Args:
+        fmu: FMPy's object, instantiated.
+        clocks: as the model description has them.
+
+    Attributes:
+        next_tick: time of the next tick of an input clock in s; infinite if there is none.
+        ticked: the output clocks that have ticked since this was last emptied.
+
+    Call sequence: `start` in Initialization Mode; then in every event mode `set_due`, after each update of the discrete
+    states `read`, and at its end `update_intervals`.
+
+    Raises:
+        FMICallException: by every method: the FMU did not return OK.
+    """
+
+    def __init__(self, fmu: Any, clocks: Sequence[Clock]) -> None:  # noqa: ANN401 FMPy is untyped
+        inputs = [clock for clock in clocks if clock.causality == "input"]
+        self.next_tick = math.inf
+        self.ticked: set[str] = set()
+        self._fmu = fmu
+        self._periodic = [_Periodic(clock) for clock in inputs if clock.interval_variability in _PERIODIC]
+        self._aperiodic = {
+            clock.value_reference: math.inf for clock in inputs if clock.interval_variability in _APERIODIC
+        }
+        self._outputs = [clock for clock in clocks if clock.causality == "output"]
+
+    def __bool__(self) -> bool:
+        """Whether there is any clock."""
+        return bool(self._periodic or self._aperiodic or self._outputs)
+
+    def start(self, time: float) -> None:
+        """In Initialization Mode: ask for the intervals that parameters decide; time in s."""
+        for clock in self._periodic:
+            if clock.interval is None:
+                clock.interval, _ = self._interval(clock.value_reference)
+                shifts = (fmi3Float64 * 1)()
+                self._fmu.getShiftDecimal(_references(clock.value_reference), shifts)
+                clock.shift = shifts[0]
+            clock.start = time
+        self._look()
+
+    @property
+    def place(self) -> tuple[float | None, ...]:
+        """The ticks of each periodic clock, then the next tick of each aperiodic one in s; None if it has none."""
+        aperiodic = (tick if math.isfinite(tick) else None for tick in self._aperiodic.values())
+        return (*(float(clock.ticks) for clock in self._periodic), *aperiodic)
+
+    def resume(self, place: Sequence[float | None]) -> None:
+        """Go on where `place` was."""
+        for clock, ticks in zip(self._periodic, place, strict=False):
+            clock.ticks = int(ticks or 0)
+        for reference, tick in zip(self._aperiodic, place[len(self._periodic) :], strict=True):
+            self._aperiodic[reference] = math.inf if tick is None else tick
+        self._look()
+
+    def set_due(self, time: float) -> None:
+        """In event mode: activate every input clock whose tick is at ``time`` (s)."""
+        due = []
+        for clock in self._periodic:
+            if not resolvable(time, clock.next_tick):
+                due.append(clock.value_reference)
+                clock.ticks += 1
+        for reference, tick in self._aperiodic.items():
+            if not resolvable(time, tick):
+                due.append(reference)
+                self._aperiodic[reference] = math.inf
+        if due:
+            self._fmu.setClock(due, [True] * len(due))
+        self._look()
+
+    def read(self) -> None:
+        """In event mode: which output clocks tick (FMI 3.0, 2.2.8.3)."""
+        if self._outputs:
+            active = self._fmu.getClock([clock.value_reference for clock in self._outputs])
+            self.ticked.update(clock.name for clock, ticks in zip(self._outputs, active, strict=True) if ticks)
+
+    def update_intervals(self, time: float) -> None:
+        """At the end of event mode: when aperiodic clocks tick next (FMI 3.0, 2.2.8.4)."""
+        for reference in self._aperiodic:
+            interval, qualifier = self._interval(reference)
+            if qualifier == _INTERVAL_CHANGED:
+                self._aperiodic[reference] = time + interval
+        self._look()
+
+    def _interval(self, reference: int) -> tuple[float, int]:
+        intervals, qualifiers = (fmi3Float64 * 1)(), (fmi3IntervalQualifier * 1)()
+        self._fmu.getIntervalDecimal(_references(reference), intervals, qualifiers)
+        return float(intervals[0]), int(qualifiers[0])
+
+    def _look(self) -> None:
+        ticks = [*(clock.next_tick for clock in self._periodic), *self._aperiodic.values()]
+        self.next_tick = min(ticks, default=math.inf)
+
+
+class _Periodic:
+    """A periodic input clock and how often it has ticked."""
+
+    def __init__(self, clock: Clock) -> None:
+        self.value_reference = clock.value_reference
+        self.interval = clock.interval
+        self.shift = clock.shift
+        self.start = 0.0
+        self.ticks = 0
+
+    @property
+    def next_tick(self) -> float:
+        return self.start + self.shift + self.ticks * (self.interval or math.inf)
+
+
+NO_CLOCKS: Final = Clocks(None, ())
+"""For an FMU without clocks: nothing of it is ever called."""
+
+
+def _references(reference: int) -> Any:  # noqa: ANN401 an array of ctypes
+    return (fmi3ValueReference * 1)(reference)

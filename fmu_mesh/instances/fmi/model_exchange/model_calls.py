@@ -1,0 +1,191 @@
+"""The functions of model exchange, the same for FMI 1.0, 2.0 and 3.0.
+
+Owns the differences between the versions: names, modes and event information. The order of the calls is
+`fmu_mesh.instances.fmi.model_exchange.model_exchange`.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import math
+from typing import Any, Final, NamedTuple
+
+from fmpy.fmi1 import FMICallException, fmi1EventInfo
+from fmpy.fmi2 import fmi2EventInfo
+
+__all__ = ["EventInfo", "Fmi1Calls", "Fmi3Calls", "ModelCalls"]
+
+WARNING: Final = 1
+
+_ARRAY = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_size_t)
+_TIME = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_double)
+_EVENT_UPDATE = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_char, ctypes.c_void_p)
+_TERMINATE = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p)
+_COMPLETED = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p)
+_INITIALIZE = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_char, ctypes.c_double, ctypes.c_void_p)
+
+
+class EventInfo(NamedTuple):
+    """What one event iteration returns (FMI 2.0, 3.2.2: fmi2EventInfo).
+
+    Attributes:
+        again: the iteration has not converged yet.
+        terminate: the FMU asks to end the simulation.
+        next_event: time of the next time event in s; infinite if there is none.
+    """
+
+    again: bool
+    terminate: bool
+    next_event: float
+
+
+class ModelCalls:
+    """The model exchange functions of one instance; `Equations` of a solver, too.
+
+    Args:
+        fmu: FMPy's object, instantiated.
+        n_states: number of continuous states.
+        n_indicators: number of event indicators.
+        prefix: what the names of the functions begin with.
+
+    Raises:
+        FMICallException: by every method: the FMU returned a status above warning.
+    """
+
+    def __init__(self, fmu: Any, n_states: int, n_indicators: int, prefix: str) -> None:  # noqa: ANN401 FMPy is untyped
+        self.n_states = n_states
+        self.n_indicators = n_indicators
+        self._fmu = fmu
+        self._component = fmu.component
+        self._prefix = prefix
+        self._set_time = self._declare("SetTime", _TIME)
+        self._set_states = self._declare("SetContinuousStates", _ARRAY)
+        self._get_states = self._declare("GetContinuousStates", _ARRAY)
+        self._get_indicators = self._declare("GetEventIndicators", _ARRAY)
+        self._get_nominals, self._get_derivatives = self._differing()
+
+    def _differing(self) -> tuple[Any, Any]:
+        return self._declare("GetNominalsOfContinuousStates", _ARRAY), self._declare("GetDerivatives", _ARRAY)
+
+    def _declare(self, name: str, prototype: Any) -> Any:  # noqa: ANN401 ctypes has no types
+        function = prototype((self._prefix + name, self._fmu.dll))
+        function.errcheck = self._checked(self._prefix.rpartition("_")[2] + name)
+        return function
+
+    @staticmethod
+    def _checked(name: str) -> Any:  # noqa: ANN401 as above
+        def check(status: int, _function: object, _arguments: object) -> int:
+            if status > WARNING:
+                raise FMICallException(function=name, status=status)
+            return status
+
+        return check
+
+    def set_time(self, time: float) -> None:
+        """Set the time in s."""
+        self._set_time(self._component, time)
+
+    def set_point(self, time: float, states: int) -> None:
+        """See `Equations.set_point`."""
+        self._set_time(self._component, time)
+        if self.n_states:
+            self._set_states(self._component, states, self.n_states)
+
+    def get_states(self, states: int) -> None:
+        """See `Equations.get_states`."""
+        self._get_states(self._component, states, self.n_states)
+
+    def get_nominals(self, nominals: int) -> None:
+        """See `Equations.get_nominals`."""
+        self._get_nominals(self._component, nominals, self.n_states)
+
+    def get_derivatives(self, derivatives: int) -> None:
+        """See `Equations.get_derivatives`."""
+        self._get_derivatives(self._component, derivatives, self.n_states)
+
+    def get_indicators(self, indicators: int) -> None:
+        """See `Equations.get_indicators`."""
+        self._get_indicators(self._component, indicators, self.n_indicators)
+
+    def enter_event_mode(self) -> None:
+        """From continuous-time mode into event mode."""
+        self._fmu.enterEventMode()
+
+    def enter_continuous_time_mode(self) -> None:
+        """From event mode into continuous-time mode."""
+        self._fmu.enterContinuousTimeMode()
+
+    def update_discrete_states(self) -> EventInfo:
+        """One event iteration, in event mode."""
+        info = fmi2EventInfo()
+        self._fmu.fmi2NewDiscreteStates(self._component, ctypes.byref(info))
+        next_event = info.nextEventTime if info.nextEventTimeDefined else math.inf
+        return EventInfo(bool(info.newDiscreteStatesNeeded), bool(info.terminateSimulation), next_event)
+
+    def completed_step(self) -> tuple[bool, bool]:
+        """Tell that a step of the solver is done; whether event mode is needed, and whether the FMU asks to end."""
+        event, terminate = self._fmu.completedIntegratorStep()
+        return bool(event), bool(terminate)
+
+
+class Fmi1Calls(ModelCalls):
+    """FMI 1.0: there are no modes; events are handled by fmiEventUpdate (FMI 1.0, 2.8).
+
+    FMPy takes the status of these functions for text and does not check it, so they are called by our own prototypes.
+    """
+
+    def __init__(self, fmu: Any, n_states: int, n_indicators: int) -> None:  # noqa: ANN401 FMPy is untyped
+        super().__init__(fmu, n_states, n_indicators, f"{fmu.modelIdentifier}_fmi")
+        self._event_update = self._declare("EventUpdate", _EVENT_UPDATE)
+        self._completed_step = self._declare("CompletedIntegratorStep", _COMPLETED)
+        self._initialize = self._declare("Initialize", _INITIALIZE)
+        self._terminate = self._declare("Terminate", _TERMINATE)
+
+    def terminate(self) -> None:
+        """End the simulation."""
+        self._terminate(self._component)
+
+    def initialize(self, time: float, tolerance: float) -> None:
+        """Compute what follows from the values that were set, at ``time`` in s (FMI 1.0, 2.5)."""
+        self.set_time(time)
+        self._initialize(self._component, b"\1", tolerance, ctypes.byref(fmi1EventInfo()))
+
+    def _differing(self) -> tuple[Any, Any]:
+        return self._declare("GetNominalContinuousStates", _ARRAY), self._declare("GetDerivatives", _ARRAY)
+
+    def enter_event_mode(self) -> None:
+        """There is no such mode."""
+
+    def enter_continuous_time_mode(self) -> None:
+        """There is no such mode."""
+
+    def update_discrete_states(self) -> EventInfo:
+        """One event iteration."""
+        info = fmi1EventInfo()
+        self._event_update(self._component, b"\0", ctypes.byref(info))
+        next_event = info.nextEventTime if info.upcomingTimeEvent != b"\0" else math.inf
+        return EventInfo(info.iterationConverged == b"\0", info.terminateSimulation != b"\0", next_event)
+
+    def completed_step(self) -> tuple[bool, bool]:
+        """Tell that a step of the solver is done; an FMU cannot ask to end here."""
+        event = ctypes.c_char()
+        self._completed_step(self._component, ctypes.byref(event))
+        return event.value != b"\0", False
+
+
+class Fmi3Calls(ModelCalls):
+    """FMI 3.0, where the FMU says itself how many states and indicators it has: it depends on structural parameters."""
+
+    def __init__(self, fmu: Any) -> None:  # noqa: ANN401 FMPy is untyped
+        super().__init__(fmu, fmu.getNumberOfContinuousStates(), fmu.getNumberOfEventIndicators(), "fmi3")
+
+    def _differing(self) -> tuple[Any, Any]:
+        return (
+            self._declare("GetNominalsOfContinuousStates", _ARRAY),
+            self._declare("GetContinuousStateDerivatives", _ARRAY),
+        )
+
+    def update_discrete_states(self) -> EventInfo:
+        """One event iteration, in event mode."""
+        again, terminate, _nominals, _states, defined, time = self._fmu.updateDiscreteStates()
+        return EventInfo(bool(again), bool(terminate), float(time) if defined else math.inf)

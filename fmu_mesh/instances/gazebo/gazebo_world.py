@@ -1,0 +1,230 @@
+"""An SDF world as a model description, and where the value of each of its variables lies.
+
+Owns names, units and meaning of the variables, which are those of `fmu_mesh.instances.mujoco.mujoco_world`, so that one
+configuration serves both engines; there are no sensors and no actuators of the model. What of the file is simulated is
+`fmu_mesh.instances.gazebo.gazebo_sdf`, and what happens in a step is `fmu_mesh.instances.gazebo.gazebo_classic`.
+
+A joint or link is named as in the file where that name is unique, and `model::name` where it is not.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import xml.etree.ElementTree as ET
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Literal
+
+import msgspec
+
+from ...config.mesh import GazeboClassicConfig
+from ...errors import LoadFailed
+from ...variables.model_description import Causality, DefaultExperiment, ModelDescription, Variable
+from .gazebo_sdf import Model, read_world
+
+__all__ = ["GazeboWorld", "Joint", "Link", "Place", "describe_gazebo_world", "load_gazebo_world"]
+
+JOINT_STATE, LINK_STATE = 3, 13
+"""Numbers per joint (position, velocity, acceleration) and link (position, attitude, two velocities) in a state."""
+
+Where = Literal[
+    "state", "effort_applied", "effort_command", "effort", "wrench", "wind", "body_wind", "relative_velocity"
+]
+
+_DEFAULT_STEP_SIZE = 1e-3
+"""s; of SDF (physics, max_step_size)."""
+
+
+class Joint(msgspec.Struct, frozen=True):
+    """A revolute or prismatic joint.
+
+    Attributes:
+        scoped: `model::joint`, as Gazebo knows it.
+        name: as in variables.
+        effort_limit: largest absolute effort in N m or N; infinite without a limit.
+        free: whether it has no limits, whatever the file says.
+    """
+
+    scoped: str
+    name: str
+    revolute: bool
+    effort_limit: float
+    free: bool
+
+
+class Link(msgspec.Struct, frozen=True):
+    """A link; `scoped` and `name` as those of a `Joint`."""
+
+    scoped: str
+    name: str
+
+
+class Place(msgspec.Struct, frozen=True):
+    """Where the value of a variable lies: the kind of value, and the place in the flat array of that kind."""
+
+    where: Where
+    index: int
+
+
+class GazeboWorld(msgspec.Struct, frozen=True):
+    """A world.
+
+    Attributes:
+        text: what Gazebo gets.
+        step_size: of the engine in s.
+        places: by variable name.
+    """
+
+    text: bytes
+    step_size: float
+    joints: tuple[Joint, ...]
+    links: tuple[Link, ...]
+    description: ModelDescription
+    places: dict[str, Place]
+
+
+def describe_gazebo_world(path: Path, config: GazeboClassicConfig) -> ModelDescription:
+    """The model description of the world at ``path``.
+
+    Raises:
+        LoadFailed: it is no world that Gazebo could load without looking elsewhere.
+    """
+    return load_gazebo_world(path, config).description
+
+
+def load_gazebo_world(path: Path, config: GazeboClassicConfig) -> GazeboWorld:
+    """Read the world at ``path``.
+
+    Raises:
+        LoadFailed: it is no world that Gazebo could load without looking elsewhere.
+    """
+    sdf = read_world(path)
+    step_size = _number(sdf.element.findtext("physics/max_step_size"), _DEFAULT_STEP_SIZE, path)
+    free = {actuator.joint for actuator in config.actuators if actuator.disable_velocity_effort_limits}
+    moving = [model for model in sdf.models if model.moving]
+    joints, links = _joints(moving, free, path), _links(moving)
+    variables = dict(_variables(joints, links))
+    description = ModelDescription(
+        model_name=sdf.element.get("name") or path.stem,
+        model_identifier="gazebo_classic",
+        fmi_version="",
+        kind="physics_engine",
+        guid=hashlib.sha256(sdf.source).hexdigest()[:32],
+        variables=tuple(
+            msgspec.structs.replace(variable, value_reference=number) for number, variable in enumerate(variables)
+        ),
+        generation_tool="Gazebo classic",
+        default_experiment=DefaultExperiment(step_size=step_size),
+        problems=sdf.notes,
+    )
+    places = {variable.name: place for variable, place in variables.items()}
+    return GazeboWorld(sdf.text, step_size, joints, links, description, places)
+
+
+def _joints(models: Sequence[Model], free: set[str], path: Path) -> tuple[Joint, ...]:
+    found = [
+        (f"{model.scoped}::{joint.get('name')}", joint)
+        for model in models
+        for joint in model.element.findall("joint")
+        if joint.get("type") in {"revolute", "prismatic"}
+    ]
+    names = _names([scoped for scoped, _ in found])
+    return tuple(
+        Joint(
+            scoped=scoped,
+            name=name,
+            revolute=joint.get("type") == "revolute",
+            effort_limit=math.inf if name in free else _effort_limit(joint, path),
+            free=name in free,
+        )
+        for name, (scoped, joint) in zip(names, found, strict=True)
+    )
+
+
+def _links(models: Sequence[Model]) -> tuple[Link, ...]:
+    scoped = [f"{model.scoped}::{link.get('name')}" for model in models for link in model.element.findall("link")]
+    return tuple(Link(*names) for names in zip(scoped, _names(scoped), strict=True))
+
+
+def _names(scoped: list[str]) -> list[str]:
+    """The last part of each name, where no other has the same; else all of it."""
+    last = [name.rpartition("::")[2] for name in scoped]
+    counts = Counter(last)
+    return [short if counts[short] == 1 else full for short, full in zip(last, scoped, strict=True)]
+
+
+def _effort_limit(joint: ET.Element, path: Path) -> float:
+    """SDF has a negative number where there is no limit."""
+    limit = _number(joint.findtext("axis/limit/effort"), -1.0, path)
+    return limit if limit >= 0.0 else math.inf
+
+
+def _number(text: str | None, default: float, path: Path) -> float:
+    if text is None:
+        return default
+    try:
+        return float(text)
+    except ValueError as error:
+        raise LoadFailed(f"'{path}' has '{text.strip()}' where a number should be") from error
+
+
+def _variables(joints: tuple[Joint, ...], links: tuple[Link, ...]) -> Iterator[tuple[Variable, Place]]:
+    for number, joint in enumerate(joints):
+        length, effort = ("rad", "N.m") if joint.revolute else ("m", "N")
+        state, name = JOINT_STATE * number, joint.name
+        yield _entry(f"{name}.position", "output", length, "position of the joint", "state", state)
+        yield _entry(f"{name}.velocity", "output", f"{length}/s", "velocity of the joint", "state", state + 1)
+        text = "acceleration in the last step"
+        yield _entry(f"{name}.acceleration", "output", f"{length}/s2", text, "state", state + 2)
+        text = "effort applied in the last step"
+        yield _entry(f"{name}.effort_applied", "output", effort, text, "effort_applied", number)
+        yield _entry(f"{name}.effort_command", "input", effort, "what a controller asks for", "effort_command", number)
+        text = "what is applied, such as the torque of an actuator"
+        yield _entry(f"{name}.effort", "input", effort, text, "effort", number)
+    for number, link in enumerate(links):
+        yield from _link_variables(link.name, number, JOINT_STATE * len(joints) + LINK_STATE * number)
+    for axis, letter in enumerate("xyz"):
+        yield _entry(f"wind_{letter}", "input", "m/s", "velocity of the medium in world axes", "wind", axis)
+
+
+def _link_variables(name: str, number: int, state: int) -> Iterator[tuple[Variable, Place]]:
+    in_state = (
+        ("position", "xyz", "m", "of the link's origin in world axes"),
+        ("orientation", "wxyz", "1", "attitude as a unit quaternion, link axes to world axes"),
+        ("linear_velocity", "xyz", "m/s", "of the link's origin, in world axes"),
+        ("angular_velocity", "xyz", "rad/s", "in world axes"),
+    )
+    for what, letters, unit, text in in_state:
+        for letter in letters:
+            yield _entry(f"{name}.{what}_{letter}", "output", unit, text, "state", state)
+            state += 1
+    for axis, letter in enumerate("xyz"):
+        place = 3 * number + axis
+        text = "velocity of the medium in link axes"
+        yield _entry(f"{name}.wind_{letter}", "output", "m/s", text, "body_wind", place)
+        text = "velocity of the link's origin against the medium in link axes"
+        yield _entry(f"{name}.relative_velocity_{letter}", "output", "m/s", text, "relative_velocity", place)
+        text = "acts at the link's origin, in link axes"
+        yield _entry(f"{name}.force_{letter}", "input", "N", text, "wrench", 6 * number + axis)
+        text = "acts about the link's origin, in link axes"
+        yield _entry(f"{name}.moment_{letter}", "input", "N.m", text, "wrench", 6 * number + 3 + axis)
+
+
+def _entry(  # noqa: PLR0913, PLR0917  each is a column of a table
+    name: str, causality: Causality, unit: str, text: str, where: Where, index: int
+) -> tuple[Variable, Place]:
+    variable = Variable(
+        name=name,
+        value_reference=0,
+        type="Float64",
+        causality=causality,
+        variability="continuous",
+        initial=None if causality == "input" else "calculated",
+        start=0.0 if causality == "input" else None,
+        unit=unit,
+        description=text,
+        dependencies=(),  # at the first point the engine has not taken a step: nothing depends on an input
+    )
+    return variable, Place(where, index)

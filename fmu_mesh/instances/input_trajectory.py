@@ -1,0 +1,61 @@
+"""What an input is when: values with times, in between constant or linear."""
+
+from __future__ import annotations
+
+from bisect import bisect_left, bisect_right
+
+from ..variables.model_description import Value
+
+__all__ = ["Trajectory"]
+
+
+class Trajectory:
+    """Values of one input over the FMU's time. Read it at rising times: what is past then is forgotten.
+
+    Args:
+        linear: linear between two times, or else constant.
+    """
+
+    def __init__(self, *, linear: bool) -> None:
+        self._linear = linear
+        self._times: list[float] = []
+        self._values: list[Value] = []
+
+    def __len__(self) -> int:
+        return len(self._times)
+
+    def add(self, time: float, value: Value) -> None:
+        """From ``time`` on the input has this value; it replaces an earlier one for the same time."""
+        place = bisect_left(self._times, time)
+        if place < len(self._times) and self._times[place] == time:
+            self._values[place] = value
+        else:
+            self._times.insert(place, time)
+            self._values.insert(place, value)
+
+    def value(self, time: float, resolution: float) -> Value:
+        """The value at ``time``, which must not be before the first one's.
+
+        Times that differ by no more than ``resolution`` are the same: the value of such a time is taken as it is.
+        """
+        place = bisect_right(self._times, time + resolution) - 1
+        if place > len(self._times) // 2:  # not at every step, because that would move a long future each time
+            del self._times[:place], self._values[:place]
+            place = 0
+        start, value = self._times[place], self._values[place]
+        if not self._linear or place + 1 == len(self._times) or start >= time - resolution:
+            return value
+        end, right = self._times[place + 1], self._values[place + 1]
+        return _between(value, right, (time - start) / (end - start))
+
+
+def _between(left: Value, right: Value, weight: float) -> Value:
+    """The value between two, of an array element by element.
+
+    With a weight below 1 this never leaves the range of the two values, which may be the limits of the FMU.
+    """
+    if isinstance(left, list) and isinstance(right, list):
+        return [_between(one, other, weight) for one, other in zip(left, right, strict=True)]
+    assert isinstance(left, float)
+    assert isinstance(right, float)
+    return left + (right - left) * weight

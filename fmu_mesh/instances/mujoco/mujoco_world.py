@@ -1,0 +1,299 @@
+"""A MuJoCo model as a model description, and where the value of each of its variables lies.
+
+Owns names, units and meaning of the variables; the only module that loads a model. What happens in a step is
+`fmu_mesh.instances.mujoco.mujoco_instance`.
+
+The last part of a name tells the kind of the variable, and what is before it is unique among the model's names of that
+kind: no two variables have one name.
+
+| variable | causality | what |
+|---|---|---|
+| `<joint>.position`, `.velocity` | output | of a revolute or prismatic joint at the communication point |
+| `<joint>.acceleration` | output | of the engine's last step; 0 before the first |
+| `<joint>.effort_applied` | output | what was applied in the last step, after limits; 0 before the first |
+| `<joint>.effort_command` | input | what a controller asks for: applied, unless an actuator stands between |
+| `<joint>.effort` | input | what is applied besides: the torque of an actuator |
+| `<body>.position_x/y/z`, `.orientation_w/x/y/z` | output | of the body's origin in world axes, as a unit quaternion |
+| `<body>.linear_velocity_…`, `.angular_velocity_…` | output | of the body's origin, in world axes |
+| `<body>.wind_…`, `.relative_velocity_…` | output | the wind, and the origin's velocity against it, in body axes |
+| `<body>.force_…`, `.moment_…` | input | acting at the body's origin, and about it, in body axes |
+| `<sensor>.value`, `<sensor>.value[1]` … | output | at the point; of forces and accelerations: of the last step |
+| `<actuator>.control` / `.force` | input / output | an actuator of the model / its force in the last step |
+| `wind_x/y/z` | input | velocity of the medium in world axes |
+"""
+
+from __future__ import annotations
+
+import hashlib
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+from typing import Any, Literal
+
+import msgspec
+
+from ...config.findings import listed, nearest
+from ...config.mesh import MujocoConfig
+from ...errors import LoadFailed
+from ...variables.model_description import Causality, DefaultExperiment, ModelDescription, Variable
+
+__all__ = ["Entry", "Where", "World", "describe_world", "engine", "load_world", "warnings"]
+
+Where = Literal[
+    "position",
+    "velocity",
+    "acceleration",
+    "effort_applied",
+    "effort_command",
+    "effort",
+    "body_position",
+    "body_orientation",
+    "linear_velocity",
+    "angular_velocity",
+    "body_wind",
+    "relative_velocity",
+    "wrench",
+    "sensor",
+    "control",
+    "actuator_force",
+    "wind",
+]
+
+warnings: list[str] = []
+"""What MuJoCo warned of since somebody cleared this; it has one handler for the process, which would write a file."""
+
+_WORLD_BODY = 0
+_WIND = ("wind_x", "wind_y", "wind_z")
+
+
+class Entry(msgspec.Struct, frozen=True):
+    """One variable and where its value lies.
+
+    Attributes:
+        where: the kind of value.
+        index: place in the flat array of that kind.
+    """
+
+    variable: Variable
+    where: Where
+    index: int
+
+
+class World(msgspec.Struct, frozen=True):
+    """A loaded model.
+
+    Attributes:
+        model: the `mujoco.MjModel`.
+        entries: all variables.
+        limits: (index of the joint's velocity, smallest, largest effort) of joints whose effort is limited.
+        keyframe: number of the keyframe to start from, or None.
+    """
+
+    model: Any
+    description: ModelDescription
+    entries: tuple[Entry, ...]
+    limits: tuple[tuple[int, float, float], ...]
+    keyframe: int | None
+
+
+def describe_world(path: Path, config: MujocoConfig) -> ModelDescription:
+    """The model description of the model at ``path``.
+
+    Raises:
+        LoadFailed: MuJoCo is not installed, or cannot load the model.
+    """
+    return load_world(path, config).description
+
+
+def load_world(path: Path, config: MujocoConfig) -> World:
+    """Load the model at ``path`` (MJCF or URDF).
+
+    Raises:
+        LoadFailed: MuJoCo is not installed, or cannot load the model; says why.
+    """
+    mujoco = engine()
+    try:
+        data = path.read_bytes()
+        warnings.clear()
+        model = mujoco.MjModel.from_xml_path(str(path))
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else " ".join(str(error).split())
+        raise LoadFailed(f"MuJoCo cannot load '{path}': {reason}") from error
+    keyframe = _keyframe(model, config.keyframe, path)
+    entries = tuple(_entries(mujoco, model, keyframe))
+    numbered = tuple(
+        msgspec.structs.replace(entry, variable=msgspec.structs.replace(entry.variable, value_reference=number))
+        for number, entry in enumerate(entries)
+    )
+    free = {actuator.joint for actuator in config.actuators if actuator.disable_velocity_effort_limits}
+    description = ModelDescription(
+        model_name=_text(model, 0) or path.stem,
+        model_identifier="mujoco",
+        fmi_version="",
+        kind="physics_engine",
+        guid=hashlib.sha256(data).hexdigest()[:32],
+        variables=tuple(entry.variable for entry in numbered),
+        generation_tool=f"MuJoCo {mujoco.__version__}",
+        default_experiment=DefaultExperiment(step_size=float(model.opt.timestep)),
+        can_get_and_set_state=True,
+        can_serialize_state=True,
+        problems=(*(" ".join(text.split()) for text in warnings), *_left_out(mujoco, model, data)),
+    )
+    return World(model, description, numbered, tuple(_limits(mujoco, model, free)), keyframe)
+
+
+def engine() -> ModuleType:
+    """The module `mujoco`, imported when it is needed: an extra, and slow to import.
+
+    Raises:
+        LoadFailed: it is not installed.
+    """
+    try:
+        import mujoco  # noqa: PLC0415  an extra, and slow to import
+    except ImportError as error:
+        text = "MuJoCo is not installed"
+        raise LoadFailed(text, hint="Install it with `pip install 'fmu-mesh[physics]'`.") from error
+    mujoco.set_mju_user_warning(warnings.append)
+    module: ModuleType = mujoco
+    return module
+
+
+def _keyframe(model: Any, name: str | None, path: Path) -> int | None:  # noqa: ANN401  mujoco has no types
+    if name is None:
+        return None
+    names = [model.key(number).name for number in range(model.nkey)]
+    if name in names:
+        return names.index(name)
+    close = nearest(name, names)
+    hint = f"Did you mean '{close}'?" if close is not None else None
+    raise LoadFailed(f"'{path}' has no keyframe '{name}', but {listed(names)}", hint=hint)
+
+
+def _entries(mujoco: ModuleType, model: Any, keyframe: int | None) -> Iterator[Entry]:  # noqa: ANN401  mujoco has no types
+    yield from _joints(mujoco, model, keyframe)
+    yield from _bodies(model)
+    for number in range(model.nsensor):
+        sensor = model.sensor(number)
+        first, size = int(sensor.adr[0]), int(sensor.dim[0])
+        for offset in range(size if sensor.name else 0):
+            index = f"[{offset + 1}]" if size > 1 else ""
+            yield _output(f"{sensor.name}.value{index}", "sensor", first + offset, None, "value of a sensor")
+    for number in range(model.nu):
+        if name := model.actuator(number).name:
+            yield _input(f"{name}.control", "control", number, None, "control of an actuator of the model")
+            yield _output(f"{name}.force", "actuator_force", number, None, "its force in the last step")
+    for axis, letter in enumerate("xyz"):
+        start = float(model.opt.wind[axis])
+        yield _input(f"wind_{letter}", "wind", axis, "m/s", "velocity of the medium in world axes", start)
+
+
+def _joints(mujoco: ModuleType, model: Any, keyframe: int | None) -> Iterator[Entry]:  # noqa: ANN401  mujoco has no types
+    positions = model.qpos0 if keyframe is None else model.key_qpos[keyframe]
+    velocities = [0.0] * model.nv if keyframe is None else model.key_qvel[keyframe]
+    for number in range(model.njnt):
+        joint = model.joint(number)
+        revolute = joint.type[0] == mujoco.mjtJoint.mjJNT_HINGE
+        if not joint.name or not (revolute or joint.type[0] == mujoco.mjtJoint.mjJNT_SLIDE):
+            continue
+        length, effort = ("rad", "N.m") if revolute else ("m", "N")
+        qpos, dof = int(joint.qposadr[0]), int(joint.dofadr[0])
+        position, velocity = float(positions[qpos]), float(velocities[dof])
+        name = joint.name
+        yield _output(f"{name}.position", "position", qpos, length, "position of the joint", position)
+        yield _output(f"{name}.velocity", "velocity", dof, f"{length}/s", "velocity of the joint", velocity)
+        yield _output(f"{name}.acceleration", "acceleration", dof, f"{length}/s2", "acceleration in the last step")
+        yield _output(f"{name}.effort_applied", "effort_applied", dof, effort, "effort applied in the last step")
+        yield _input(f"{name}.effort_command", "effort_command", dof, effort, "what a controller asks for")
+        yield _input(f"{name}.effort", "effort", dof, effort, "what is applied, such as the torque of an actuator")
+
+
+def _bodies(model: Any) -> Iterator[Entry]:  # noqa: ANN401  mujoco has no types
+    for number in range(_WORLD_BODY + 1, model.nbody):
+        name = model.body(number).name
+        if not name:
+            continue
+        yield from _vector(name, "position", "body_position", number, "m", "of the body's origin in world axes")
+        for part, letter in enumerate("wxyz"):
+            text = "attitude as a unit quaternion, body axes to world axes"
+            yield _output(f"{name}.orientation_{letter}", "body_orientation", 4 * number + part, "1", text)
+        text = "of the body's origin in world axes"
+        yield from _vector(name, "linear_velocity", "linear_velocity", number, "m/s", text)
+        yield from _vector(name, "angular_velocity", "angular_velocity", number, "rad/s", "in world axes")
+        yield from _vector(name, "wind", "body_wind", number, "m/s", "velocity of the medium in body axes")
+        text = "velocity of the body's origin against the medium in body axes"
+        yield from _vector(name, "relative_velocity", "relative_velocity", number, "m/s", text)
+        for offset, (what, unit) in enumerate((("force", "N"), ("moment", "N.m"))):
+            acting = "acts at the body's origin" if what == "force" else "acts about the body's origin"
+            for axis, letter in enumerate("xyz"):
+                place = 6 * number + 3 * offset + axis
+                yield _input(f"{name}.{what}_{letter}", "wrench", place, unit, f"{acting}, in body axes")
+
+
+def _vector(body: str, what: str, where: Where, number: int, unit: str, text: str) -> Iterator[Entry]:  # noqa: PLR0913, PLR0917  each is a column of the table above
+    for axis, letter in enumerate("xyz"):
+        yield _output(f"{body}.{what}_{letter}", where, 3 * number + axis, unit, text)
+
+
+def _output(name: str, where: Where, index: int, unit: str | None, text: str, start: float | None = None) -> Entry:  # noqa: PLR0913, PLR0917  each is a column of the table above
+    return Entry(_variable(name, "output", unit, text, start), where, index)
+
+
+def _input(name: str, where: Where, index: int, unit: str | None, text: str, start: float = 0.0) -> Entry:  # noqa: PLR0913, PLR0917  each is a column of the table above
+    return Entry(_variable(name, "input", unit, text, start), where, index)
+
+
+def _variable(name: str, causality: Causality, unit: str | None, text: str, start: float | None) -> Variable:
+    return Variable(
+        name=name,
+        value_reference=0,
+        type="Float64",
+        causality=causality,
+        variability="continuous",
+        initial=None if causality == "input" else "exact" if start is not None else "calculated",
+        start=start,
+        unit=unit,
+        description=text,
+        # At the first point the engine has not taken a step: only the wind of that moment makes a difference.
+        dependencies=_WIND if ".wind_" in name or ".relative_velocity_" in name else (),
+    )
+
+
+def _limits(mujoco: ModuleType, model: Any, free: set[str]) -> Iterator[tuple[int, float, float]]:  # noqa: ANN401  mujoco has no types
+    for number in range(model.njnt):
+        joint = model.joint(number)
+        scalar = int(joint.type[0]) in (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+        if scalar and model.jnt_actfrclimited[number] and joint.name not in free:
+            lower, upper = model.jnt_actfrcrange[number]
+            yield int(joint.dofadr[0]), float(lower), float(upper)
+
+
+def _left_out(mujoco: ModuleType, model: Any, data: bytes) -> Iterator[str]:  # noqa: ANN401  mujoco has no types
+    """What is in the file and has no variables. Of a free joint, position and velocity are those of its body."""
+    joints = [model.joint(number) for number in range(model.njnt)]
+    for joint in joints:
+        if joint.type[0] == mujoco.mjtJoint.mjJNT_BALL:
+            yield f"the joint '{joint.name}' is simulated, and has no variables, as it is a ball joint"
+    scalar = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+    nameless = {
+        "joints": sum(not joint.name for joint in joints if int(joint.type[0]) in scalar),
+        "sensors": sum(not model.sensor(number).name for number in range(model.nsensor)),
+        "actuators": sum(not model.actuator(number).name for number in range(model.nu)),
+    }
+    for what, count in nameless.items():
+        if count:
+            yield f"{what} without a name have no variables; there are {count}"
+    try:
+        root = ET.fromstring(data)  # noqa: S314  a file of the user's own; it is run as a simulation anyway
+    except ET.ParseError:  # MuJoCo reads more than XML
+        return
+    bodies = {model.body(number).name for number in range(model.nbody)}
+    links = [name for link in root.findall("link") if (name := link.get("name", "")) not in bodies]
+    if root.tag == "robot" and links:
+        yield f"links that a fixed joint makes part of another have no variables: {listed(links)}"
+
+
+def _text(model: Any, address: int) -> str:  # noqa: ANN401  mujoco has no types
+    """The text at an address among the names of a model; the first is the model's own."""
+    end = model.names.index(b"\0", address)
+    return str(model.names[address:end].decode(errors="replace"))

@@ -1,1 +1,0 @@
-"""Launching: from a configuration to running processes, and their supervision."""

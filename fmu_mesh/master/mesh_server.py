@@ -1,0 +1,168 @@
+"""The master's face to the rest of the world: what it answers to queries, its status, and the log of all instances.
+
+Everything that arrives, on foreign threads, is posted to the main thread.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+import time
+from collections.abc import Callable, Collection, Sequence
+from typing import Literal, Protocol
+
+import msgspec
+import zenoh
+
+from .. import __version__
+from ..errors import MessageRefused
+from ..system.plan import Plan
+from ..wire.inbox import Inbox
+from ..wire.keys import Keys
+from ..wire.messages import decode_json
+from ..wire.session import matches, undeclare_all
+from ..wire.values import json_encoding
+from ..wire.views import LogLine, MeshInfo, MeshStatus
+
+__all__ = ["STATUS_S", "Events", "Server", "mesh_info"]
+
+STATUS_S = 0.1
+"""How often the status is published."""
+
+_MOST_LOG_BYTES = 1 << 20
+
+
+class Events(Protocol):
+    """What the master tells whoever started it. Called on the master's main thread."""
+
+    def status(self, status: MeshStatus) -> None:
+        """The state of the run, about ten times a second."""
+        ...
+
+    def log(self, line: LogLine) -> None:
+        """A log message of an FMU, or about a setting that was refused."""
+        ...
+
+
+class Server:
+    """Serves the queries of one run.
+
+    Args:
+        session: the session of this process; stays the caller's.
+        inbox: the inbox of the master.
+        status: the state of the run right now.
+        instances: the names of all instances.
+    """
+
+    def __init__(  # noqa: PLR0913, PLR0917  the run and whom it tells
+        self,
+        session: zenoh.Session,
+        keys: Keys,
+        inbox: Inbox,
+        events: Events,
+        status: Callable[[], MeshStatus],
+        instances: Collection[str],
+    ) -> None:
+        self._session = session
+        self._keys = keys
+        self._inbox = inbox
+        self._events = events
+        self._status = status
+        self._instances = frozenset(instances)
+        self._status_published = 0.0
+        self._entities: list[zenoh.Queryable[None] | zenoh.Subscriber[None]] = []
+        self._status_publisher = session.declare_publisher(
+            self._keys.mesh_key("status"), encoding=json_encoding, congestion_control=zenoh.CongestionControl.DROP
+        )
+
+    def serve(self, key: str, answer: Callable[[zenoh.Query], None]) -> None:
+        """From now on ``answer`` gets the queries of a key; what it refuses is answered with the reason."""
+        post, guard = self._inbox.post, self._inbox.refusals.guard
+
+        def take(query: zenoh.Query) -> None:
+            with guard(str(query.key_expr), query):
+                answer(query)
+
+        self._entities.append(self._session.declare_queryable(key, lambda query: post(lambda: take(query))))
+
+    def show(self, what: Literal["info", "status", "plan"], view: Callable[[], object]) -> None:
+        """From now on a key of the mesh is answered with a view."""
+        key = self._keys.mesh_key(what)
+
+        def reply(query: zenoh.Query) -> None:
+            query.reply(key, msgspec.json.encode(view()), encoding=json_encoding)
+            query.drop()
+
+        self.serve(key, reply)
+
+    def watch(self, tokens: str, changed: Callable[[zenoh.Sample], None]) -> None:
+        """From now on ``changed`` gets every change of these liveliness tokens."""
+        post = self._inbox.post
+        self._entities.append(
+            self._session.liveliness().declare_subscriber(
+                tokens, lambda sample: post(lambda: changed(sample)), history=True
+            )
+        )
+
+    def hand_on_logs(self) -> None:
+        """From now on the log of all instances is handed on."""
+        post = self._inbox.post
+        self._entities.append(
+            self._session.declare_subscriber(f"{self._keys.root}/*/log", lambda sample: post(lambda: self._log(sample)))
+        )
+
+    def _log(self, sample: zenoh.Sample) -> None:
+        key = str(sample.key_expr)
+        with self._inbox.refusals.guard(key):
+            line = decode_json(sample.payload.to_bytes(), LogLine, _MOST_LOG_BYTES)
+            if key != f"{self._keys.instance(line.instance)}/log" or line.instance not in self._instances:
+                raise MessageRefused("it is not the log of an instance of this mesh")
+            self._events.log(line)
+
+    def publish_status(self, *, at_once: bool = False) -> None:
+        """Publish the status if it is time to, or ``at_once``."""
+        now = time.monotonic()
+        if not at_once and now - self._status_published < STATUS_S:
+            return
+        self._status_published = now
+        status = self._status()
+        self._events.status(status)
+        if matches(self._status_publisher):
+            self._status_publisher.put(msgspec.json.encode(status))
+
+    def close(self) -> None:
+        """Undeclare everything."""
+        undeclare_all(self._entities, [self._status_publisher])
+
+
+def mesh_info(plan: Plan, run: str, config_file: str, endpoints: Sequence[str], shared: Sequence[str]) -> MeshInfo:
+    """What `mesh/info` answers.
+
+    Args:
+        plan: the plan of the whole mesh.
+        run: the run's id.
+        config_file: name of the configuration file.
+        endpoints: where tools can reach this process.
+        shared: who gets all messages through shared memory.
+    """
+    config = plan.system.config
+    grid = plan.grid
+    return MeshInfo(
+        mesh=config.mesh,
+        version=__version__,
+        run=run,
+        config=config_file,
+        start_time=grid.start_time,
+        stop_time=grid.stop_time,
+        step_size=grid.step_size,
+        algorithm=config.simulation.algorithm,
+        window=plan.window,
+        real_time_factor=config.simulation.real_time_factor,
+        instances=tuple(plan.system.instances),
+        nodes=tuple(plan.nodes),
+        result_file=plan.system.result_file,
+        endpoints=tuple(endpoints),
+        pid=os.getpid(),
+        host=socket.gethostname(),
+        shared_memory=tuple(shared),
+    )

@@ -1,0 +1,234 @@
+"""The node's face to the rest of the world: info, status, current values, settings, streams and log.
+
+Runs on a thread of its own; what it answers is in `fmu_mesh.node.answering`. Values come from the rings (rows that were
+completed), or are read by the main thread at the next point. So a query never waits for a step, a step never waits for
+a query, and `status` answers while an FMU hangs.
+"""
+
+from __future__ import annotations
+
+import logging
+import queue
+import threading
+import time
+from collections.abc import Callable, Mapping
+from functools import partial
+
+import msgspec
+import zenoh
+
+from ..errors import FmuError, FmuMeshError
+from ..system.plan import NodePlan
+from ..wire.inbox import Inbox
+from ..wire.keys import Keys
+from ..wire.messages import NodeReport
+from ..wire.session import matches, undeclare_all
+from ..wire.values import json_encoding
+from ..wire.views import LogLine
+from .activity import Activity
+from .answering import Answers, Job
+from .stepping import Runner
+from .streams import MAX_WAITING_ROWS, Batch, InstanceStreams
+
+__all__ = ["Server"]
+
+log = logging.getLogger(__name__)
+
+_TICK_S = 0.25
+_LAST_ROWS_S = 1.0
+_LAST_WORDS_S = 0.5
+_STREAM_SHARE = 4.0
+_EARLY_LINES = 1000
+"""How many log messages are kept until this node belongs to a mesh."""
+
+
+class Server:
+    """Serves the instances of one node.
+
+    Args:
+        plan: what the node has to do.
+        session: the session of this process; stays the caller's.
+        inbox: the inbox of the node.
+        activity: what the node is doing.
+        report: tells the master how the node has ended, within so many seconds.
+    """
+
+    def __init__(
+        self,
+        plan: NodePlan,
+        session: zenoh.Session,
+        inbox: Inbox,
+        activity: Activity,
+        report: Callable[[NodeReport, float], None],
+    ) -> None:
+        self.on_hang: Callable[[FmuError], None] = lambda _error: None
+        self._plan = plan
+        self._session = session
+        self._report = report
+        self._keys = Keys(plan.key_prefix, plan.mesh)
+        self._inbox = inbox
+        self._activity = activity
+        self._streams: list[InstanceStreams] = []
+        self._waiting_rows = 0
+        self._jobs: queue.SimpleQueue[Job | None] = queue.SimpleQueue()
+        self._answers = Answers(plan, inbox, activity, self._jobs.put, self._publish_log)
+        self._entities: list[zenoh.Queryable[None] | zenoh.Subscriber[None] | zenoh.LivelinessToken] = []
+        self._status_publishers: dict[str, zenoh.Publisher] = {}
+        self._log_publishers: dict[str, zenoh.Publisher] = {}
+        self._early_lines: list[LogLine] = []
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="server", daemon=True)
+        self._thread.start()
+
+    def open(self) -> None:
+        """From any thread, when the node belongs to the mesh: from now on it is seen, even while FMUs are loaded."""
+        self._jobs.put(self._declare)
+
+    # --- called by the main thread
+
+    def serve(self, runners: Mapping[str, Runner]) -> None:
+        """From now on values can be asked for and set, and outputs be subscribed."""
+        self._activity.runners = runners
+        for runner in runners.values():
+            self._streams.append(
+                InstanceStreams(runner, self._session, self._keys, self._plan.grid, self._streams_changed)
+            )
+            for kind in ("in", "param"):
+                key = f"{self._keys.instance(runner.name)}/{kind}/*"
+                take = partial(self._answers.put_arrived, runner)
+                self._entities.append(self._session.declare_subscriber(key, take, allowed_origin=zenoh.Locality.REMOTE))
+
+    def stepped(self) -> None:
+        """Hand rows that were just stepped to the streams that have subscribers."""
+        for streams in self._streams:
+            collected = streams.collect(self._waiting_rows)
+            if collected is not None:
+                rows, batch = collected
+                self._waiting_rows += rows
+                self._jobs.put(partial(self._publish_rows, rows, batch))
+
+    def started(self) -> None:
+        """All streams begin at the first point: subscriptions made before it are looked at now."""
+        self._activity.started()
+        for streams in self._streams:
+            streams.update()
+        self.stepped()
+
+    def log_message(self, line: LogLine) -> None:
+        """Publish one log message; never waits."""
+        self._jobs.put(partial(self._publish_log, line))
+
+    def close(self) -> None:
+        """Publish what is waiting, for a second at most, and undeclare everything."""
+        if self._closing.is_set():
+            return
+        self._jobs.put(None)
+        self._thread.join(_LAST_ROWS_S)
+        self._closing.set()
+        undeclare_all(self._entities, self._status_publishers.values(), self._log_publishers.values())
+        for streams in self._streams:
+            streams.close()
+
+    # --- the thread
+
+    def _run(self) -> None:
+        published = 0.0
+        while True:
+            try:
+                job = self._jobs.get(timeout=_TICK_S)
+            except queue.Empty:
+                pass
+            else:
+                if job is None:
+                    return
+                with self._inbox.refusals.guard("a query or a value"):
+                    job()
+            now = time.monotonic()
+            if now - published >= _TICK_S:
+                published = now
+                self._tick(now)
+
+    def _tick(self, now: float) -> None:
+        self._answers.refuse_late(now)
+        for streams in self._streams:
+            if dropped := streams.take_dropped():
+                text = f"{dropped} points were not published: the run is faster than samples can be sent"
+                self._publish_log(LogLine(streams.runner.name, "warning", "stream", text, streams.runner.point))
+        for name, publisher in self._status_publishers.items():
+            if matches(publisher):
+                publisher.put(msgspec.json.encode(self._activity.status(name)))
+        if (hang := self._activity.look_at_steps(now)) is not None:
+            self.on_hang(hang)
+
+    def report_hang(self, error: FmuError, deadline_s: float) -> bool:
+        """From a watching thread: tell the master that an FMU does not return; whether it knows now."""
+        runner = self._activity.runners.get(error.instance or "")
+        if runner is not None and self._activity.state != "initializing":
+            error.point = point = runner.point
+            error.time = self._plan.grid.time(point)
+        report = NodeReport(self._plan.node, error.point or 0, error.report())
+        try:
+            self._report(report, deadline_s)
+        except FmuMeshError as unreachable:
+            log.warning("hang_not_reported", extra={"error": str(unreachable)})
+            return False
+        return True
+
+    # --- queries
+
+    def _declare(self) -> None:
+        for instance in self._plan.instances:
+            self._declare_instance(instance.name)
+        for line in self._early_lines:
+            self._publish_log(line)
+
+    def _declare_instance(self, name: str) -> None:
+        root = self._keys.instance(name)
+        self._entities.append(self._session.liveliness().declare_token(root))
+        self._entities.append(self._session.declare_queryable(f"{root}/**", partial(self._query_arrived, name)))
+        # A log message is not lost; the status is told again.
+        for what, publishers, congestion_control in (
+            ("status", self._status_publishers, zenoh.CongestionControl.DROP),
+            ("log", self._log_publishers, zenoh.CongestionControl.BLOCK),
+        ):
+            publishers[name] = self._session.declare_publisher(
+                f"{root}/{what}", encoding=json_encoding, congestion_control=congestion_control
+            )
+
+    def _query_arrived(self, name: str, query: zenoh.Query) -> None:
+        def answer() -> None:
+            with self._inbox.refusals.guard(str(query.key_expr), query):
+                self._answers.answer(name, query)
+
+        self._jobs.put(answer)
+
+    # --- publishing
+
+    def say_everything(self) -> None:
+        """Let what was logged so far go out before what follows from it; not for longer than `_LAST_WORDS_S`."""
+        said = threading.Event()
+        self._jobs.put(said.set)
+        said.wait(_LAST_WORDS_S)
+
+    def _streams_changed(self, streams: InstanceStreams) -> None:
+        def update() -> None:
+            self.stepped()  # what was stepped before belongs to the old set of variables
+            streams.update()
+
+        self._inbox.post(update)
+
+    def _publish_rows(self, rows: int, batch: Batch) -> None:
+        streams, first, columns = batch
+        started = time.monotonic()
+        streams.publish(first, columns)
+        self._waiting_rows -= rows
+        if self._waiting_rows > MAX_WAITING_ROWS // 2:
+            # Subscribers cannot keep up with this run: they get a share of the node's time, and samples are left out.
+            self._closing.wait(_STREAM_SHARE * (time.monotonic() - started))
+
+    def _publish_log(self, line: LogLine) -> None:
+        publisher = self._log_publishers.get(line.instance)
+        if publisher is not None:
+            publisher.put(msgspec.json.encode(line))
+        elif len(self._early_lines) < _EARLY_LINES:
+            self._early_lines.append(line)

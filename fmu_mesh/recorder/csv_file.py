@@ -1,0 +1,164 @@
+"""The result CSV: first column `time`, then `<instance>.<variable>`, floats written shortest-round-trip.
+
+A float is written with as few digits as read back to the same bits; Boolean as `true` or `false`; String as quoted
+text; Binary as base64.
+"""
+
+from __future__ import annotations
+
+import base64
+import csv
+import io
+import math
+from collections.abc import Sequence
+from contextlib import suppress
+from itertools import chain
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+import orjson
+from numpy.typing import NDArray
+
+from ..files import Kept, open_alone
+from ..variables.value_types import Value, VariableType, is_text
+from .lines import in_lines, prepare
+
+__all__ = ["CsvFile", "cut_after_last_row"]
+
+_CHUNK_NUMBERS = 4096
+"""What is formatted at once: more would not stay in the cache, and its memory would come from the system each time."""
+
+_BUFFER_BYTES = 1 << 16
+_READ_BYTES = 1 << 20
+
+
+class CsvFile:
+    """Writes rows of results, always whole ones at once.
+
+    Args:
+        path: the file; its folder is made, an older file is replaced by the first row.
+        columns: (name, type) of every column but `time`.
+
+    Attributes:
+        path: the file.
+        rows: rows written so far; once it is closed, those that are in the file.
+        kept: what the operating system has by now.
+
+    Raises:
+        ConfigurationError: the file cannot be written, or another run writes into it.
+    """
+
+    def __init__(self, path: Path, columns: Sequence[tuple[str, VariableType]]) -> None:
+        self.path = path
+        self.rows = 0
+        self.kept = Kept()
+        self._has_text = any(is_text(type_) for _, type_ in columns)
+        self._is_float = all(type_ == "Float64" for _, type_ in columns)
+        self._chunk_rows = max(1, _CHUNK_NUMBERS // (1 + len(columns)))
+        if not self._has_text:
+            prepare()
+        self._file = open_alone(path)
+        header = io.StringIO()
+        csv.writer(header, lineterminator="\n").writerow(["time", *(name for name, _ in columns)])
+        self._waiting: list[bytes | memoryview] = [header.getvalue().encode()]
+        self._waiting_bytes = 0
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def write(self, times: NDArray[np.float64], columns: Sequence[NDArray[Any]]) -> None:
+        """Append one row per time; ``columns`` are arrays of the same length, of their types' dtypes."""
+        for first in range(0, len(times), self._chunk_rows):
+            part = slice(first, first + self._chunk_rows)
+            chunk = [times[part], *(column[part] for column in columns)]
+            lines = self._format(chunk)
+            self._waiting.append(lines)
+            self._waiting_bytes += len(lines)
+            self.rows += len(chunk[0])
+            if self._waiting_bytes >= _BUFFER_BYTES:
+                self.flush()
+
+    def flush(self) -> None:
+        """Hand everything to the operating system, so that it survives the end of this process."""
+        if not self._waiting_bytes:
+            return
+        left = memoryview(b"".join(self._waiting))
+        self._waiting, self._waiting_bytes = [], 0
+        try:
+            while left:
+                left = left[self._file.write(left) :]
+        except OSError:
+            self.rows = self._rows_in_file()
+            raise
+        self.kept = Kept(self.rows, self._file.size)
+
+    def close(self) -> None:
+        """Write what is left and close the file; without a row, nothing has changed."""
+        try:
+            self.flush()
+        finally:
+            self._file.close()
+
+    def _rows_in_file(self) -> int:
+        """Rows that are there after a write failed, the last of them complete."""
+        with suppress(OSError):
+            if self.path.is_file():
+                return cut_after_last_row(self.path, self.kept)
+        return self.kept.rows
+
+    def _format(self, columns: Sequence[NDArray[Any]]) -> bytes | memoryview:
+        # JSON's numbers are shortest-round-trip, too, and orjson writes those of an array without a Python object each.
+        if self._is_float:
+            values = np.stack(columns, axis=1)
+            if np.isfinite(values).all():
+                return in_lines(orjson.dumps(values.ravel(), option=orjson.OPT_SERIALIZE_NUMPY), len(columns))
+        rows = zip(*(column.tolist() for column in columns), strict=True)
+        if self._has_text or not all(np.isfinite(column).all() for column in columns):
+            return "".join(",".join(map(_text, row)) + "\n" for row in rows).encode()
+        return in_lines(orjson.dumps(list(chain.from_iterable(rows))), len(columns))
+
+
+def cut_after_last_row(path: Path, kept: Kept) -> int:
+    """Cut a result file off after its last complete row; returns how many rows it has.
+
+    Args:
+        path: the file; nobody writes it any more.
+        kept: rows that are known to be complete; only what follows them is read.
+    """
+    lines, end, quoted = 0, kept.size, False
+    with path.open("r+b") as file:
+        if file.seek(0, io.SEEK_END) < kept.size:
+            return 0  # it is another file by now
+        offset = file.seek(kept.size)
+        while piece := file.read(_READ_BYTES):
+            for number, part in enumerate(piece.split(b'"')):  # text may have line ends in it
+                if number:
+                    quoted = not quoted
+                    offset += 1
+                if not quoted and (last := part.rfind(b"\n")) >= 0:
+                    lines += part.count(b"\n")
+                    end = offset + last + 1
+                offset += len(part)
+        rows = kept.rows + lines - (0 if kept.size else 1)  # the first line is the heading
+        file.truncate(end if rows > 0 else 0)
+    return max(rows, 0)
+
+
+def _text(value: Value) -> str:
+    """One value where JSON has no word for it: `nan`, `inf`, `-inf`, text; all others as JSON has them."""
+    match value:
+        case str():
+            return '"' + value.replace('"', '""') + '"'
+        case bytes():
+            return base64.b64encode(value).decode()
+        case float() if not math.isfinite(value):
+            return repr(value)
+        case _:
+            return orjson.dumps(value).decode()

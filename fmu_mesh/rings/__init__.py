@@ -1,0 +1,1 @@
+"""How rows travel between instances: rings, and what moves rows from one ring to another."""

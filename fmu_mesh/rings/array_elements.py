@@ -1,0 +1,64 @@
+"""Inputs that are arrays of which only some elements are connected.
+
+An FMU takes and gives arrays as a whole (FMI 3.0, 2.2.6.2), so what is not connected keeps what the FMU has there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+
+from ..variables.value_types import Value
+from .ring import Column, Layout, Ring
+
+__all__ = ["element_of", "fill_unconnected", "merged", "scaled"]
+
+Get = Callable[[Sequence[str]], list[Value]]
+
+
+def merged(values: Mapping[str, Value], layout: Layout, get: Get) -> dict[str, Value]:
+    """Values of variables, out of values of variables and of elements.
+
+    Args:
+        values: by name; `u[2]` is an element of `u`.
+        layout: the columns that the names are of.
+        get: the current values of variables, to which the elements go.
+    """
+    row = Ring(layout, 1)
+    columns = {name: layout.column(name).name for name in values}
+    arrays = list(dict.fromkeys(column for name, column in columns.items() if name != column))
+    if arrays:
+        for array, value in zip(arrays, get(arrays), strict=True):
+            row.put(0, array, value)
+    for name, value in values.items():
+        row.put(0, name, value)
+    return {column: row.value(0, column) for column in dict.fromkeys(columns.values())}
+
+
+def element_of(value: Value, column: Column, name: str) -> Value:
+    """The element called ``name`` of the value of a column, or the value itself if that is the column's own name."""
+    row = Ring(Layout((column,)), 1)
+    row.put(0, column.name, value)
+    return row.value(0, name)
+
+
+def fill_unconnected(ring: Ring, connected: Iterable[str], get: Get) -> None:
+    """Let the elements of input arrays that are not ``connected`` keep what the FMU has there, in every row."""
+    names = {*connected}
+    for column in ring.layout.columns:
+        if not column.shape or column.name in names:
+            continue
+        free = [offset for offset, element in enumerate(column.elements) if element not in names]
+        if free:
+            place = ring.layout.place(column.name)
+            row = Ring(Layout((column,)), 1)
+            row.put(0, column.name, get([column.name])[0])
+            ring.parts[place.part][:, [place.first + offset for offset in free]] = row.parts[0][0, free]
+
+
+def scaled(value: Value, factor: float, offset: float) -> Value:
+    """``value * factor + offset``, one rounding each; of an array, each element; as it is if that is nothing to do."""
+    if (factor, offset) == (1.0, 0.0) or isinstance(value, str | bytes):
+        return value
+    if isinstance(value, list):
+        return [scaled(element, factor, offset) for element in value]
+    return value * factor + offset

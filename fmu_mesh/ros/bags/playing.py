@@ -1,0 +1,170 @@
+"""A bag as input: recorded values go into the inputs of a running mesh, each at the point of its stamp.
+
+Owns which sample belongs to which communication point, and holds the mesh there while it sets the values: the mesh runs
+from sample to sample, so the result depends on the bag alone and not on how fast anybody is.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+
+import msgspec
+
+from ...errors import ConfigurationError, DeadlineExceeded, MeshLost
+from ...simtime import ENDLESS, TimeGrid
+from ...variables.model_description import Value
+from ...wire.client.mesh_client import MeshClient
+from ...wire.client.readings import Target
+from ...wire.values import encode_value
+from ...wire.views import Command, MeshInfo
+from ..messages.stamp import nanoseconds
+from .reading import Sample
+
+__all__ = ["Moment", "grid_of", "play", "schedule"]
+
+_LOOK_S = 0.001
+_LONGEST_LOOK_S = 0.05
+
+
+class Moment(msgspec.Struct, frozen=True):
+    """What the inputs are given at one point, by (instance, variable)."""
+
+    point: int
+    values: dict[tuple[str, str], Value]
+
+
+def grid_of(info: MeshInfo) -> TimeGrid:
+    """The communication points of a running mesh."""
+    if info.stop_time is None:
+        return TimeGrid(info.start_time, info.step_size, ENDLESS)
+    return TimeGrid(info.start_time, info.step_size, round((info.stop_time - info.start_time) / info.step_size))
+
+
+def schedule(
+    samples: Iterable[Sample], grid: TimeGrid, step_points: Mapping[str, int], *, start: float | None
+) -> tuple[list[Moment], int, int]:
+    """Put samples to the points from which on they hold.
+
+    A value holds from the first point of its instance that is not before its stamp, as the value of a trajectory does.
+    Of several for one point the last one counts.
+
+    Args:
+        samples: in any order.
+        grid: the communication points.
+        step_points: points per step of every instance.
+        start: simulation time in s of the earliest stamp; None: stamps are simulation times.
+
+    Returns:
+        The moments in order, how many samples were replaced, and how many are too late to be seen.
+    """
+    ordered = sorted(samples, key=lambda sample: sample.stamp)
+    shift = 0 if start is None or not ordered else nanoseconds(start) - ordered[0].stamp
+    moments: dict[int, dict[tuple[str, str], Value]] = {}
+    merged = beyond = 0
+    for sample in ordered:
+        point = _point_of(sample.stamp + shift, grid, step_points[sample.instance])
+        if point >= grid.last_point:
+            beyond += 1
+            continue
+        values = moments.setdefault(point, {})
+        merged += (sample.instance, sample.variable) in values
+        values[sample.instance, sample.variable] = sample.value
+    return [Moment(point, moments[point]) for point in sorted(moments)], merged, beyond
+
+
+def play(
+    client: MeshClient, moments: Sequence[Moment], step_points: Mapping[str, int], timeout_s: float
+) -> tuple[int, int]:
+    """Let a mesh run from moment to moment, and set the values of each while it rests there; then let it run on.
+
+    Moments that are past already count as the present: of each input the last one is set.
+
+    Args:
+        client: the mesh; it is paused, or is going to be.
+        moments: in the order of their points.
+        step_points: points per step of every instance.
+        timeout_s: how long the mesh may rest without having come where it should, in s.
+
+    Returns:
+        How many values were set, and the point of the first.
+
+    Raises:
+        ConfigurationError: a value was refused.
+        MeshLost: the mesh has ended, or does not come to the next moment.
+    """
+    hold = _commanded(client, Command("pause"))
+    together = math.lcm(*step_points.values())  # where every instance can rest
+    hold = _go_on(client, hold, -(-hold // together) * together)
+    targets: dict[tuple[str, str], Target] = {}
+    first, count = hold, 0
+    for moment in _from(hold, moments):
+        hold = _go_on(client, hold, moment.point)
+        for instance in {instance for instance, _ in moment.values}:
+            _wait_until_at(client, instance, hold, timeout_s)
+        for (instance, variable), value in moment.values.items():
+            key = (instance, variable)
+            if key not in targets:
+                targets[key] = client.target(f"{instance}.{variable}")
+            answer = client.set(targets[key], encode_value(value).decode())
+            if answer.point != hold:
+                raise MeshLost(f"the value for point {hold} came to '{instance}.{variable}' at point {answer.point}.")
+            count += 1
+    client.command(Command("resume"))
+    return count, first
+
+
+def _commanded(client: MeshClient, command: Command) -> int:
+    """Give a command that lets the mesh rest; the point where it is going to."""
+    hold = client.command(command).hold
+    if hold is None:
+        raise ConfigurationError("the mesh does not say where it rests.", hint="Is it another version of fmu_mesh?")
+    return hold
+
+
+def _go_on(client: MeshClient, hold: int, point: int) -> int:
+    """Let the mesh go on from the point where it rests, or is going to, to a later one; returns that."""
+    if point > hold and _commanded(client, Command("step", point - hold)) != point:
+        raise MeshLost(f"the mesh goes to another point than {point}: somebody else commands it, too.")
+    return point
+
+
+def _from(point: int, moments: Sequence[Moment]) -> Iterator[Moment]:
+    """The moments from ``point`` on; what is past is one moment at ``point``."""
+    past: dict[tuple[str, str], Value] = {}
+    for moment in moments:
+        if moment.point <= point:
+            past |= moment.values
+            continue
+        if past:
+            yield Moment(point, past)
+            past = {}
+        yield moment
+    if past:
+        yield Moment(point, past)
+
+
+def _wait_until_at(client: MeshClient, instance: str, point: int, timeout_s: float) -> None:
+    """Wait until an instance rests at ``point``."""
+    never = threading.Event()
+    look, reached, moved = _LOOK_S, -1, time.monotonic()
+    while (status := client.instance_status(instance)).point != point:
+        now = time.monotonic()
+        if status.point != reached:
+            look, reached, moved = _LOOK_S, status.point, now
+        if now - moved > timeout_s:
+            raise DeadlineExceeded(
+                f"it does not come to point {point}: {status.activity}.", instance=instance, point=reached
+            )
+        never.wait(look)
+        look = min(2 * look, _LONGEST_LOOK_S)
+
+
+def _point_of(stamp: int, grid: TimeGrid, points: int) -> int:
+    """The first point of an instance that is not before ``stamp``; a stamp is good to a nanosecond."""
+    exact = (stamp / 1e9 - grid.start_time) / (points * grid.step_size)
+    near = round(exact)
+    step = near if abs(nanoseconds(grid.time(near * points)) - stamp) <= 1 else math.ceil(exact)
+    return max(0, step) * points

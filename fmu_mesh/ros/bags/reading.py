@@ -1,0 +1,212 @@
+"""Reading bags: MCAP and SQLite, of `ros2 bag` and of our own, by `rosbags`; and which of their topics are inputs.
+
+Knows nothing of points: when a value holds is `fmu_mesh.ros.bags.playing`.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, Self
+
+import msgspec
+import numpy as np
+from msgspec.structs import replace
+
+from ... import files
+from ...config.findings import listed, nearest, nearest_file
+from ...config.loading import LoadedConfig
+from ...config.mesh import RosConfig, RosTopicConfig
+from ...errors import ConfigurationError
+from ...variables.model_description import Value
+from ...variables.value_types import nested
+from ...wire.views import InstanceInfo
+from ..gateway.mapping import message_types
+from ..gateway.resolver import Resolver
+from ..gateway.seen import descriptions_of
+from ..gateway.topics import Port, Topic
+from ..messages.definitions import MessageTypes, path_parts
+
+if TYPE_CHECKING:
+    from rosbags.highlevel import AnyReader
+
+__all__ = ["Bag", "Sample", "chosen_topics"]
+
+_CHOICE = re.compile(r"(?P<topic>/?[^=:]+)(:(?P<field>[^=]+))?=(?P<variable>.+)")
+
+StampSource = Literal["header", "log"]
+
+
+class Sample(msgspec.Struct, frozen=True):
+    """One recorded value.
+
+    Attributes:
+        stamp: when it holds from, in ns.
+        instance: of the input.
+        variable: name of the input.
+    """
+
+    stamp: int
+    instance: str
+    variable: str
+    value: Value
+
+
+class Bag:
+    """A bag that is open for reading; use it as a context manager.
+
+    Args:
+        path: an MCAP file, or the folder of a `ros2 bag`.
+
+    Raises:
+        ConfigurationError: it cannot be read, or `rosbags` is not installed.
+    """
+
+    def __init__(self, path: Path) -> None:
+        try:
+            from rosbags.highlevel import AnyReader, AnyReaderError  # noqa: PLC0415 an optional dependency
+        except ImportError as error:
+            raise ConfigurationError(
+                "reading a bag needs the package rosbags", hint="Install it: pip install 'fmu-mesh[ros]'."
+            ) from error
+        self.path = path
+        if not files.exists(path):
+            near = nearest_file(path)
+            raise ConfigurationError(
+                f"the bag '{path}' does not exist.", hint=f"Did you mean '{near}'?" if near is not None else None
+            )
+        if files.is_folder(path) and not (path / "metadata.yaml").is_file():
+            raise ConfigurationError(
+                f"the folder '{path}' is no bag: it has no metadata.yaml.",
+                hint="Name the folder that `ros2 bag record` made, or an .mcap file.",
+            )
+        try:
+            self._reader: AnyReader = AnyReader([path])
+            self._reader.open()
+        except (AnyReaderError, OSError, ValueError) as error:
+            raise ConfigurationError(f"'{path}' cannot be read as a bag: {str(error).rstrip('.')}.") from error
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._reader.close()
+
+    @property
+    def topics(self) -> dict[str, str]:
+        """The message type of every topic."""
+        return {name: info.msgtype or "" for name, info in self._reader.topics.items()}
+
+    def add_types(self, types: MessageTypes) -> None:
+        """Let ``types`` have the message types of this bag, too."""
+        for name, definition in self._reader.typestore.fielddefs.items():
+            types.store.fielddefs.setdefault(name, definition)
+
+    def samples(self, topics: Sequence[Topic], stamps: StampSource) -> Iterator[Sample]:
+        """The values of ``topics`` in the order in which they were recorded.
+
+        Args:
+            topics: subscribed topics.
+            stamps: `header` takes the stamp of the header where there is one, `log` when it was recorded.
+
+        Raises:
+            ConfigurationError: a message does not have what its topic needs.
+        """
+        wanted = {topic.name: [(path_parts(port.path), port) for port in topic.ports] for topic in topics}
+        connections = [connection for connection in self._reader.connections if connection.topic in wanted]
+        for connection, logged, data in self._reader.messages(connections) if connections else ():
+            message: Any = self._reader.deserialize(data, connection.msgtype)
+            stamp = _header_stamp(message) if stamps == "header" else None
+            for parts, port in wanted[connection.topic]:
+                value = _value_at(message, parts, port, connection.topic)
+                yield Sample(logged if stamp is None else stamp, port.instance, port.variable.name, value)
+
+
+def chosen_topics(
+    loaded: LoadedConfig, infos: Mapping[str, InstanceInfo], bag: Bag, choices: Sequence[str] = ()
+) -> list[Topic]:
+    """The topics of a bag that go into inputs of a mesh.
+
+    Args:
+        loaded: the configuration of the mesh.
+        infos: what its instances say of themselves.
+        bag: the bag.
+        choices: `TOPIC=INSTANCE.VARIABLE` or `TOPIC:FIELD=INSTANCE.VARIABLE` each; without any, the topics are those
+            that the mesh subscribes to by its `ros` section, or by the names that it would give its inputs.
+
+    Raises:
+        ConfigurationError: a choice is wrong, or no topic fits.
+    """
+    there = bag.topics
+    section = loaded.config.ros or RosConfig()
+    if choices:
+        section = replace(section, topics=list(_entries(choices, there)))
+    config = replace(loaded.config, ros=section)
+    findings = loaded.findings()
+    types = message_types(replace(loaded, config=config), findings)
+    findings.raise_any()
+    assert types is not None
+    bag.add_types(types)
+    plan = Resolver(config, section, descriptions_of(infos), types, findings).plan()
+    if choices and len(findings):
+        problems = "; ".join(f"{finding.found}, where {finding.expected} is possible" for finding in findings)
+        raise ConfigurationError(f"--topic: {problems}.")
+    topics = [topic for topic in plan.topics if topic.direction == "in" and topic.name in there]
+    for topic in topics:
+        if there[topic.name] != topic.message:
+            raise ConfigurationError(
+                f"the topic '{topic.name}' has messages of '{there[topic.name]}' in '{bag.path}', and of "
+                f"'{topic.message}' in the mesh.",
+                hint=f"Say which field goes where: --topic {topic.name}:FIELD=INSTANCE.VARIABLE.",
+            )
+    if not topics:
+        wanted = [topic.name for topic in plan.topics if topic.direction == "in"]
+        raise ConfigurationError(
+            f"no topic of '{bag.path}' is one that the mesh subscribes to: it has {listed(sorted(there))}, and the "
+            f"mesh wants {listed(wanted)}.",
+            hint="Say what goes where: --topic TOPIC=INSTANCE.VARIABLE.",
+        )
+    return topics
+
+
+def _entries(choices: Sequence[str], there: Mapping[str, str]) -> Iterator[RosTopicConfig]:
+    fields: dict[str, dict[str, str]] = {}
+    for choice in choices:
+        found = _CHOICE.fullmatch(choice)
+        if found is None:
+            raise ConfigurationError(f"--topic {choice}: expected TOPIC=INSTANCE.VARIABLE or TOPIC:FIELD=….")
+        topic = "/" + found["topic"].lstrip("/")
+        if topic not in there:
+            near = nearest(topic, there)
+            hint = f"Did you mean '{near}'?" if near else f"It has {listed(sorted(there))}."
+            raise ConfigurationError(f"--topic {choice}: the bag has no topic '{topic}'.", hint=hint)
+        fields.setdefault(topic, {})[found["field"] or "data"] = found["variable"]
+    for topic, own in fields.items():
+        yield RosTopicConfig(topic=topic, type=there[topic], fields=own)
+
+
+def _header_stamp(message: Any) -> int | None:  # noqa: ANN401 a message of rosbags
+    stamp = getattr(getattr(message, "header", None), "stamp", None)
+    if stamp is None or not (stamp.sec or stamp.nanosec):
+        return None
+    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+
+
+def _value_at(message: Any, parts: Sequence[str | int], port: Port, topic: str) -> Value:  # noqa: ANN401 of rosbags
+    """A field as a value of a variable, an array in its shape."""
+    value = message
+    try:
+        for part in parts:
+            value = value[part] if isinstance(part, int) else getattr(value, part)
+    except IndexError as error:
+        raise ConfigurationError(f"a message of '{topic}' has no '{port.path}'.") from error
+    plain: Value = value.tolist() if isinstance(value, np.generic | np.ndarray) else value
+    if not port.variable.shape:
+        return plain
+    if not isinstance(plain, list) or len(plain) != port.variable.size:
+        raise ConfigurationError(
+            f"a message of '{topic}' does not have the {port.variable.size} elements of "
+            f"'{port.instance}.{port.variable.name}'."
+        )
+    return nested(plain, port.variable.shape)

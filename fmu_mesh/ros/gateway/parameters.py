@@ -1,0 +1,184 @@
+"""The parameters of all FMUs as the parameters of the node in ROS, by the services that ROS has for it.
+
+A parameter is called `<instance>.<variable>`. What the mesh refuses (a fixed parameter, a value out of range) is
+refused with the same reason.
+"""
+
+from __future__ import annotations
+
+import logging
+import queue
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import zenoh
+
+from ...errors import FmuMeshError
+from ...variables.model_description import Value, Variable
+from ...wire.keys import Keys
+from ...wire.messages import decode_json
+from ...wire.session import ask
+from ...wire.values import encode_value
+from ..messages.cdr import Codec, Message
+from ..messages.definitions import MessageTypes
+from ..messages.ros_names import absolute
+from .rmw_zenoh import RmwZenoh, Service
+from .topics import Parameter, RosPlan
+
+__all__ = ["SERVICES", "ParameterServices"]
+
+log = logging.getLogger(__name__)
+
+SERVICES = {
+    "GetParameters": ("string[] names\n", "rcl_interfaces/ParameterValue[] values\n"),
+    "GetParameterTypes": ("string[] names\n", "uint8[] types\n"),
+    "SetParameters": ("rcl_interfaces/Parameter[] parameters\n", "rcl_interfaces/SetParametersResult[] results\n"),
+    "ListParameters": ("string[] prefixes\nuint64 depth\n", "rcl_interfaces/ListParametersResult result\n"),
+    "DescribeParameters": ("string[] names\n", "rcl_interfaces/ParameterDescriptor[] descriptors\n"),
+}
+"""Request and response of each service (package rcl_interfaces)."""
+
+_ANSWER_S = 2.0
+_CLOSE_S = 2.0
+_NOT_SET, _BOOL, _INTEGER, _DOUBLE, _STRING = range(5)
+_VALUE_FIELDS = {_BOOL: "bool_value", _INTEGER: "integer_value", _DOUBLE: "double_value", _STRING: "string_value"}
+
+
+class ParameterServices:
+    """Answers for the parameters of one mesh, on a thread of its own: the mesh is asked, and may take its time.
+
+    Args:
+        plan: the parameters.
+        types: the message types; gets those of the services.
+        mesh: a session that reaches the mesh; stays the caller's.
+        keys: the keys of the mesh.
+    """
+
+    def __init__(self, plan: RosPlan, types: MessageTypes, mesh: zenoh.Session, keys: Keys) -> None:
+        self._plan = plan
+        self._mesh = mesh
+        self._keys = keys
+        self._parameters = {parameter.name: parameter for parameter in plan.parameters}
+        self._jobs: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
+        for name, (request, response) in SERVICES.items():
+            types.define_service(f"rcl_interfaces/srv/{name}", request, response)
+        self._no_value = Codec(types, "rcl_interfaces/msg/ParameterValue").empty()
+
+    @contextmanager
+    def served_by(self, node: RmwZenoh) -> Iterator[None]:
+        """Offer the services as those of ``node`` while inside."""
+        thread = threading.Thread(target=self._run, name="parameters", daemon=True)
+        thread.start()
+        for name, kind, answer in (
+            ("get_parameters", "GetParameters", self._get),
+            ("get_parameter_types", "GetParameterTypes", self._get_types),
+            ("set_parameters", "SetParameters", self._set),
+            ("list_parameters", "ListParameters", self._list),
+            ("describe_parameters", "DescribeParameters", self._describe),
+        ):
+            full_name = absolute(f"{self._plan.node}/{name}", self._plan.namespace)
+            node.serve(full_name, f"rcl_interfaces/srv/{kind}", self._later(answer))
+        try:
+            yield
+        finally:
+            self._jobs.put(None)
+            thread.join(_CLOSE_S)
+
+    def _later(self, answer: Callable[[Message], Message]) -> Service:
+        def service(request: Message, reply: Callable[[Message], None]) -> None:
+            self._jobs.put(lambda: reply(answer(request)))
+
+        return service
+
+    def _run(self) -> None:
+        while (job := self._jobs.get()) is not None:
+            try:
+                job()
+            except zenoh.ZError as error:  # whoever asked is gone
+                log.info("answer_not_sent", extra={"error": str(error)})
+
+    # --- the services
+
+    def _get(self, request: Message) -> Message:
+        return {"values": [self._value(name) for name in request["names"]]}
+
+    def _get_types(self, request: Message) -> Message:
+        kinds = [self._parameters.get(name) for name in request["names"]]
+        return {"types": [_kind(own.variable) if own is not None else _NOT_SET for own in kinds]}
+
+    def _set(self, request: Message) -> Message:
+        results = [self._set_one(own["name"], own["value"]) for own in request["parameters"]]
+        return {"results": [{"successful": not reason, "reason": reason} for reason in results]}
+
+    def _list(self, request: Message) -> Message:
+        wanted = [
+            name
+            for name in self._parameters
+            if not request["prefixes"] or any(name == p or name.startswith(f"{p}.") for p in request["prefixes"])
+        ]
+        return {"result": {"names": wanted, "prefixes": sorted({name.partition(".")[0] for name in wanted})}}
+
+    def _describe(self, request: Message) -> Message:
+        return {"descriptors": [_descriptor(name, self._parameters.get(name)) for name in request["names"]]}
+
+    # --- the mesh
+
+    def _value(self, name: str) -> Message:
+        parameter = self._parameters.get(name)
+        value = self._ask(parameter)[0] if parameter is not None else None
+        if parameter is None or value is None:
+            return self._no_value
+        kind = _kind(parameter.variable)
+        return {**self._no_value, "type": kind, _VALUE_FIELDS[kind]: float(value) if kind == _DOUBLE else value}
+
+    def _set_one(self, name: str, value: Message) -> str:
+        """Set one parameter; the reason where it is refused, nothing where it is set."""
+        parameter = self._parameters.get(name)
+        if parameter is None:
+            return f"there is no parameter '{name}'"
+        field = _VALUE_FIELDS.get(value["type"])
+        if field is None:
+            return f"'{name}' takes one value, a {parameter.variable.type}"
+        return self._ask(parameter, value[field])[1]
+
+    def _ask(self, parameter: Parameter, value: Value | None = None) -> tuple[Any, str]:
+        """The current value, or what the mesh says to a new one, and the reason where it says no."""
+        key = self._keys.variable(parameter.instance, "param", parameter.variable.name)
+        payload = encode_value(value) if value is not None else None
+        try:
+            return decode_json(ask(self._mesh, key, payload, _ANSWER_S, f"'{parameter.name}'"), object), ""
+        except FmuMeshError as error:
+            return None, error.message
+
+
+def _kind(variable: Variable) -> int:
+    """The number of the parameter type in ROS (`rcl_interfaces/msg/ParameterType`)."""
+    match variable.type:
+        case "Boolean":
+            return _BOOL
+        case "String":
+            return _STRING
+        case "Real" | "Float64" | "Float32":
+            return _DOUBLE
+        case _:
+            return _INTEGER
+
+
+def _descriptor(name: str, parameter: Parameter | None) -> Message:
+    variable = parameter.variable if parameter is not None else None
+    ranges: list[Message] = []
+    if variable is not None and variable.minimum is not None and variable.maximum is not None:
+        ranges = [{"from_value": variable.minimum, "to_value": variable.maximum, "step": 0.0}]
+    double = variable is not None and _kind(variable) == _DOUBLE
+    return {
+        "name": name,
+        "type": _kind(variable) if variable is not None else _NOT_SET,
+        "description": (variable.description or "") if variable is not None else "",
+        "additional_constraints": f"unit: {variable.unit}" if variable is not None and variable.unit else "",
+        "read_only": variable is None or variable.variability != "tunable",
+        "dynamic_typing": False,
+        "floating_point_range": ranges if double else [],
+        "integer_range": [] if double else [{name: int(limit) for name, limit in own.items()} for own in ranges],
+    }

@@ -1,0 +1,148 @@
+"""The profile of rmw_zenoh: the mesh as one ROS node with publishers, subscribers and services, without any bridge.
+
+Keys are `<domain>/<name>/<type in DDS>/<hash>`. Tokens are
+`@ros2_lv/<domain>/<zid>/<node>/<entity>/<kind>/<enclave>/<namespace>/<node name>/<name>/<type>/<hash>/<qos>` with `%`
+for every slash within a part. Every sample, request and response has an attachment: sequence number, time in ns, and
+the 16 bytes that identify its sender (rmw_zenoh, docs/design.md).
+"""
+
+from __future__ import annotations
+
+import itertools
+import struct
+from collections.abc import Callable
+
+import zenoh
+
+from ...wire.session import undeclare_all
+from ..messages.cdr import CdrError, Codec, Message
+from ..messages.definitions import MessageTypes
+from ..messages.ros_names import dds_type
+from ..messages.stamp import nanoseconds
+from .profile import DEPTH, Put, Take, congestion_control
+from .topics import RosPlan, Topic
+
+__all__ = ["RmwZenoh", "Service", "decode_attachment"]
+
+_ATTACHMENT = struct.Struct("<qqB16s")
+_SHORT_ATTACHMENT = struct.Struct("<qq16s")
+_GID_SIZE = 16
+_RELIABLE, _BEST_EFFORT, _VOLATILE, _KEEP_LAST = 1, 2, 2, 1
+_NO_HASH = "TypeHashNotSupported"
+
+Service = Callable[[Message, Callable[[Message], None]], None]
+"""Gets a request on a foreign thread, and a function that takes the response, now or later and on any thread."""
+
+
+class RmwZenoh:
+    """One ROS node on Zenoh.
+
+    Args:
+        session: stays the caller's.
+        types: message types, for their hashes.
+        plan: the name and the namespace of the node.
+        domain: ROS_DOMAIN_ID.
+    """
+
+    def __init__(self, session: zenoh.Session, types: MessageTypes, plan: RosPlan, domain: int) -> None:
+        self._session = session
+        self._types = types
+        self._plan = plan
+        self._domain = domain
+        self._entities = itertools.count(1)
+        self._publishers: list[zenoh.Publisher] = []
+        self._others: list[zenoh.Subscriber[None] | zenoh.Queryable[None]] = []
+        node = f"@ros2_lv/{domain}/{session.zid()}/0/0/NN/{self._node()}"
+        self._tokens = [session.liveliness().declare_token(node)]
+
+    def publish(self, topic: Topic) -> Put:
+        """Be a publisher of ``topic``; the time of a sample is its simulation time."""
+        publisher = self._session.declare_publisher(
+            self._key(topic.name, topic.message),
+            encoding=zenoh.Encoding.APPLICATION_CDR,
+            congestion_control=congestion_control(topic),
+        )
+        self._publishers.append(publisher)
+        gid = self._announce("MP", topic.name, topic.message, reliable=topic.reliability == "reliable")
+        sequence = itertools.count(1)
+
+        def put(data: bytes, time: float) -> None:
+            publisher.put(data, attachment=_ATTACHMENT.pack(next(sequence), nanoseconds(time), _GID_SIZE, gid))
+
+        return put
+
+    def subscribe(self, topic: Topic, take: Take) -> None:
+        """Be a subscriber of ``topic``."""
+        key = self._key(topic.name, topic.message)
+        self._others.append(self._session.declare_subscriber(key, lambda sample: take(sample.payload.to_bytes())))
+        self._announce("MS", topic.name, topic.message, reliable=topic.reliability == "reliable")
+
+    def serve(self, name: str, kind: str, service: Service) -> None:
+        """Be the server of the service ``name`` of the type ``kind``, which `MessageTypes` has to know."""
+        key = self._key(name, kind)
+        request_codec = Codec(self._types, f"{kind}_Request")
+        response_codec = Codec(self._types, f"{kind}_Response")
+
+        def answer(query: zenoh.Query) -> None:
+            try:
+                sequence, time_ns, gid = decode_attachment(query.attachment)
+                request = request_codec.decode(query.payload.to_bytes() if query.payload is not None else b"")
+            except CdrError as error:
+                query.reply_err(f"'{name}': {error}")
+                query.drop()
+                return
+
+            def reply(response: Message) -> None:
+                own = _ATTACHMENT.pack(sequence, time_ns, _GID_SIZE, gid)
+                query.reply(key, response_codec.encode(response), attachment=own)
+                query.drop()
+
+            service(request, reply)
+
+        self._others.append(self._session.declare_queryable(key, answer, complete=True))
+        self._announce("SS", name, kind, reliable=True)
+
+    def close(self) -> None:
+        """Undeclare everything; announcements first."""
+        undeclare_all(self._tokens, self._publishers, self._others)
+
+    def _announce(self, kind: str, name: str, message: str, *, reliable: bool) -> bytes:
+        """Declare the token of an entity, and return what identifies it."""
+        import xxhash  # noqa: PLC0415  an optional dependency
+
+        qos = f"{_RELIABLE if reliable else _BEST_EFFORT}:{_VOLATILE}:{_KEEP_LAST},{DEPTH}:,:,:,,"
+        own = f"{_mangled(name)}/{dds_type(message)}/{self._hash(message)}/{qos}"
+        token = f"@ros2_lv/{self._domain}/{self._session.zid()}/0/{next(self._entities)}/{kind}/{self._node()}/{own}"
+        self._tokens.append(self._session.liveliness().declare_token(token))
+        number = xxhash.xxh3_128_intdigest(token.encode())
+        low, high = number & (1 << 64) - 1, number >> 64
+        return struct.pack("<QQ", low, high)
+
+    def _node(self) -> str:
+        return f"%/{_mangled(self._plan.namespace)}/{self._plan.node}"
+
+    def _key(self, name: str, message: str) -> str:
+        return f"{self._domain}/{name.strip('/')}/{dds_type(message)}/{self._hash(message)}"
+
+    def _hash(self, message: str) -> str:
+        return _NO_HASH if self._types.distribution == "humble" else self._types.type_hash(message)
+
+
+def decode_attachment(attachment: zenoh.ZBytes | None) -> tuple[int, int, bytes]:
+    """Sequence number, time in ns and sender of an attachment, with or without the length of the sender.
+
+    Raises:
+        CdrError: it is none.
+    """
+    data = attachment.to_bytes() if attachment is not None else b""
+    if len(data) == _ATTACHMENT.size and data[_ATTACHMENT.size - _GID_SIZE - 1] == _GID_SIZE:
+        sequence, time_ns, _size, gid = _ATTACHMENT.unpack(data)
+    elif len(data) == _SHORT_ATTACHMENT.size:
+        sequence, time_ns, gid = _SHORT_ATTACHMENT.unpack(data)
+    else:
+        raise CdrError(f"an attachment of {len(data)} bytes where sequence number, time and sender should be")
+    return sequence, time_ns, gid
+
+
+def _mangled(name: str) -> str:
+    return name.replace("/", "%")

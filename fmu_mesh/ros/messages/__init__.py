@@ -1,0 +1,1 @@
+"""ROS messages: definitions, CDR, names, stamps, and how variables fit into them."""

@@ -1,0 +1,188 @@
+"""Between values of the mesh and ROS messages: assembling a message of values, and taking one apart.
+
+Owns which values belong into one message: those of one communication point, never those that came last.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable, Iterator
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from ...variables.model_description import Value
+from ...variables.value_types import flattened, nested
+from ..gateway.topics import Port, Topic
+from .cdr import CdrError, Codec, Message
+from .definitions import HEADER, Array, Basic, FieldType, MessageTypes, Nested, Sequence, path_parts
+from .stamp import from_stamp, to_stamp
+
+__all__ = ["Assembler", "Disassembler"]
+
+_WAITING = 1 << 14
+_FLOATS = {"NaN": float("nan"), "INF": float("inf"), "-INF": float("-inf")}
+
+
+class Assembler:
+    """Makes the messages of one published topic.
+
+    A message belongs to one point. Where its variables are of instances with different step sizes, there is one at
+    every point of any of them, with the values that hold there.
+    """
+
+    def __init__(self, topic: Topic, types: MessageTypes) -> None:
+        self.topic = topic
+        self._codec = Codec(types, topic.message)
+        self._message = self._codec.empty()
+        self._setters = [self._setter(port, types) for port in topic.ports]
+        for path, value in topic.constants:
+            owner, last = self._place(path, types)
+            owner[last] = value
+        self._steps = [port.step_points for port in topic.ports]
+        self._waiting: list[deque[tuple[int, float, Any]]] = [deque(maxlen=_WAITING) for _ in topic.ports]
+        self._last = -1
+        self._headers = list(_headers(self._message, Nested(topic.message), types))
+        named = {path for path, _ in topic.constants} | {port.path for port in topic.ports}
+        for path, header in self._headers:
+            if f"{path}.frame_id" not in named:
+                header["frame_id"] = topic.frame_id
+
+    def add(self, port: int, point: int, time: float, value: Value) -> Iterator[tuple[bytes, float]]:
+        """Take the value of a port at a point, and yield the messages that are complete now, with their times in s.
+
+        Raises:
+            CdrError: a value does not fit into its field.
+        """
+        self._waiting[port].append((point, time, value))
+        while all(self._waiting):
+            heads = [waiting[0] for waiting in self._waiting]
+            ends = [head[0] + step for head, step in zip(heads, self._steps, strict=True)]
+            now = max(head[0] for head in heads)
+            # What holds no longer at this point goes; after a message, what ends first.
+            until = now if now > self._last else min(ends)
+            over = [waiting for waiting, end in zip(self._waiting, ends, strict=True) if end <= until]
+            for waiting in over:
+                waiting.popleft()
+            if not over:
+                self._last = now
+                stamp = next(head[1] for head in heads if head[0] == now)
+                yield self.make([head[2] for head in heads], stamp), stamp
+
+    def make(self, values: list[Any], time: float) -> bytes:
+        """The message that has these values, one per port, at ``time`` s.
+
+        Raises:
+            CdrError: a value does not fit into its field.
+        """
+        for put, value in zip(self._setters, values, strict=True):
+            put(value)
+        stamp = to_stamp(time) if self._headers else None
+        for _, header in self._headers:
+            header["stamp"] = stamp
+        return self._codec.encode(self._message)
+
+    def _setter(self, port: Port, types: MessageTypes) -> Callable[[Any], None]:
+        """A function that puts a value of the mesh into its field."""
+        container, last = self._place(port.path, types)
+        kind = types.field(self.topic.message, port.path)
+        element = kind if isinstance(kind, Basic) else getattr(kind, "element", None)
+        floats = isinstance(element, Basic) and element.kind in ("float64", "float32")
+        shape = port.variable.shape
+        if shape and "layout" in self._message:
+            self._message["layout"]["dim"] = [
+                {"label": f"dim{axis}", "size": size, "stride": math.prod(shape[axis:])}
+                for axis, size in enumerate(shape)
+            ]
+
+        def one(value: Any) -> Any:  # noqa: ANN401 a value of any variable
+            return _FLOATS[value] if floats and isinstance(value, str) else value
+
+        def put(value: Any) -> None:  # noqa: ANN401 a value of any variable
+            container[last] = [one(own) for own in flattened(value, len(shape))] if shape else one(value)
+
+        return put
+
+    def _place(self, path: str, types: MessageTypes) -> tuple[Any, str | int]:
+        """What holds the field at ``path``, and its name or index there; every sequence on the way is long enough.
+
+        Elements that this adds are empty, as is all that nobody gives a value.
+        """
+        parts = path_parts(path)
+        container: Any = self._message
+        reached = ""
+        for part, following in pairwise(parts):
+            reached += f"[{part}]" if isinstance(part, int) else f".{part}" if reached else part
+            if isinstance(following, int):
+                kind = types.field(self.topic.message, reached)
+                container[part] = self._with_length(container[part], following + 1, kind)
+            container = container[part]
+        return container, parts[-1]
+
+    def _with_length(self, elements: Any, length: int, kind: FieldType) -> list[Any]:  # noqa: ANN401 an array or a list
+        """The elements as a list, of at least ``length`` where it is a sequence."""
+        # The list that another port has already.
+        listed: list[Any] = elements if isinstance(elements, list) else elements.tolist()
+        if isinstance(kind, Sequence):
+            listed += [self._codec.empty_field(kind.element) for _ in range(length - len(listed))]
+        return listed
+
+
+class Disassembler:
+    """Takes the messages of one subscribed topic apart."""
+
+    def __init__(self, topic: Topic, types: MessageTypes) -> None:
+        self.topic = topic
+        self._codec = Codec(types, topic.message)
+        self._paths = [path_parts(port.path) for port in topic.ports]
+
+    def values(self, data: bytes) -> tuple[list[Value], float | None]:
+        """The values of the ports, and the stamp in s; None without a header, or with a stamp of zero.
+
+        Raises:
+            CdrError: the bytes are no such message, or an element that a port needs is not in it.
+        """
+        message = self._codec.decode(data)
+        values = []
+        for port, path in zip(self.topic.ports, self._paths, strict=True):
+            value: Any = message
+            try:
+                for part in path:
+                    value = value[part]
+            except IndexError as error:
+                raise CdrError(f"it has no '{port.path}'") from error
+            values.append(_in_shape(value, port))
+        if not self.topic.stamped:
+            return values, None
+        stamp = message["header"]["stamp"]
+        time = from_stamp(stamp["sec"], stamp["nanosec"])
+        return values, time or None
+
+
+def _headers(value: Any, kind: FieldType, types: MessageTypes, path: str = "") -> Iterator[tuple[str, Message]]:  # noqa: ANN401 any field
+    """The path and the value of every header in a message, also in its elements."""
+    match kind:
+        case Nested(message) if message == HEADER and path:
+            yield path, value
+        case Nested(message):
+            for name, own in types.fields(message):
+                yield from _headers(value[name], own, types, f"{path}.{name}" if path else name)
+        case Array(Nested() as element) | Sequence(Nested() as element):
+            for index, own_value in enumerate(value):
+                yield from _headers(own_value, element, types, f"{path}[{index}]")
+
+
+def _in_shape(value: Any, port: Port) -> Value:  # noqa: ANN401 a field of any message
+    """A field as a value of the mesh: an array in the shape of its variable.
+
+    Raises:
+        CdrError: there are too many elements, or too few.
+    """
+    plain: Value = value.tolist() if isinstance(value, np.ndarray | np.generic) else value
+    if not port.variable.shape:
+        return plain
+    if not isinstance(plain, list) or len(plain) != port.variable.size:
+        raise CdrError(f"'{port.path}' needs {port.variable.size} elements for '{port.variable.name}'")
+    return nested(plain, port.variable.shape)

@@ -1,0 +1,365 @@
+"""ROS message types: their fields, their RIHS01 hashes, and which of them carries a variable.
+
+Definitions and hashes come from `rosbags`, as pure data: of it nothing is generated or evaluated here. How a message is
+written as bytes is `fmu_mesh.ros.messages.cdr`.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, Any, Final, Literal
+
+import msgspec
+
+from ...errors import ConfigurationError
+
+if TYPE_CHECKING:
+    from rosbags.typesys.store import Typestore
+
+__all__ = [
+    "CLOCK",
+    "HEADER",
+    "MAX_ELEMENTS",
+    "TIME",
+    "Array",
+    "Basic",
+    "Distribution",
+    "FieldType",
+    "MessageTypes",
+    "Nested",
+    "Sequence",
+    "UnknownField",
+    "UnknownType",
+    "carries",
+    "default_type",
+    "is_message_name",
+    "path_parts",
+]
+
+CLOCK = "rosgraph_msgs/msg/Clock"
+TIME = "builtin_interfaces/msg/Time"
+HEADER = "std_msgs/msg/Header"
+
+MAX_ELEMENTS: Final = 1 << 16
+"""Strings and nested messages that all sequences and arrays of a message may hold together; an index is below it."""
+
+Distribution = Literal["humble", "jazzy", "kilted", "lyrical"]
+
+_MESSAGE_NAME = re.compile(r"[a-z][a-z0-9_]*/(?:msg|srv)/[A-Z][A-Za-z0-9_]*")
+_INDEXED = re.compile(r"(?P<name>[^\[\]]+)\[(?P<index>[^\[\]]*)\]")
+_INDEX = re.compile(r"[0-9]{1,9}")
+_PART = re.compile(r"[^.\[\]]+|\[[0-9]+\]")
+
+
+class Basic(msgspec.Struct, frozen=True):
+    """A number, a bool or a string; ``bound`` is the length limit of a string, 0 for none."""
+
+    kind: str
+    bound: int = 0
+
+
+class Nested(msgspec.Struct, frozen=True):
+    """A message in a message."""
+
+    message: str
+
+
+class Array(msgspec.Struct, frozen=True):
+    """A fixed number of elements."""
+
+    element: Basic | Nested
+    length: int
+
+
+class Sequence(msgspec.Struct, frozen=True):
+    """Any number of elements, at most ``bound`` if that is not 0."""
+
+    element: Basic | Nested
+    bound: int = 0
+
+
+FieldType = Basic | Nested | Array | Sequence
+
+
+class UnknownType(ValueError):
+    """There is no message type with this name; ``names`` has those that there are."""
+
+    def __init__(self, message: str, names: tuple[str, ...]) -> None:
+        super().__init__(f"there is no message type '{message}'")
+        self.names = names
+
+
+class UnknownField(ValueError):
+    """A message has no field at this place, and why; ``names`` has the paths of those that it has."""
+
+    def __init__(self, message: str, path: str, names: tuple[str, ...], reason: str = "") -> None:
+        super().__init__(f"'{message}' has no field '{path}'{f': {reason}' if reason else ''}")
+        self.names = names
+
+
+class MessageTypes:
+    """The message types of a ROS distribution, and custom ones.
+
+    Args:
+        distribution: the ROS 2 distribution whose definitions hold.
+        custom: definitions in the syntax of a `.msg` file, by full name (`my_msgs/msg/Wheel`).
+
+    Raises:
+        ConfigurationError: `rosbags` is not installed, or a custom definition is wrong.
+    """
+
+    def __init__(self, distribution: Distribution = "jazzy", custom: Mapping[str, str] | None = None) -> None:
+        try:
+            from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415  an optional dependency
+        except ImportError as error:
+            raise ConfigurationError(
+                "ROS message types need the package rosbags", hint="Install it: pip install 'fmu-mesh[ros]'."
+            ) from error
+        self.distribution = distribution
+        self.store: Typestore = get_typestore(Stores[f"ROS2_{distribution.upper()}"])
+        self._hashes: dict[str, str] = {}
+        # ROS 2 means uint8 by char, in hashes too; rosbags hashes it as a type of its own.
+        for name, (constants, fields) in self.store.fielddefs.items():
+            if any("char" in repr(kind) for _, kind in fields):
+                self.store.fielddefs[name] = (constants, [(own, _without_char(kind)) for own, kind in fields])
+        for name, text in (custom or {}).items():
+            self.define(name, text)
+        for name in custom or {}:
+            self._check_references(name)
+
+    def define(self, name: str, text: str) -> None:
+        """Add a definition in the syntax of a `.msg` file.
+
+        Raises:
+            ConfigurationError: the text is no definition, or another one with this name is there.
+        """
+        from rosbags.typesys import TypesysError, get_types_from_msg  # noqa: PLC0415  as above
+
+        if not is_message_name(name):
+            raise ConfigurationError(f"'{name}' is no name of a message type; write package/msg/Name.")
+        try:
+            defined = get_types_from_msg(text, name)
+        except TypesysError as error:
+            raise ConfigurationError(f"the definition of '{name}' is not understood: {error}") from error
+        for own, fields in defined.items():
+            if self.store.fielddefs.setdefault(own, fields) != fields:
+                raise ConfigurationError(f"'{own}' is defined already, with other fields")
+
+    def __contains__(self, message: str) -> bool:
+        return message in self.store.fielddefs
+
+    def fields(self, message: str) -> tuple[tuple[str, FieldType], ...]:
+        """The fields of a message, in order.
+
+        Raises:
+            UnknownType: there is no such type.
+        """
+        if message not in self.store.fielddefs:
+            raise UnknownType(message, tuple(self.store.fielddefs))
+        return tuple((name, _field_type(description)) for name, description in self.store.fielddefs[message][1])
+
+    def field(self, message: str, path: str) -> FieldType:
+        """The type of the field at a path such as `twist.linear.x`, `pose.covariance[7]` or `transforms[0].header`.
+
+        Raises:
+            UnknownType: there is no such type.
+            UnknownField: there is no such field, or its index is not one of the array.
+        """
+        kind: FieldType = Nested(message)
+        reached = ""
+        for part in path.split("."):
+            indexed = _INDEXED.fullmatch(part)
+            name = indexed["name"] if indexed is not None else part
+            found = dict(self.fields(kind.message)).get(name) if isinstance(kind, Nested) else None
+            reason = ""
+            if isinstance(kind, Array | Sequence) and isinstance(kind.element, Nested):
+                reason = f"'{reached}' is an array, write an index, such as {reached}[0].{part}"
+            elif found is not None and indexed is not None:
+                reason = _index_problem(found, indexed["index"])
+                found = found.element if isinstance(found, Array | Sequence) else None
+            if found is None or reason:
+                raise UnknownField(message, path, tuple(self.paths(message)), reason)
+            kind, reached = found, f"{reached}.{part}" if reached else part
+        return kind
+
+    def paths(self, message: str, prefix: str = "") -> Iterator[str]:
+        """The paths of all fields that are no message themselves; of arrays of messages, those of the first element."""
+        for name, kind in self.fields(message):
+            if isinstance(kind, Nested):
+                yield from self.paths(kind.message, f"{prefix}{name}.")
+            elif isinstance(kind, Array | Sequence) and isinstance(kind.element, Nested):
+                yield from self.paths(kind.element.message, f"{prefix}{name}[0].")
+            else:
+                yield f"{prefix}{name}"
+
+    def has_header(self, message: str) -> bool:
+        """Whether a message starts with a `std_msgs/msg/Header`, and so has a stamp."""
+        return ("header", Nested(HEADER)) in self.fields(message)
+
+    def type_hash(self, message: str) -> str:
+        """The RIHS01 hash of a message or of a service defined by `define_service` (REP 2016)."""
+        if message not in self._hashes:
+            self.fields(message)
+            self._hashes[message] = self.store.hash_rihs01(message)
+        return self._hashes[message]
+
+    def define_service(self, name: str, request: str, response: str) -> None:
+        """Add a service as the messages that ROS makes of it: request, response and event (REP 2016)."""
+        one: dict[str, object] = {}
+        for part, text in (("Request", request), ("Response", response)):
+            as_message = f"{name.replace('/srv/', '/msg/')}_{part}"
+            self.define(as_message, text)
+            self.store.fielddefs[f"{name}_{part}"] = self.store.fielddefs.pop(as_message)
+            one[part] = (2, f"{name}_{part}")
+        event = [
+            ("info", (2, "service_msgs/msg/ServiceEventInfo")),
+            ("request", (4, (one["Request"], 1))),
+            ("response", (4, (one["Response"], 1))),
+        ]
+        whole = [
+            ("request_message", one["Request"]),
+            ("response_message", one["Response"]),
+            ("event_message", (2, f"{name}_Event")),
+        ]
+        self.store.fielddefs |= msgspec.convert({f"{name}_Event": ([], event), name: ([], whole)}, Any)
+
+    def definition(self, message: str) -> str:
+        """The text of a definition with all that it refers to, as MCAP and Foxglove want it (`ros2msg`)."""
+        self.fields(message)
+        text, _md5 = self.store.generate_msgdef(message, ros_version=2)
+        return text
+
+    def _check_references(self, message: str) -> None:
+        try:
+            for _ in self.paths(message):
+                pass
+        except UnknownType as error:
+            raise ConfigurationError(f"the definition of '{message}': {error}") from error
+
+
+def path_parts(path: str) -> list[str | int]:
+    """`pose.covariance[7]` as `pose`, `covariance`, 7."""
+    return [int(part[1:-1]) if part.startswith("[") else part for part in _PART.findall(path)]
+
+
+def is_message_name(name: str) -> bool:
+    """Whether ``name`` has the form `package/msg/Name`."""
+    return _MESSAGE_NAME.fullmatch(name) is not None
+
+
+_MESSAGES: Mapping[str, str] = {
+    "Real": "Float64",
+    "Float64": "Float64",
+    "Float32": "Float32",
+    "Integer": "Int32",
+    "Int8": "Int8",
+    "Int16": "Int16",
+    "Int32": "Int32",
+    "Int64": "Int64",
+    "UInt8": "UInt8",
+    "UInt16": "UInt16",
+    "UInt32": "UInt32",
+    "UInt64": "UInt64",
+    "Boolean": "Bool",
+    "Enumeration": "Int64",
+    "String": "String",
+}
+
+
+def default_type(variable_type: str, *, array: bool = False) -> str | None:
+    """The message that carries a variable of an FMI type on a topic of its own; None if there is none.
+
+    An array goes as a multi-array (`std_msgs/msg/Float64MultiArray`), which there is for numbers only.
+    """
+    name = _MESSAGES.get(variable_type)
+    if name is None or (array and name in ("Bool", "String")):
+        return None
+    return f"std_msgs/msg/{name}{'MultiArray' if array else ''}"
+
+
+_BITS: Mapping[str, tuple[int, bool]] = {
+    "int8": (8, True),
+    "int16": (16, True),
+    "int32": (32, True),
+    "int64": (64, True),
+    "uint8": (8, False),
+    "byte": (8, False),
+    "char": (8, False),
+    "uint16": (16, False),
+    "uint32": (32, False),
+    "uint64": (64, False),
+}
+"""Width of an integer, and whether it has a sign."""
+
+_KINDS: Mapping[str, str] = {
+    "Real": "float64",
+    "Integer": "int32",
+    "Boolean": "bool",
+    "Enumeration": "int64",
+    **{name: name.lower() for name in _MESSAGES if name[0] in "FIU" and name[-1].isdigit()},
+    "String": "string",
+}
+
+
+def carries(target: str, source: str) -> bool:
+    """Whether a value of the kind ``source`` fits into ``target``; both are kinds of fields, or FMI types.
+
+    Whole numbers never lose anything. Between the two kinds of floats the user chooses, so float64 may go into float32.
+    """
+    to, of = _KINDS.get(target, target), _KINDS.get(source, source)
+    if to == of:
+        return True
+    if to in ("float64", "float32"):
+        exact = 53 if to == "float64" else 24
+        return of in ("float64", "float32", "bool") or (of in _BITS and _BITS[of][0] <= exact)
+    if to in _BITS:
+        bits, signed = _BITS[to]
+        if of == "bool":
+            return True
+        if of not in _BITS:
+            return False
+        other, other_signed = _BITS[of]
+        return other <= bits if signed == other_signed else signed and other < bits
+    return False
+
+
+def _without_char(description: Any) -> Any:  # noqa: ANN401 a nested tuple of rosbags
+    if isinstance(description, tuple):
+        return tuple(_without_char(part) for part in description)
+    return "uint8" if description == "char" else description
+
+
+def _field_type(description: object) -> FieldType:
+    """A field as `rosbags` describes it: (kind, (name, bound)), (kind, name), or (kind, (element, length))."""
+    match description:
+        case (1, (str(kind), int(bound))):
+            return Basic(kind, bound)
+        case (2, str(message)):
+            return Nested(message)
+        case (3, (element, int(length))):
+            return Array(_element_type(element), length)
+        case (4, (element, int(bound))):
+            return Sequence(_element_type(element), bound)
+    raise ConfigurationError(f"rosbags describes a field in a way that is not known: {description!r}")
+
+
+def _element_type(description: object) -> Basic | Nested:
+    kind = _field_type(description)
+    assert isinstance(kind, Basic | Nested)  # ROS has no arrays of arrays
+    return kind
+
+
+def _index_problem(kind: FieldType, index: str) -> str:
+    """Why a field has no element with this index; empty if it has, or can have."""
+    last = MAX_ELEMENTS - 1
+    match kind:
+        case Array(_, length):
+            last = min(last, length - 1)
+        case Sequence(_, bound) if bound:
+            last = min(last, bound - 1)
+        case Basic() | Nested():
+            return "it is no array"
+    if _INDEX.fullmatch(index) is None or int(index) > last:
+        return f"an index is a whole number from 0 to {last}"
+    return ""

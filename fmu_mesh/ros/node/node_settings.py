@@ -1,0 +1,120 @@
+"""What a node that runs an FMU is told by its own parameters, and the time that it can make itself."""
+
+from __future__ import annotations
+
+import math
+import time
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from ...errors import ConfigurationError
+from .driving import DriveSettings
+from .node_parameters import RosNode
+from .node_topics import own_names
+
+__all__ = ["PARAMETERS", "RESERVED", "NodeSettings", "PacedTime", "read_settings"]
+
+PARAMETERS: dict[str, tuple[Any, str]] = {
+    "fmu_path": ("", "Path of the FMU."),
+    "step_size": (0.0, "Communication step size in s; 0.0: that of the FMU's default experiment."),
+    "update_period": (0.01, "How often the FMU catches up with time and publishes its outputs, in s of wall clock."),
+    "stop_time": (0.0, "Simulated time in s after which the node deactivates itself; 0.0: never."),
+    "max_steps": (1000, "How many steps one update may take to catch up."),
+    "stamped": (False, "Whether every number has a second topic NAME_stamped (geometry_msgs/msg/PointStamped)."),
+    "names": ([""], "Other ROS names of variables, each as 'VARIABLE: NAME'."),
+    "messages": ([""], "Fields of messages, each as 'TOPIC: {type: TYPE, fields: {PATH: VARIABLE}}'."),
+    "publish_clock": (False, "Whether this node is the source of simulated time: it starts at 0 and goes to /clock."),
+    "real_time_factor": (1.0, "With publish_clock: simulated over wall-clock time."),
+}
+"""The parameters of the node itself, which it has before an FMU is there: default and description."""
+
+RESERVED = frozenset(
+    {
+        *PARAMETERS,
+        *("autostart", "autostart_timeout", "config", "connect"),
+        *("use_sim_time", "start_type_description_service"),
+    }
+)
+"""Names of parameters that a node has without its FMU."""
+
+
+class NodeSettings(msgspec.Struct, frozen=True, kw_only=True):
+    """The parameters of the node itself, checked.
+
+    Attributes:
+        drive: how the FMU is driven.
+        update_period: of the timer in s.
+        stamped: whether numbers have a second topic with a header.
+        names: ROS names by variable, where the usual ones do not do.
+        messages: entries of the parameter `messages`.
+        publish_clock: whether the node is the source of simulated time.
+        real_time_factor: of that time.
+    """
+
+    drive: DriveSettings
+    update_period: float
+    stamped: bool
+    names: dict[str, str]
+    messages: tuple[str, ...]
+    publish_clock: bool
+    real_time_factor: float
+
+
+def read_settings(node: RosNode) -> NodeSettings:
+    """Read `PARAMETERS` of a node.
+
+    Raises:
+        ConfigurationError: a value is missing or out of its range.
+    """
+    value = {name: node.get_parameter(name).value for name in (*PARAMETERS, "use_sim_time")}
+    if not value["fmu_path"]:
+        raise ConfigurationError("the parameter 'fmu_path' is not set.", hint="It is the path of the FMU.")
+    for name in ("step_size", "stop_time"):
+        if not (math.isfinite(value[name]) and value[name] >= 0.0):
+            raise ConfigurationError(f"the parameter '{name}' is {value[name]!r}; expected a time of 0.0 s or more.")
+    for name in ("update_period", "real_time_factor", "max_steps"):
+        if not (math.isfinite(value[name]) and value[name] > 0):
+            raise ConfigurationError(f"the parameter '{name}' is {value[name]!r}; expected a number above 0.")
+    if value["publish_clock"] and value["use_sim_time"]:
+        raise ConfigurationError(
+            "this node cannot publish /clock and run by it.", hint="Set either publish_clock or use_sim_time."
+        )
+    return NodeSettings(
+        drive=DriveSettings(
+            fmu_path=Path(value["fmu_path"]),
+            step_size=value["step_size"] or None,
+            stop_time=value["stop_time"] or None,
+            max_steps=value["max_steps"],
+        ),
+        update_period=value["update_period"],
+        stamped=value["stamped"],
+        names=own_names(filter(None, value["names"])),
+        messages=tuple(filter(None, value["messages"])),
+        publish_clock=value["publish_clock"],
+        real_time_factor=value["real_time_factor"],
+    )
+
+
+class PacedTime:
+    """Simulated time that this node makes itself: 0 at first, then wall-clock time by a factor; it can be paused."""
+
+    def __init__(self, factor: float) -> None:
+        self._factor = factor
+        self._before = 0
+        self._since: int | None = None
+
+    def now(self) -> int:
+        """The time in ns."""
+        running = 0 if self._since is None else time.monotonic_ns() - self._since
+        return self._before + round(running * self._factor)
+
+    def go_on(self) -> None:
+        """Start, or go on."""
+        if self._since is None:
+            self._since = time.monotonic_ns()
+
+    def pause(self) -> None:
+        """Hold it."""
+        self._before, self._since = self.now(), None

@@ -1,0 +1,117 @@
+"""The fixed-point iteration of an algebraic loop at the start: arithmetic and the criterion, and nothing of who calls.
+
+Every process that takes part in a loop sees the same values and runs this on them, so all of them come to the same end
+at the same sweep without asking each other, and so does a run in one process.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from ..config.mesh import InitializationConfig
+from ..errors import LoopNotConverged
+from ..variables.model_description import Value, Variable
+from ..variables.value_conversion import to_value
+from .initialization_plan import Loop, Tear
+
+__all__ = ["FixedPoint"]
+
+_SHOWN = 8
+
+
+class FixedPoint:
+    """The assumed values of the torn inputs of one loop.
+
+    One sweep, by the caller: set the torn inputs to `assumed`, get all outputs of the loop level by level, and hand
+    what the torn connections bring then to `update`. With what a connection brings as ``new``::
+
+        residual = |new - assumed|, which must be at most tolerance * max(1, |new|)
+        assumed  = assumed + relaxation * (new - assumed)          (new itself where the relaxation is 1)
+
+    Of an array, each element. Other types than Float64 and Float32 have to be equal, and take the new value as it is.
+    When all agree, the torn inputs keep what was assumed: then every other connection is exact, and only these are off,
+    by their residual at most.
+
+    Args:
+        loop: the loop.
+        settings: tolerance, relaxation, and the limit.
+
+    Attributes:
+        assumed: by (instance, input).
+        sweeps: sweeps done.
+    """
+
+    def __init__(self, loop: Loop, settings: InitializationConfig) -> None:
+        self.assumed: dict[tuple[str, str], Value] = {(tear.target, tear.input): _start(tear) for tear in loop.tears}
+        self.sweeps = 0
+        self._loop = loop
+        self._settings = settings
+
+    def update(self, brought: Sequence[Value]) -> bool:
+        """Take what the torn connections bring, in the order of the loop's tears; whether the loop is consistent.
+
+        Raises:
+            LoopNotConverged: the limit is reached, or a value is not finite.
+        """
+        self.sweeps += 1
+        pairs = list(zip(self.assumed.values(), brought, strict=True))
+        if not all(_finite(new) for new in brought):
+            raise self._not_converged("a value is not finite any more", pairs)
+        if all(self._agree(old, new) for old, new in pairs):
+            return True
+        if self.sweeps >= self._settings.iterations:
+            raise self._not_converged(f"not within a tolerance of {self._settings.tolerance:g}", pairs)
+        for key, (old, new) in zip(self.assumed, pairs, strict=True):
+            self.assumed[key] = self._relaxed(old, new)
+        return False
+
+    def _agree(self, old: Value, new: Value) -> bool:
+        if isinstance(old, list) and isinstance(new, list):
+            return all(self._agree(one, other) for one, other in zip(old, new, strict=True))
+        if isinstance(old, float) and isinstance(new, float):
+            return _finite(new) and abs(new - old) <= self._settings.tolerance * max(1.0, abs(new))
+        return old == new
+
+    def _relaxed(self, old: Value, new: Value) -> Value:
+        if isinstance(old, list) and isinstance(new, list):
+            return [self._relaxed(one, other) for one, other in zip(old, new, strict=True)]
+        relaxation = self._settings.relaxation
+        if relaxation != 1.0 and isinstance(old, float) and isinstance(new, float):
+            return old + relaxation * (new - old)
+        return new
+
+    def _not_converged(self, why: str, pairs: Sequence[tuple[Value, Value]]) -> LoopNotConverged:
+        names = " -> ".join(f"{instance}.{output}" for instance, output in self._loop.outputs[:_SHOWN])
+        rest = len(self._loop.outputs) - _SHOWN
+        apart = [
+            f"{tear} {_residual(old, new)}"
+            for tear, (old, new) in zip(self._loop.tears, pairs, strict=True)
+            if not self._agree(old, new)
+        ]
+        more = f" and {len(apart) - _SHOWN} more" if len(apart) > _SHOWN else ""
+        return LoopNotConverged(
+            f"the algebraic loop {names}{f' and {rest} more' if rest > 0 else ''} did not converge at the start: after "
+            f"{self.sweeps} iterations {why}; residuals: {', '.join(apart[:_SHOWN])}{more}",
+            hint="Lower `initialization.relaxation` "
+            f"(now {self._settings.relaxation:g}), raise `initialization.iterations`, or give its inputs better start "
+            "values; `fmu-mesh check` shows the loop.",
+        )
+
+
+def _start(tear: Tear) -> Value:
+    return to_value(tear.start, Variable(tear.input, 0, tear.type, "input", "discrete", shape=tear.shape))
+
+
+def _finite(value: Value) -> bool:
+    if isinstance(value, list):
+        return all(map(_finite, value))
+    return not isinstance(value, float) or math.isfinite(value)
+
+
+def _residual(old: Value, new: Value) -> str:
+    if isinstance(old, float) and isinstance(new, float):
+        return f"{abs(new - old):.6g} (from {old:.12g} to {new:.12g})"
+    if isinstance(old, list) and isinstance(new, list) and all(isinstance(one, float) for one in [*old, *new]):
+        return f"{max(abs(two - one) for one, two in zip(old, new, strict=True)):.6g} (the largest of its elements)"
+    return f"(from {old!r} to {new!r})"

@@ -1,0 +1,329 @@
+"""Connections of the configuration to connections between variables.
+
+Owns the names of connection ends (the first dot ends the instance name), causality, and which types may be
+connected.
+Delays and cycles are `fmu_mesh.system.plan`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Literal
+
+import msgspec
+from msgspec.structs import replace
+
+from fmu_mesh.config.findings import Findings, listed, nearest
+from fmu_mesh.config.mesh import ConnectionConfig
+from fmu_mesh.variables.model_description import ModelDescription, Variable
+from fmu_mesh.variables.units import Linear, conversion
+from fmu_mesh.variables.value_types import FMI2_TYPES, TYPES, VariableType, element_name, is_float, split_element, takes
+
+__all__ = ["Connection", "Variables", "resolve_connections", "resolve_variable", "unit_warnings"]
+
+Variables = Mapping[str, Mapping[str, Variable] | None]
+"""The variables of every instance by name; None where the model description could not be read."""
+
+
+class Connection(msgspec.Struct, frozen=True):
+    """One connection: `target = factor * source + offset`.
+
+    Attributes:
+        factor: that of the file after that of the unit conversion; so is the offset.
+        source_index: the element of the source array that is connected, counted from 0; empty for all of it.
+        target_index: as ``source_index``, for the target.
+        delay: 0, 1, or None where the algorithm decides.
+        path: its place in the configuration file, such as `connections[2]`.
+        units: in words what was done about units; empty if nothing was to do.
+        extrapolation: whether the target's input changes linearly within a step.
+    """
+
+    source_instance: str
+    source: Variable
+    target_instance: str
+    target: Variable
+    factor: float
+    offset: float
+    delay: int | None
+    path: str
+    extrapolation: Literal["hold", "linear"] = "hold"
+    source_index: tuple[int, ...] = ()
+    target_index: tuple[int, ...] = ()
+    units: str = ""
+
+    @property
+    def source_name(self) -> str:
+        """The name of the source, as `y` or `y[2]`."""
+        return element_name(self.source.name, self.source_index) if self.source_index else self.source.name
+
+    @property
+    def target_name(self) -> str:
+        """The name of the target, as `u` or `u[1,3]`."""
+        return element_name(self.target.name, self.target_index) if self.target_index else self.target.name
+
+    def __str__(self) -> str:
+        return f"{self.source_instance}.{self.source_name} -> {self.target_instance}.{self.target_name}"
+
+
+def resolve_connections(
+    configs: Sequence[ConnectionConfig], variables: Variables, findings: Findings
+) -> tuple[Connection, ...]:
+    """All connections whose ends exist and fit; what is wrong with the others goes to ``findings``."""
+    connections: list[Connection] = []
+    sources: dict[str, tuple[str, ConnectionConfig]] = {}
+    for index, config in enumerate(configs):
+        path = f"connections[{index}]"
+        if not config.source and not config.target:
+            findings.add(path, "no ends", "instance.output -> instance.input")
+            continue
+        source = resolve_variable(config.source, f"{path}.from", variables, "output", findings)
+        target = resolve_variable(config.target, f"{path}.to", variables, "input", findings)
+        _check_single_source(config, path, _taken(config.target, target), sources, findings)
+        if source is None or target is None:
+            continue
+        connection = Connection(
+            source_instance=config.source.partition(".")[0],
+            source=source[0],
+            target_instance=config.target.partition(".")[0],
+            target=target[0],
+            factor=config.factor,
+            offset=config.offset,
+            delay=config.delay,
+            path=path,
+            extrapolation=config.extrapolation,
+            source_index=source[1],
+            target_index=target[1],
+        )
+        if _causality_is_right(connection, variables, findings):
+            _check_types(connection, findings)
+            _check_delay(connection, findings)
+            connections.append(_with_units(connection, config, findings))
+    return tuple(connections)
+
+
+def resolve_variable(
+    reference: str, path: str, variables: Variables, causality: str, findings: Findings
+) -> tuple[Variable, tuple[int, ...]] | None:
+    """The variable that `instance.variable` names, or None where that cannot be told.
+
+    `instance.array[1,2]` names an element of an array, counted from 1, unless a variable has that very name.
+
+    Returns:
+        The variable, and the index of the element, counted from 0; empty for the variable as a whole.
+
+    Args:
+        reference: instance name and FMI variable name; the first dot is between them.
+        path: the place of the reference in the file.
+        variables: all variables of all instances.
+        causality: the causality that names are suggested from.
+        findings: where unknown names go.
+    """
+    instance, dot, name = reference.partition(".")
+    if not instance or not dot or not name:
+        names = [v.name for v in (variables.get(instance) or {}).values() if v.causality == causality]
+        findings.add(path, f"'{reference}'", f"{instance}.{names[0]}" if len(names) == 1 else "instance.variable")
+        return None
+    if instance not in variables:
+        expected = f"one of the instances {listed(list(variables))}"
+        findings.add(path, f"the unknown instance '{instance}'", expected, nearest(instance, variables))
+        return None
+    own = variables[instance]
+    if own is None:
+        return None
+    if name not in own:
+        if (parts := split_element(name)) is not None and parts[0] in own:
+            return _element(own[parts[0]], parts[1], path, reference, findings)
+        names = [variable.name for variable in own.values() if variable.causality == causality]
+        expected = f"one of the {causality}s of '{instance}': {listed(names)}"
+        findings.add(path, f"the unknown variable '{name}' of instance '{instance}'", expected, nearest(name, names))
+        return None
+    return own[name], ()
+
+
+def unit_warnings(
+    connections: Sequence[Connection], descriptions: Mapping[str, ModelDescription], findings: Findings
+) -> None:
+    """Note the connections between different units that nothing converts, because one of them is not defined.
+
+    Such units are compared as they are written; a model may write one unit in several ways, so this is a warning.
+    FMI 1.0 has display units only, which no value ever is in (FMI 1.0, 3.3), so its units are never defined.
+    """
+    for connection in connections:
+        source, target = connection.source.unit, connection.target.unit
+        undefined = [(owner, end) for owner, end in _ends(connection) if end.base_unit is None]
+        if source and target and source != target and undefined and not connection.units and _is_identity(connection):
+            owner, end = undefined[0]
+            old = descriptions[owner].fmi_version.startswith("1.")
+            reason = "FMI 1.0 gives units a name only" if old else f"its model does not define '{end.unit}'"
+            found = (
+                f"{connection} connects the unit '{source}' to the unit '{target}' and converts nothing, because there "
+                f"are no base units of {owner}.{end.name}: {reason}"
+            )
+            expected = "the same unit, a factor that converts it, or `ignore_units: true` if both are the same"
+            findings.add(connection.path, found, expected)
+
+
+def _with_units(connection: Connection, config: ConnectionConfig, findings: Findings) -> Connection:
+    """The connection with the conversion between the units of its ends.
+
+    The conversion comes first and the factor and offset of the file after it, so they are in the unit of the target
+    (SSP 1.0, LinearTransformation of a connection; `ignore_units` is suppressUnitConversion).
+    """
+    source, target = connection.source, connection.target
+    if config.ignore_units:
+        return replace(connection, units="units ignored")
+    if source.base_unit is None or target.base_unit is None:
+        without = [f"{owner}.{end.name}" for owner, end in _ends(connection) if end.unit is None]
+        return (
+            replace(connection, units=f"not converted: {without[0]} has no unit") if len(without) == 1 else connection
+        )
+    relative = source.relative_quantity or target.relative_quantity
+    change = conversion(source.base_unit, target.base_unit, relative=relative)
+    if change is None:
+        found = (
+            f"{connection} connects the unit '{source.unit}' ({source.base_unit}) "
+            f"to the unit '{target.unit}' ({target.base_unit})"
+        )
+        findings.add(connection.path, found, "units of one dimension, or `ignore_units: true` on the connection")
+        return connection
+    if change.identity:
+        return connection
+    own = Linear(connection.factor, connection.offset)
+    both = change.then(own)
+    after = "" if own.identity else f", then factor {own.factor:.12g} and offset {own.offset:.12g}"
+    units = f"{source.unit} to {target.unit}{after}"
+    return replace(connection, factor=both.factor, offset=both.offset, units=units)
+
+
+def _ends(connection: Connection) -> tuple[tuple[str, Variable], tuple[str, Variable]]:
+    return (connection.source_instance, connection.source), (connection.target_instance, connection.target)
+
+
+def _taken(reference: str, target: tuple[Variable, tuple[int, ...]] | None) -> tuple[str, str]:
+    """The name of the target and that of the variable it belongs to, each with the instance; as written if unknown."""
+    if target is None:
+        return reference, reference
+    variable, index = target
+    whole = f"{reference.partition('.')[0]}.{variable.name}"
+    return element_name(whole, index) if index else whole, whole
+
+
+def _check_single_source(
+    config: ConnectionConfig,
+    path: str,
+    taken: tuple[str, str],
+    sources: dict[str, tuple[str, ConnectionConfig]],
+    findings: Findings,
+) -> None:
+    """An input has one source, and so has each element of an array.
+
+    ``sources`` holds the first source by target, and by `*` after the name of an array that of its first element.
+    """
+    name, whole = taken
+    first_source = sources.get(name) or sources.get(whole if name != whole else f"{whole}*")
+    if first_source is None:
+        sources[name] = path, config
+        if name != whole:
+            sources.setdefault(f"{whole}*", (path, config))
+        return
+    first_path, first = first_source
+    line = findings.line(first_path)
+    place = f"{first_path} in line {line}" if line is not None else first_path
+    if first.source == config.source:
+        found = f"{config.source} -> {config.target} a second time (first: {place})"
+    else:
+        found = (
+            f"a second source for the input '{name}': {config.source} -> {config.target}, "
+            f"after {first.source} -> {first.target} ({place})"
+        )
+    findings.add(path, found, "one source for an input")
+
+
+def _causality_is_right(connection: Connection, variables: Variables, findings: Findings) -> bool:
+    source, target = connection.source, connection.target
+    source_name = f"{connection.source_instance}.{source.name}"
+    target_name = f"{connection.target_instance}.{target.name}"
+    if source.causality == "input" and target.causality == "output":
+        found = f"the wrong way round: '{source_name}' is an input and '{target_name}' an output"
+        findings.add(connection.path, found, "output -> input", f"{target_name} -> {source_name}")
+        return False
+    if source.causality != "output":
+        outputs = _names_of(connection.source_instance, "output", variables)
+        findings.add(f"{connection.path}.from", f"'{source_name}' is {_a(source.causality)}", f"an output{outputs}")
+    if target.causality != "input":
+        inputs = _names_of(connection.target_instance, "input", variables)
+        findings.add(f"{connection.path}.to", f"'{target_name}' is {_a(target.causality)}", f"an input{inputs}")
+    return source.causality == "output" and target.causality == "input"
+
+
+def _names_of(instance: str, causality: str, variables: Variables) -> str:
+    """Which variables of an instance would be right, to follow `an output` or `an input`."""
+    own = variables[instance] or {}
+    names = [variable.name for variable in own.values() if variable.causality == causality]
+    return f" of '{instance}': {listed(names)}"
+
+
+def _check_types(connection: Connection, findings: Findings) -> None:
+    source, target = connection.source, connection.target
+    items = tuple(number for _, number in source.items)
+    have, want = _end(source, connection.source_index), _end(target, connection.target_index)
+    if not takes(target.type, source.type, items):
+        accepted = [_name_of(type_, target) for type_ in _sources_for(target.type, source)]
+        found = f"{connection} connects {_a(have)} to {_a(want)}"
+        findings.add(connection.path, found, f"a source of type {' or '.join(dict.fromkeys(accepted))}")
+    elif (source.shape if not connection.source_index else ()) != (target.shape if not connection.target_index else ()):
+        found = f"{connection} connects {_a(have)} to {_a(want)}"
+        expected = "ends of the same shape: two arrays of the same dimensions, or one element as in y[1]"
+        findings.add(connection.path, found, expected)
+    elif not is_float(target.type) and not _is_identity(connection):
+        conversion = f"factor {connection.factor:g} and offset {connection.offset:g}"
+        name = f"the {target.type_name} '{connection.target_name}'"
+        findings.add(connection.path, f"{conversion} for {name}", "factor and offset on Real inputs only")
+
+
+def _sources_for(target: VariableType, source: Variable) -> list[VariableType]:
+    """All types that an input of this type takes, its own first; as far as the source's version of FMI has them."""
+    known = TYPES if source.declared_type is None else FMI2_TYPES.values()
+    return [target, *(type_ for type_ in known if type_ != target and takes(target, type_))]
+
+
+def _name_of(type_: VariableType, like: Variable) -> str:
+    """A type in the words of the FMI version of a variable."""
+    if like.declared_type is None:
+        return type_
+    return next((name for name, own in FMI2_TYPES.items() if own == type_), type_)
+
+
+def _end(variable: Variable, index: tuple[int, ...]) -> str:
+    """The type at one end: that of the variable, or of one element of it."""
+    return variable.type_name.partition("[")[0] if index else variable.type_name
+
+
+def _element(
+    variable: Variable, index: tuple[int, ...], path: str, reference: str, findings: Findings
+) -> tuple[Variable, tuple[int, ...]] | None:
+    """The element of an array, if it has one with this index."""
+    if len(index) == len(variable.shape) and all(0 <= i < size for i, size in zip(index, variable.shape, strict=True)):
+        return variable, index
+    if not variable.shape:
+        expected = "an element of an array only: this variable is a scalar"
+    else:
+        last = ",".join(map(str, variable.shape))
+        first = ",".join("1" for _ in variable.shape)
+        expected = f"an index from [{first}] to [{last}]"
+    findings.add(path, f"'{reference}' of the {variable.type_name} '{variable.name}'", expected)
+    return None
+
+
+def _check_delay(connection: Connection, findings: Findings) -> None:
+    if connection.source_instance == connection.target_instance and connection.delay == 0:
+        found = f"delay 0 on {connection}, from an instance to itself"
+        findings.add(f"{connection.path}.delay", found, "delay 1")
+
+
+def _is_identity(connection: Connection) -> bool:
+    return connection.factor == 1.0 and connection.offset == 0.0
+
+
+def _a(word: str) -> str:
+    return f"an {word}" if word[0] in "aeiouAEIOU" else f"a {word}"

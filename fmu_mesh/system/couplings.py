@@ -1,0 +1,196 @@
+"""What `controllers`, `actuators` and `fluid_dynamics` of a physics engine mean as connections.
+
+Owns the variable names of the two `gazebo-fmi` plugins and of controllers. The order is theirs, too: what comes from
+the engine has a delay of one point, so that within a step the controller is first, then the actuator, then the engine
+with the fresh effort.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Literal
+
+import msgspec
+from msgspec.structs import replace
+
+from ..config.findings import Findings, listed, nearest
+from ..config.mesh import ActuatorConfig, Config, ControllerConfig, EngineConfig, FluidDynamicsConfig
+from ..variables.model_description import Variable
+from .connections import Connection, Variables
+
+__all__ = ["coupled_connections"]
+
+AnyCoupling = ControllerConfig | ActuatorConfig | FluidDynamicsConfig
+
+_AXES = ("x", "y", "z")
+
+
+class _Coupling(msgspec.Struct, frozen=True):
+    """One entry of a section, and what its variables are connected to in the engine.
+
+    Attributes:
+        part: the joint or body.
+        reads: the engine's outputs by default name of the instance's input.
+        drives: the engine's inputs by default name of the instance's output.
+    """
+
+    engine: str
+    path: str
+    config: AnyCoupling
+    what: Literal["joint", "body"]
+    part: str
+    reads: dict[str, str]
+    drives: dict[str, str]
+
+
+def coupled_connections(
+    config: Config, variables: Variables, explicit: Sequence[Connection], findings: Findings
+) -> tuple[Connection, ...]:
+    """The connections that the sections of all physics engines stand for.
+
+    Args:
+        config: the configuration.
+        variables: the variables of every instance by name; what needs a missing one is left out.
+        explicit: the connections that the file has.
+        findings: where everything goes that does not fit.
+    """
+    found: list[Connection] = []
+    couplings = [*_couplings(config)]
+    # Controllers first: what they ask for is what actuators take.
+    for coupling in sorted(couplings, key=lambda coupling: isinstance(coupling.config, ActuatorConfig)):
+        found += _connect(coupling, variables, [*explicit, *found], findings)
+        if isinstance(coupling.config, ActuatorConfig):
+            _check_command(config, coupling, findings)
+    return tuple(found)
+
+
+def _check_command(config: Config, coupling: _Coupling, findings: Findings) -> None:
+    """With an actuator the engine has no use for a command; a start value for it would do nothing."""
+    command = coupling.reads["actuatorInput"]
+    if command in config.instances[coupling.engine].start_values:
+        own = coupling.config.variable_names.get("actuatorInput", "actuatorInput")
+        found = f"a start value for '{command}', although the joint has the actuator '{coupling.config.name}'"
+        path = f"instances.{coupling.engine}.start_values.{command}"
+        findings.add(path, found, f"a start value of '{coupling.config.instance}.{own}'")
+
+
+def _couplings(config: Config) -> Iterator[_Coupling]:
+    for name, engine in config.instances.items():
+        if not isinstance(engine, EngineConfig):
+            continue
+        sections: tuple[tuple[str, Sequence[AnyCoupling]], ...] = (
+            ("controllers", engine.controllers),
+            ("actuators", engine.actuators),
+            ("fluid_dynamics", engine.fluid_dynamics),
+        )
+        for section, entries in sections:
+            for number, entry in enumerate(entries):
+                if entry.enabled:
+                    yield _coupling(name, f"instances.{name}.{section}[{number}]", entry)
+
+
+def _coupling(engine: str, path: str, config: AnyCoupling) -> _Coupling:
+    match config:
+        case ActuatorConfig(joint=joint):
+            reads = {
+                "actuatorInput": f"{joint}.effort_command",
+                "jointPosition": f"{joint}.position",
+                "jointVelocity": f"{joint}.velocity",
+                "jointAcceleration": f"{joint}.acceleration",
+            }
+            return _Coupling(engine, path, config, "joint", joint, reads, {"jointTorque": f"{joint}.effort"})
+        case ControllerConfig(joint=joint):
+            reads = {"position": f"{joint}.position", "velocity": f"{joint}.velocity"}
+            return _Coupling(engine, path, config, "joint", joint, reads, {"effort": f"{joint}.effort_command"})
+        case FluidDynamicsConfig(link=link):
+            reads = {f"relativeVelocity_{axis}": f"{link}.relative_velocity_{axis}" for axis in _AXES}
+            drives = {f"fluidDynamicForce_{axis}": f"{link}.force_{axis}" for axis in _AXES}
+            drives |= {f"fluidDynamicMoment_{axis}": f"{link}.moment_{axis}" for axis in _AXES}
+            return _Coupling(engine, path, config, "body", link, reads, drives)
+
+
+def _connect(
+    coupling: _Coupling, variables: Variables, others: Sequence[Connection], findings: Findings
+) -> list[Connection]:
+    """The connections of one coupling; none if anything of it does not fit."""
+    own = _own_variables(coupling, variables, findings)
+    engine = variables[coupling.engine]
+    if engine is None or not _part_exists(coupling, engine, findings) or own is None:
+        return []
+    connections: list[Connection] = []
+    for default, variable in own.items():
+        if default == "actuatorInput":
+            connections += _command(coupling, coupling.reads[default], variable, others)
+        elif default in coupling.reads:
+            source = engine[coupling.reads[default]]
+            ends = (coupling.engine, source, coupling.config.instance, variable)
+            connections.append(Connection(*ends, factor=1.0, offset=0.0, delay=1, path=coupling.path))
+        else:
+            driven = engine[coupling.drives[default]]
+            ends = (coupling.config.instance, variable, coupling.engine, driven)
+            connections.append(Connection(*ends, factor=1.0, offset=0.0, delay=None, path=coupling.path))
+    taken = {(other.target_instance, other.target.name): other for other in others}
+    for connection in connections:
+        other = taken.get((connection.target_instance, connection.target.name))
+        if other is not None:
+            target = f"{connection.target_instance}.{connection.target.name}"
+            found = f"a second source for the input '{target}': {connection}, after {other} ({other.path})"
+            findings.add(coupling.path, found, "one source for an input")
+    return connections
+
+
+def _command(
+    coupling: _Coupling, command: str, variable: Variable, others: Sequence[Connection]
+) -> Iterator[Connection]:
+    """What a controller sends to the joint, to the actuator as well; nothing if nobody sends anything."""
+    for other in others:
+        if (other.target_instance, other.target.name) == (coupling.engine, command):
+            yield replace(other, target_instance=coupling.config.instance, target=variable, path=coupling.path)
+
+
+def _part_exists(coupling: _Coupling, engine: Mapping[str, Variable], findings: Findings) -> bool:
+    """Whether the engine has the joint or body, with all that a coupling connects."""
+    config, last = coupling.config, ".effort" if coupling.what == "joint" else ".force_x"
+    if f"{coupling.part}{last}" in engine:
+        return True
+    names = [name.removesuffix(last) for name in engine if name.endswith(last)]
+    key = "link" if isinstance(config, FluidDynamicsConfig) else "joint"
+    kind = "bodies" if key == "link" else "revolute and prismatic joints"
+    found = f"the unknown {coupling.what} '{coupling.part}' of '{coupling.engine}'"
+    expected = f"one of its {kind}: {listed(names)}"
+    findings.add(f"{coupling.path}.{key}", found, expected, nearest(coupling.part, names))
+    return False
+
+
+def _own_variables(coupling: _Coupling, variables: Variables, findings: Findings) -> dict[str, Variable] | None:
+    """The instance's own variables by default name; None after a finding, or where they are not known."""
+    config, path = coupling.config, coupling.path
+    defaults = [*coupling.reads, *coupling.drives]
+    before = len(findings)
+    for name in config.variable_names:
+        if name not in defaults:
+            place = f"{path}.variable_names.{name}"
+            findings.add(place, f"the unknown name '{name}'", f"one of {listed(defaults)}", nearest(name, defaults))
+    if config.instance not in variables:
+        expected = f"one of the instances {listed(list(variables))}"
+        found = f"the unknown instance '{config.instance}'"
+        findings.add(f"{path}.instance", found, expected, nearest(config.instance, variables))
+        return None
+    known = variables[config.instance]
+    if known is None:
+        return None
+    own = {}
+    for default in defaults:
+        name = config.variable_names.get(default, default)
+        causality = "input" if default in coupling.reads else "output"
+        variable = known.get(name)
+        if variable is not None and variable.causality == causality and variable.type == "Float64":
+            own[default] = variable
+            continue
+        place = f"{path}.variable_names.{default}" if default in config.variable_names else path
+        candidates = [v.name for v in known.values() if v.causality == causality and v.type == "Float64"]
+        missing = "no variable" if variable is None else f"no Real {causality}"
+        found = f"'{config.instance}', which has {missing} '{name}'"
+        expected = f"a Real {causality} for '{default}' ({config.name!r}); it may have another name in `variable_names`"
+        findings.add(place, found, expected, nearest(name, candidates))
+    return own if len(findings) == before else None

@@ -1,0 +1,53 @@
+"""The digest by which processes of a mesh prove that they agree: on our version, the configuration, and every model.
+
+Processes that somebody started by hand, or on several hosts, read the configuration and the models each for itself. The
+digest has one part for each of these, so that whoever refuses another one can say what differs. What counts as the
+configuration is known in `fmu_mesh.system.plan`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable, Mapping
+
+import msgspec
+
+from .. import __version__
+from ..config.findings import listed
+
+__all__ = ["difference", "digest_of"]
+
+_CONFIGURATION_DIGITS, _MODEL_DIGITS = 16, 12
+
+
+def digest_of(configuration: object, models: Mapping[str, tuple[str, str]]) -> str:
+    """The digest of a mesh: our version, a hash of the configuration, and one of the model of each instance.
+
+    Args:
+        configuration: all that must be the same, as a value that JSON can hold.
+        models: the GUID and the SHA-256 of the content by instance name.
+    """
+    hashes = [_hash(models[name])[:_MODEL_DIGITS] for name in sorted(models)]
+    return " ".join([__version__, _hash(configuration)[:_CONFIGURATION_DIGITS], *hashes])
+
+
+def difference(own: str, other: str, instances: Iterable[str]) -> str:
+    """In words, what a process with the digest ``other`` has instead: `another model of 'gain'`.
+
+    Args:
+        own: the digest of this process.
+        other: one that differs.
+        instances: the names of all instances here.
+    """
+    (version, configuration, *models), there = own.split(), other.split()
+    if len(there) < 2 or there[0] != version:
+        return f"another version of fmu_mesh than {version}"
+    if there[1] != configuration:
+        return "another configuration"
+    pairs = zip(sorted(instances), models, there[2:], strict=False)
+    changed = listed([f"'{name}'" for name, one, two in pairs if one != two])
+    return f"another model of {changed}"
+
+
+def _hash(value: object) -> str:
+    return hashlib.sha256(msgspec.json.encode(value, order="deterministic")).hexdigest()

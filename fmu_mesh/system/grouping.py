@@ -1,0 +1,69 @@
+"""`group: auto`: which instances should share a node because they form a cycle, and what keeps them apart.
+
+Within a cycle every point needs what another member did at the same point or the one before: over several nodes that
+is a message there and one back, within one node it is a copy in memory. Between cycles data flows one way, and nodes
+that work side by side are faster. So each cycle gets one node, and everything else a node of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+
+from ..config.mesh import Config
+from ..variables.model_description import ModelDescription
+from .graph import strongly_connected
+
+__all__ = ["automatic_nodes"]
+
+_SUFFIX = "-cycle"
+
+
+def automatic_nodes(
+    config: Config, edges: Iterable[tuple[str, str]], descriptions: Mapping[str, ModelDescription]
+) -> dict[str, str]:
+    """The node of each instance that shares one with other members of its cycle; the others are not in it.
+
+    An instance with a ``group`` of its own stays there. Instances with different hosts never share a node, nor do
+    two of an FMU that allows one instance per process.
+
+    Args:
+        config: the configuration, whatever its own ``group`` says.
+        edges: (source instance, target instance) of every connection.
+        descriptions: model descriptions by instance name.
+    """
+    position = {name: place for place, name in enumerate(config.instances)}
+    taken = {*config.instances, *(instance.group for instance in config.instances.values() if instance.group)}
+    nodes: dict[str, str] = {}
+    cycles = [sorted(part, key=position.__getitem__) for part in strongly_connected(config.instances, edges)]
+    for cycle in sorted(cycles, key=lambda members: position[members[0]]):
+        for members in _together(config, [n for n in cycle if config.instances[n].group is None], descriptions):
+            if len(members) > 1:
+                name = _free_name(members[0], taken)
+                taken.add(name)
+                nodes.update(dict.fromkeys(members, name))
+    return nodes
+
+
+def _together(
+    config: Config, cycle: Sequence[str], descriptions: Mapping[str, ModelDescription]
+) -> Iterable[list[str]]:
+    """The members of a cycle in as few nodes as hosts and FMUs allow."""
+    parts: list[tuple[str | None, set[str], list[str]]] = []
+    for name in cycle:
+        host, description = config.instances[name].host, descriptions[name]
+        guid = description.guid if description.only_once_per_process else ""
+        part = next((part for part in parts if part[0] == host and guid not in part[1]), None)
+        if part is None:
+            part = (host, set(), [])
+            parts.append(part)
+        if guid:
+            part[1].add(guid)
+        part[2].append(name)
+    return [members for _, _, members in parts]
+
+
+def _free_name(first: str, taken: set[str]) -> str:
+    name, number = first + _SUFFIX, 2
+    while name in taken:
+        name, number = f"{first}{_SUFFIX}-{number}", number + 1
+    return name

@@ -1,0 +1,206 @@
+"""In which order connected values become known in Initialization Mode, and which of them have to be iterated.
+
+Each connected output gets a level: 0 if it depends on no connected input there, otherwise one more than the highest
+level among the outputs that feed the inputs it depends on (FMI 2.0, 2.2.8, InitialUnknowns). Outputs that depend on
+each other form a loop (docs/adr/0013): it is torn at some of its connections, its outputs have levels of their own in
+the torn graph, and these levels are gone through until the torn connections bring what was assumed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from operator import itemgetter
+
+import msgspec
+
+from ..variables.model_description import Variable
+from ..variables.value_conversion import to_plain
+from ..variables.value_types import PlainValue, Value, VariableType, nested, zero
+from .graph import reaches, strongly_connected
+from .system import Connection, System
+
+__all__ = ["InitializationPlan", "Loop", "Tear", "plan_initialization"]
+
+Key = tuple[str, str]
+
+
+class Tear(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A connection at which a loop is torn: the input has an assumed value, which the source has to confirm.
+
+    Attributes:
+        output: as `y`, or an element of it as `y[2]`; ``input`` likewise.
+        type: the type of the input, or of the element.
+        shape: the sizes of its dimensions.
+        start: what is assumed at first: the start value of the input.
+    """
+
+    source: str
+    output: str
+    target: str
+    input: str
+    factor: float
+    offset: float
+    type: VariableType
+    start: PlainValue
+    shape: tuple[int, ...] = ()
+
+    def __str__(self) -> str:
+        return f"{self.source}.{self.output} -> {self.target}.{self.input}"
+
+
+class Loop(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """An algebraic loop in Initialization Mode.
+
+    Attributes:
+        first: its first level; no other output has a level of the loop.
+        last: its last level.
+        tears: where it is torn; without them it has no cycle.
+        outputs: (instance, output) of all its outputs, in the order of their levels.
+        nodes: the nodes that have these outputs.
+    """
+
+    first: int
+    last: int
+    tears: tuple[Tear, ...]
+    outputs: tuple[Key, ...]
+    nodes: tuple[str, ...]
+
+
+class InitializationPlan(msgspec.Struct, frozen=True):
+    """Levels of connected outputs by (instance, output), and the loops among them in the order of their levels."""
+
+    levels: dict[Key, int]
+    loops: tuple[Loop, ...]
+
+
+def plan_initialization(system: System, connections: Sequence[Connection]) -> InitializationPlan:
+    """Levels of all connected outputs, and the loops.
+
+    Args:
+        system: where the start values of inputs are.
+        connections: all connections, with their delays. A delay means nothing in Initialization Mode, but a connection
+            that has one is torn rather than one that has none: values go the way that steps go.
+    """
+    outputs = tuple(dict.fromkeys((c.source_instance, c.source.name) for c in connections))
+    reached = _reached(connections)
+    edges = [(_source(c), target) for c in connections for target in reached[id(c)]]
+    on_themselves = {source for source, target in edges if source == target}
+    place = {key: number for number, key in enumerate(outputs)}
+    leaving: dict[Key, list[tuple[int, Connection]]] = {}
+    for number, c in enumerate(connections):
+        leaving.setdefault(_source(c), []).append((number, c))
+    levels: dict[Key, int] = {}
+    loops: list[Loop] = []
+    level = 0
+    for parts in _by_depth(outputs, edges):
+        single = [part[0] for part in parts if len(part) == 1 and part[0] not in on_themselves]
+        levels.update(dict.fromkeys(single, level))
+        level += bool(single)
+        for part in parts:
+            if len(part) > 1 or part[0] in on_themselves:
+                members = sorted(part, key=place.__getitem__)
+                own = [c for _, c in sorted((pair for key in part for pair in leaving[key]), key=itemgetter(0))]
+                torn, kept = _torn(members, own, reached)
+                depths = {key: depth for depth, deep in enumerate(_by_depth(members, kept)) for (key,) in deep}
+                levels.update({key: level + depth for key, depth in depths.items()})
+                last = level + max(depths.values())
+                ordered = tuple(sorted(members, key=depths.__getitem__))
+                nodes = tuple(dict.fromkeys(system.instances[name].node for name, _ in members))
+                loops.append(Loop(level, last, tuple(_tear(system, c) for c in torn), ordered, nodes))
+                level = last + 1
+    return InitializationPlan(levels=levels, loops=tuple(loops))
+
+
+def _torn(
+    members: Sequence[Key], connections: Sequence[Connection], reached: Mapping[int, Sequence[Key]]
+) -> tuple[list[Connection], list[tuple[Key, Key]]]:
+    """The ones of the connections out of a loop at which it is torn, and the edges that are left.
+
+    As with the delays of Gauss-Seidel, it is the connection written last that closes a cycle.
+    """
+    own = set(members)
+    torn: set[int] = set()
+    kept: list[tuple[Key, Key]] = []
+    successors: dict[Key, list[Key]] = {key: [] for key in members}
+    for connection in sorted(connections, key=lambda c: c.delay or 0):
+        source = _source(connection)
+        targets = [key for key in reached[id(connection)] if key in own]
+        if any(reaches(successors, target, source) for target in targets):
+            torn.add(id(connection))
+        else:
+            kept += [(source, target) for target in targets]
+            successors[source].extend(targets)
+    return [c for c in connections if id(c) in torn], kept
+
+
+def _tear(system: System, connection: Connection) -> Tear:
+    instance, variable = system.instances[connection.target_instance], connection.target
+    start: Value | None = instance.start_values.get(variable.name, variable.start)
+    if start is None:  # an input must have one (FMI 2.0, 2.2.7)
+        start = nested([zero(variable.type)] * variable.size, variable.shape)
+    for number in connection.target_index:
+        assert isinstance(start, list)
+        start = start[number]
+    return Tear(
+        source=connection.source_instance,
+        output=connection.source_name,
+        target=connection.target_instance,
+        input=connection.target_name,
+        factor=connection.factor,
+        offset=connection.offset,
+        type=variable.type,
+        start=to_plain(start),
+        shape=() if connection.target_index else variable.shape,
+    )
+
+
+def _reached(connections: Sequence[Connection]) -> dict[int, list[Key]]:
+    """By the id of each connection: the connected outputs that depend on its target."""
+    outputs: dict[str, dict[str, Variable]] = {}
+    for c in connections:
+        outputs.setdefault(c.source_instance, {})[c.source.name] = c.source
+    dependents = {instance: _Dependents(own.values()) for instance, own in outputs.items()}
+    return {
+        id(c): [(c.target_instance, name) for name in dependents[c.target_instance].of(c.target.name)]
+        if c.target_instance in dependents
+        else []
+        for c in connections
+    }
+
+
+class _Dependents:
+    """Which of the outputs of an instance depend on an input, in the order of the outputs."""
+
+    def __init__(self, outputs: Iterable[Variable]) -> None:
+        self._on_all: list[tuple[int, str]] = []
+        self._on: dict[str, list[tuple[int, str]]] = {}
+        for number, output in enumerate(outputs):
+            if output.dependencies is None:
+                self._on_all.append((number, output.name))
+            for known in dict.fromkeys(output.dependencies or ()):
+                self._on.setdefault(known, []).append((number, output.name))
+
+    def of(self, known: str) -> list[str]:
+        """The names of the outputs that depend on ``known``."""
+        return [name for _, name in sorted(self._on_all + self._on.get(known, []))]
+
+
+def _by_depth(vertices: Sequence[Key], edges: Sequence[tuple[Key, Key]]) -> list[list[list[Key]]]:
+    """The strongly connected components, by how many others lie before them on the longest way to them."""
+    parts = strongly_connected(vertices, edges)
+    part_of = {key: number for number, part in enumerate(parts) for key in part}
+    before: list[set[int]] = [set() for _ in parts]
+    for source, target in edges:
+        if part_of[source] != part_of[target]:
+            before[part_of[target]].add(part_of[source])
+    depths: list[int] = []
+    for others in before:  # sources stand before their targets
+        depths.append(1 + max((depths[other] for other in others), default=-1))
+    by_depth: list[list[list[Key]]] = [[] for _ in range(max(depths, default=-1) + 1)]
+    for part, depth in zip(parts, depths, strict=True):
+        by_depth[depth].append(part)
+    return by_depth
+
+
+def _source(connection: Connection) -> Key:
+    return connection.source_instance, connection.source.name

@@ -1,0 +1,448 @@
+"""What follows from the graph: delays, order, cycles, initialization levels, and what every node has to do.
+
+Owns the synchronization model (design, section 3) as data. The plan is a pure function of a `System`; every process of
+a mesh computes or receives the same one, and its digest proves it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Literal
+
+import msgspec
+from msgspec.structs import replace
+
+from ..config.mesh import (
+    GazeboClassicConfig,
+    HostConfig,
+    InitializationConfig,
+    InstanceConfig,
+    LimitsConfig,
+    MujocoConfig,
+    TimeoutsConfig,
+)
+from ..errors import ConfigurationError, Finding
+from ..instances.contract import StepOptions
+from ..rings.ring import Layout, rows_for
+from ..simtime import TimeGrid
+from ..variables.model_description import HostKind, Kind
+from ..variables.value_conversion import to_plain
+from ..variables.value_types import PlainValue
+from .digest import digest_of
+from .graph import cycle_through, feedback_edges, strongly_connected, topological_order
+from .initialization_plan import InitializationPlan, Loop, plan_initialization
+from .step_options import linear_inputs
+from .system import Connection, System, SystemInstance
+from .window import LAZY_ROWS, recorder_window, window_of
+
+__all__ = ["RECORDER", "Feed", "InstancePlan", "Link", "NodePlan", "Plan", "make_plan"]
+
+RECORDER = "@record"
+"""Name of the recorder where node names stand; no instance can have it."""
+
+
+class Feed(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """How one source instance feeds one instance, all connections with the same delay together.
+
+    Attributes:
+        columns: (source, target, factor, offset) of each connection; an end is a variable, or an element as `y[2]`.
+    """
+
+    source: str
+    delay: int
+    columns: tuple[tuple[str, str, float, float], ...]
+
+
+class InstancePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What a node has to do for one of its instances.
+
+    Attributes:
+        step_points: base points per own step.
+        outputs: the columns read after every step: connected or recorded outputs.
+        inputs: the connected inputs, set before every step.
+        initialization: the levels at which connected outputs become known in Initialization Mode, by name.
+        interpolation: what the time of a value that is sent to an unconnected input means; None: nothing.
+        kind: which kind of the FMU is used.
+        options: how it is stepped.
+        hosted: the section of the configuration of an instance that is no FMU.
+    """
+
+    name: str
+    fmu: str
+    start_values: dict[str, PlainValue]
+    step_points: int
+    outputs: Layout
+    inputs: Layout
+    feeds: tuple[Feed, ...]
+    initialization: dict[str, int]
+    interpolation: Literal["hold", "linear"] | None = None
+    sha256: str | None = None
+    kind: Kind | HostKind = "co_simulation"
+    options: StepOptions = StepOptions()
+    hosted: HostConfig | None = None
+
+
+class Link(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The frames of one instance for one node: every link has its own columns and is flushed on its own.
+
+    Attributes:
+        index: number of the link in the mesh; stands in every frame.
+        levels: initialization level of each column, in the order of `layout.names`; -1 for one that is not needed then.
+        initial_only: whether it carries nothing after Initialization Mode: a node that takes part in the iteration of a
+            loop has to see what the torn connections of others bring.
+    """
+
+    index: int
+    source: str
+    source_node: str
+    target_node: str
+    step_points: int
+    layout: Layout
+    levels: tuple[int, ...]
+    initial_only: bool = False
+
+
+class NodePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Everything that one node must know.
+
+    Attributes:
+        units: the instances in execution order; those of one inner tuple form a cycle within the node and step point by
+            point, the others run as far ahead as their inputs and the grant allow.
+        window: how many points this node may be behind the grant.
+        progress_stride: points after which the master is told; a quarter of the window, or every point where a single
+            step is as long as that.
+        ring_rows: rows of every ring; a power of two.
+        loops: the algebraic loops at the start that instances of this node are part of.
+        initialization: how they are iterated.
+        links_in: links that end here.
+        links_out: links that start here.
+        result_file: absolute path of the result CSV (for the recorder).
+        restarts: how often the run was started again.
+        shared_memory: whether processes of one host exchange messages through shared memory.
+    """
+
+    mesh: str
+    node: str
+    digest: str
+    key_prefix: str
+    grid: TimeGrid
+    window: int
+    progress_stride: int
+    ring_rows: int
+    timeouts: TimeoutsConfig
+    instances: tuple[InstancePlan, ...]
+    units: tuple[tuple[str, ...], ...]
+    links_in: tuple[Link, ...]
+    links_out: tuple[Link, ...]
+    loops: tuple[Loop, ...] = ()
+    initialization: InitializationConfig = InitializationConfig()
+    result_file: str | None = None
+    recorded: tuple[tuple[str, str], ...] = ()
+    limits: LimitsConfig = LimitsConfig()
+    shared_memory: bool = True
+    restarts: int = 0
+
+    def instance(self, name: str) -> InstancePlan:
+        """The plan of one of its instances."""
+        return next(instance for instance in self.instances if instance.name == name)
+
+    def peers(self) -> set[str]:
+        """Names of the nodes that this one exchanges frames with; the recorder is with the master."""
+        nodes = {link.source_node for link in self.links_in} | {link.target_node for link in self.links_out}
+        return nodes - {RECORDER}
+
+
+class Plan(msgspec.Struct, frozen=True):
+    """The plan of the whole mesh.
+
+    Attributes:
+        connections: the connections of the system, each with its delay.
+        order: instance names in execution order within one point.
+        cycles: instance names of every cycle.
+        closing: the connections that close a cycle and got a delay of 1 for it.
+        nodes: by node name, recorder included if there is one.
+    """
+
+    system: System
+    connections: tuple[Connection, ...]
+    order: tuple[str, ...]
+    cycles: tuple[tuple[str, ...], ...]
+    closing: tuple[Connection, ...]
+    initialization: InitializationPlan
+    window: int
+    digest: str
+    nodes: dict[str, NodePlan]
+
+    @property
+    def grid(self) -> TimeGrid:
+        """The communication points of the run."""
+        return self.system.grid
+
+    def node_of(self, instance: str) -> str:
+        """The node that an instance runs in."""
+        return self.system.instances[instance].node
+
+
+def make_plan(
+    system: System,
+    *,
+    window: int | None = None,
+    file: str = "",
+    contents: Mapping[str, str] = {},
+) -> Plan:
+    """Plan a validated system.
+
+    Args:
+        system: the system.
+        window: overrides the window of the configuration, in points.
+        file: name of the configuration file, for errors.
+        contents: the SHA-256 of what the model of each instance is, by instance name.
+
+    Raises:
+        ConfigurationError: a cycle has no delay; names the cycle.
+    """
+    connections, closing = _with_delays(system)
+    instant = [(c.source_instance, c.target_instance) for c in connections if c.delay == 0]
+    loops = [loop for loop in strongly_connected(system.instances, instant) if _is_cycle(loop, instant)]
+    if loops:
+        findings = tuple(_algebraic_loop(loop, connections, file) for loop in loops)
+        text = f"{file}: {len(findings)} algebraic loops" if len(findings) > 1 else str(findings[0])
+        raise ConfigurationError(text, findings=findings)
+    edges = [(c.source_instance, c.target_instance) for c in connections]
+    order = topological_order(system.instances, instant)
+    cycles = tuple(tuple(part) for part in strongly_connected(system.instances, edges) if _is_cycle(part, edges))
+    initialization = plan_initialization(system, connections)
+    points = window if window is not None else window_of(system)
+    plan = Plan(
+        system=system,
+        connections=connections,
+        order=tuple(order),
+        cycles=cycles,
+        closing=closing,
+        initialization=initialization,
+        window=points,
+        digest="",
+        nodes={},
+    )
+    nodes = _nodes(plan)
+    digest = _digest(system, nodes, contents)
+    return replace(plan, digest=digest, nodes={name: replace(node, digest=digest) for name, node in nodes.items()})
+
+
+def _digest(system: System, nodes: dict[str, NodePlan], contents: Mapping[str, str]) -> str:
+    """What all processes of a mesh must agree on: also what is in files, but not where they lie on each host."""
+    agreed = [
+        replace(
+            node,
+            result_file=None,
+            limits=LimitsConfig(),
+            instances=tuple(
+                replace(instance, fmu="", sha256=None, hosted=_without_path(instance.hosted))
+                for instance in node.instances
+            ),
+        )
+        for node in nodes.values()
+    ]
+    models = {name: (own.description.guid, contents.get(name, "")) for name, own in system.instances.items()}
+    return digest_of(agreed, models)
+
+
+def _without_path(section: HostConfig | None) -> HostConfig | None:
+    if isinstance(section, MujocoConfig):
+        return replace(section, mujoco="")
+    return replace(section, gazebo_classic="") if isinstance(section, GazeboClassicConfig) else section
+
+
+def _with_delays(system: System) -> tuple[tuple[Connection, ...], tuple[Connection, ...]]:
+    """All connections with a delay of 0 or 1, and those that got 1 because they close a cycle."""
+    if system.config.simulation.algorithm == "jacobi":
+        return tuple(replace(c, delay=1) if c.delay is None else c for c in system.connections), ()
+    free = [c for c in system.connections if c.delay != 1]
+    edges = [(c.source_instance, c.target_instance, c.delay is None) for c in free]
+    closing = {id(free[index]) for index in feedback_edges(system.instances, edges)}
+    connections = []
+    for connection in system.connections:
+        delay = connection.delay
+        if delay is None:
+            delay = 1 if id(connection) in closing else 0
+        connections.append(replace(connection, delay=delay))
+    chosen = tuple(new for old, new in zip(system.connections, connections, strict=True) if id(old) in closing)
+    return tuple(connections), chosen
+
+
+def _is_cycle(part: Iterable[str], edges: list[tuple[str, str]]) -> bool:
+    members = list(part)
+    return len(members) > 1 or (members[0], members[0]) in edges
+
+
+def _algebraic_loop(loop: list[str], connections: tuple[Connection, ...], file: str) -> Finding:
+    edges = [(c.source_instance, c.target_instance) for c in connections if c.delay == 0]
+    walk = cycle_through(loop, edges)
+    first = next(
+        c for c in connections if c.delay == 0 and (c.source_instance, c.target_instance) == (walk[0], walk[1])
+    )
+    return Finding(
+        file=file,
+        path=first.path,
+        found=f"an algebraic loop: every connection on the cycle {' -> '.join(walk)} has delay 0",
+        expected="at least one connection with delay 1 (set `delay: 1`, or leave the delays to the algorithm)",
+    )
+
+
+def _nodes(plan: Plan) -> dict[str, NodePlan]:
+    system = plan.system
+    outputs = {name: _output_layout(plan, name) for name in system.instances}
+    node_names = list(dict.fromkeys(instance.node for instance in system.instances.values()))
+    links = _links(plan)
+    nodes = {}
+    for node in node_names:
+        members = [name for name in plan.order if plan.node_of(name) == node]
+        within = _units(plan, node, members)
+        nodes[node] = _node(
+            plan,
+            node,
+            instances=tuple(_instance_plan(plan, system.instances[name], outputs[name]) for name in members),
+            units=tuple(dict.fromkeys(within[name] for name in members)),
+            links=links,
+        )
+    if system.recorded:
+        nodes[RECORDER] = _node(plan, RECORDER, instances=(), units=(), links=links)
+    return nodes
+
+
+def _units(plan: Plan, node: str, members: list[str]) -> dict[str, tuple[str, ...]]:
+    """The unit of each member of a node: its cycle, if the whole cycle is in this node, otherwise itself alone.
+
+    A cycle that leaves the node must be stepped member by member: one member may wait for what another one caused.
+    """
+    units: dict[str, tuple[str, ...]] = {name: (name,) for name in members}
+    for cycle in plan.cycles:
+        if all(plan.node_of(name) == node for name in cycle):
+            unit = tuple(name for name in plan.order if name in cycle)
+            units.update(dict.fromkeys(unit, unit))
+    return units
+
+
+def _node(
+    plan: Plan,
+    node: str,
+    *,
+    instances: tuple[InstancePlan, ...],
+    units: tuple[tuple[str, ...], ...],
+    links: tuple[Link, ...],
+) -> NodePlan:
+    config = plan.system.config
+    window = plan.window
+    if node == RECORDER:
+        window = recorder_window(window, [link.layout.row_size for link in links if link.target_node == RECORDER])
+    longest_step = max(instance.step_points for instance in plan.system.instances.values())
+    return NodePlan(
+        mesh=config.mesh,
+        node=node,
+        digest="",
+        key_prefix=config.zenoh.key_prefix,
+        grid=plan.grid,
+        window=window,
+        progress_stride=window // 4 if window >= 4 * longest_step else 1,
+        # A source may be two own steps beyond the grant (the one it takes, and the one it holds its value for), and a
+        # target one own step before what it told.
+        ring_rows=rows_for(max(window, LAZY_ROWS) + 3 * longest_step),
+        timeouts=config.timeouts,
+        instances=instances,
+        units=units,
+        links_in=tuple(link for link in links if link.target_node == node),
+        links_out=tuple(link for link in links if link.source_node == node),
+        loops=tuple(loop for loop in plan.initialization.loops if node in loop.nodes),
+        initialization=config.initialization,
+        result_file=plan.system.result_file if node == RECORDER else None,
+        recorded=plan.system.recorded if node == RECORDER else (),
+        limits=config.limits,
+        shared_memory=config.zenoh.shared_memory,
+    )
+
+
+def _output_layout(plan: Plan, name: str) -> Layout:
+    """Connected and recorded outputs of an instance, in the order of its model description."""
+    wanted = {c.source.name for c in plan.connections if c.source_instance == name}
+    wanted |= {_base(plan, instance, variable) for instance, variable in plan.system.recorded if instance == name}
+    variables = plan.system.instances[name].description.variables
+    return Layout.of(v for v in variables if v.name in wanted)
+
+
+def _instance_plan(plan: Plan, instance: SystemInstance, outputs: Layout) -> InstancePlan:
+    incoming = [c for c in plan.connections if c.target_instance == instance.name]
+    section = plan.system.config.instances[instance.name]
+    feeds: dict[tuple[str, int], list[tuple[str, str, float, float]]] = {}
+    for c in incoming:
+        feeds.setdefault((c.source_instance, c.delay or 0), []).append(
+            (c.source_name, c.target_name, c.factor, c.offset)
+        )
+    connected = {c.target.name for c in incoming}
+    levels = plan.initialization.levels
+    return InstancePlan(
+        name=instance.name,
+        fmu=instance.fmu,
+        start_values={variable: to_plain(value) for variable, value in instance.start_values.items()},
+        step_points=instance.step_points,
+        outputs=outputs,
+        inputs=Layout.of(v for v in instance.description.variables if v.name in connected),
+        feeds=tuple(Feed(source=s, delay=d, columns=tuple(columns)) for (s, d), columns in sorted(feeds.items())),
+        initialization={variable: level for (owner, variable), level in levels.items() if owner == instance.name},
+        interpolation=section.interpolation if isinstance(section, InstanceConfig) else None,
+        sha256=section.sha256 if isinstance(section, InstanceConfig) else None,
+        kind=instance.description.kind,
+        options=replace(instance.options, linear_inputs=linear_inputs(plan.connections, instance.name)),
+        hosted=instance.hosted,
+    )
+
+
+def _links(plan: Plan) -> tuple[Link, ...]:
+    """One link per source instance and other node that needs some of its outputs, recorder last, initial ones after."""
+    needed: dict[tuple[str, str], set[str]] = {}
+    for c in plan.connections:
+        target_node = plan.node_of(c.target_instance)
+        if target_node != plan.node_of(c.source_instance):
+            needed.setdefault((c.source_instance, target_node), set()).add(c.source.name)
+    for name, variable in plan.system.recorded:
+        needed.setdefault((name, RECORDER), set()).add(_base(plan, name, variable))
+    links = []
+    ends = sorted(needed, key=lambda end: (end[0], end[1] == RECORDER, end[1]))
+    initial = _needed_initially(plan, needed)
+    for index, (source, target_node) in enumerate([*ends, *sorted(initial)]):
+        names = needed[source, target_node] if index < len(ends) else initial[source, target_node]
+        instance = plan.system.instances[source]
+        layout = Layout.of(v for v in instance.description.variables if v.name in names)
+        levels = plan.initialization.levels
+        links.append(
+            Link(
+                index=index,
+                source=source,
+                source_node=instance.node,
+                target_node=target_node,
+                step_points=instance.step_points,
+                layout=layout,
+                levels=tuple(
+                    -1 if target_node == RECORDER else levels.get((source, name), -1) for name in layout.names
+                ),
+                initial_only=index >= len(ends),
+            )
+        )
+    return tuple(links)
+
+
+def _needed_initially(plan: Plan, needed: dict[tuple[str, str], set[str]]) -> dict[tuple[str, str], set[str]]:
+    """Outputs by (instance, node) that decide whether a loop is consistent, and come over no other link."""
+    initial: dict[tuple[str, str], set[str]] = {}
+    for loop in plan.initialization.loops:
+        for node in loop.nodes:
+            for tear in loop.tears:
+                output = _base(plan, tear.source, tear.output)
+                if node != plan.node_of(tear.source) and output not in needed.get((tear.source, node), ()):
+                    initial.setdefault((tear.source, node), set()).add(output)
+    return initial
+
+
+def _base(plan: Plan, instance: str, name: str) -> str:
+    """The name of the variable that a column or an end of a connection is, or is an element of."""
+    variable = plan.system.instances[instance].description.variable_of(name)
+    return variable.name if variable is not None else name

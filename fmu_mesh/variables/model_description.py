@@ -1,0 +1,225 @@
+"""What an instance offers: its variables, capabilities and default experiment.
+
+Owns the description Structs that every layer above speaks of; independent of FMPy and of the FMI version. The readers
+in `fmu_mesh.instances.fmi` (and later the hosts) fill them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from functools import cached_property
+from typing import Literal
+
+import msgspec
+from msgspec.structs import replace
+
+from .units import BaseUnit
+from .value_types import MAX_ELEMENTS, PlainValue, Value, VariableType, element_names, flattened, nested, split_element
+
+__all__ = [
+    "Causality",
+    "Clock",
+    "DefaultExperiment",
+    "HostKind",
+    "Kind",
+    "ModelDescription",
+    "PlainValue",
+    "Value",
+    "Variability",
+    "Variable",
+    "VariableType",
+]
+
+Causality = Literal[
+    "parameter", "calculatedParameter", "structuralParameter", "input", "output", "local", "independent"
+]
+Variability = Literal["constant", "fixed", "tunable", "discrete", "continuous"]
+Initial = Literal["exact", "approx", "calculated"]
+Kind = Literal["co_simulation", "model_exchange"]
+HostKind = Literal["physics_engine", "controller"]
+"""What an instance is that is no FMU."""
+
+
+class Variable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One variable of a model description (FMI 2.0, 2.2.7; FMI 3.0, 2.4.7).
+
+    Attributes:
+        type: the type, in the words of FMI 3.0 for all versions.
+        declared_type: the type in the words of FMI 1.0 and 2.0, such as Real; None for FMI 3.0.
+        dimensions: of each dimension its size, or the name of the structural parameter that is its size; empty for a
+            scalar (FMI 3.0, 2.4.7.5.1).
+        shape: the sizes of all dimensions.
+        negated: whether it is an FMI 1.0 alias with the opposite sign of the value behind its value reference.
+        max_size: most bytes of a Binary, if known.
+        dependencies: names of the knowns an output depends on in Initialization Mode; None if it may depend on all
+            (FMI 2.0, 2.2.8, InitialUnknowns). Empty for a variable that is not an initial unknown.
+        items: item names and values of an Enumeration.
+        base_unit: its unit in SI base units, if the model description defines it.
+        relative_quantity: whether it is a difference, to which the offset of a unit does not apply.
+    """
+
+    name: str
+    value_reference: int
+    type: VariableType
+    causality: Causality
+    variability: Variability
+    initial: Initial | None = None
+    start: Value | None = None
+    unit: str | None = None
+    description: str | None = None
+    minimum: float | None = None
+    maximum: float | None = None
+    dependencies: tuple[str, ...] | None = None
+    items: tuple[tuple[str, int], ...] = ()
+    base_unit: BaseUnit | None = None
+    relative_quantity: bool = False
+    declared_type: str | None = None
+    dimensions: tuple[int | str, ...] = ()
+    shape: tuple[int, ...] = ()
+    negated: bool = False
+    max_size: int | None = None
+
+    @property
+    def type_name(self) -> str:
+        """The type as a reader knows it from the FMU, with the sizes of its dimensions: `Real`, `Float64[2,3]`."""
+        name = self.declared_type or self.type
+        return f"{name}[{','.join(map(str, self.shape))}]" if self.shape else name
+
+    @property
+    def size(self) -> int:
+        """How many elements it has; 1 for a scalar."""
+        return math.prod(self.shape)
+
+    @property
+    def elements(self) -> tuple[str, ...]:
+        """The names of its elements, as `y[1,2]`; of a scalar, its own name."""
+        return element_names(self.name, self.shape)
+
+    @property
+    def settable_before_start(self) -> bool:
+        """Whether a start value may be given (FMI 2.0, 2.2.7: initial is exact or approx, or it is an input)."""
+        if not self.may_take_start_value:
+            return False
+        return self.causality in ("input", "structuralParameter") or self.initial in ("exact", "approx")
+
+    @property
+    def may_take_start_value(self) -> bool:
+        """Whether an FMU can be asked to take a start value; some take one where the standard forbids it."""
+        return self.variability != "constant" and self.causality != "independent"
+
+    @property
+    def role(self) -> str:
+        """What it is for somebody who wants to set it, in the words of FMI: `an output with initial 'calculated'`."""
+        if self.variability == "constant":
+            return "a constant"
+        article = "an" if self.causality[0] in "aeiou" else "a"
+        initial = f" with initial '{self.initial}'" if self.initial is not None else ""
+        return f"{article} {self.causality}{initial}"
+
+
+class DefaultExperiment(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The default experiment of a model description, times in s (FMI 2.0, 2.2.5)."""
+
+    start_time: float | None = None
+    stop_time: float | None = None
+    step_size: float | None = None
+    tolerance: float | None = None
+
+
+class Clock(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One clock of an FMI 3.0 model description (FMI 3.0, 2.2.8).
+
+    Attributes:
+        interval_variability: constant, fixed, tunable, changing, countdown or triggered.
+        interval: in s; None where parameters or the FMU decide.
+        shift: time of the first tick after the start, in s.
+    """
+
+    name: str
+    value_reference: int
+    causality: Causality
+    interval_variability: str
+    interval: float | None = None
+    shift: float = 0.0
+
+    def __str__(self) -> str:
+        """Such as `tick (input, constant, every 0.4 s from 0.2 s on)`."""
+        every = f", every {self.interval:g} s from {self.shift:g} s on" if self.interval is not None else ""
+        return f"{self.name} ({self.causality}, {self.interval_variability}{every})"
+
+
+class ModelDescription(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict=True):
+    """A model description (FMI 2.0, 2.2) as far as the mesh needs it.
+
+    Attributes:
+        library: the file of the FMU that is loaded on this platform; None if it is compiled, or nothing is loaded.
+    """
+
+    model_name: str
+    model_identifier: str
+    fmi_version: str
+    kind: Kind | HostKind
+    guid: str
+    variables: tuple[Variable, ...]
+    description: str | None = None
+    generation_tool: str | None = None
+    default_experiment: DefaultExperiment = DefaultExperiment()
+    can_handle_variable_step_size: bool = False
+    can_reject_steps: bool = False
+    can_get_and_set_state: bool = False
+    can_serialize_state: bool = False
+    only_once_per_process: bool = False
+    needs_execution_tool: bool = False
+    can_interpolate_inputs: bool = False
+    has_event_mode: bool = False
+    tell_completed_steps: bool = False
+    continuous_states: int = 0
+    event_indicators: int = 0
+    clocks: tuple[Clock, ...] = ()
+    platforms: tuple[str, ...] = ()
+    kinds: tuple[Kind, ...] = ()
+    problems: tuple[str, ...] = ()
+    library: str | None = None
+
+    def variable(self, name: str) -> Variable | None:
+        """The variable with this name, or None."""
+        return self._by_name.get(name)
+
+    @cached_property
+    def _by_name(self) -> dict[str, Variable]:
+        return {variable.name: variable for variable in self.variables}
+
+    def variable_of(self, name: str) -> Variable | None:
+        """The variable that ``name`` means, where ``name`` may also be that of an element of an array, as `y[1,2]`."""
+        found = self.variable(name)
+        if found is None and (parts := split_element(name)) is not None:
+            found = self.variable(parts[0])
+        return found
+
+    def with_causality(self, *causalities: Causality) -> tuple[Variable, ...]:
+        """All variables with one of these causalities, in the order of the model description."""
+        return tuple(variable for variable in self.variables if variable.causality in causalities)
+
+    def sized(self, start_values: Mapping[str, Value]) -> ModelDescription:
+        """With the shapes that its arrays have if structural parameters get these values (FMI 3.0, 2.2.8)."""
+        if not any(isinstance(size, str) for variable in self.variables for size in variable.dimensions):
+            return self
+        sizes = {v.name: v.start for v in self.variables if v.causality in ("structuralParameter", "parameter")}
+        sizes.update({name: value for name, value in start_values.items() if name in sizes})
+
+        def size_of(dimension: int | str) -> int:
+            value = dimension if isinstance(dimension, int) else sizes.get(dimension)
+            return value if isinstance(value, int) and value > 0 else 1
+
+        return replace(self, variables=tuple(_reshaped(v, tuple(map(size_of, v.dimensions))) for v in self.variables))
+
+
+def _reshaped(variable: Variable, shape: tuple[int, ...]) -> Variable:
+    """A variable with another shape; its start value goes along if it is one value for all elements."""
+    if shape == variable.shape:
+        return variable
+    elements = [] if variable.start is None else flattened(variable.start, len(variable.shape))
+    is_one = bool(elements) and elements == elements[:1] * len(elements) and math.prod(shape) <= MAX_ELEMENTS
+    start = nested(elements[:1] * math.prod(shape), shape) if is_one else None
+    return replace(variable, shape=shape, start=start)

@@ -1,0 +1,196 @@
+"""Plain values, as files and the wire have them, to values of variables, and back.
+
+The one place that knows which plain value stands for which value of a type: the configuration, settings over the wire
+and programs that use the library all come through here, so all of them take and refuse the same.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import math
+from typing import Any
+
+import numpy as np
+
+from ..config.findings import listed, nearest
+from .model_description import Variable
+from .value_types import INTEGERS, PlainValue, Value, nested
+
+__all__ = ["MAX_TEXT_SIZE", "ValueRefused", "range_of", "to_plain", "to_value"]
+
+MAX_TEXT_SIZE = 16 * 2**20
+"""Bytes that a String or Binary may have."""
+
+_NOT_FINITE = {"NaN": math.nan, "INF": math.inf, "-INF": -math.inf}
+_FLOAT32_MAX = float(np.finfo(np.float32).max)
+
+
+class ValueRefused(ValueError):
+    """A value that a variable cannot take.
+
+    Args:
+        message: why, where no ``expected`` says it.
+        expected: what would be right.
+        suggestion: the nearest right value, if there is one.
+        out_of_range: whether only its size is wrong.
+    """
+
+    def __init__(
+        self, message: str, *, expected: str = "", suggestion: str | None = None, out_of_range: bool = False
+    ) -> None:
+        super().__init__(message)
+        self.expected = expected
+        self.suggestion = suggestion
+        self.out_of_range = out_of_range
+
+
+def to_value(plain: object, variable: Variable) -> Value:
+    """The value that a plain value, or a Python or numpy value, gives for a variable.
+
+    A floating-point number may be given as a whole number, or as `NaN`, `INF` or `-INF` (FMI 3.0, 2.4.8); an
+    Enumeration by the name or the number of an item; Binary as bytes or as base64; an array as nested lists by rows.
+
+    Raises:
+        ValueRefused: it is no value of the variable's type and shape, or out of its range.
+    """
+    plain = plain.tolist() if isinstance(plain, np.ndarray | np.generic) else plain
+    values = [_element(element, variable) for element in _elements(plain, variable, variable.shape)]
+    return nested(values, variable.shape)
+
+
+def to_plain(value: Value) -> PlainValue:
+    """A value as JSON and YAML have it; `to_value` takes it back."""
+    match value:
+        case float() if not math.isfinite(value):
+            return "NaN" if math.isnan(value) else "INF" if value > 0 else "-INF"
+        case bytes():
+            return base64.b64encode(value).decode()
+        case list():
+            return [to_plain(element) for element in value]
+        case _:
+            return value
+
+
+def range_of(variable: Variable) -> str:
+    """The range of a variable in words."""
+    if variable.minimum is None:
+        return f"<= {variable.maximum:g}"
+    return f">= {variable.minimum:g}" + (f" and <= {variable.maximum:g}" if variable.maximum is not None else "")
+
+
+def _elements(plain: object, variable: Variable, shape: tuple[int, ...]) -> list[Any]:
+    """The elements of an array, whose lists must be as long as its dimensions are large."""
+    elements: list[Any] = [plain]
+    for size in shape:
+        for row in elements:
+            if not isinstance(row, list | tuple) or len(row) != size:
+                raise _refused(variable)
+        elements = [element for row in elements for element in row]
+    return elements
+
+
+def _element(plain: object, variable: Variable) -> Value:
+    """One element of a variable, or the value of a scalar."""
+    value = _converted(plain, variable)
+    if value is None:
+        names = [item for item, _ in variable.items]
+        raise _refused(variable, nearest(plain, names) if isinstance(plain, str) else None)
+    if not _within(value, variable):
+        raise ValueRefused(
+            f"{plain!r} is out of its range", expected=f"a value {range_of(variable)}", out_of_range=True
+        )
+    return value
+
+
+def _refused(variable: Variable, suggestion: str | None = None) -> ValueRefused:
+    expected = _expected(variable)
+    return ValueRefused(f"expected {expected}", expected=expected, suggestion=suggestion)
+
+
+def _converted(plain: object, variable: Variable) -> Value | None:
+    """``plain`` as a value of the variable's type, or None if it is none."""
+    converted: Value | None = None
+    match variable.type, plain:
+        case "Boolean", bool():
+            converted = plain
+        case _, bool():
+            pass  # which Python would take for a number
+        case "Float64" | "Float32", int() | float() | str():
+            converted = _float(plain, variable)
+        case "Enumeration", int() | str():
+            items = dict(variable.items)
+            number = items.get(plain) if isinstance(plain, str) else plain
+            known = isinstance(number, int) and number in (items.values() if items else INTEGERS["Enumeration"])
+            converted = number if known else None
+        case _, int() if plain in INTEGERS.get(variable.type, ()):
+            converted = plain
+        case "String", str() if "\0" not in plain and len(plain) <= MAX_TEXT_SIZE and _is_unicode(plain):
+            converted = plain
+        case "Binary", bytes() | bytearray() if len(plain) <= MAX_TEXT_SIZE:
+            converted = bytes(plain)
+        case "Binary", str() if len(plain) <= 2 * MAX_TEXT_SIZE:
+            converted = _binary(plain)
+    return converted
+
+
+def _float(plain: float | str, variable: Variable) -> float | None:
+    """A floating-point number; of a Float32 the nearest one that it can hold, which must not be an infinity."""
+    if isinstance(plain, str):
+        return _NOT_FINITE.get(plain)
+    try:
+        value = float(plain)
+    except OverflowError:
+        return None
+    if variable.type == "Float64" or not math.isfinite(value):
+        return value
+    return float(np.float32(value)) if abs(value) <= _FLOAT32_MAX else None
+
+
+def _binary(text: str) -> bytes | None:
+    try:
+        return base64.b64decode(text, validate=True)
+    except (binascii.Error, ValueError):
+        return None
+
+
+def _is_unicode(text: str) -> bool:
+    """Whether a text can be sent at all: JSON can hold half a character."""
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
+def _within(value: Value, variable: Variable) -> bool:
+    if isinstance(value, str | bytes | bool | list):
+        return True
+    above = variable.minimum is None or value >= variable.minimum
+    return above and (variable.maximum is None or value <= variable.maximum)
+
+
+def _expected(variable: Variable) -> str:
+    one = _expected_element(variable)
+    if not variable.shape:
+        return one
+    sizes = " x ".join(map(str, variable.shape))
+    return f"a list of {sizes} values, row by row, each of them {one}"
+
+
+def _expected_element(variable: Variable) -> str:
+    match variable.type:
+        case "Float64" | "Float32":
+            return "a number" if variable.type == "Float64" else f"a number from -{_FLOAT32_MAX!r} to {_FLOAT32_MAX!r}"
+        case "Boolean":
+            return "true or false"
+        case "String":
+            return f"text without the character 0, {MAX_TEXT_SIZE} characters at most"
+        case "Binary":
+            return f"base64 of {MAX_TEXT_SIZE} bytes at most"
+        case "Enumeration":
+            items = [f"{item} ({number})" for item, number in variable.items]
+            return f"one of {listed(items)}" if items else "the number of an item"
+        case _:
+            whole = INTEGERS[variable.type]
+            return f"a whole number from {whole[0]} to {whole[-1]}"

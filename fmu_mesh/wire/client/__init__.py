@@ -1,0 +1,1 @@
+"""A running mesh from outside: finding it, asking it, following it, waiting for it."""

@@ -1,0 +1,87 @@
+"""What a mesh publishes, as a tool follows it to the end of the mesh.
+
+Owns how that end is noticed: by the liveliness token of the master, which goes with a killed master, too.
+"""
+
+from __future__ import annotations
+
+import queue
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from types import TracebackType
+from typing import Generic, Self, TypeVar
+
+import zenoh
+
+from ...errors import DeadlineExceeded
+from ..keys import Keys
+from .readings import latecomers
+
+__all__ = ["Follower"]
+
+Item = TypeVar("Item")
+
+
+class Follower(Generic[Item]):
+    """Follows a mesh as long as the `with` block lasts.
+
+    Args:
+        session: a session that reaches the mesh.
+        keys: those of the mesh.
+
+    Attributes:
+        arrived: what subscribers have put there, in order; None where the mesh has ended.
+        there: set when the mesh was seen.
+    """
+
+    def __init__(self, session: zenoh.Session, keys: Keys) -> None:
+        self._session = session
+        self._keys = keys
+        self._stack = ExitStack()
+        self._over = False
+        self.arrived: queue.SimpleQueue[Item | None] = queue.SimpleQueue()
+        self.there = threading.Event()
+
+    def __enter__(self) -> Self:
+        token = self._session.liveliness().declare_subscriber(self._keys.master, self._token_changed, history=True)
+        self._stack.callback(token.undeclare)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stack.close()
+
+    def subscribe(self, key: str, take: Callable[[zenoh.Sample], None]) -> None:
+        """From now on ``take`` gets the samples of a key."""
+        self._stack.callback(self._session.declare_subscriber(key, take).undeclare)
+
+    def to_the_last(self, deadline: float | None = None) -> Iterator[Item]:
+        """What arrives until the mesh has ended, and what comes behind that, unless the mesh starts again.
+
+        Raises:
+            DeadlineExceeded: the mesh has not ended before the monotonic time ``deadline`` in s.
+        """
+        while (item := self._next(deadline)) is not None:
+            yield item
+        for late in latecomers(self.arrived):
+            if late is None:
+                return
+            yield late
+
+    def _next(self, deadline: float | None) -> Item | None:
+        if deadline is None:
+            return self.arrived.get()
+        try:
+            return self.arrived.get(timeout=max(0.0, deadline - time.monotonic()))
+        except queue.Empty:
+            raise DeadlineExceeded(f"mesh '{self._keys.mesh}' says nothing more in time") from None
+
+    def _token_changed(self, sample: zenoh.Sample) -> None:
+        if sample.kind == zenoh.SampleKind.PUT and not self._over:
+            self.there.set()  # Zenoh may say so twice, as where somebody else of this session asks for tokens
+        else:
+            self._over = True
+            self.arrived.put(None)

@@ -1,0 +1,349 @@
+"""A running mesh as a tool sees it: its views, its values, its settings and its streams.
+
+Owns the questions that the commands ask. Which meshes there are, and which one a key means, is
+`fmu_mesh.wire.client.reaching`. Nothing here prints, and nothing here is needed by a mesh itself: it is what any Zenoh
+program can do (docs/key-space.md), with deadlines and with names instead of keys.
+"""
+
+from __future__ import annotations
+
+import re
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from typing import Any, TypeVar
+
+import msgspec
+import zenoh
+
+from ...config.findings import listed, nearest
+from ...errors import ConfigurationError, DeadlineExceeded, MessageRefused
+from ..keys import Keys
+from ..messages import decode_json
+from ..session import matches, reason_of
+from ..values import json_encoding
+from ..views import (
+    Command,
+    CommandAnswer,
+    InstanceInfo,
+    InstanceStatus,
+    MeshInfo,
+    MeshStatus,
+    RosView,
+    SetAnswer,
+)
+from .following import Follower
+from .readings import Keeper, Reading, Target, reading_of
+
+__all__ = ["MeshClient", "is_key", "key_expression"]
+
+View = TypeVar("View")
+
+_TIMEOUT = "Timeout"  # what Zenoh itself answers in the name of somebody who did not
+_LOOK_S = 0.05
+
+
+class MeshClient:
+    """One running mesh, seen from outside.
+
+    Args:
+        session: a session that reaches the mesh; stays the caller's.
+        keys: the keys of the mesh.
+        endpoints: where the session reaches it, for a person to read.
+        timeout_s: the deadline of every question in s.
+
+    Raises:
+        ConfigurationError: (every method) a name is unknown, or the mesh refused; says why.
+        DeadlineExceeded: (every method) nobody answered in time.
+    """
+
+    def __init__(self, session: zenoh.Session, keys: Keys, endpoints: Sequence[str], timeout_s: float) -> None:
+        self.keys = keys
+        self.endpoints = tuple(endpoints)
+        self._session = session
+        self._timeout_s = timeout_s
+
+    @property
+    def session(self) -> zenoh.Session:
+        """The session that reaches the mesh."""
+        return self._session
+
+    def info(self) -> MeshInfo:
+        """What the mesh is."""
+        return self._view(self.keys.mesh_key("info"), MeshInfo, f"mesh '{self.keys.mesh}'")
+
+    def status(self) -> MeshStatus:
+        """How far the mesh is."""
+        return self._view(self.keys.mesh_key("status"), MeshStatus, f"mesh '{self.keys.mesh}'")
+
+    def ros(self) -> list[RosView]:
+        """What the gateways to ROS reach; none where the mesh has none."""
+        # A get: a mesh without a gateway has nobody to wait for.
+        replies = self._session.get(f"{self.keys.mesh_key('ros')}/*", timeout=self._timeout_s)
+        try:
+            return [decode_json(sample.payload.to_bytes(), RosView) for sample in _answers(replies) or ()]
+        except MessageRefused as error:
+            raise _not_understood(f"the gateway of mesh '{self.keys.mesh}'", error) from error
+
+    def instance_info(self, instance: str) -> InstanceInfo:
+        """What an instance is: model description, connections, process. Waits while its FMU is being loaded."""
+        return self._view(f"{self._instance_key(instance)}/info", InstanceInfo, f"instance '{instance}'")
+
+    def instance_status(self, instance: str) -> InstanceStatus:
+        """How far an instance is, and what it is doing."""
+        return self._view(f"{self._instance_key(instance)}/status", InstanceStatus, f"instance '{instance}'")
+
+    def all_status(self) -> tuple[MeshStatus, dict[str, InstanceStatus]]:
+        """How far the mesh and all its instances are, by one question; an instance that does not answer is left out."""
+        # A querier for a key that spans several queryables is not told that they match (zenoh 1.10): this is a get.
+        replies = self._session.get(f"{self.keys.root}/*/status", timeout=self._timeout_s)
+        answers = {str(sample.key_expr): sample.payload.to_bytes() for sample in _answers(replies) or ()}
+        mesh = answers.pop(self.keys.mesh_key("status"), None)
+        status = self.status() if mesh is None else None  # nothing is known of the mesh yet, or it is gone
+        try:
+            status = status or decode_json(mesh or b"", MeshStatus)
+            views = [decode_json(data, InstanceStatus) for data in answers.values()]
+        except MessageRefused as error:
+            raise _not_understood(f"mesh '{self.keys.mesh}'", error) from error
+        return status, {view.instance: view for view in views}
+
+    @contextmanager
+    def until_end(self, tell: Callable[[], None] = lambda: None) -> Iterator[threading.Event]:
+        """An event that is set when the mesh ends, or is gone; ``tell`` is called then, on a foreign thread."""
+        there, ended = threading.Event(), threading.Event()
+
+        def changed(sample: zenoh.Sample) -> None:
+            (there if sample.kind == zenoh.SampleKind.PUT else ended).set()
+            if ended.is_set():
+                tell()
+
+        token = self._session.liveliness().declare_subscriber(self.keys.master, changed, history=True)
+        try:
+            if not there.wait(self._timeout_s):
+                ended.set()
+            yield ended
+        finally:
+            token.undeclare()
+
+    def instance_in(self, reference: str) -> str | None:
+        """The instance that a reference names; None if it names the mesh as a whole."""
+        name = reference.removeprefix(self.keys.root).strip("/")
+        name = name.removesuffix("/info").removesuffix("/status")
+        return None if name in ("", "mesh") or reference == self.keys.mesh else name
+
+    def targets(self, reference: str) -> list[Target]:
+        """The variables that a reference means: `instance.variable` or a key, either of them with wildcards.
+
+        In the short form `*` stands for any characters; in a key the wildcards are those of Zenoh.
+        """
+        if not is_key(reference, self.keys):
+            return self._targets_by_name(reference)
+        asked = key_expression(reference)
+        instances = [
+            name for name in self.info().instances if asked.intersects(zenoh.KeyExpr(f"{self.keys.instance(name)}/**"))
+        ]
+        if not instances:
+            chunk = reference.removeprefix(self.keys.root + "/").partition("/")[0]
+            raise self._unknown_instance(chunk)
+        found = [target for name in instances for target in self._variables(name)]
+        matching = [target for target in found if asked.intersects(zenoh.KeyExpr(target.key))]
+        if not matching:
+            raise _unknown(f"no variable has the key '{reference}'", reference, [target.key for target in found])
+        return matching
+
+    def target(self, reference: str) -> Target:
+        """The one variable that a reference means."""
+        found = self.targets(reference)
+        if len(found) > 1:
+            names = listed([f"{target.instance}.{target.variable.name}" for target in found])
+            raise ConfigurationError(f"'{reference}' means {len(found)} variables: {names}.")
+        return found[0]
+
+    def get(self, targets: Sequence[Target]) -> list[Reading]:
+        """The current values, in the order of the targets; each comes with the point that it belongs to."""
+        readings: dict[str, Reading] = {}
+        for instance in dict.fromkeys(target.instance for target in targets):
+            own = {target.key: target for target in targets if target.instance == instance}
+            key = next(iter(own)) if len(own) == 1 else f"{self._instance_key(instance)}/*/*"
+            for sample in self._ask(key, f"the values of instance '{instance}'"):
+                target = own.get(str(sample.key_expr))
+                if target is not None and (reading := reading_of(target, sample)) is not None:
+                    readings[target.key] = reading
+        return [readings[target.key] for target in targets if target.key in readings]
+
+    def set(self, target: Target, text: str) -> SetAnswer:
+        """Give an unconnected input or a tunable parameter a value; the answer says from which point on it holds.
+
+        Args:
+            target: the variable.
+            text: the value as JSON; what is no JSON is taken as text, so an item, a String or base64 needs no quotes.
+        """
+        payload = text.encode()
+        try:
+            value = msgspec.json.decode(payload)
+        except msgspec.DecodeError:
+            value = None
+        if value is None or (target.variable.type in ("String", "Binary") and not isinstance(value, str | list)):
+            payload = msgspec.json.encode(text)
+        return self._view(target.key, SetAnswer, f"'{target.instance}.{target.variable.name}'", payload)
+
+    def command(self, command: Command) -> CommandAnswer:
+        """Pause, resume, step or stop the mesh; the answer comes before the mesh rests where it is told to."""
+        payload = msgspec.json.encode(command)
+        return self._view(self.keys.mesh_key("command"), CommandAnswer, f"mesh '{self.keys.mesh}'", payload)
+
+    @contextmanager
+    def statuses(self, timeout_s: float | None = None) -> Iterator[Iterator[MeshStatus]]:
+        """The status of the mesh from now on, ten times a second, to its last; none if the mesh is gone already.
+
+        After ``timeout_s`` seconds, by default those of a question, the iterator raises `DeadlineExceeded`.
+        """
+        timeout_s = timeout_s if timeout_s is not None else self._timeout_s
+        deadline = time.monotonic() + timeout_s
+        with Follower[MeshStatus](self._session, self.keys) as follower:
+
+            def take(sample: zenoh.Sample) -> None:
+                with suppress(MessageRefused):
+                    follower.arrived.put(decode_json(sample.payload.to_bytes(), MeshStatus))
+
+            follower.subscribe(self.keys.mesh_key("status"), take)
+            there = follower.there.wait(min(timeout_s, self._timeout_s))
+            yield follower.to_the_last(deadline) if there else iter(())
+
+    @contextmanager
+    def watch(self, targets: Sequence[Target]) -> Iterator[Iterator[Reading]]:
+        """Every value from now on, in the order in which it comes; ends when the mesh does.
+
+        A reader that falls far behind loses the newest samples; the points tell which.
+        """
+        with Follower[Reading](self._session, self.keys) as follower:
+            for target in targets:
+                follower.subscribe(target.key, Keeper(target, follower.arrived).keep)
+            yield follower.to_the_last() if follower.there.wait(self._timeout_s) else iter(())
+
+    # --- names
+
+    def _targets_by_name(self, reference: str) -> list[Target]:
+        instance, _, name = reference.partition(".")
+        names = self.info().instances
+        if not name:
+            if not any(_fits(instance, candidate) for candidate in names):
+                instance = "INSTANCE"
+            raise ConfigurationError(
+                f"'{reference}' names no variable.", hint=f"Write '{instance}.VARIABLE', or '{instance}.*' for all."
+            )
+        instances = [candidate for candidate in names if _fits(instance, candidate)]
+        if not instances:
+            raise self._unknown_instance(instance)
+        found = [target for candidate in instances for target in self._variables(candidate)]
+        matching = [target for target in found if _fits(name, target.variable.name)]
+        if not matching:
+            where = (
+                f"instance '{instances[0]}' has" if len(instances) == 1 else f"the instances {listed(instances)} have"
+            )
+            raise _unknown(f"{where} no variable '{name}'", name, [target.variable.name for target in found])
+        return matching
+
+    def _variables(self, instance: str) -> list[Target]:
+        root = self.keys.instance(instance)
+        return [Target(instance, f"{root}/{view.key}", view) for view in self.instance_info(instance).variables]
+
+    def _instance_key(self, instance: str) -> str:
+        if instance not in (names := self.info().instances):
+            raise self._unknown_instance(instance, names)
+        return self.keys.instance(instance)
+
+    def _unknown_instance(self, name: str, names: Sequence[str] | None = None) -> ConfigurationError:
+        there = names if names is not None else self.info().instances
+        return _unknown(f"mesh '{self.keys.mesh}' has no instance '{name}'", name, there)
+
+    # --- questions
+
+    def _view(self, key: str, kind: type[View], who: str, payload: bytes | None = None) -> View:
+        data = self._ask(key, who, payload)[0].payload.to_bytes()
+        try:
+            return decode_json(data, kind)
+        except MessageRefused as error:
+            raise _not_understood(who, error) from error
+
+    def _ask(self, key: str, who: str, payload: bytes | None = None) -> list[zenoh.Sample]:
+        """The answers to a query, at least one of them.
+
+        A query sent before the queryable is known gets no answer at all, so this waits until one matches; and again
+        where one matches that has no answer yet.
+        """
+        end = time.monotonic() + self._timeout_s
+        changed = threading.Event()
+        encoding = json_encoding if payload is not None else None
+        with self._session.declare_querier(key, timeout=self._timeout_s) as querier:
+            listener: zenoh.MatchingListener[Any] = querier.declare_matching_listener(lambda _status: changed.set())
+            try:
+                while (left := end - time.monotonic()) > 0:
+                    if matches(querier):
+                        samples = _answers(querier.get(payload=payload, encoding=encoding))
+                        if samples is None:
+                            break
+                        if samples:
+                            return samples
+                    changed.wait(min(left, _LOOK_S))
+                    changed.clear()
+            finally:
+                listener.undeclare()
+        raise DeadlineExceeded(f"no answer from {who} within {self._timeout_s:g} s.", hint="--timeout waits longer.")
+
+
+def is_key(reference: str, keys: Keys) -> bool:
+    """Whether a reference is a key; otherwise it is a name, or `instance.variable`."""
+    return reference.startswith(f"{keys.prefix}/") or "/" in reference.partition(".")[0]
+
+
+def key_expression(text: str) -> zenoh.KeyExpr:
+    """A key expression that a person wrote.
+
+    Raises:
+        ConfigurationError: it is none.
+    """
+    try:
+        return zenoh.KeyExpr(text)
+    except zenoh.ZError as error:
+        reason = reason_of(error).rpartition("`: ")[2].removesuffix(".")
+        raise ConfigurationError(f"'{text}' is no key expression: {reason}") from error
+
+
+def _answers(replies: Any) -> list[zenoh.Sample] | None:  # noqa: ANN401 a Zenoh handler
+    """What was answered; None if somebody did not in time.
+
+    Raises:
+        ConfigurationError: somebody refused.
+    """
+    samples: list[zenoh.Sample] = []
+    late = False
+    for reply in replies:
+        if reply.ok is not None:
+            samples.append(reply.ok)
+            continue
+        text = reply.err.payload.to_bytes().decode(errors="replace")
+        if text != _TIMEOUT:
+            raise ConfigurationError(text)
+        late = True
+    return samples or (None if late else [])
+
+
+def _fits(pattern: str, name: str) -> bool:
+    """Whether a name is the pattern, in which `*` stands for any characters."""
+    if "*" not in pattern:
+        return pattern == name
+    return re.fullmatch(".*".join(map(re.escape, pattern.split("*"))), name) is not None
+
+
+def _not_understood(who: str, error: MessageRefused) -> ConfigurationError:
+    return ConfigurationError(
+        f"the answer of {who} is not understood: {error}.", hint="Is it another version of fmu_mesh?"
+    )
+
+
+def _unknown(message: str, name: str, names: Sequence[str]) -> ConfigurationError:
+    suggestion = nearest(name, names)
+    hint = f"Did you mean '{suggestion}'?" if suggestion is not None else f"There are: {listed(names)}."
+    return ConfigurationError(f"{message}.", hint=hint)

@@ -1,0 +1,340 @@
+"""Which meshes a tool can reach, and which of them a key means.
+
+Owns the way from the notes in the runtime folder, or from endpoints, to a `MeshClient` for each running mesh. Tools
+open sessions in client mode: the master, which is their way in, passes everything on to the nodes.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from types import TracebackType
+from typing import NamedTuple, Self, TypeVar
+
+import zenoh
+
+from ...config.findings import listed, nearest
+from ...errors import ConfigurationError, DeadlineExceeded, FmuMeshError
+from ..keys import Keys
+from ..runtime import meshes
+from ..session import Wiring, close_session, open_session, tokens
+from .mesh_client import MeshClient, is_key, key_expression
+
+__all__ = ["Meshes"]
+
+Answer = TypeVar("Answer")
+
+_GRACE_S = 1.0
+_LOOK_S = 0.05
+_AGAIN_S = 1.0
+_TOKENS = "**/mesh"
+_NOBODY = "nobody answered"
+
+
+class Meshes:
+    """The meshes that can be reached, as long as the `with` block lasts.
+
+    Where the notes tell of several, only what is asked for is opened: a mesh that does not answer is no reason to keep
+    somebody from another one.
+
+    Args:
+        endpoints: Zenoh endpoints to connect to; without any, the notes of this user's meshes on this host tell.
+        timeout_s: the deadline of every wait in s.
+
+    Attributes:
+        silent: why meshes that have a note are not among `all`.
+    """
+
+    def __init__(self, endpoints: Sequence[str], timeout_s: float) -> None:
+        self.silent: list[FmuMeshError] = []
+        self._endpoints = tuple(endpoints)
+        self._timeout_s = timeout_s
+        self._found: list[_Found] = []
+        self._openings: dict[tuple[str, ...], _Opening] = {}
+
+    def __enter__(self) -> Self:
+        """Connect.
+
+        Raises:
+            DeadlineExceeded: an endpoint does not answer.
+        """
+        try:
+            self.look()
+        except BaseException:
+            self._close()
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._close()
+
+    def look(self) -> None:
+        """Look which meshes there are now.
+
+        Raises:
+            DeadlineExceeded: an endpoint does not answer.
+        """
+        self._found = [*(self._shown() if self._endpoints else self._noted())]
+        self._found.sort(key=lambda found: found.keys.mesh)
+
+    @contextmanager
+    def changes(self) -> Iterator[Callable[[float], None]]:
+        """While inside, a function that waits until there may be other meshes, for some seconds at most."""
+        changed = threading.Event()
+
+        def wait(left_s: float) -> None:
+            # Nobody tells of a note; of a token somebody does, but an answer about it may still have been empty.
+            changed.wait(min(left_s, _AGAIN_S if self._endpoints else _LOOK_S))
+            changed.clear()
+
+        with ExitStack() as stack:
+            if self._endpoints:
+                liveliness = self._open(self._endpoints, _NOBODY).session().liveliness()
+                watcher = liveliness.declare_subscriber(_TOKENS, lambda _token: changed.set(), history=True)
+                stack.callback(watcher.undeclare)
+            yield wait
+
+    def appeared(self, mesh: str | None) -> MeshClient | None:
+        """The mesh with this name or key, or the only one; None if there is none.
+
+        Raises:
+            ConfigurationError: there are several.
+            DeadlineExceeded: it does not answer.
+        """
+        if mesh is None:
+            return self.one(None) if self._found else None
+        return self.named(mesh) if any(found.is_called(mesh) for found in self._found) else None
+
+    def all(self) -> list[MeshClient]:
+        """All meshes that answer, at least one.
+
+        Raises:
+            ConfigurationError: there is none.
+            DeadlineExceeded: none of them answers.
+        """
+        clients: list[MeshClient] = []
+        self.silent = []
+        running = self._running()
+        for found in running:
+            found.opening.start()
+        for found in running:
+            try:
+                clients.append(self._client(found))
+            except FmuMeshError as error:
+                self.silent.append(error)
+        if not clients:
+            raise self.silent[0]
+        return clients
+
+    def answers(
+        self, clients: Sequence[MeshClient], question: Callable[[MeshClient], Answer]
+    ) -> list[tuple[MeshClient, Answer]]:
+        """What those of some meshes answer that do, at least one; the others join the `silent` ones.
+
+        Raises:
+            FmuMeshError: none of them answers.
+        """
+        answers: list[tuple[MeshClient, Answer]] = []
+        for client in clients:
+            try:
+                answers.append((client, question(client)))
+            except FmuMeshError as error:
+                self.silent.append(error)
+        if not answers:
+            raise self.silent.pop()
+        return answers
+
+    def one(self, reference: str | None) -> MeshClient:
+        """The mesh that a reference (a key, a name, or nothing) means.
+
+        Raises:
+            ConfigurationError: there is none, or more than one.
+            DeadlineExceeded: it does not answer.
+        """
+        running = self._running()
+        if reference is not None:
+            named = [found for found in running if _means(found.keys, reference)]
+            if len(named) == 1:
+                return self._client(named[0])
+            if not named and any(is_key(reference, found.keys) for found in running):
+                raise _not_running(reference, running)
+        if len(running) == 1:
+            return self._client(running[0])
+        if len({found.keys.root for found in running}) < len(running):
+            raise _same_name(running, listed([found.keys.mesh for found in running]))
+        raise ConfigurationError(
+            f"{len(running)} meshes are running: {listed([found.keys.mesh for found in running])}.",
+            hint=f"Say which one by a full key, such as '{running[0].keys.root}/INSTANCE/out/VARIABLE'.",
+        )
+
+    def named(self, mesh: str) -> MeshClient:
+        """The mesh with this name, or with this key.
+
+        Raises:
+            ConfigurationError: there is none, or more than one.
+            DeadlineExceeded: it does not answer.
+        """
+        running = self._running()
+        named = [found for found in running if found.is_called(mesh)]
+        if len(named) == 1:
+            return self._client(named[0])
+        if named:
+            roots = listed([found.keys.root for found in named])
+            if len({found.keys.root for found in named}) < len(named):
+                raise _same_name(named, roots)
+            raise ConfigurationError(f"{len(named)} meshes are named '{mesh}': {roots}.", hint="Give the key.")
+        raise _not_running(mesh, running)
+
+    def _running(self) -> list[_Found]:
+        """What was found, at least one.
+
+        Raises:
+            ConfigurationError: there is none.
+        """
+        if (absence := self.absence) is not None:
+            raise absence
+        return self._found
+
+    @property
+    def absence(self) -> ConfigurationError | None:
+        """What to say where no mesh was found; None if one was."""
+        if self._found:
+            return None
+        if self._endpoints:
+            return ConfigurationError(f"no mesh can be reached at {', '.join(self._endpoints)}.")
+        return ConfigurationError(
+            "no mesh is running here.", hint="Start one with `fmu-mesh launch CONFIG`, or reach another with --connect."
+        )
+
+    def _noted(self) -> Iterator[_Found]:
+        """Every mesh of this user on this host."""
+        for note in meshes():
+            opening = self._open(note.endpoints, f"mesh '{note.mesh}' did not answer")
+            yield _Found(Keys(note.key_prefix, note.mesh), note.endpoints, opening)
+
+    def _shown(self) -> Iterator[_Found]:
+        """Every mesh whose master shows at the endpoints."""
+        opening = self._open(self._endpoints, _NOBODY)
+        for key in tokens(opening.session(), _TOKENS, self._timeout_s):
+            *prefix, mesh, _ = key.split("/")
+            if prefix:  # otherwise it is a token of something else
+                yield _Found(Keys("/".join(prefix), mesh), self._endpoints, opening)
+
+    def _open(self, endpoints: tuple[str, ...], else_: str) -> _Opening:
+        """The session with these endpoints; there is one, however often it is asked for."""
+        return self._openings.setdefault(endpoints, _Opening(endpoints, else_, self._timeout_s))
+
+    def _client(self, found: _Found) -> MeshClient:
+        return MeshClient(found.opening.session(), found.keys, found.endpoints, self._timeout_s)
+
+    def _close(self) -> None:
+        for opening in self._openings.values():
+            opening.close()
+
+
+class _Opening:
+    """A session in client mode that is opened when it is wanted.
+
+    On a thread: several are opened at the same time. It comes back soon after the deadline; a process that ended while
+    it was still inside Zenoh could be aborted by that.
+
+    Args:
+        endpoints: where.
+        else_: what to say when it is not open in time.
+        timeout_s: from its start on, in s.
+    """
+
+    def __init__(self, endpoints: Sequence[str], else_: str, timeout_s: float) -> None:
+        self._endpoints = tuple(endpoints)
+        self._else = else_
+        self._timeout_s = timeout_s
+        self._end = 0.0
+        self._sessions: list[zenoh.Session] = []
+        self._errors: list[FmuMeshError] = []
+        self._late = False
+        self._thread: threading.Thread | None = None
+
+    def start(self) -> None:
+        """Begin to open it, if that has not begun."""
+        if self._thread is None:
+            self._end = time.monotonic() + self._timeout_s
+            self._thread = threading.Thread(target=self._run, name="open", daemon=True)
+            self._thread.start()
+
+    def session(self) -> zenoh.Session:
+        """The session, as soon as it is open.
+
+        Raises:
+            FmuMeshError: it cannot be opened, or not in time.
+        """
+        self.start()
+        self._join()
+        if self._sessions:
+            return self._sessions[0]
+        if self._errors and not self._late:
+            raise self._errors[0]
+        where = ", ".join(self._endpoints)
+        raise DeadlineExceeded(
+            f"{self._else} at {where} within {self._timeout_s:g} s.",
+            hint="`launch` and `ls` show where a mesh can be reached, on the host where it runs.",
+        )
+
+    def close(self) -> None:
+        """Close it if it is open."""
+        self._join()
+        for session in self._sessions:
+            close_session(session)
+
+    def _join(self) -> None:
+        if self._thread is not None:
+            self._thread.join(max(0.0, self._end + _GRACE_S - time.monotonic()))
+
+    def _run(self) -> None:
+        try:
+            wiring = Wiring(mode="client", connect=self._endpoints, patience_s=self._timeout_s)
+            self._sessions.append(open_session(wiring))
+        except FmuMeshError as error:
+            self._errors.append(error)
+            self._late = time.monotonic() >= self._end
+
+
+class _Found(NamedTuple):
+    """A mesh, and how it is reached."""
+
+    keys: Keys
+    endpoints: tuple[str, ...]
+    opening: _Opening
+
+    def is_called(self, mesh: str) -> bool:
+        """Whether this is its name, or its key."""
+        return mesh in (self.keys.mesh, self.keys.root)
+
+
+def _means(keys: Keys, reference: str) -> bool:
+    """Whether a reference says that it is about this mesh."""
+    if reference in (keys.mesh, keys.root):
+        return True
+    return is_key(reference, keys) and key_expression(reference).intersects(zenoh.KeyExpr(f"{keys.root}/**"))
+
+
+def _same_name(found: Sequence[_Found], names: str) -> ConfigurationError:
+    """Meshes that no name and no key tells apart, such as one that was launched twice."""
+    where = ", ".join(endpoint for one in found for endpoint in one.endpoints[:1])
+    return ConfigurationError(
+        f"{len(found)} meshes are running: {names}.", hint=f"Say which one by --connect and its endpoint: {where}."
+    )
+
+
+def _not_running(reference: str, running: Sequence[_Found]) -> ConfigurationError:
+    names = [name for found in running for name in (found.keys.mesh, found.keys.root)]
+    suggestion = nearest(reference, names)
+    hint = (
+        f"Did you mean '{suggestion}'?"
+        if suggestion is not None
+        else f"Running: {listed([found.keys.mesh for found in running])}."
+    )
+    return ConfigurationError(f"no mesh '{reference}' is running.", hint=hint)

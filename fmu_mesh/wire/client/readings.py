@@ -1,0 +1,93 @@
+"""Values of variables as a tool receives them: which variable, and at which point."""
+
+from __future__ import annotations
+
+import queue
+from collections.abc import Iterator
+from typing import Any, TypeVar
+
+import msgspec
+import zenoh
+
+from ...errors import MessageRefused
+from ...variables.model_description import PlainValue
+from ..messages import decode_json
+from ..values import decode_stamp
+from ..views import VariableView
+
+__all__ = ["Keeper", "Reading", "Target", "latecomers", "reading_of"]
+
+_WAITING_SAMPLES = 1 << 16
+_LOOKS = 5
+_LOOK_S = 0.05
+
+Item = TypeVar("Item")
+
+
+class Target(msgspec.Struct, frozen=True):
+    """One variable of the mesh, and the key where its value is."""
+
+    instance: str
+    key: str
+    variable: VariableView
+
+
+class Reading(msgspec.Struct, frozen=True, omit_defaults=True):
+    """One value as it came, with its communication point and the time of that in s."""
+
+    key: str
+    instance: str
+    variable: str
+    value: PlainValue
+    point: int
+    time: float
+    unit: str | None = None
+
+
+def reading_of(target: Target, sample: zenoh.Sample) -> Reading | None:
+    """A sample as a value; None if it has no point, as what somebody else puts on the key of an input."""
+    if sample.attachment is None:
+        return None
+    try:
+        stamp = decode_stamp(sample.attachment.to_bytes())
+        value: Any = decode_json(sample.payload.to_bytes(), object)
+    except MessageRefused:
+        return None
+    view = target.variable
+    return Reading(target.key, target.instance, view.name, value, stamp.point, stamp.time, view.unit)
+
+
+class Keeper:
+    """Puts the samples of one subscriber into the queue of all.
+
+    A reader that falls far behind loses samples: this runs on a thread of Zenoh, which must not wait for it.
+    """
+
+    def __init__(self, target: Target, arrived: queue.SimpleQueue[Reading | None]) -> None:
+        self._target = target
+        self._arrived = arrived
+
+    def keep(self, sample: zenoh.Sample) -> None:
+        """The subscriber's callback."""
+        if str(sample.key_expr) != self._target.key or self._arrived.qsize() >= _WAITING_SAMPLES:
+            return
+        if (reading := reading_of(self._target, sample)) is not None:
+            self._arrived.put(reading)
+
+
+def latecomers(arrived: queue.SimpleQueue[Item]) -> Iterator[Item]:
+    """What still comes after the master's token has gone, until nothing has come for a quarter of a second.
+
+    Zenoh tells of the token before samples that were sent earlier: it goes ahead of them on the way, by its priority,
+    and here, where each subscriber has a thread of its own. Looks are counted, not time: a process that had no
+    processor meanwhile has not looked.
+    """
+    looks = 0
+    while looks < _LOOKS:
+        try:
+            item = arrived.get(timeout=_LOOK_S)
+        except queue.Empty:
+            looks += 1
+        else:
+            looks = 0
+            yield item

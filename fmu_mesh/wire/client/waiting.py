@@ -1,0 +1,112 @@
+"""Waiting for a running mesh: until it rests, or is in a state, from before it is there."""
+
+from __future__ import annotations
+
+import time
+from typing import Final
+
+from msgspec.structs import replace
+
+from ...errors import DeadlineExceeded, FmuMeshError, MeshLost, from_report
+from ..views import Command, CommandAnswer, MeshState, MeshStatus
+from .mesh_client import MeshClient
+from .reaching import Meshes
+
+__all__ = ["rest", "wait_for"]
+
+_RANKS: Final[dict[MeshState, int]] = {
+    "starting": 0,
+    "initializing": 1,
+    "running": 2,
+    "paused": 2,
+    "stopping": 3,
+    "done": 4,
+    "failed": 4,
+}
+_GOES_AND_RESTS: Final = 2
+"""A mesh goes from a state of this rank to the other one and back."""
+
+
+def rest(client: MeshClient, command: Command) -> CommandAnswer:
+    """Pause or step a mesh; the answer comes when it rests, and its point is the one where it does.
+
+    Raises:
+        ConfigurationError: it refused.
+        MeshLost: it ends or is resumed before, or does not rest in time.
+        FmuMeshError: it has failed before.
+    """
+    mesh, what, last = client.keys.mesh, "come to rest", None
+    with client.statuses() as statuses:  # from before the command, so that the last one of a short run is not missed
+        answer, holds = client.command(command), False
+        try:
+            for last in statuses:
+                holds = holds or last.state == "paused"
+                if last.state in ("stopping", "done", "failed") or (holds and last.state != "paused"):
+                    raise _ended(last, what)
+                if holds and (answer.hold is None or last.point >= answer.hold):
+                    return replace(answer, point=last.point)
+        except DeadlineExceeded:
+            at = (last or answer).point
+            text = f"mesh '{mesh}' is at point {at}, on its way to point {answer.hold}, where it is going to rest."
+            raise DeadlineExceeded(text, hint="--timeout waits longer.") from None
+    raise _gone(mesh, what)
+
+
+def wait_for(meshes: Meshes, mesh: str | None, state: MeshState, timeout_s: float) -> MeshStatus:
+    """The first status in which a mesh is in a state.
+
+    Args:
+        meshes: where it is looked for.
+        mesh: its name or key; None for the only one.
+        state: as `status` names it.
+        timeout_s: from now on, in s.
+
+    Raises:
+        ConfigurationError: there are several.
+        MeshLost: it is not there, or not in this state, in time; or it has ended and will not be.
+        FmuMeshError: it has failed.
+    """
+    end = time.monotonic() + timeout_s
+    with meshes.changes() as wait:
+        while (left_s := end - time.monotonic()) > 0:
+            meshes.look()
+            if (client := meshes.appeared(mesh)) is not None:
+                return _in_state(client, state, end - time.monotonic())
+            wait(left_s)
+    who = f"mesh '{mesh}'" if mesh is not None else "mesh"
+    raise DeadlineExceeded(f"there is no {who} after {timeout_s:g} s.", hint="--timeout waits longer.")
+
+
+def _in_state(client: MeshClient, state: MeshState, timeout_s: float) -> MeshStatus:
+    """The first status in which a mesh that is there is in a state."""
+    mesh, last = client.keys.mesh, None
+    with client.statuses(timeout_s) as statuses:
+        try:
+            for last in statuses:
+                if last.state == state:
+                    return last
+                if not _can_become(last.state, state):
+                    raise _ended(last, f"become {state}")
+        except DeadlineExceeded:
+            now = last.state if last is not None else "silent"
+            text = f"mesh '{mesh}' is {now}, and was not {state} in time."
+            raise DeadlineExceeded(text, hint="--timeout waits longer.") from None
+    raise _gone(mesh, f"become {state}")
+
+
+def _can_become(state: MeshState, wanted: MeshState) -> bool:
+    """Whether a mesh that is in a state can come to another one."""
+    return _RANKS[wanted] > _RANKS[state] or _RANKS[wanted] == _RANKS[state] == _GOES_AND_RESTS
+
+
+def _ended(status: MeshStatus, what: str) -> FmuMeshError:
+    """Why a mesh has not come to what somebody waits for."""
+    if status.error is None:
+        return MeshLost(f"mesh '{status.mesh}' is {status.state} at point {status.point}, and does not {what} any more")
+    error = from_report(status.error)
+    error.message = f"mesh '{status.mesh}' has failed and does not {what}: {error.message}"
+    return error
+
+
+def _gone(mesh: str, what: str) -> MeshLost:
+    return MeshLost(f"mesh '{mesh}' is gone, and does not {what} any more")
