@@ -10,8 +10,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ..config.findings import listed, nearest
 from ..errors import CallRefused
+from ..text import listed, nearest
 from ..variables.model_description import Causality, ModelDescription, Value, Variable
 from ..variables.value_conversion import ValueRefused, to_value
 from .times import Instant, RosStamp, RosTime, Time, instant_of

@@ -15,9 +15,9 @@ from typing import Any, Literal, NoReturn
 
 from .. import files
 from ..config.base import ENDPOINT_PATTERN
-from ..config.findings import listed, nearest, nearest_file
 from ..config.mesh import MAX_WINDOW
 from ..errors import ConfigurationError, LoadFailed
+from ..text import listed, nearest, nearest_file
 
 __all__ = ["CommandParser", "add_command", "add_window", "count", "endpoint", "no_fmu", "number", "positive_seconds"]
 

@@ -7,7 +7,6 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from ..config.findings import listed, shown
 from ..config.schema import schema_text
 from ..instances.registry import check_engines
 from ..run.preparing import Options, prepare
@@ -15,6 +14,7 @@ from ..system.grouping import automatic_nodes
 from ..system.initialization_plan import Loop
 from ..system.plan import Plan
 from ..system.system import Connection, SystemInstance
+from ..text import listed, shown
 from ..variables.model_description import Variable
 from .arguments import add_command, add_window
 from .output.display import say

@@ -14,9 +14,9 @@ from typing import Any, Final
 
 import msgspec
 
-from ..config.findings import nearest, shown
 from ..errors import ConfigurationError, LoadFailed
 from ..instances.fmi import read_description, sha256_of
+from ..text import nearest, shown
 from ..variables.model_description import Causality, Kind, ModelDescription, Variable
 from .arguments import add_command, no_fmu
 from .output.tables import pairs

@@ -10,8 +10,8 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
 from .. import __version__
-from ..config.findings import nearest
 from ..errors import ConfigurationError, FmuMeshError, Interrupted
+from ..text import nearest
 from . import checking, free_running, inspecting, looking, play, plotting, running, top
 from .arguments import CommandParser
 from .limits import address_space_problem, needed_mib, out_of_memory

@@ -14,10 +14,10 @@ from typing import Any, TextIO
 
 import numpy as np
 
-from ..config.findings import listed, nearest, nearest_file
 from ..errors import ConfigurationError, FmuMeshError
 from ..system.plan import Plan
 from ..system.system import System
+from ..text import listed, nearest, nearest_file
 from ..variables.model_description import Variable
 from ..variables.value_types import is_float
 from .arguments import add_command

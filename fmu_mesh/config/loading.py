@@ -13,12 +13,13 @@ from pathlib import Path
 import msgspec
 from msgspec import inspect
 
-from fmu_mesh.config.findings import Findings, listed, locate, nearest, nearest_file, shown
+from fmu_mesh.config.findings import Findings, locate
 from fmu_mesh.config.mesh import KIND, Config
 from fmu_mesh.config.salvage import salvage
 from fmu_mesh.config.structure import check
 from fmu_mesh.config.yaml_text import Plain, read
 from fmu_mesh.errors import Finding
+from fmu_mesh.text import listed, nearest, nearest_file, shown
 
 __all__ = ["MAXIMUM_BYTES", "LoadedConfig", "examine", "load", "parse"]
 

@@ -14,8 +14,9 @@ from types import NoneType
 
 from msgspec import inspect
 
-from fmu_mesh.config.findings import Findings, listed, nearest, shown
+from fmu_mesh.config.findings import Findings
 from fmu_mesh.config.yaml_text import Plain
+from fmu_mesh.text import listed, nearest, shown
 
 __all__ = ["check", "describe"]
 

@@ -26,8 +26,9 @@ from ruamel.yaml.events import (
     StreamEndEvent,
 )
 
-from fmu_mesh.config.findings import Findings, shown
+from fmu_mesh.config.findings import Findings
 from fmu_mesh.config.yaml_errors import in_words
+from fmu_mesh.text import shown
 
 __all__ = ["MAXIMUM_DEPTH", "MAXIMUM_VALUES", "Plain", "read"]
 

@@ -11,11 +11,12 @@ from pathlib import Path
 import msgspec
 
 from .. import files
-from ..config.findings import Findings, listed
+from ..config.findings import Findings
 from ..config.mesh import AnyInstanceConfig, GazeboClassicConfig, MujocoConfig, PidConfig
 from ..errors import ConfigurationError, LoadFailed
 from ..system.plan import InstancePlan
 from ..system.system import System
+from ..text import listed
 from ..variables.model_description import ModelDescription
 from .contract import Instance
 from .fmi import FmuInstance, LogMessage, Terms, compile_sources, content_of, read_description

@@ -11,9 +11,9 @@ from collections.abc import Callable, Collection, Sequence
 
 from ..errors import DeadlineExceeded
 from ..rings.array_elements import element_of, merged, scaled
-from ..rings.ring import Column
 from ..system.algebraic_loop import FixedPoint
 from ..system.initialization_plan import Loop
+from ..system.layout import Column
 from ..system.plan import Link, NodePlan
 from ..variables.value_types import Value, split_element
 from ..wire.frames import initial_values, needed_levels

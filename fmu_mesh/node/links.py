@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 from ..errors import FmuMeshError
-from ..rings.ring import Layout, Ring
+from ..rings.ring import Ring
+from ..system.layout import Layout
 from ..system.plan import RECORDER, Link
 from ..system.window import lazy_frame_rows
 from ..variables.value_types import Value

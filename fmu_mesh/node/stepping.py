@@ -13,9 +13,10 @@ from time import perf_counter
 from ..instances.call_guard import DEFAULT_MODE, floating_point_changed, restore_floating_point
 from ..instances.contract import Instance
 from ..rings.array_elements import fill_unconnected
-from ..rings.ring import Layout, Ring
+from ..rings.ring import Ring
 from ..rings.transfer import Transfer
 from ..simtime import TimeGrid
+from ..system.layout import Layout
 from ..system.plan import InstancePlan
 from ..wire.frames import FrameReceiver
 from .links import OutLink

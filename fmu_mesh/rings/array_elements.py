@@ -7,8 +7,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
+from ..system.layout import Column, Layout
 from ..variables.value_types import Value
-from .ring import Column, Layout, Ring
+from .ring import Ring
 
 __all__ = ["element_of", "fill_unconnected", "merged", "scaled"]
 

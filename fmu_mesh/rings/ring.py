@@ -1,147 +1,24 @@
-"""Rings: the preallocated rows in which values wait between an FMU, a frame and an FMU.
+"""Rings: the preallocated rows in which values wait between an instance, a frame and another instance.
 
-A row holds the values of one instance at one of its own steps; row ``n`` lives in slot ``n & mask``. Owns the memory
-layout and nothing else: no FMI, no Zenoh.
+Row ``n`` lives in slot ``n & mask``. Owns the memory and nothing else: no FMI, no Zenoh.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import Any
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from ..variables.model_description import Variable
-from ..variables.value_types import (
-    DTYPES,
-    TYPES,
-    Value,
-    VariableType,
-    element_names,
-    flattened,
-    is_text,
-    nested,
-    split_element,
-    zero,
-)
+from ..system.layout import Layout, Place
+from ..variables.value_types import DTYPES, Value, VariableType, flattened, nested, zero
 
-__all__ = ["Column", "Layout", "Part", "Place", "Ring", "Rows", "rows_for"]
+__all__ = ["Ring", "Rows"]
 
 Rows = tuple[NDArray[Any], ...]
 """Consecutive rows: one array of shape (rows, elements) for each part of a layout."""
-
-_TEXT_BYTES = 64
-"""What a String or Binary is taken for where memory and frames are planned, if it does not say how long it can be."""
-
-
-class Column(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One variable in a row; an array takes as many neighbouring elements as it has, row by row."""
-
-    name: str
-    type: VariableType
-    shape: tuple[int, ...] = ()
-    max_size: int | None = None
-
-    @property
-    def size(self) -> int:
-        """How many elements it has."""
-        return math.prod(self.shape)
-
-    @property
-    def elements(self) -> tuple[str, ...]:
-        """The names of its elements, as `y[1,2]`; of a scalar, its own name."""
-        return element_names(self.name, self.shape)
-
-
-class Part(NamedTuple):
-    """The columns of one type, which lie in one array.
-
-    Attributes:
-        width: how many elements they have together.
-    """
-
-    type: VariableType
-    columns: tuple[Column, ...]
-    width: int
-
-
-class Place(NamedTuple):
-    """Where a variable, or one element of an array, lies in a row: elements ``first .. first + size - 1`` of a part."""
-
-    part: int
-    first: int
-    size: int
-    shape: tuple[int, ...]
-
-
-class Layout(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The columns of a row, those of each type together: first Float64, then the others in the order of `TYPES`.
-
-    Make it by `of`, which puts the columns in that order.
-    """
-
-    columns: tuple[Column, ...] = ()
-
-    @classmethod
-    def of(
-        cls, columns: Iterable[tuple[str, VariableType] | tuple[str, VariableType, tuple[int, ...]] | Variable]
-    ) -> Layout:
-        """The layout that holds these variables, or (name, type) or (name, type, shape), in their order per type."""
-        made = [Column(c.name, c.type, c.shape, c.max_size) if isinstance(c, Variable) else Column(*c) for c in columns]
-        return cls(tuple(sorted(made, key=lambda column: TYPES.index(column.type))))
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """All column names, Float64 ones first."""
-        return tuple(column.name for column in self.columns)
-
-    @property
-    def row_size(self) -> int:
-        """Size of one row in bytes when packed; for String and Binary an estimate."""
-        return sum(
-            column.size * (column.max_size or _TEXT_BYTES if is_text(column.type) else _itemsize(column.type))
-            for column in self.columns
-        )
-
-    @property
-    def parts(self) -> tuple[Part, ...]:
-        """The parts that have columns, in the order in which they lie in memory and in a frame."""
-        by_type: dict[VariableType, list[Column]] = {}
-        for column in self.columns:
-            by_type.setdefault(column.type, []).append(column)
-        return tuple(Part(type_, tuple(own), sum(c.size for c in own)) for type_, own in by_type.items())
-
-    def column(self, name: str) -> Column:
-        """The column of a variable, or of the array that ``name`` is an element of.
-
-        Raises:
-            KeyError: there is none.
-        """
-        by_name = {column.name: column for column in self.columns}
-        if name not in by_name and (parts := split_element(name)) is not None:
-            return by_name[parts[0]]
-        return by_name[name]
-
-    def place(self, name: str) -> Place:
-        """Where a variable lies, or an element of an array such as `y[2]`; a variable of that very name comes first.
-
-        Raises:
-            KeyError: there is no such column.
-        """
-        wanted = self.column(name)
-        for number, part in enumerate(self.parts):
-            first = 0
-            for column in part.columns:
-                if column == wanted:
-                    if name == column.name:
-                        return Place(number, first, column.size, column.shape)
-                    _, index = split_element(name) or ("", ())
-                    return Place(number, first + int(np.ravel_multi_index(index, column.shape)), 1, ())
-                first += column.size
-        raise KeyError(name)
 
 
 class Ring:
@@ -225,12 +102,3 @@ class Ring:
         if name not in self._places:
             self._places[name] = self.layout.place(name)
         return self._places[name]
-
-
-def rows_for(window: int) -> int:
-    """Rows that a ring needs so that no row is overwritten while a node runs ``window`` points ahead."""
-    return 1 << (window + 3).bit_length()
-
-
-def _itemsize(type_: VariableType) -> int:
-    return np.dtype(DTYPES[type_]).itemsize

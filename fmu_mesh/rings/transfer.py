@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..system.layout import Layout
 from ..system.plan import Feed
-from .ring import Layout, Ring, Rows
+from .ring import Ring, Rows
 
 __all__ = ["Transfer"]
 

@@ -28,10 +28,11 @@ from ..recorder.csv_file import CsvFile
 from ..recorder.result_file import OpenResult
 from ..recorder.row_buffer import RowBuffer
 from ..rings.array_elements import scaled
-from ..rings.ring import Layout, Ring
+from ..rings.ring import Ring
 from ..simtime import TimeGrid
 from ..system.algebraic_loop import FixedPoint
 from ..system.initialization_plan import Loop, Tear
+from ..system.layout import Layout
 from ..system.plan import Plan
 from ..variables.value_types import Value
 from .results import what_is_kept

@@ -10,7 +10,7 @@ import msgspec
 from msgspec.structs import replace
 
 from .. import files
-from ..config.findings import Findings, nearest_file
+from ..config.findings import Findings
 from ..config.loading import LoadedConfig, examine
 from ..config.mesh import AnyInstanceConfig, GazeboClassicConfig, InstanceConfig, MujocoConfig, PidConfig, ZenohConfig
 from ..errors import Finding, LoadFailed
@@ -19,6 +19,7 @@ from ..instances.registry import Showing, check_showing, content, describe, expe
 from ..ros.gateway.mapping import resolve as resolve_ros
 from ..system.plan import Plan, make_plan
 from ..system.system import build
+from ..text import nearest_file
 from ..variables.model_description import ModelDescription
 from .results import check_results
 

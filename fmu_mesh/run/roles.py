@@ -15,7 +15,6 @@ from pathlib import Path
 
 import msgspec
 
-from ..config.findings import listed, nearest
 from ..config.loading import load
 from ..errors import ConfigurationError, FmuError, FmuMeshError, StepFailed
 from ..instances.call_guard import CallWatch, Guarded
@@ -27,6 +26,7 @@ from ..master.master import Master
 from ..node.node import Node
 from ..recorder.recorder import Recorder
 from ..system.plan import RECORDER, NodePlan, Plan
+from ..text import listed, nearest
 from ..wire.keys import MASTER
 from ..wire.runtime import (
     MeshNote,

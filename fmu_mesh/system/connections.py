@@ -13,8 +13,9 @@ from typing import Literal
 import msgspec
 from msgspec.structs import replace
 
-from fmu_mesh.config.findings import Findings, listed, nearest
+from fmu_mesh.config.findings import Findings
 from fmu_mesh.config.mesh import ConnectionConfig
+from fmu_mesh.text import listed, nearest
 from fmu_mesh.variables.model_description import ModelDescription, Variable
 from fmu_mesh.variables.units import Linear, conversion
 from fmu_mesh.variables.value_types import FMI2_TYPES, TYPES, VariableType, element_name, is_float, split_element, takes

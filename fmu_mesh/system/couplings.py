@@ -13,8 +13,9 @@ from typing import Literal
 import msgspec
 from msgspec.structs import replace
 
-from ..config.findings import Findings, listed, nearest
+from ..config.findings import Findings
 from ..config.mesh import ActuatorConfig, Config, ControllerConfig, EngineConfig, FluidDynamicsConfig
+from ..text import listed, nearest
 from ..variables.model_description import Variable
 from .connections import Connection, Variables
 

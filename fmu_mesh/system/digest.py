@@ -13,7 +13,7 @@ from collections.abc import Iterable, Mapping
 import msgspec
 
 from .. import __version__
-from ..config.findings import listed
+from ..text import listed
 
 __all__ = ["difference", "digest_of"]
 

@@ -22,8 +22,6 @@ from ..config.mesh import (
     TimeoutsConfig,
 )
 from ..errors import ConfigurationError, Finding
-from ..instances.contract import StepOptions
-from ..rings.ring import Layout, rows_for
 from ..simtime import TimeGrid
 from ..variables.model_description import HostKind, Kind
 from ..variables.value_conversion import to_plain
@@ -31,7 +29,8 @@ from ..variables.value_types import PlainValue
 from .digest import digest_of
 from .graph import cycle_through, feedback_edges, strongly_connected, topological_order
 from .initialization_plan import InitializationPlan, Loop, plan_initialization
-from .step_options import linear_inputs
+from .layout import Layout, rows_for
+from .step_options import StepOptions, linear_inputs
 from .system import Connection, System, SystemInstance
 from .window import LAZY_ROWS, recorder_window, window_of
 

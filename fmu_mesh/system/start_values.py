@@ -9,8 +9,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Final
 
-from fmu_mesh.config.findings import Findings, listed, nearest, shown
+from fmu_mesh.config.findings import Findings
 from fmu_mesh.config.mesh import AnyInstanceConfig, Config, InstanceConfig
+from fmu_mesh.text import listed, nearest, shown
 from fmu_mesh.variables.model_description import ModelDescription, Value, Variable
 from fmu_mesh.variables.value_conversion import ValueRefused, to_value
 from fmu_mesh.variables.value_types import MAX_ELEMENTS

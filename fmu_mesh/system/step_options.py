@@ -7,16 +7,62 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import Literal
+
+import msgspec
 
 from ..config.findings import Findings
 from ..config.mesh import AnyInstanceConfig, InstanceConfig
-from ..instances.contract import LinearInput, SolverSettings, StepOptions
 from ..variables.model_description import ModelDescription
 from .connections import Connection
 
-__all__ = ["capability_warnings", "check_extrapolation", "linear_inputs", "resolve_step_options"]
+__all__ = [
+    "LinearInput",
+    "SolverSettings",
+    "StepOptions",
+    "capability_warnings",
+    "check_extrapolation",
+    "linear_inputs",
+    "resolve_step_options",
+]
 
 _DEFAULT_TOLERANCE = 1e-6
+
+
+class SolverSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """How the continuous states of a model-exchange FMU are solved.
+
+    Attributes:
+        relative_tolerance: of the local error; the absolute ones are this times the nominal values of the states.
+        maximum_step_size: in s; None: at most the communication step.
+    """
+
+    name: Literal["cvode", "euler"] = "cvode"
+    relative_tolerance: float = 1e-6
+    maximum_step_size: float | None = None
+
+
+class LinearInput(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """An input that changes linearly within a step, and the delay of its connection (0 or 1)."""
+
+    name: str
+    delay: int
+
+
+class StepOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """How one instance is stepped; what its FMU cannot do has been refused before.
+
+    Attributes:
+        solver: of a model-exchange FMU.
+        tolerance: relative tolerance that a co-simulation FMU is told; None: that of its default experiment.
+        retry_discarded_steps: whether a step that the FMU discards is tried again in smaller ones.
+        linear_inputs: the inputs whose connections are extrapolated.
+    """
+
+    solver: SolverSettings = SolverSettings()
+    tolerance: float | None = None
+    retry_discarded_steps: bool = False
+    linear_inputs: tuple[LinearInput, ...] = ()
 
 
 def resolve_step_options(

@@ -13,11 +13,10 @@ import msgspec
 from msgspec.structs import replace
 
 from fmu_mesh import files
-from fmu_mesh.config.findings import Findings, nearest_file, shown
+from fmu_mesh.config.findings import Findings
 from fmu_mesh.config.loading import LoadedConfig
 from fmu_mesh.config.mesh import AnyInstanceConfig, Config, HostConfig, InstanceConfig
 from fmu_mesh.errors import Finding
-from fmu_mesh.instances.contract import StepOptions
 from fmu_mesh.simtime import ENDLESS, TimeGrid, steps_between
 from fmu_mesh.system.connections import (
     Connection,
@@ -29,7 +28,8 @@ from fmu_mesh.system.connections import (
 from fmu_mesh.system.couplings import coupled_connections
 from fmu_mesh.system.grouping import automatic_nodes
 from fmu_mesh.system.start_values import forbidden_start_values, resolve_start_values, sized
-from fmu_mesh.system.step_options import capability_warnings, check_extrapolation, resolve_step_options
+from fmu_mesh.system.step_options import StepOptions, capability_warnings, check_extrapolation, resolve_step_options
+from fmu_mesh.text import nearest_file, shown
 from fmu_mesh.variables.model_description import ModelDescription, Value
 from fmu_mesh.variables.value_types import element_name, is_text
 

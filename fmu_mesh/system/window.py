@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from ..rings.ring import Layout
+from .layout import Layout
 from .system import System
 
 __all__ = [

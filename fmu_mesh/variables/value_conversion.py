@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ..config.findings import listed, nearest
+from ..text import listed, nearest
 from .model_description import Variable
 from .value_types import INTEGERS, PlainValue, Value, nested
 

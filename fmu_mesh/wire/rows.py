@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FmuMeshError, MessageRefused
-from ..rings.ring import Part, Rows
+from ..rings.ring import Rows
+from ..system.layout import Part
 from ..variables.value_types import DTYPES, VariableType, is_text
 from .messages import HEADER, MAX_MESSAGE_SIZE
 

@@ -7,8 +7,9 @@ from pathlib import Path
 
 from fmu_mesh.config.mesh import MujocoConfig
 from fmu_mesh.instances.mujoco import MujocoInstance, Picture
-from fmu_mesh.rings.ring import Layout, Ring
+from fmu_mesh.rings.ring import Ring
 from fmu_mesh.simtime import TimeGrid
+from fmu_mesh.system.layout import Layout
 
 __all__ = ["Driven", "body", "slider", "write_world"]
 

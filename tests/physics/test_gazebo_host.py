@@ -18,10 +18,11 @@ from fmu_mesh.config.mesh import ActuatorConfig, GazeboClassicConfig
 from fmu_mesh.errors import FmuError, InitializationFailed, LoadFailed, StepFailed
 from fmu_mesh.instances.gazebo import GazeboClassicInstance, describe_gazebo_world, gazebo_process
 from fmu_mesh.instances.gazebo.gazebo_world import load_gazebo_world
-from fmu_mesh.rings.ring import Layout, Ring
+from fmu_mesh.rings.ring import Ring
 from fmu_mesh.run.local import LocalMesh
 from fmu_mesh.run.preparing import Options, prepare
 from fmu_mesh.simtime import TimeGrid
+from fmu_mesh.system.layout import Layout
 from tests.helpers import FMUS
 
 WORLDS = Path(__file__).resolve().parents[2] / "configs" / "worlds"

@@ -11,12 +11,13 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from fmu_mesh.config.findings import locate, nearest
+from fmu_mesh.config.findings import locate
 from fmu_mesh.config.loading import LoadedConfig, _examine, parse
 from fmu_mesh.config.mesh import MAX_WINDOW, Config, ConnectionConfig, InstanceConfig, SimulationConfig
 from fmu_mesh.config.yaml_text import resolve
 from fmu_mesh.errors import ConfigurationError, Finding
 from fmu_mesh.system.system import build
+from fmu_mesh.text import nearest
 from fmu_mesh.variables.model_description import ModelDescription, Variable
 
 FILE = Path("/nowhere/mesh.yaml")

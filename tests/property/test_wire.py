@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 
 from fmu_mesh.errors import ErrorReport, FmuMeshError, FrameGap, MessageRefused
 from fmu_mesh.recorder.csv_file import CsvFile
-from fmu_mesh.rings.ring import Layout, Ring, Rows
+from fmu_mesh.rings.ring import Ring, Rows
+from fmu_mesh.system.layout import Layout
 from fmu_mesh.system.plan import Link
 from fmu_mesh.variables.model_description import Value, Variable, VariableType
 from fmu_mesh.variables.value_types import DTYPES, INTEGERS, TYPES, is_text, nested

@@ -7,7 +7,8 @@ from typing import Any, cast
 
 from fmu_mesh.node.answering import Answers
 from fmu_mesh.node.stepping import Runner
-from fmu_mesh.rings.ring import Layout, Ring
+from fmu_mesh.rings.ring import Ring
+from fmu_mesh.system.layout import Layout
 from tests.scenarios.scenario import variable
 
 ROWS = 8

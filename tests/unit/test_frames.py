@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fmu_mesh.errors import FmuMeshError, FrameGap
-from fmu_mesh.rings.ring import Layout
+from fmu_mesh.system.layout import Layout
 from fmu_mesh.system.plan import Link
 from fmu_mesh.wire.frames import FrameReceiver, initial_values, needed_levels
 from fmu_mesh.wire.messages import FRAME, HEADER, INITIAL

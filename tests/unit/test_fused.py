@@ -22,8 +22,9 @@ from fmu_mesh.instances.fmi.co_simulation.fused import (
     fmi3_step,
     fuse,
 )
-from fmu_mesh.rings.ring import Layout, Ring
+from fmu_mesh.rings.ring import Ring
 from fmu_mesh.simtime import TimeGrid
+from fmu_mesh.system.layout import Layout
 from fmu_mesh.variables.value_types import VariableType
 from tests.fmus.helpers import find_fmu
 

@@ -8,8 +8,9 @@ import pytest
 
 from fmu_mesh.errors import StepFailed
 from fmu_mesh.instances.position_pid import PidInstance, describe_pid
-from fmu_mesh.rings.ring import Layout, Ring
+from fmu_mesh.rings.ring import Ring
 from fmu_mesh.simtime import TimeGrid
+from fmu_mesh.system.layout import Layout
 
 INPUTS = ("target", "position", "velocity")
 

@@ -7,7 +7,7 @@ from itertools import pairwise
 import pytest
 
 from fmu_mesh.errors import ConfigurationError
-from fmu_mesh.rings.ring import rows_for
+from fmu_mesh.system.layout import rows_for
 from fmu_mesh.system.plan import RECORDER, Plan, make_plan
 from fmu_mesh.system.window import recorder_window
 from tests.scenarios.scenario import Scenario

@@ -13,13 +13,14 @@ from typing import cast
 import pytest
 
 from fmu_mesh.errors import StepFailed, TerminationRequested
-from fmu_mesh.instances.contract import LinearInput, SolverSettings, StepOptions
 from fmu_mesh.instances.fmi import FmuInstance, open_instance, read_description, stepped
 from fmu_mesh.instances.fmi.co_simulation.extrapolation import LinearInputs
 from fmu_mesh.instances.fmi.co_simulation.fmi3_steps import Fmi3Steps
 from fmu_mesh.instances.fmi.co_simulation.substeps import DISCARD, SMALLEST, take_sub_steps
-from fmu_mesh.rings.ring import Layout, Ring
+from fmu_mesh.rings.ring import Ring
 from fmu_mesh.simtime import TimeGrid
+from fmu_mesh.system.layout import Layout
+from fmu_mesh.system.step_options import LinearInput, SolverSettings, StepOptions
 from fmu_mesh.variables.model_description import Kind, ModelDescription
 from fmu_mesh.variables.value_types import Value
 from tests.fmus.event_fmus import Version

@@ -12,8 +12,9 @@ from fmu_mesh.instances.contract import Instance
 from fmu_mesh.instances.fmi import Fmi2Instance, read_description
 from fmu_mesh.node.inputs import TimedInputs, set_input
 from fmu_mesh.node.stepping import Runner
-from fmu_mesh.rings.ring import Layout, Ring
+from fmu_mesh.rings.ring import Ring
 from fmu_mesh.simtime import TimeGrid
+from fmu_mesh.system.layout import Layout
 from fmu_mesh.system.plan import InstancePlan
 from fmu_mesh.wire.values import ValueRefused, decode_time
 from tests.helpers import FMUS

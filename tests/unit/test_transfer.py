@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fmu_mesh.rings.ring import Layout, Ring
+from fmu_mesh.rings.ring import Ring
 from fmu_mesh.rings.transfer import Transfer
+from fmu_mesh.system.layout import Layout
 from fmu_mesh.system.plan import Feed
 from fmu_mesh.variables.value_types import Value
 

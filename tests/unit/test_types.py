@@ -15,8 +15,9 @@ import pytest
 from fmu_mesh import FMIAdapter
 from fmu_mesh.errors import CallRefused, InitializationFailed, LoadFailed, StepFailed, TerminationRequested
 from fmu_mesh.instances.fmi import FmuInstance, open_instance, read_description
-from fmu_mesh.rings.ring import Layout, Ring
+from fmu_mesh.rings.ring import Ring
 from fmu_mesh.simtime import TimeGrid
+from fmu_mesh.system.layout import Layout
 from fmu_mesh.variables.value_types import INTEGERS, VariableType
 from tests.fmus.helpers import NO_COMPILER, build_test_fmu
 from tests.fmus.packing import repacked

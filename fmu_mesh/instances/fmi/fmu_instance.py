@@ -17,12 +17,13 @@ import msgspec
 from fmpy.fmi1 import FMICallException
 
 from ...errors import InitializationFailed, LoadFailed, StepFailed
-from ...rings.ring import Part, Ring
+from ...rings.ring import Ring
 from ...simtime import TimeGrid
+from ...system.layout import Part
+from ...system.step_options import StepOptions
 from ...variables.model_description import ModelDescription, Variable
 from ...variables.value_conversion import to_value
 from ...variables.value_types import Value, VariableType, flattened, nested
-from ..contract import StepOptions
 from .archive.archive import Terms
 from .archive.sources import extract
 from .buffers import Buffer

@@ -5,8 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Final, cast
 
+from ...system.step_options import StepOptions
 from ...variables.model_description import Kind, ModelDescription
-from ..contract import Instance, StepOptions
+from ..contract import Instance
 from .archive.archive import Terms
 from .co_simulation.extrapolation import LinearInputs, TakesDerivatives
 from .co_simulation.fmi1 import Fmi1Instance

@@ -33,9 +33,9 @@ from typing import Any, Literal
 
 import msgspec
 
-from ...config.findings import listed, nearest
 from ...config.mesh import MujocoConfig
 from ...errors import LoadFailed
+from ...text import listed, nearest
 from ...variables.model_description import Causality, DefaultExperiment, ModelDescription, Variable
 
 __all__ = ["Entry", "Where", "World", "describe_world", "engine", "load_world", "warnings"]

@@ -15,10 +15,10 @@ import numpy as np
 from msgspec.structs import replace
 
 from ... import files
-from ...config.findings import listed, nearest, nearest_file
 from ...config.loading import LoadedConfig
 from ...config.mesh import RosConfig, RosTopicConfig
 from ...errors import ConfigurationError
+from ...text import listed, nearest, nearest_file
 from ...variables.model_description import Value
 from ...variables.value_types import nested
 from ...wire.views import InstanceInfo

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 
-from ...config.findings import Findings, nearest_file
+from ...config.findings import Findings
 from ...config.loading import LoadedConfig
 from ...config.mesh import Config, RosConfig
 from ...errors import ConfigurationError
 from ...system.start_values import sized
+from ...text import nearest_file
 from ..messages.definitions import MessageTypes, is_message_name
 from ..messages.ros_names import topic_problem
 from .resolver import Resolver

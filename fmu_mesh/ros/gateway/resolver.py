@@ -9,9 +9,10 @@ from collections.abc import Iterator, Mapping
 
 from msgspec.structs import replace
 
-from ...config.findings import Findings, listed, nearest
+from ...config.findings import Findings
 from ...config.mesh import Config, RosConfig, RosTopicConfig
 from ...system.driven import driven_inputs
+from ...text import listed, nearest
 from ...variables.model_description import Variable
 from ..messages.definitions import MessageTypes, default_type
 from ..messages.fitting import Entry, check_fields, why_not_carried

@@ -10,8 +10,9 @@ from collections.abc import Mapping
 
 import msgspec
 
-from ...config.findings import Findings, listed, nearest, shown
+from ...config.findings import Findings
 from ...config.mesh import RosTopicConfig
+from ...text import listed, nearest, shown
 from ...variables.model_description import Variable
 from ...variables.value_types import nested
 from ..gateway.topics import Direction, Port, Topic

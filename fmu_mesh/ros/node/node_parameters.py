@@ -10,8 +10,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ...adapter import FMIAdapter
-from ...config.findings import nearest
 from ...errors import CallRefused, ConfigurationError
+from ...text import nearest
 from ...variables.model_description import ModelDescription, Value, Variable
 from ...variables.value_types import nested
 from ..messages.ros_names import NameProblem, name_problems, ros_name

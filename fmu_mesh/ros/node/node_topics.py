@@ -13,9 +13,10 @@ from typing import Any, Literal
 import msgspec
 import numpy as np
 
-from ...config.findings import Findings, listed, nearest
+from ...config.findings import Findings
 from ...config.yaml_text import Plain, read
 from ...errors import ConfigurationError
+from ...text import listed, nearest
 from ...variables.model_description import ModelDescription, Value, Variable
 from ...variables.value_types import flattened, nested
 from ..messages.definitions import MAX_ELEMENTS, default_type, path_parts

@@ -17,8 +17,8 @@ from typing import Any, TypeVar
 import msgspec
 import zenoh
 
-from ...config.findings import listed, nearest
 from ...errors import ConfigurationError, DeadlineExceeded, MessageRefused
+from ...text import listed, nearest
 from ..keys import Keys
 from ..messages import decode_json
 from ..session import matches, reason_of

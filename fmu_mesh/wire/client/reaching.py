@@ -15,8 +15,8 @@ from typing import NamedTuple, Self, TypeVar
 
 import zenoh
 
-from ...config.findings import listed, nearest
 from ...errors import ConfigurationError, DeadlineExceeded, FmuMeshError
+from ...text import listed, nearest
 from ..keys import Keys
 from ..runtime import meshes
 from ..session import Wiring, close_session, open_session, tokens

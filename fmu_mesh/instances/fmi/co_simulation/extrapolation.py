@@ -15,9 +15,11 @@ import msgspec
 import numpy as np
 
 from ....errors import FmuMeshError
-from ....rings.ring import Layout, Ring
+from ....rings.ring import Ring
 from ....simtime import TimeGrid
-from ...contract import Instance, KeepsState, LinearInput
+from ....system.layout import Layout
+from ....system.step_options import LinearInput
+from ...contract import Instance, KeepsState
 from ...instance_wrapper import AroundInstance
 
 __all__ = ["LinearInputs", "TakesDerivatives"]

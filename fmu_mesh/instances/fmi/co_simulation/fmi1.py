@@ -16,7 +16,7 @@ import numpy as np
 from fmpy.fmi1 import FMU1Slave
 
 from ....errors import InitializationFailed
-from ....rings.ring import Part
+from ....system.layout import Part
 from ....variables.model_description import Variable
 from ....variables.value_types import Value, VariableType
 from ..buffers import Buffer, NumberBuffer, StringBuffer

@@ -16,8 +16,9 @@ from fmpy.fmi1 import FMICallException
 from fmpy.fmi2 import FMU2Slave, fmi2Terminated
 
 from ....errors import TerminationRequested
-from ....rings.ring import Part, Ring
+from ....rings.ring import Ring
 from ....simtime import TimeGrid
+from ....system.layout import Part
 from ....variables.model_description import Variable
 from ....variables.value_types import Value, VariableType
 from ..buffers import Buffer, NumberBuffer, StringBuffer

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from fmpy.fmi3 import FMU3Slave
 
-from ....rings.ring import Part
+from ....system.layout import Part
 from ....variables.model_description import Variable
 from ....variables.value_types import DTYPES, Value, VariableType, is_text
 from ..buffers import BinaryBuffer, Buffer, NumberBuffer, StringBuffer

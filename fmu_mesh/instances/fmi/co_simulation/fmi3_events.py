@@ -13,8 +13,9 @@ from typing import Any, TypeVar
 from fmpy.fmi1 import FMICallException
 
 from ....errors import FmuError, TerminationRequested
-from ....rings.ring import Part, Ring
+from ....rings.ring import Ring
 from ....simtime import TimeGrid
+from ....system.layout import Part
 from ....variables.value_types import Value
 from ..calls import DirectCall
 from ..fmu_instance import STATUS_NAMES, WARNING, FmuInstance, Verb

@@ -18,7 +18,7 @@ import math
 from collections.abc import Callable
 from typing import Final
 
-from ...contract import SolverSettings
+from ....system.step_options import SolverSettings
 from ..clocks import NO_CLOCKS, Clocks
 from .model_calls import ModelCalls
 from .solver import Equations, Solver, SolverFailed, make_solver, resolvable
