@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ..config.schema import schema_text
+from ..instances.configuration import installed_config
 from ..instances.registry import check_engines
 from ..run.preparing import Options, prepare
 from ..system.grouping import automatic_nodes
@@ -41,13 +42,13 @@ def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.Arg
 def _check(arguments: argparse.Namespace) -> int:
     plan = prepare(arguments.config, Options(start_values=tuple(arguments.set), window=arguments.window), say)
     print("\n".join(plan_page(plan)))
-    check_engines(plan.system, str(arguments.config))
+    check_engines(plan.system.config.instances, str(arguments.config))
     print(f"\nOK: {arguments.config} can run.")
     return 0
 
 
 def _schema(_arguments: argparse.Namespace) -> int:
-    sys.stdout.write(schema_text())
+    sys.stdout.write(schema_text(installed_config()))
     return 0
 
 
@@ -92,7 +93,7 @@ def _instances(plan: Plan) -> list[str]:
     rows = [
         [
             instance.name,
-            _model(instance),
+            _model(plan, instance),
             f"step {_number(instance.step_points * plan.grid.step_size)} s",
             "a process of its own" if instance.node == instance.name else f"group {instance.node}",
             _start_values(instance),
@@ -102,22 +103,10 @@ def _instances(plan: Plan) -> list[str]:
     return table(rows, indent=2)
 
 
-def _solver(instance: SystemInstance) -> str:
-    """How a model-exchange FMU is solved; of co-simulation, which has its own solver, the tolerance that it is told."""
-    if instance.description.kind == "co_simulation":
-        told = instance.options.tolerance
-        return f", tolerance {told:g}" if told is not None else ""
-    solver = instance.options.solver
-    tolerance = f" {solver.relative_tolerance:g}" if solver.name == "cvode" else ""
-    return f" model exchange, {solver.name}{tolerance}"
-
-
-def _model(instance: SystemInstance) -> str:
-    """The file of an instance, and what it is a model of."""
-    description = instance.description
-    if instance.hosted is None:
-        return f"{Path(instance.fmu).name} (FMI {description.fmi_version}{_solver(instance)})"
-    return f"{Path(instance.fmu).name or description.model_name} ({description.generation_tool})"
+def _model(plan: Plan, instance: SystemInstance) -> str:
+    """The file of an instance, and what computes it."""
+    summary = plan.system.config.instances[instance.name].summary(instance.description)
+    return f"{Path(instance.fmu).name or instance.description.model_name} ({summary})"
 
 
 def _start_values(instance: SystemInstance) -> str:

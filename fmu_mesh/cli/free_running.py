@@ -15,8 +15,9 @@ import msgspec
 from msgspec.structs import replace
 
 from ..config.base import NAME_PATTERN
-from ..config.loading import LoadedConfig, parse
+from ..config.loading import LoadedConfig
 from ..errors import ConfigurationError, LoadFailed
+from ..instances.configuration import parse
 from ..instances.fmi import read_description
 from ..run.launcher import Launcher
 from ..run.preparing import Options, planned

@@ -6,8 +6,8 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from ..config.loading import load
 from ..errors import ConfigurationError
+from ..instances.configuration import load
 from ..ros.bags.playing import grid_of, play, schedule
 from ..ros.bags.reading import Bag, chosen_topics
 from ..wire.client.reaching import Meshes

@@ -12,9 +12,7 @@ from types import FrameType
 from typing import Any
 
 from ..errors import ConfigurationError, FmuError, FmuMeshError, MeshLost
-from ..instances.fmi import LogMessage
-from ..instances.mujoco import check_film, check_window
-from ..instances.registry import Showing
+from ..instances.contract import LogMessage, Showing
 from ..run.events import End, Event, EventWriter, Ready
 from ..run.gateway_role import run_gateway
 from ..run.launcher import Launcher
@@ -129,15 +127,11 @@ def _add_showing(parser: argparse.ArgumentParser) -> None:
 
 
 def _showing(arguments: argparse.Namespace) -> Showing:
-    """What `--view` and `--video` ask for, if it can be done here."""
+    """What `--view` and `--video` ask for."""
     video: Path | None = getattr(arguments, "video", None)
     showing = Showing(view=getattr(arguments, "view", False), video=video.absolute() if video is not None else None)
     if showing.view and showing.video is not None:
         raise ConfigurationError("--view and --video do not go together", hint="Leave one of them out.")
-    if showing.view:
-        check_window()
-    if showing.video is not None:
-        check_film(showing.video)
     return showing
 
 

@@ -8,13 +8,15 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from collections.abc import Set as AbstractSet
 from pathlib import Path
 
 import msgspec
 from msgspec import inspect
 
 from fmu_mesh.config.findings import Findings, locate
-from fmu_mesh.config.mesh import KIND, Config
+from fmu_mesh.config.instance_sections import KIND, InstanceSection, Kinds, keys_of
+from fmu_mesh.config.mesh import Config, config_type
 from fmu_mesh.config.salvage import salvage
 from fmu_mesh.config.structure import check
 from fmu_mesh.config.yaml_text import Plain, read
@@ -67,21 +69,22 @@ class LoadedConfig(msgspec.Struct, frozen=True):
         return path.parent.resolve() / path.name
 
 
-def load(path: Path, overrides: Sequence[str] = ()) -> LoadedConfig:
+def load(path: Path, overrides: Sequence[str], kinds: Kinds) -> LoadedConfig:
     """Read a configuration file.
 
     Args:
         path: the YAML file.
         overrides: start values of the command line, each `instance.variable=value` with a YAML scalar.
+        kinds: the kinds of instances.
 
     Raises:
         ConfigurationError: the file cannot be read, or its structure is wrong; carries all findings.
     """
-    loaded, findings = examine(path, overrides)
+    loaded, findings = examine(path, overrides, kinds)
     return _right(loaded, findings)
 
 
-def examine(path: Path, overrides: Sequence[str] = ()) -> tuple[LoadedConfig, Findings]:
+def examine(path: Path, overrides: Sequence[str], kinds: Kinds) -> tuple[LoadedConfig, Findings]:
     """As `load`, but go on where the structure is wrong: give what is left, and the findings.
 
     Hand both to `system.build`, which checks the meaning of what is left and raises one error with everything. With
@@ -93,16 +96,16 @@ def examine(path: Path, overrides: Sequence[str] = ()) -> tuple[LoadedConfig, Fi
     findings = Findings(str(path))
     text = _text(path, findings)
     findings.raise_any()
-    return _examine(text, path, overrides)
+    return _examine(text, path, overrides, kinds)
 
 
-def parse(text: str, path: Path, overrides: Sequence[str] = ()) -> LoadedConfig:
+def parse(text: str, path: Path, overrides: Sequence[str], kinds: Kinds) -> LoadedConfig:
     """As `load`, with the text of the file at hand; ``path`` is what relative paths and errors refer to.
 
     Raises:
         ConfigurationError: the structure is wrong; carries all findings.
     """
-    loaded, findings = _examine(text, path, overrides)
+    loaded, findings = _examine(text, path, overrides, kinds)
     return _right(loaded, findings)
 
 
@@ -111,7 +114,7 @@ def _right(loaded: LoadedConfig, findings: Findings) -> LoadedConfig:
     return loaded
 
 
-def _examine(text: str, path: Path, overrides: Sequence[str]) -> tuple[LoadedConfig, Findings]:
+def _examine(text: str, path: Path, overrides: Sequence[str], kinds: Kinds) -> tuple[LoadedConfig, Findings]:
     lines: dict[str, int] = {}
     replaced: dict[str, str] = {}
     findings = Findings(str(path), lines, replaced)
@@ -120,11 +123,13 @@ def _examine(text: str, path: Path, overrides: Sequence[str]) -> tuple[LoadedCon
         if not len(findings):
             findings.add("", "nothing (null)", "a mapping with mesh, simulation and instances")
         findings.raise_any()
+    sections = kinds.own()
     if isinstance(data, dict):
         data = _with_long_connections(data, findings)
-        data = _with_kinds(_with_overrides(data, overrides, replaced, findings))
-    check(data, inspect.type_info(Config), "", findings)
-    config = salvage(data, findings.places) if len(findings) else msgspec.convert(data, Config)
+        data = _with_kinds(_with_overrides(data, overrides, replaced, findings), sections, kinds, findings)
+    type_ = config_type(tuple(sections.values()))
+    check(data, inspect.type_info(type_), "", findings)
+    config = salvage(data, findings.places, sections) if len(findings) else msgspec.convert(data, type_)
     if config is None:
         findings.raise_any()
     assert config is not None  # without a finding there is a configuration
@@ -179,19 +184,41 @@ def _with_long_connections(data: dict[str, Plain], findings: Findings) -> dict[s
     return {**data, "connections": written}
 
 
-def _with_kinds(data: dict[str, Plain]) -> dict[str, Plain]:
-    """``data`` with the kind of every instance, as its keys say it: that of an FMU where they say nothing."""
+def _with_kinds(
+    data: dict[str, Plain], sections: dict[str, type[InstanceSection]], kinds: Kinds, findings: Findings
+) -> dict[str, Plain]:
+    """``data`` with the kind of every instance, as its keys say it: the usual kind where they do not.
+
+    Kinds of other packages are looked for only where an instance has no key of ours; those that are found are added to
+    ``sections``.
+    """
     instances = data.get("instances")
     if not isinstance(instances, dict):
         return data
+    usual = next(iter(sections))
     written: dict[str, Plain] = {}
     for name, instance in instances.items():
-        if isinstance(instance, dict):
-            kind = next((key for key in ("fmu", "mujoco", "gazebo_classic", "controller") if key in instance), "fmu")
-            written[name] = {**instance, KIND: kind}
-        else:
+        if not isinstance(instance, dict):
             written[name] = instance
+            continue
+        key = next((key for key in sections if key in instance), None)
+        if key is None and (others := instance.keys() - set(keys_of(sections[usual]))):
+            key = _kind_meant(others, kinds)
+            if key is None:
+                expected = f"one of the keys {listed(kinds.names())}"
+                findings.add(f"instances.{name}", "no key of an installed kind of instance", expected)
+            else:
+                sections.setdefault(key, kinds.section(key))
+        written[name] = {**instance, KIND: key or usual}
     return {**data, "instances": written}
+
+
+def _kind_meant(keys: AbstractSet[str], kinds: Kinds) -> str | None:
+    """The kind that one of the keys is, or is most likely a slip of."""
+    names = kinds.names()
+    exact = [name for name in names if name in keys]
+    near = [name for key in sorted(keys) if (name := nearest(key, names)) is not None]
+    return next(iter([*exact, *near]), None)
 
 
 def _arrow_meant(connection: Plain) -> str | None:

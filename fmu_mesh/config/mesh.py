@@ -6,7 +6,9 @@ what is wrong with it is `fmu_mesh.config.loading`; what the names in it mean is
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from functools import cache, reduce
+from operator import or_
+from typing import Annotated, Any, Literal, cast
 
 import msgspec
 from msgspec import Meta
@@ -23,51 +25,27 @@ from fmu_mesh.config.base import (
     Endpoint,
     Name,
 )
-from fmu_mesh.config.instance_sections import (
-    KIND,
-    ActuatorConfig,
-    AnyInstanceConfig,
-    ControllerConfig,
-    EngineConfig,
-    FluidDynamicsConfig,
-    GazeboClassicConfig,
-    HostConfig,
-    InstanceConfig,
-    MujocoConfig,
-    PidConfig,
-    SolverConfig,
-)
+from fmu_mesh.config.instance_sections import InstanceSection
 from fmu_mesh.config.ros_section import RosConfig, RosProfile, RosTopicConfig
 
 __all__ = [
     "ENDPOINT_PATTERN",
     "KEY_PREFIX_PATTERN",
-    "KIND",
     "MAX_WINDOW",
     "NAME_PATTERN",
     "SHA256_PATTERN",
-    "ActuatorConfig",
-    "AnyInstanceConfig",
     "Config",
     "ConnectionConfig",
-    "ControllerConfig",
-    "EngineConfig",
-    "FluidDynamicsConfig",
-    "GazeboClassicConfig",
-    "HostConfig",
     "InitializationConfig",
-    "InstanceConfig",
     "LimitsConfig",
-    "MujocoConfig",
-    "PidConfig",
     "RecordConfig",
     "RosConfig",
     "RosProfile",
     "RosTopicConfig",
     "SimulationConfig",
-    "SolverConfig",
     "TimeoutsConfig",
     "ZenohConfig",
+    "config_type",
 ]
 
 MAX_WINDOW = 1_000_000
@@ -293,15 +271,15 @@ class TimeoutsConfig(Base, frozen=True, kw_only=True):
     ] = 30.0
 
 
+_INSTANCES = Meta(min_length=1, description="The instances by name; `mesh` is reserved.")
+
+
 class Config(Base, frozen=True, kw_only=True):
     """A mesh: its instances, connections, and how it runs (version 1)."""
 
     mesh: Annotated[Name, Meta(description="Name of the mesh; part of every key.")]
     simulation: SimulationConfig
-    instances: Annotated[
-        dict[Name, AnyInstanceConfig],
-        Meta(min_length=1, description="The instances by name; `mesh` is reserved."),
-    ]
+    instances: Annotated[dict[Name, InstanceSection], _INSTANCES]
     group: Annotated[
         Literal["auto"] | None,
         Meta(
@@ -327,6 +305,29 @@ class Config(Base, frozen=True, kw_only=True):
     ros: Annotated[RosConfig | None, Meta(description="Topics for ROS 2; null: none.")] = None
     version: Annotated[Literal[1], Meta(description="Version of this file format.")] = 1
 
-    def is_strict(self, instance: InstanceConfig) -> bool:
+    def is_strict(self, section: InstanceSection) -> bool:
         """Whether what FMI forbids is an error for an instance of this mesh."""
-        return instance.strict if instance.strict is not None else self.strict
+        return section.follows_fmi and (self.strict if section.strict is None else section.strict)
+
+
+@cache
+def config_type(sections: tuple[type[InstanceSection], ...]) -> type[Config]:
+    """The `Config` that a file is converted to, and that its JSON Schema is made from.
+
+    `Config` itself knows no kind of instance, so msgspec needs a hook to decode it; this one needs none.
+
+    Args:
+        sections: the sections of the kinds that instances may have, the usual kind first.
+    """
+    union: Any = reduce(or_, sections)
+    instances: Any = Annotated[dict[Name, union], _INSTANCES]
+    made = msgspec.defstruct(
+        "Config",
+        [("instances", instances)],
+        bases=(Config,),
+        namespace={"__doc__": Config.__doc__},
+        frozen=True,
+        forbid_unknown_fields=True,
+        kw_only=True,
+    )
+    return cast("type[Config]", made)

@@ -1,7 +1,7 @@
 """The JSON Schema of the configuration file, by which editors complete and check it.
 
-Made from the Structs of `fmu_mesh.config.mesh`; `configs/schema.json` is a copy. What names mean is beyond a
-schema: a file that keeps it can still be refused by `fmu_mesh.system.system`.
+Made from the Structs of `fmu_mesh.config.mesh` and of the kinds of instances; `configs/schema.json` is a copy for our
+own kinds. A schema cannot check what names mean: `fmu_mesh.system.system` may refuse a file that is valid here.
 """
 
 from __future__ import annotations
@@ -11,7 +11,8 @@ from typing import Any
 
 import msgspec
 
-from fmu_mesh.config.mesh import KIND, Config
+from fmu_mesh.config.instance_sections import KIND
+from fmu_mesh.config.mesh import Config
 
 __all__ = ["SCHEMA_ID", "json_schema", "schema_text"]
 
@@ -25,9 +26,9 @@ _SHORT_CONNECTION = {
 }
 
 
-def json_schema() -> dict[str, object]:
-    """The schema (JSON Schema, draft 2020-12)."""
-    (reference,), definitions = msgspec.json.schema_components([Config])
+def json_schema(type_: type[Config]) -> dict[str, object]:
+    """The schema (JSON Schema, draft 2020-12) of configurations with the kinds of instances of ``type_``."""
+    (reference,), definitions = msgspec.json.schema_components([type_])
     config = definitions["Config"]
     config["properties"]["connections"]["items"] = {
         "anyOf": [_SHORT_CONNECTION, config["properties"]["connections"]["items"]]
@@ -44,12 +45,12 @@ def json_schema() -> dict[str, object]:
 
 def _without_kinds(config: dict[str, Any], definitions: dict[str, Any]) -> None:
     """Take out what tells the kinds of instances apart in the program: in a file their own keys do."""
-    del config["properties"]["instances"]["additionalProperties"]["discriminator"]
+    config["properties"]["instances"]["additionalProperties"].pop("discriminator", None)
     for section in definitions.values():
         if section["properties"].pop(KIND, None) is not None:
             section["required"].remove(KIND)
 
 
-def schema_text() -> str:
+def schema_text(type_: type[Config]) -> str:
     """The schema as the text of a file."""
-    return json.dumps(json_schema(), indent=2, ensure_ascii=False) + "\n"
+    return json.dumps(json_schema(type_), indent=2, ensure_ascii=False) + "\n"

@@ -176,8 +176,8 @@ class Node:
         self._activity.state = "loading"
         for item in plan.instances:
             instance = self._open_instance(item.name)
-            if item.interpolation is not None:
-                instance = TimedInputs(instance, item.interpolation)
+            if item.section.interpolation is not None:
+                instance = TimedInputs(instance, item.section.interpolation)
             self._runners[item.name] = Runner(item, instance, plan.grid, plan.ring_rows)
         self._remote = connect_feeds(plan, self._runners)
         self._units = [Unit([self._runners[name] for name in names]) for names in plan.units]

@@ -6,8 +6,9 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 
-from ..config.loading import LoadedConfig, load
+from ..config.loading import LoadedConfig
 from ..errors import ConfigurationError, Interrupted
+from ..instances.configuration import load
 from ..ros.gateway.gateway import Gateway
 from ..ros.gateway.link import RosLink
 from ..ros.gateway.mapping import message_types, resolve

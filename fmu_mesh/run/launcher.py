@@ -17,8 +17,8 @@ from pathlib import Path
 
 import msgspec
 
-from ..config.mesh import MujocoConfig
 from ..errors import DeadlineExceeded, FmuError, FmuMeshError, Interrupted, MeshLost, from_report
+from ..instances.registry import can_be_shown
 from ..system.plan import RECORDER, Plan
 from ..wire.runtime import MeshNote, remove_run_folder, remove_stale_folders, run_folder, runtime_folder, write_note
 from ..wire.session import LEASE_MS
@@ -153,7 +153,7 @@ class Launcher:
                 continue
             plan_file = folder / f"{number}.json"
             plan_file.write_bytes(msgspec.json.encode(msgspec.structs.replace(plan, restarts=self._restarts)))
-            shown = self._showing() if any(isinstance(i.hosted, MujocoConfig) for i in plan.instances) else []
+            shown = self._showing() if any(can_be_shown(own.section) for own in plan.instances) else []
             self._spawn(node, ["node", str(self._config_file), node, *common, *shown, "--plan", str(plan_file)], folder)
 
     def _showing(self) -> list[str]:

@@ -20,9 +20,8 @@ from typing import NamedTuple
 
 from ..errors import ConfigurationError, FmuError, FmuMeshError, Interrupted, StepFailed, TerminationRequested
 from ..instances.call_guard import CallWatch, Guarded, floating_point_changed, restore_floating_point
-from ..instances.contract import Instance
-from ..instances.fmi import LogMessage, Terms
-from ..instances.registry import Showing, open_instance, stepped
+from ..instances.contract import Instance, LogMessage, Opening, Showing
+from ..instances.registry import open_instance
 from ..master.pacing import Pacer
 from ..recorder.csv_file import CsvFile
 from ..recorder.result_file import OpenResult
@@ -168,8 +167,18 @@ class LocalMesh:
         if self._open_instance is not None:
             return self._open_instance(name)
         item = self._plan.nodes[self._plan.node_of(name)].instance(name)
-        terms = Terms(self._plan.system.config.limits, item.sha256)
-        return stepped(open_instance(item, folder, self._log, terms, self._showing), item)
+        opening = Opening(
+            name=name,
+            path=Path(item.fmu),
+            section=item.section,
+            description=self._plan.system.instances[name].description,
+            folder=folder,
+            limits=self._plan.system.config.limits,
+            linear_inputs=item.linear_inputs,
+            log=self._log,
+            showing=self._showing,
+        )
+        return open_instance(opening)
 
     def _guarded(self, name: str, folder: Path, watch: CallWatch) -> Guarded:
         return Guarded(name, lambda: self._open(name, folder), watch, self._plan.system.config.timeouts)

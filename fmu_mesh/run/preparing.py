@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -11,11 +11,13 @@ from msgspec.structs import replace
 
 from .. import files
 from ..config.findings import Findings
-from ..config.loading import LoadedConfig, examine
-from ..config.mesh import AnyInstanceConfig, GazeboClassicConfig, InstanceConfig, MujocoConfig, PidConfig, ZenohConfig
+from ..config.instance_sections import InstanceSection, key_of, placed
+from ..config.loading import LoadedConfig
+from ..config.mesh import ZenohConfig
 from ..errors import Finding, LoadFailed
-from ..instances.fmi import Terms
-from ..instances.registry import Showing, check_showing, content, describe, expected_model
+from ..instances.configuration import examine
+from ..instances.contract import Showing
+from ..instances.registry import check_showing, content, describe, expected_model
 from ..ros.gateway.mapping import resolve as resolve_ros
 from ..system.plan import Plan, make_plan
 from ..system.system import build
@@ -80,12 +82,13 @@ def planned(
         ConfigurationError: with everything that is wrong with it or its FMUs.
     """
     loaded = _with_options(loaded, options)
+    if not len(findings):  # otherwise the world may be what is wrong
+        check_showing(loaded.config.instances, options.showing)
     descriptions, unreadable = _descriptions(loaded, tell)
     findings.merge(unreadable)
     resolve_ros(loaded, descriptions, findings)
     system = build(loaded, descriptions, tuple(findings))
     check_results(loaded, system)
-    check_showing(system, options.showing)
     sections = loaded.config.instances
     contents = {name: content(Path(own.fmu), sections[name]) for name, own in system.instances.items()}
     return make_plan(system, file=str(loaded.file), contents=contents)
@@ -117,59 +120,37 @@ def _descriptions(
     loaded: LoadedConfig, tell: Callable[[str], None]
 ) -> tuple[dict[str, ModelDescription], Sequence[Finding]]:
     """The description of every instance whose model can be read, and a finding for every other."""
-    cache: dict[tuple[Path, Terms, str], ModelDescription | LoadFailed] = {}
+    cache: dict[tuple[Path, bytes], ModelDescription | LoadFailed] = {}
     descriptions: dict[str, ModelDescription] = {}
     findings = []
-    for name, instance in loaded.config.instances.items():
-        if not instance.path and not isinstance(instance, PidConfig):
-            continue  # what stands there instead is a finding already
-        path, key = loaded.resolve(instance.path), None
-        if isinstance(instance, InstanceConfig):
-            terms = Terms(loaded.config.limits, instance.sha256)
-            key = (path, terms, instance.kind)
-        else:
-            terms = Terms()
-        found = cache.get(key) if key is not None else None
-        if found is None:
+    for name, section in loaded.config.instances.items():
+        key = key_of(section)
+        if getattr(section, key) == "":
+            continue  # a placeholder, for which there is a finding already
+        path, own = loaded.resolve(section.path) if section.path else Path(), placed(section)
+        known = (path, msgspec.json.encode(own))
+        if known not in cache:
             try:
-                found = describe(path, instance, terms, tell)
+                cache[known] = describe(path, own, loaded.config.limits, tell)
             except LoadFailed as error:
-                found = error
-        if key is not None:
-            cache[key] = found
+                cache[known] = error
+        found = cache[known]
+        place = f"instances.{name}.{key}"
         if isinstance(found, LoadFailed):
             text = found.message.rstrip(".") + (f" ({found.hint.rstrip('.')})" if found.hint else "")
-            place = f"instances.{name}.{_key_of_path(instance)}"
-            expected = expected_model(instance)
-            if not files.exists(path) and files.exists(Path(instance.path)):
-                expected += "; paths are relative to the configuration file"
-            findings.append(loaded.finding(place, text, expected, _similar(path)))
-        else:
-            descriptions[name] = found
-            findings += _strict_findings(loaded, name, instance, found)
+            findings.append(loaded.finding(place, text, _expected(section, path), _similar(path)))
+            continue
+        descriptions[name] = found
+        if loaded.config.is_strict(section):
+            expected = "an FMU without problems, or `strict: false`"
+            findings += [loaded.finding(place, " ".join(text.split()), expected) for text in found.problems]
     return descriptions, findings
 
 
-def _strict_findings(
-    loaded: LoadedConfig, name: str, instance: AnyInstanceConfig, description: ModelDescription
-) -> Iterable[Finding]:
-    """The problems of an FMU, where the configuration says that they are errors."""
-    if not isinstance(instance, InstanceConfig):
-        return
-    for problem in description.problems if loaded.config.is_strict(instance) else ():
-        text = " ".join(problem.split())
-        yield loaded.finding(f"instances.{name}.fmu", text, "an FMU without problems, or `strict: false`")
-
-
-def _key_of_path(instance: AnyInstanceConfig) -> str:
-    """Where the file of an instance stands in its section."""
-    match instance:
-        case MujocoConfig():
-            return "mujoco"
-        case GazeboClassicConfig():
-            return "gazebo_classic"
-        case _:
-            return "fmu"
+def _expected(section: InstanceSection, path: Path) -> str:
+    """In words, what the file of a model should be, where the one at ``path`` is not."""
+    elsewhere = not files.exists(path) and files.exists(Path(section.path))
+    return expected_model(section) + ("; paths are relative to the configuration file" if elsewhere else "")
 
 
 def _similar(path: Path) -> str | None:

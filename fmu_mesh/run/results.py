@@ -7,9 +7,10 @@ from contextlib import suppress
 from pathlib import Path
 
 from ..config.findings import Findings
-from ..config.loading import LoadedConfig, load
+from ..config.loading import LoadedConfig
 from ..errors import ConfigurationError
 from ..files import open_alone
+from ..instances.configuration import load
 from ..recorder.csv_file import CsvFile, cut_after_last_row
 from ..recorder.noted import NotedFile, noted
 from ..recorder.result_file import OpenResult, ResultFile

@@ -15,12 +15,11 @@ from pathlib import Path
 
 import msgspec
 
-from ..config.loading import load
 from ..errors import ConfigurationError, FmuError, FmuMeshError, StepFailed
 from ..instances.call_guard import CallWatch, Guarded
-from ..instances.contract import Instance
-from ..instances.fmi import FmuInstance, LogMessage, Terms
-from ..instances.registry import open_instance, stepped
+from ..instances.configuration import load
+from ..instances.contract import Instance, KeepsFiles, LogMessage, Opening
+from ..instances.registry import decode_section, describe, open_instance
 from ..master.grant_watch import GrantWatch
 from ..master.master import Master
 from ..node.node import Node
@@ -73,7 +72,7 @@ def run_node(
     if child:
         die_with_parent()
     if plan_file is not None:
-        plan = msgspec.json.decode(plan_file.read_bytes(), type=NodePlan)
+        plan = msgspec.json.decode(plan_file.read_bytes(), type=NodePlan, dec_hook=decode_section)
         plan_file.unlink()
     else:
         plan = _node_plan(prepare(config_file, options), name)
@@ -124,12 +123,22 @@ class _NodeProcess:
 
     def _open(self, name: str) -> Guarded:
         item = self._plan.instance(name)
-        terms = Terms(self._plan.limits, item.sha256)
 
         def instantiate() -> Instance:
-            instance = open_instance(item, fmu_folder(self._folder), self._log, terms, self._options.showing)
-            self._instances.append(instance)
-            return stepped(instance, item)
+            limits, path = self._plan.limits, Path(item.fmu)
+            opening = Opening(
+                name=name,
+                path=path,
+                section=item.section,
+                description=describe(path, item.section, limits),
+                folder=fmu_folder(self._folder),
+                limits=limits,
+                linear_inputs=item.linear_inputs,
+                log=self._log,
+                showing=self._options.showing,
+            )
+            self._instances.append(open_instance(opening))
+            return self._instances[-1]
 
         self._guarded.append(Guarded(name, instantiate, self._watch, self._plan.timeouts))
         return self._guarded[-1]
@@ -152,7 +161,7 @@ class _NodeProcess:
     def _clean_up(self) -> None:
         """From another thread, when the main thread does not come back from an FMU."""
         for instance in self._instances:
-            if isinstance(instance, FmuInstance):
+            if isinstance(instance, KeepsFiles):
                 instance.remove_files()
         leave_run_folder(self._folder)
 

@@ -14,7 +14,8 @@ import msgspec
 from msgspec.structs import replace
 
 from ..config.findings import Findings
-from ..config.mesh import ActuatorConfig, Config, ControllerConfig, EngineConfig, FluidDynamicsConfig
+from ..config.instance_sections import ActuatorConfig, ControllerConfig, FluidDynamicsConfig, PhysicsSection
+from ..config.mesh import Config
 from ..text import listed, nearest
 from ..variables.model_description import Variable
 from .connections import Connection, Variables
@@ -77,7 +78,7 @@ def _check_command(config: Config, coupling: _Coupling, findings: Findings) -> N
 
 def _couplings(config: Config) -> Iterator[_Coupling]:
     for name, engine in config.instances.items():
-        if not isinstance(engine, EngineConfig):
+        if not isinstance(engine, PhysicsSection):
             continue
         sections: tuple[tuple[str, Sequence[AnyCoupling]], ...] = (
             ("controllers", engine.controllers),

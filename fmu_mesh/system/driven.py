@@ -8,7 +8,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from ..config.findings import Findings
-from ..config.mesh import ActuatorConfig, Config, EngineConfig
+from ..config.instance_sections import ActuatorConfig, PhysicsSection
+from ..config.mesh import Config
 from ..variables.model_description import ModelDescription
 from .connections import Variables, resolve_connections
 from .couplings import coupled_connections
@@ -39,7 +40,7 @@ def driven_inputs(config: Config, descriptions: Mapping[str, ModelDescription]) 
     # A connection whose source is not known, which is found elsewhere, still says what its target is for.
     driven |= {connection.target: _FREE for connection in config.connections}
     for name, engine in config.instances.items():
-        for actuator in engine.actuators if isinstance(engine, EngineConfig) else ():
+        for actuator in engine.actuators if isinstance(engine, PhysicsSection) else ():
             if actuator.enabled:
                 driven.setdefault(f"{name}.{actuator.joint}.effort_command", _instead(actuator))
     return driven

@@ -7,30 +7,21 @@ a mesh computes or receives the same one, and its digest proves it.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Literal
 
 import msgspec
 from msgspec.structs import replace
 
-from ..config.mesh import (
-    GazeboClassicConfig,
-    HostConfig,
-    InitializationConfig,
-    InstanceConfig,
-    LimitsConfig,
-    MujocoConfig,
-    TimeoutsConfig,
-)
+from ..config.instance_sections import InstanceSection, placed
+from ..config.mesh import InitializationConfig, LimitsConfig, TimeoutsConfig
 from ..errors import ConfigurationError, Finding
 from ..simtime import TimeGrid
-from ..variables.model_description import HostKind, Kind
 from ..variables.value_conversion import to_plain
 from ..variables.value_types import PlainValue
 from .digest import digest_of
 from .graph import cycle_through, feedback_edges, strongly_connected, topological_order
 from .initialization_plan import InitializationPlan, Loop, plan_initialization
 from .layout import Layout, rows_for
-from .step_options import StepOptions, linear_inputs
+from .linear_inputs import LinearInput, linear_inputs
 from .system import Connection, System, SystemInstance
 from .window import LAZY_ROWS, recorder_window, window_of
 
@@ -60,10 +51,9 @@ class InstancePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         outputs: the columns read after every step: connected or recorded outputs.
         inputs: the connected inputs, set before every step.
         initialization: the levels at which connected outputs become known in Initialization Mode, by name.
-        interpolation: what the time of a value that is sent to an unconnected input means; None: nothing.
-        kind: which kind of the FMU is used.
-        options: how it is stepped.
-        hosted: the section of the configuration of an instance that is no FMU.
+        section: its section of the configuration, without the common keys: their meaning is in the other fields. It is
+            decoded with the hook `fmu_mesh.instances.registry.decode_section`, because only that knows the kinds.
+        linear_inputs: the inputs whose connections are extrapolated.
     """
 
     name: str
@@ -74,11 +64,8 @@ class InstancePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     inputs: Layout
     feeds: tuple[Feed, ...]
     initialization: dict[str, int]
-    interpolation: Literal["hold", "linear"] | None = None
-    sha256: str | None = None
-    kind: Kind | HostKind = "co_simulation"
-    options: StepOptions = StepOptions()
-    hosted: HostConfig | None = None
+    section: InstanceSection
+    linear_inputs: tuple[LinearInput, ...] = ()
 
 
 class Link(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -236,20 +223,13 @@ def _digest(system: System, nodes: dict[str, NodePlan], contents: Mapping[str, s
             result_file=None,
             limits=LimitsConfig(),
             instances=tuple(
-                replace(instance, fmu="", sha256=None, hosted=_without_path(instance.hosted))
-                for instance in node.instances
+                replace(instance, fmu="", section=instance.section.agreed()) for instance in node.instances
             ),
         )
         for node in nodes.values()
     ]
     models = {name: (own.description.guid, contents.get(name, "")) for name, own in system.instances.items()}
     return digest_of(agreed, models)
-
-
-def _without_path(section: HostConfig | None) -> HostConfig | None:
-    if isinstance(section, MujocoConfig):
-        return replace(section, mujoco="")
-    return replace(section, gazebo_classic="") if isinstance(section, GazeboClassicConfig) else section
 
 
 def _with_delays(system: System) -> tuple[tuple[Connection, ...], tuple[Connection, ...]]:
@@ -370,7 +350,6 @@ def _output_layout(plan: Plan, name: str) -> Layout:
 
 def _instance_plan(plan: Plan, instance: SystemInstance, outputs: Layout) -> InstancePlan:
     incoming = [c for c in plan.connections if c.target_instance == instance.name]
-    section = plan.system.config.instances[instance.name]
     feeds: dict[tuple[str, int], list[tuple[str, str, float, float]]] = {}
     for c in incoming:
         feeds.setdefault((c.source_instance, c.delay or 0), []).append(
@@ -387,11 +366,8 @@ def _instance_plan(plan: Plan, instance: SystemInstance, outputs: Layout) -> Ins
         inputs=Layout.of(v for v in instance.description.variables if v.name in connected),
         feeds=tuple(Feed(source=s, delay=d, columns=tuple(columns)) for (s, d), columns in sorted(feeds.items())),
         initialization={variable: level for (owner, variable), level in levels.items() if owner == instance.name},
-        interpolation=section.interpolation if isinstance(section, InstanceConfig) else None,
-        sha256=section.sha256 if isinstance(section, InstanceConfig) else None,
-        kind=instance.description.kind,
-        options=replace(instance.options, linear_inputs=linear_inputs(plan.connections, instance.name)),
-        hosted=instance.hosted,
+        section=placed(plan.system.config.instances[instance.name]),
+        linear_inputs=linear_inputs(plan.connections, instance.name),
     )
 
 

@@ -10,7 +10,8 @@ from collections.abc import Mapping
 from typing import Final
 
 from fmu_mesh.config.findings import Findings
-from fmu_mesh.config.mesh import AnyInstanceConfig, Config, InstanceConfig
+from fmu_mesh.config.instance_sections import InstanceSection
+from fmu_mesh.config.mesh import Config
 from fmu_mesh.text import listed, nearest, shown
 from fmu_mesh.variables.model_description import ModelDescription, Value, Variable
 from fmu_mesh.variables.value_conversion import ValueRefused, to_value
@@ -22,7 +23,7 @@ _SOURCES: Final = {"1": "FMI 1.0 (ME 3.3)", "2": "FMI 2.0 (2.2.7)", "3": "FMI 3.
 """What says which variables may have a start value, by the version of FMI."""
 
 
-def sized(name: str, description: ModelDescription, config: AnyInstanceConfig, findings: Findings) -> ModelDescription:
+def sized(name: str, description: ModelDescription, config: InstanceSection, findings: Findings) -> ModelDescription:
     """A model description with the shapes that its arrays get by the structural parameters of the configuration.
 
     Args:
@@ -47,7 +48,7 @@ def sized(name: str, description: ModelDescription, config: AnyInstanceConfig, f
 
 
 def resolve_start_values(
-    name: str, config: AnyInstanceConfig, variables: Mapping[str, Variable], findings: Findings
+    name: str, config: InstanceSection, variables: Mapping[str, Variable], findings: Findings
 ) -> dict[str, Value]:
     """The start values of the instance ``name``, converted to the types of its variables.
 
@@ -57,7 +58,6 @@ def resolve_start_values(
         variables: its variables by name.
         findings: where unknown names and impossible values go; they are left out of the result.
     """
-    is_fmu = isinstance(config, InstanceConfig)
     settable = [variable.name for variable in variables.values() if variable.settable_before_start]
     values: dict[str, Value] = {}
     for variable_name, value in config.start_values.items():
@@ -66,7 +66,7 @@ def resolve_start_values(
         if variable is None:
             found = f"the unknown variable '{variable_name}' of instance '{name}'"
             findings.add(path, found, f"one of {listed(settable)}", nearest(variable_name, settable))
-        elif not (variable.may_take_start_value if is_fmu else variable.settable_before_start):
+        elif not (variable.may_take_start_value if config.follows_fmi else variable.settable_before_start):
             found = f"'{variable_name}', {variable.role} that cannot be set before the start"
             findings.add(path, found, f"one of {listed(settable)}")
         else:
@@ -92,7 +92,7 @@ def forbidden_start_values(
         strict: whether to look at the instances where they are errors, or at those where they are warnings.
     """
     for name, instance in config.instances.items():
-        if not isinstance(instance, InstanceConfig) or name not in descriptions or config.is_strict(instance) != strict:
+        if not instance.follows_fmi or name not in descriptions or config.is_strict(instance) != strict:
             continue
         variables = {variable.name: variable for variable in descriptions[name].variables}
         settable = [variable.name for variable in variables.values() if variable.settable_before_start]

@@ -14,8 +14,9 @@ from msgspec.structs import replace
 
 from fmu_mesh import files
 from fmu_mesh.config.findings import Findings
+from fmu_mesh.config.instance_sections import InstanceSection, key_of
 from fmu_mesh.config.loading import LoadedConfig
-from fmu_mesh.config.mesh import AnyInstanceConfig, Config, HostConfig, InstanceConfig
+from fmu_mesh.config.mesh import Config
 from fmu_mesh.errors import Finding
 from fmu_mesh.simtime import ENDLESS, TimeGrid, steps_between
 from fmu_mesh.system.connections import (
@@ -27,8 +28,8 @@ from fmu_mesh.system.connections import (
 )
 from fmu_mesh.system.couplings import coupled_connections
 from fmu_mesh.system.grouping import automatic_nodes
+from fmu_mesh.system.linear_inputs import check_extrapolation
 from fmu_mesh.system.start_values import forbidden_start_values, resolve_start_values, sized
-from fmu_mesh.system.step_options import StepOptions, capability_warnings, check_extrapolation, resolve_step_options
 from fmu_mesh.text import nearest_file, shown
 from fmu_mesh.variables.model_description import ModelDescription, Value
 from fmu_mesh.variables.value_types import element_name, is_text
@@ -53,8 +54,6 @@ class SystemInstance(msgspec.Struct, frozen=True):
         start_values: start values by variable name, converted to the variable's type.
         step_points: its step size as a multiple of the base step size; 1 or more.
         node: name of the node (process) it runs in: its group, that of its cycle (`group: auto`), or its own name.
-        options: how it is stepped; its linear inputs are not known before the delays.
-        hosted: its section of the configuration if it is no FMU.
     """
 
     name: str
@@ -63,8 +62,6 @@ class SystemInstance(msgspec.Struct, frozen=True):
     start_values: dict[str, Value]
     step_points: int
     node: str
-    options: StepOptions = StepOptions()
-    hosted: HostConfig | None = None
 
 
 class System(msgspec.Struct, frozen=True):
@@ -136,7 +133,7 @@ def build(
     warnings = loaded.findings()
     forbidden_start_values(config, descriptions, warnings, strict=False)
     unit_warnings(connections, descriptions, warnings)
-    capability_warnings(config.instances, descriptions, warnings)
+    _needed_tools(config, descriptions, warnings)
     return System(config, grid, instances, connections, recorded, result_file, tuple(warnings))
 
 
@@ -189,20 +186,20 @@ def _instances(
         own = variables[name]
         if own is None:
             continue
+        start_values = resolve_start_values(name, config, own, findings)
+        config.check(f"instances.{name}", descriptions[name], findings)
         instances[name] = SystemInstance(
             name=name,
             fmu=str(loaded.resolve(config.path)) if config.path else "",
             description=descriptions[name],
-            start_values=resolve_start_values(name, config, own, findings),
+            start_values=start_values,
             step_points=step_points,
             node=config.group or name,
-            options=resolve_step_options(name, config, descriptions[name], findings),
-            hosted=None if isinstance(config, InstanceConfig) else config,
         )
     return instances
 
 
-def _step_points(name: str, config: AnyInstanceConfig, base: float, findings: Findings) -> int:
+def _step_points(name: str, config: InstanceSection, base: float, findings: Findings) -> int:
     """The step size of an instance in points; 1 after a finding."""
     path, step = f"instances.{name}.step_size", config.step_size
     if step is None:
@@ -247,6 +244,16 @@ def _check_nodes(config: Config, descriptions: Mapping[str, ModelDescription], f
             if other != name:
                 found = f"'{name}' in one process with '{other}'"
                 findings.add(path, found, "different groups: this FMU allows one instance per process")
+
+
+def _needed_tools(config: Config, descriptions: Mapping[str, ModelDescription], findings: Findings) -> None:
+    """Note which models need a tool that fmu_mesh does not start."""
+    for name, section in config.instances.items():
+        if descriptions[name].needs_execution_tool:
+            tool = descriptions[name].generation_tool
+            found = f"the FMU of '{name}' needs an execution tool ({tool or 'it does not say which'})"
+            place = f"instances.{name}.{key_of(section)}"
+            findings.add(place, found, f"{tool or 'that tool'} on the host that runs it")
 
 
 def _recorded(config: Config, variables: Variables, findings: Findings) -> tuple[tuple[str, str], ...]:

@@ -18,8 +18,10 @@ from hypothesis import HealthCheck, event, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from fmu_mesh.config.mesh import KIND, Config
+from fmu_mesh.config.instance_sections import KIND
+from fmu_mesh.config.mesh import Config
 from fmu_mesh.errors import LoopNotConverged
+from fmu_mesh.instances.registry import decode_section
 from fmu_mesh.rings.ring import Ring
 from fmu_mesh.run.local import LocalMesh
 from fmu_mesh.simtime import TimeGrid
@@ -257,6 +259,7 @@ def planned(drawn: Drawn) -> Plan:
             "initialization": {"iterations": ITERATIONS},
         },
         Config,
+        dec_hook=decode_section,
     )
     system = System(
         config=config,

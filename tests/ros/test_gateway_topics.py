@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from fmu_mesh.config.loading import load
 from fmu_mesh.errors import ConfigurationError
+from fmu_mesh.instances.configuration import load
 from fmu_mesh.ros.gateway.mapping import resolve
 from fmu_mesh.ros.gateway.topics import RosPlan
 from fmu_mesh.run.preparing import prepare

@@ -14,6 +14,7 @@ from fmu_mesh.cli.checking import plan_page
 from fmu_mesh.cli.main import main
 from fmu_mesh.config.schema import json_schema
 from fmu_mesh.errors import Finding
+from fmu_mesh.instances.configuration import installed_config
 from fmu_mesh.run.preparing import prepare
 
 FMUS = Path(__file__).parents[2] / "fmus"
@@ -222,4 +223,4 @@ def test_every_kept_configuration_can_run(
 
 def test_schema_prints_the_json_schema(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["schema"]) == 0
-    assert json.loads(capsys.readouterr().out) == json_schema()
+    assert json.loads(capsys.readouterr().out) == json_schema(installed_config())

@@ -6,10 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from fmu_mesh.config.loading import MAXIMUM_BYTES, LoadedConfig, load, parse
+from fmu_mesh.config.loading import MAXIMUM_BYTES, LoadedConfig
 from fmu_mesh.config.mesh import ConnectionConfig
 from fmu_mesh.config.yaml_text import MAXIMUM_DEPTH
 from fmu_mesh.errors import ConfigurationError, Finding
+from fmu_mesh.instances.configuration import load, parse
 
 CONFIGS = sorted((Path(__file__).parents[2] / "configs").glob("*.yaml"))
 

@@ -17,10 +17,11 @@ from fmu_mesh.instances.fmi import FmuInstance, open_instance, read_description,
 from fmu_mesh.instances.fmi.co_simulation.extrapolation import LinearInputs
 from fmu_mesh.instances.fmi.co_simulation.fmi3_steps import Fmi3Steps
 from fmu_mesh.instances.fmi.co_simulation.substeps import DISCARD, SMALLEST, take_sub_steps
+from fmu_mesh.instances.fmi.step_options import SolverSettings, StepOptions
 from fmu_mesh.rings.ring import Ring
 from fmu_mesh.simtime import TimeGrid
 from fmu_mesh.system.layout import Layout
-from fmu_mesh.system.step_options import LinearInput, SolverSettings, StepOptions
+from fmu_mesh.system.linear_inputs import LinearInput
 from fmu_mesh.variables.model_description import Kind, ModelDescription
 from fmu_mesh.variables.value_types import Value
 from tests.fmus.event_fmus import Version

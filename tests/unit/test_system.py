@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from fmu_mesh.config.loading import examine, parse
 from fmu_mesh.errors import ConfigurationError, Finding
+from fmu_mesh.instances.configuration import examine, parse
 from fmu_mesh.simtime import TimeGrid
 from fmu_mesh.system.system import System, build
 from fmu_mesh.variables.model_description import Causality, ModelDescription, Value, Variable, VariableType

@@ -13,46 +13,30 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, Literal
 
-import msgspec
 from fmpy.fmi1 import FMICallException
 
 from ...errors import InitializationFailed, LoadFailed, StepFailed
 from ...rings.ring import Ring
 from ...simtime import TimeGrid
 from ...system.layout import Part
-from ...system.step_options import StepOptions
 from ...variables.model_description import ModelDescription, Variable
 from ...variables.value_conversion import to_value
 from ...variables.value_types import Value, VariableType, flattened, nested
+from ..contract import LogMessage
 from .archive.archive import Terms
 from .archive.sources import extract
 from .buffers import Buffer
 from .calls import DirectCall, Function, Pointer, Rows, hot, memory, pointer
 from .state import KeepsFmuState, Standing
+from .step_options import StepOptions
 
-__all__ = ["OK", "STATUS_NAMES", "WARNING", "FmuInstance", "LogMessage", "LogSink", "Verb"]
+__all__ = ["OK", "STATUS_NAMES", "WARNING", "FmuInstance", "LogSink", "Verb"]
 
 OK: Final = 0
 WARNING: Final = 1
 STATUS_NAMES: Final = ("ok", "warning", "discard", "error", "fatal", "pending")
 
 Verb = Literal["Get", "Set"]
-
-
-class LogMessage(msgspec.Struct, frozen=True):
-    """One message of an FMU's logger (FMI 2.0, 2.1.5; FMI 3.0, 2.3.1).
-
-    Attributes:
-        step: the instance's own step during which it came; -1 before the first.
-    """
-
-    instance: str
-    status: str
-    category: str
-    message: str
-    step: int
-
-
 LogSink = Callable[[LogMessage], None]
 
 

@@ -23,12 +23,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ...config.mesh import GazeboClassicConfig
 from ...errors import InitializationFailed, LoadFailed, StepFailed
 from ...rings.ring import Ring
 from ...simtime import TimeGrid, steps_between
 from ...variables.model_description import ModelDescription, Value
 from ..body_axes import relative_velocity, to_body
+from .gazebo_kind import GazeboClassicConfig
 from .gazebo_process import PROGRAM_VARIABLE, GazeboGone, GazeboProcess, check_program
 from .gazebo_world import JOINT_STATE, LINK_STATE, Place, load_gazebo_world
 

@@ -19,9 +19,9 @@ from typing import Literal
 
 import msgspec
 
-from ...config.mesh import GazeboClassicConfig
 from ...errors import LoadFailed
 from ...variables.model_description import Causality, DefaultExperiment, ModelDescription, Variable
+from .gazebo_kind import GazeboClassicConfig
 from .gazebo_sdf import Model, read_world
 
 __all__ = ["GazeboWorld", "Joint", "Link", "Place", "describe_gazebo_world", "load_gazebo_world"]

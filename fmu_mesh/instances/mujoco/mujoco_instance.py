@@ -24,12 +24,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ...config.mesh import MujocoConfig
 from ...errors import InitializationFailed, StepFailed
 from ...rings.ring import Ring
 from ...simtime import TimeGrid, steps_between
 from ...variables.model_description import ModelDescription, Value
 from ..body_axes import relative_velocity, to_body, wrench_at_center
+from .mujoco_kind import MujocoConfig
 from .mujoco_world import Entry, engine, load_world, warnings
 from .rendering import Picture
 

@@ -33,10 +33,10 @@ from typing import Any, Literal
 
 import msgspec
 
-from ...config.mesh import MujocoConfig
 from ...errors import LoadFailed
 from ...text import listed, nearest
 from ...variables.model_description import Causality, DefaultExperiment, ModelDescription, Variable
+from .mujoco_kind import MujocoConfig
 
 __all__ = ["Entry", "Where", "World", "describe_world", "engine", "load_world", "warnings"]
 

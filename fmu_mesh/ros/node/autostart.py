@@ -6,8 +6,8 @@ import threading
 import time
 from pathlib import Path
 
-from ...config.loading import load
 from ...errors import FmuMeshError
+from ...instances.configuration import load
 from ...wire.client.reaching import Meshes
 from .node_parameters import RosNode
 from .rclpy_modules import ros_module

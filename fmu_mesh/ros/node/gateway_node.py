@@ -15,9 +15,9 @@ from typing import Any
 import msgspec
 from msgspec.structs import replace
 
-from ...config.loading import load
 from ...config.mesh import RosConfig
 from ...errors import ConfigurationError, FmuMeshError, MeshLost
+from ...instances.configuration import load
 from ...wire.client.mesh_client import MeshClient
 from ...wire.client.reaching import Meshes
 from ...wire.client.readings import Target

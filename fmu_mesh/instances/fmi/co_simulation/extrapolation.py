@@ -18,7 +18,7 @@ from ....errors import FmuMeshError
 from ....rings.ring import Ring
 from ....simtime import TimeGrid
 from ....system.layout import Layout
-from ....system.step_options import LinearInput
+from ....system.linear_inputs import LinearInput
 from ...contract import Instance, KeepsState
 from ...instance_wrapper import AroundInstance
 
@@ -30,6 +30,10 @@ class TakesDerivatives(Instance, KeepsState, Protocol):
 
     def set_input_derivatives(self, derivatives: Mapping[str, float]) -> None:
         """Time derivatives (1/s) of inputs for the next step; see FMI 2.0, 4.2.1, fmi2SetRealInputDerivatives."""
+        ...
+
+    def remove_files(self) -> None:
+        """See `KeepsFiles`."""
         ...
 
 
@@ -51,6 +55,10 @@ class LinearInputs(AroundInstance[TakesDerivatives]):
         self._inner = self._outer
         self._columns = np.zeros(0, dtype=np.intp)
         self._step_size = 0.0
+
+    def remove_files(self) -> None:
+        """See `KeepsFiles`."""
+        self._instance.remove_files()
 
     def bind(self, inputs: Ring, outputs: Sequence[Ring], grid: TimeGrid, points: int, step: int = 0) -> None:
         """See `Instance`."""

@@ -18,8 +18,8 @@ import math
 from collections.abc import Callable
 from typing import Final
 
-from ....system.step_options import SolverSettings
 from ..clocks import NO_CLOCKS, Clocks
+from ..step_options import SolverSettings
 from .model_calls import ModelCalls
 from .solver import Equations, Solver, SolverFailed, make_solver, resolvable
 
