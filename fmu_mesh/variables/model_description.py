@@ -21,7 +21,6 @@ __all__ = [
     "Causality",
     "Clock",
     "DefaultExperiment",
-    "HostKind",
     "Kind",
     "ModelDescription",
     "PlainValue",
@@ -37,8 +36,6 @@ Causality = Literal[
 Variability = Literal["constant", "fixed", "tunable", "discrete", "continuous"]
 Initial = Literal["exact", "approx", "calculated"]
 Kind = Literal["co_simulation", "model_exchange"]
-HostKind = Literal["physics_engine", "controller"]
-"""What an instance is that is no FMU."""
 
 
 class Variable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -153,13 +150,14 @@ class ModelDescription(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
     """A model description (FMI 2.0, 2.2) as far as the mesh needs it.
 
     Attributes:
+        kind: a `Kind` of FMU, or in one word what the model is: physics_engine, controller, ...
         library: the file of the FMU that is loaded on this platform; None if it is compiled, or nothing is loaded.
     """
 
     model_name: str
     model_identifier: str
     fmi_version: str
-    kind: Kind | HostKind
+    kind: str
     guid: str
     variables: tuple[Variable, ...]
     description: str | None = None
