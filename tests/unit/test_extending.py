@@ -114,16 +114,18 @@ def test_the_schema_has_the_section_of_another_package(place: Place) -> None:
 
 
 def test_an_unknown_field_in_the_section_of_another_package_has_the_usual_finding(place: Place, mesh: Path) -> None:
-    changed(mesh, "between: linear", "betwen: linear")
+    changed(mesh, "between: linear", "betweem: linear")
     assert (
-        "mesh.yaml:4: instances.wave.betwen: an unknown key; expected one of table, between, start_values, step_size, "
+        "mesh.yaml:4: instances.wave.betweem: an unknown key; expected one of table, between, start_values, step_size, "
         "group, host. Did you mean 'between'?"
     ) in findings(place.run("check", mesh))
 
 
 def test_a_slip_in_the_key_of_another_package_is_suggested(place: Place, mesh: Path) -> None:
-    changed(mesh, "steps: {table", "steps: {tabel")
-    assert "instances.steps.tabel: an unknown key; expected one of table, between" in findings(place.run("check", mesh))
+    changed(mesh, "steps: {table", "steps: {tables")
+    assert "instances.steps.tables: an unknown key; expected one of table, between" in findings(
+        place.run("check", mesh)
+    )
 
 
 def test_a_model_that_another_package_cannot_read_is_a_finding_about_the_file(place: Place, mesh: Path) -> None:
