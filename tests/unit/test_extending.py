@@ -114,10 +114,10 @@ def test_the_schema_has_the_section_of_another_package(place: Place) -> None:
 
 
 def test_an_unknown_field_in_the_section_of_another_package_has_the_usual_finding(place: Place, mesh: Path) -> None:
-    changed(mesh, "between: linear", "betweem: linear")
+    changed(mesh, "between: linear", "between_: linear")
     assert (
-        "mesh.yaml:4: instances.wave.betweem: an unknown key; expected one of table, between, start_values, step_size, "
-        "group, host. Did you mean 'between'?"
+        "mesh.yaml:4: instances.wave.between_: an unknown key; expected one of table, between, start_values, "
+        "step_size, group, host. Did you mean 'between'?"
     ) in findings(place.run("check", mesh))
 
 

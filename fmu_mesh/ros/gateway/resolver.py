@@ -11,7 +11,7 @@ from msgspec.structs import replace
 
 from ...config.findings import Findings
 from ...config.mesh import Config, RosConfig, RosTopicConfig
-from ...system.driven import driven_inputs
+from ...system.couplings import driven_inputs
 from ...text import listed, nearest
 from ...variables.model_description import Variable
 from ..messages.definitions import MessageTypes, default_type
