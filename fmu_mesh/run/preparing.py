@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from collections.abc import Set as AbstractSet
 from pathlib import Path
 from typing import Literal
 
@@ -84,7 +85,7 @@ def planned(
     loaded = _with_options(loaded, options)
     if not len(findings):  # otherwise the world may be what is wrong
         check_showing(loaded.config.instances, options.showing)
-    descriptions, unreadable = _descriptions(loaded, tell)
+    descriptions, unreadable = _descriptions(loaded, findings.places, tell)
     findings.merge(unreadable)
     resolve_ros(loaded, descriptions, findings)
     system = build(loaded, descriptions, tuple(findings))
@@ -117,16 +118,22 @@ def _with_options(loaded: LoadedConfig, options: Options) -> LoadedConfig:
 
 
 def _descriptions(
-    loaded: LoadedConfig, tell: Callable[[str], None]
+    loaded: LoadedConfig, known_places: AbstractSet[str], tell: Callable[[str], None]
 ) -> tuple[dict[str, ModelDescription], Sequence[Finding]]:
-    """The description of every instance whose model can be read, and a finding for every other."""
+    """The description of every instance whose model can be read, and a finding for every other.
+
+    ``known_places`` are the places of earlier findings: an empty path stands for a section with one of them.
+    """
     cache: dict[tuple[Path, bytes], ModelDescription | LoadFailed] = {}
     descriptions: dict[str, ModelDescription] = {}
     findings = []
     for name, section in loaded.config.instances.items():
         key = key_of(section)
+        place = f"instances.{name}.{key}"
         if getattr(section, key) == "":
-            continue  # a placeholder, for which there is a finding already
+            if not any(f"{known}.".startswith(f"instances.{name}.") for known in known_places):
+                findings.append(loaded.finding(place, "an empty path", expected_model(section)))
+            continue
         path, own = loaded.resolve(section.path) if section.path else Path(), placed(section)
         known = (path, msgspec.json.encode(own))
         if known not in cache:
@@ -135,7 +142,6 @@ def _descriptions(
             except LoadFailed as error:
                 cache[known] = error
         found = cache[known]
-        place = f"instances.{name}.{key}"
         if isinstance(found, LoadFailed):
             text = found.message.rstrip(".") + (f" ({found.hint.rstrip('.')})" if found.hint else "")
             findings.append(loaded.finding(place, text, _expected(section, path), _similar(path)))

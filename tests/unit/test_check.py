@@ -224,3 +224,15 @@ def test_every_kept_configuration_can_run(
 def test_schema_prints_the_json_schema(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["schema"]) == 0
     assert json.loads(capsys.readouterr().out) == json_schema(installed_config())
+
+
+@pytest.mark.parametrize("key", ["fmu", "mujoco", "gazebo_classic"])
+def test_an_empty_path_of_a_model_is_a_finding(key: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    config = tmp_path / "mesh.yaml"
+    config.write_text(
+        f"mesh: m\nsimulation: {{stop_time: 1, step_size: 0.1}}\ninstances: {{a: {{{key}: ''}}}}\n", encoding="utf-8"
+    )
+
+    assert main(["check", str(config)]) == 2
+
+    assert f"mesh.yaml:3: instances.a.{key}: an empty path; expected a" in capsys.readouterr().err
