@@ -21,7 +21,6 @@ from ..run.launcher import Launcher
 from ..run.local import LocalMesh
 from ..run.preparing import Options, prepare
 from ..run.process import ended_by_signals
-from ..run.results import result_opener
 from ..run.roles import BY_HAND, run_master, run_node
 from ..system.plan import Plan
 from ..wire.router import run_router
@@ -102,7 +101,7 @@ def _add_config(parser: argparse.ArgumentParser) -> None:
         metavar="F",
         help="1: wall clock; 2: twice as fast; 0: as fast as possible; default: that of the configuration",
     )
-    parser.add_argument("--output", type=Path, metavar="FILE", help="another result file, .csv or .mcap")
+    parser.add_argument("--output", type=Path, metavar="FILE", help="another result file; its ending is its format")
     parser.add_argument(
         "--connect",
         type=endpoint,
@@ -249,7 +248,7 @@ def _run_local(plan: Plan, config: Path, display: Display, showing: Showing) -> 
         on_hang=end,
         parent=fmus,
         showing=showing,
-        open_result=result_opener(config, plan.system),
+        config_file=config,
     )
     try:
         with stdout_as_stderr(), ended_by_signals(mesh.interrupt, clean_up, watch_stdin=False):

@@ -12,7 +12,7 @@ import pytest
 
 from fmu_mesh.errors import ConfigurationError
 from fmu_mesh.files import Kept
-from fmu_mesh.recorder.csv_file import CsvFile, cut_after_last_row
+from fmu_mesh.recorder.csv_file import CsvFile
 from fmu_mesh.variables.model_description import VariableType
 
 COLUMNS: list[tuple[str, VariableType]] = [
@@ -208,6 +208,6 @@ def test_a_file_is_cut_after_its_last_whole_row(tmp_path: Path, text: str, kept:
     path = tmp_path / "a.csv"
     path.write_text(text)
 
-    assert cut_after_last_row(path, kept) == rows
+    assert CsvFile.keep_whole_rows(path, kept) == rows
 
     assert path.read_text() == left
