@@ -94,8 +94,6 @@ class CsvFile:
         """
         lines, end, quoted = 0, kept.size, False
         with path.open("r+b") as file:
-            if file.seek(0, io.SEEK_END) < kept.size:
-                return 0  # it is another file by now
             offset = file.seek(kept.size)
             while piece := file.read(_READ_BYTES):
                 for number, part in enumerate(piece.split(b'"')):  # text may have line ends in it

@@ -75,7 +75,7 @@ def rows_left(result_file: str, folder: Path) -> int:
         kept = None
     # Opening the file makes sure that no other run is writing it, and removes a draft that the process has left.
     with suppress(ConfigurationError, OSError), open_alone(path):
-        if kept is not None and path.is_file():
+        if kept is not None and path.is_file() and path.stat().st_size >= kept.size:  # or it is another file by now
             return _format(path).keep_whole_rows(path, kept)
     return 0
 

@@ -201,7 +201,6 @@ def test_what_a_full_disk_leaves_ends_with_a_whole_row_and_nothing_follows_when_
         ("", Kept(), 0, ""),
         ("time,a\n0.0,1\n0.1,2\n0.", Kept(1, 13), 2, "time,a\n0.0,1\n0.1,2\n"),
         ("time,a\n0.0,1\n", Kept(1, 13), 1, "time,a\n0.0,1\n"),
-        ("another", Kept(1, 13), 0, "another"),
     ],
 )
 def test_a_file_is_cut_after_its_last_whole_row(tmp_path: Path, text: str, kept: Kept, rows: int, left: str) -> None:
