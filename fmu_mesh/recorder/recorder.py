@@ -13,7 +13,6 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
-from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
@@ -21,7 +20,8 @@ import numpy as np
 import zenoh
 from numpy.typing import NDArray
 
-from ..errors import ConfigurationError, DeadlineExceeded, FmuMeshError, MeshLost, MessageRefused, from_report
+from ..errors import DeadlineExceeded, FmuMeshError, MeshLost, MessageRefused, from_report
+from ..files import unwritable
 from ..system.plan import RECORDER, Link, NodePlan
 from ..system.recording import ResultFile
 from ..wire.frames import FrameReceiver
@@ -41,7 +41,7 @@ from ..wire.messages import (
     decode_abort,
 )
 
-__all__ = ["Recorder", "unwritable"]
+__all__ = ["Recorder"]
 
 log = logging.getLogger(__name__)
 
@@ -317,14 +317,6 @@ class Recorder:
             self._report(error)
         except FmuMeshError as unreachable:
             log.info("failure_not_reported", extra={"error": str(unreachable)})
-
-
-def unwritable(path: Path, error: OSError) -> ConfigurationError:
-    """What to tell when a result file could be opened, but not be written to its end."""
-    return ConfigurationError(
-        f"the result file '{path}' cannot be written: {error.strerror}",
-        hint="The run has ended there. Make room, or choose another file with --output.",
-    )
 
 
 class _Ended(FmuMeshError):
