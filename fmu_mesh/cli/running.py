@@ -101,7 +101,9 @@ def _add_config(parser: argparse.ArgumentParser) -> None:
         metavar="F",
         help="1: wall clock; 2: twice as fast; 0: as fast as possible; default: that of the configuration",
     )
-    parser.add_argument("--output", type=Path, metavar="FILE", help="another result file; its ending is its format")
+    parser.add_argument(
+        "--output", type=Path, metavar="FILE", help="another result file; its ending chooses the format"
+    )
     parser.add_argument(
         "--connect",
         type=endpoint,

@@ -37,11 +37,11 @@ class Mesh:
         plan = Scenario(("a -> b",), points=POINTS).plan(groups={"a": "n", "b": "n"}, record=True, window=ROWS)
         self.plan: NodePlan = msgspec.structs.replace(
             plan.nodes[RECORDER],
-            result_file=str(folder / "result.csv"),
             shared_memory=False,
             timeouts=msgspec.structs.replace(plan.system.config.timeouts, stop=DEADLINE_S),
         )
         self.session = session
+        self._folder = folder
         self.reported = threading.Event()
         self._welcomed = threading.Event()
         public = Keys(self.plan.key_prefix, self.plan.mesh)
@@ -56,7 +56,7 @@ class Mesh:
 
     def file(self) -> CsvFile:
         """The result file."""
-        return CsvFile(Path(self.plan.result_file or ""), [(f"{i}.{v}", "Float64") for i, v in self.plan.recorded])
+        return CsvFile(self._folder / "result.csv", [(f"{i}.{v}", "Float64") for i, v in self.plan.recorded])
 
     def put(self, message: bytes) -> None:
         """What the master sends."""

@@ -1,7 +1,7 @@
 """Playing a bag: recorded values are set on the inputs of a running mesh, each at the point of its stamp.
 
-Owns which sample belongs to which communication point. The mesh is paused at that point while the values are set, so the
-result depends on the bag alone, and not on the speed of any process.
+Owns which sample belongs to which communication point. The mesh is paused at that point while the values are set. So
+the result depends on the bag alone, and not on the speed of any process.
 """
 
 from __future__ import annotations
