@@ -11,6 +11,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
+from ..config.loading import LoadedConfig
 from ..errors import ConfigurationError, FmuError, FmuMeshError, MeshLost
 from ..instances.fmi import LogMessage
 from ..instances.mujoco import check_film, check_window
@@ -250,7 +251,7 @@ def _run_local(plan: Plan, config: Path, display: Display, showing: Showing) -> 
         on_hang=end,
         parent=fmus,
         showing=showing,
-        config_file=config,
+        loaded=LoadedConfig(plan.system.config, config),
     )
     try:
         with stdout_as_stderr(), ended_by_signals(mesh.interrupt, clean_up, watch_stdin=False):

@@ -18,6 +18,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import NamedTuple
 
+from ..config.loading import LoadedConfig
 from ..errors import ConfigurationError, FmuError, FmuMeshError, Interrupted, StepFailed, TerminationRequested
 from ..instances.call_guard import CallWatch, Guarded, floating_point_changed, restore_floating_point
 from ..instances.contract import Instance
@@ -55,7 +56,7 @@ class LocalMesh:
             result file; the thread in the FMU cannot be got back, so only the end of the process is left to do.
         parent: an existing folder to extract FMUs into; by default that for temporary files.
         showing: whether and how a physics engine shows its world.
-        config_file: the configuration file. Paths in the configuration are relative to its folder.
+        loaded: the configuration; None: that of the plan, with paths relative to the working directory.
 
     Attributes:
         point: the last point reached.
@@ -73,7 +74,7 @@ class LocalMesh:
         on_hang: Callable[[FmuError], None] = lambda error: log.error("%s", error),
         parent: Path | None = None,
         showing: Showing = Showing(),  # noqa: B008  a frozen Struct
-        config_file: Path = Path(),
+        loaded: LoadedConfig | None = None,
     ) -> None:
         self.point = 0
         self.rows = 0
@@ -88,7 +89,7 @@ class LocalMesh:
         self._stepping = ""
         self._save: Callable[[], None] = lambda: None
         self._showing = showing
-        self._config_file = config_file
+        self._loaded = loaded if loaded is not None else LoadedConfig(plan.system.config, Path())
         self._stop: str | None = None
         self._stopped = threading.Event()
         self._folder: Path | None = None
@@ -143,7 +144,7 @@ class LocalMesh:
         watch = CallWatch(self._take_hang)
         with tempfile.TemporaryDirectory(prefix="fmu_mesh-", dir=self._parent) as folder, closing(watch):
             self._folder = Path(folder)
-            file = open_result(self._config_file, plan.system) if plan.system.result_file else None
+            file = open_result(self._loaded, plan.system) if plan.system.result_file else None
             rows = RowBuffer(file, plan.grid, types)
             self._save = lambda: self._close(rows)
             try:

@@ -42,11 +42,11 @@ def check_results(loaded: LoadedConfig, system: System) -> None:
         findings.raise_any()
 
 
-def open_result(config_file: Path, system: System, folder: Path | None = None) -> ResultFile:
+def open_result(loaded: LoadedConfig, system: System, folder: Path | None = None) -> ResultFile:
     """Open the result file of a run.
 
     Args:
-        config_file: the configuration file. Paths in the configuration are relative to its folder.
+        loaded: the configuration.
         system: the system of this configuration; it has a result file.
         folder: the folder of the run, if somebody calls `rows_left` when this process was killed.
 
@@ -55,7 +55,7 @@ def open_result(config_file: Path, system: System, folder: Path | None = None) -
     """
     assert system.result_file is not None
     path = Path(system.result_file)
-    file = _format(path).open(path, _recording(LoadedConfig(system.config, config_file), system))
+    file = _format(path).open(path, _recording(loaded, system))
     return _NotedFile(file, folder) if folder is not None else file
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import msgspec
 
-from ..config.loading import load
+from ..config.loading import LoadedConfig, load
 from ..errors import ConfigurationError, FmuError, FmuMeshError, StepFailed
 from ..instances.call_guard import CallWatch, Guarded
 from ..instances.contract import Instance
@@ -225,7 +225,7 @@ def run_master(
             master.interrupt(reason)
         try:
             if RECORDER in plan.nodes:
-                file = open_result(config_file, plan.system, folder if child else None)
+                file = open_result(LoadedConfig(config, config_file), plan.system, folder if child else None)
                 with Recorder(
                     plan.nodes[RECORDER], session, file, lambda: master.has_begun, launch=_launch(run)
                 ) as recorder:
