@@ -30,7 +30,7 @@ from .errors import ConfigurationError
 if TYPE_CHECKING:
     from _typeshed import ReadableBuffer
 
-__all__ = ["Kept", "OwnFile", "exists", "is_file", "is_folder", "open_alone", "replaced", "sha256_of"]
+__all__ = ["Kept", "OwnFile", "exists", "is_file", "is_folder", "open_alone", "replaced", "sha256_of", "unwritable"]
 
 _DRAFT = ".starting"
 _TRIES = 10
@@ -80,6 +80,14 @@ def open_alone(path: Path) -> OwnFile:
         raise ConfigurationError(f"another run is writing the result file '{path}'", hint=hint) from error
     except OSError as error:
         raise ConfigurationError(f"the result file '{path}' cannot be written: {error.strerror}") from error
+
+
+def unwritable(path: Path, error: OSError) -> ConfigurationError:
+    """The error for a result file that could be opened, but not be written to its end."""
+    return ConfigurationError(
+        f"the result file '{path}' cannot be written: {error.strerror}",
+        hint="The run has ended there. Make room, or choose another file with --output.",
+    )
 
 
 @contextmanager

@@ -71,7 +71,7 @@ def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.Arg
         default="linear",
         help="how inputs go from one time to the next; other types than Real hold (linear)",
     )
-    run.add_argument("--output", type=Path, metavar="FILE.csv", help="record all outputs into a file")
+    run.add_argument("--output", type=Path, metavar="FILE", help="record all outputs into a file")
     run.add_argument(
         "--listen",
         type=endpoint,

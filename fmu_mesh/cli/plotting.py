@@ -15,7 +15,9 @@ from typing import Any, TextIO
 import numpy as np
 
 from ..errors import ConfigurationError, FmuMeshError
+from ..recorder.csv_file import CsvFile
 from ..system.plan import Plan
+from ..system.recording import result_format
 from ..system.system import System
 from ..text import listed, nearest, nearest_file
 from ..variables.model_description import Variable
@@ -70,12 +72,12 @@ def check_plot(plot: Path, result: str | None) -> None:
         raise ConfigurationError(f"a plot cannot be written as '{plot}'.", hint="Name it .png, .svg or .pdf.")
     if result is None:
         raise ConfigurationError("nothing is recorded, so there is nothing to plot.", hint="Name a file with --output.")
-    if Path(result).suffix == ".mcap":
-        raise _is_mcap(Path(result))
+    _require_csv(Path(result))
 
 
-def _is_mcap(path: Path) -> ConfigurationError:
-    return ConfigurationError(f"'{path}' is an MCAP, and plots are drawn from CSV.", hint="Record into a .csv file.")
+def _require_csv(path: Path) -> None:
+    if result_format(path) not in (CsvFile, None):
+        raise ConfigurationError(f"'{path}' is no CSV, and plots are drawn from CSV.", hint="Record into a .csv file.")
 
 
 def _require_matplotlib() -> None:
@@ -160,8 +162,7 @@ def read_results(path: Path, wanted: Sequence[str] | None = None) -> Results:
     Raises:
         ConfigurationError: there is no such file or variable, or it is no result file; says in which line.
     """
-    if path.suffix == ".mcap":
-        raise _is_mcap(path)
+    _require_csv(path)
     try:
         with path.open(encoding="utf-8", newline="") as file:
             names, first, values = _read(path, file)

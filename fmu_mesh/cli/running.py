@@ -11,6 +11,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
+from ..config.loading import LoadedConfig
 from ..errors import ConfigurationError, FmuError, FmuMeshError, MeshLost
 from ..instances.contract import LogMessage, Showing
 from ..run.events import End, Event, EventWriter, Ready
@@ -19,7 +20,6 @@ from ..run.launcher import Launcher
 from ..run.local import LocalMesh
 from ..run.preparing import Options, prepare
 from ..run.process import ended_by_signals
-from ..run.results import result_opener
 from ..run.roles import BY_HAND, run_master, run_node
 from ..system.plan import Plan
 from ..wire.router import run_router
@@ -100,7 +100,9 @@ def _add_config(parser: argparse.ArgumentParser) -> None:
         metavar="F",
         help="1: wall clock; 2: twice as fast; 0: as fast as possible; default: that of the configuration",
     )
-    parser.add_argument("--output", type=Path, metavar="FILE", help="another result file, .csv or .mcap")
+    parser.add_argument(
+        "--output", type=Path, metavar="FILE", help="another result file; its ending chooses the format"
+    )
     parser.add_argument(
         "--connect",
         type=endpoint,
@@ -243,7 +245,7 @@ def _run_local(plan: Plan, config: Path, display: Display, showing: Showing) -> 
         on_hang=end,
         parent=fmus,
         showing=showing,
-        open_result=result_opener(config, plan.system),
+        loaded=LoadedConfig(plan.system.config, config),
     )
     try:
         with stdout_as_stderr(), ended_by_signals(mesh.interrupt, clean_up, watch_stdin=False):

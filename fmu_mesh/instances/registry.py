@@ -7,6 +7,7 @@ are. A kind is imported when a configuration has its key, and what it needs when
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -52,7 +53,7 @@ class InstalledKinds:
 
     def names(self) -> list[str]:
         """The keys of all installed kinds, ours first."""
-        return plugin_names(GROUP)
+        return _names()
 
     def section(self, key: str) -> type[InstanceSection]:
         """The section of the kind with the key ``key``.
@@ -65,6 +66,11 @@ class InstalledKinds:
 
 
 KINDS = InstalledKinds()
+
+
+@cache
+def _names() -> list[str]:
+    return plugin_names(GROUP)  # reads all distributions
 
 
 def decode_section(type_: type, value: object) -> object:

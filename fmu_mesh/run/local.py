@@ -18,13 +18,12 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import NamedTuple
 
+from ..config.loading import LoadedConfig
 from ..errors import ConfigurationError, FmuError, FmuMeshError, Interrupted, StepFailed, TerminationRequested
 from ..instances.call_guard import CallWatch, Guarded, floating_point_changed, restore_floating_point
 from ..instances.contract import Instance, LogMessage, Opening, Showing
 from ..instances.registry import open_instance
 from ..master.pacing import Pacer
-from ..recorder.csv_file import CsvFile
-from ..recorder.result_file import OpenResult
 from ..recorder.row_buffer import RowBuffer
 from ..rings.array_elements import scaled
 from ..rings.ring import Ring
@@ -34,7 +33,7 @@ from ..system.initialization_plan import Loop, Tear
 from ..system.layout import Layout
 from ..system.plan import Plan
 from ..variables.value_types import Value
-from .results import what_is_kept
+from .results import open_result, what_is_kept
 
 __all__ = ["LocalMesh"]
 
@@ -56,7 +55,7 @@ class LocalMesh:
             result file; the thread in the FMU cannot be got back, so only the end of the process is left to do.
         parent: an existing folder to extract FMUs into; by default that for temporary files.
         showing: whether and how a physics engine shows its world.
-        open_result: opens the result file.
+        loaded: the configuration; None: that of the plan, with paths relative to the working directory.
 
     Attributes:
         point: the last point reached.
@@ -74,7 +73,7 @@ class LocalMesh:
         on_hang: Callable[[FmuError], None] = lambda error: log.error("%s", error),
         parent: Path | None = None,
         showing: Showing = Showing(),  # noqa: B008  a frozen Struct
-        open_result: OpenResult = CsvFile,
+        loaded: LoadedConfig | None = None,
     ) -> None:
         self.point = 0
         self.rows = 0
@@ -89,7 +88,7 @@ class LocalMesh:
         self._stepping = ""
         self._save: Callable[[], None] = lambda: None
         self._showing = showing
-        self._open_result = open_result
+        self._loaded = loaded if loaded is not None else LoadedConfig(plan.system.config, Path())
         self._stop: str | None = None
         self._stopped = threading.Event()
         self._folder: Path | None = None
@@ -138,15 +137,14 @@ class LocalMesh:
 
     def _run(self) -> None:
         plan = self._plan
-        recorded = plan.system.recorded
         layouts = {name: Layout.of(i.description.variables) for name, i in plan.system.instances.items()}
-        columns = [(f"{instance}.{name}", layouts[instance].column(name).type) for instance, name in recorded]
+        types = [layouts[instance].column(name).type for instance, name in plan.system.recorded]
         members: dict[str, _Member] = {}
         watch = CallWatch(self._take_hang)
         with tempfile.TemporaryDirectory(prefix="fmu_mesh-", dir=self._parent) as folder, closing(watch):
             self._folder = Path(folder)
-            file = self._open_result(Path(plan.system.result_file), columns) if plan.system.result_file else None
-            rows = RowBuffer(file, plan.grid, [type_ for _, type_ in columns])
+            file = open_result(self._loaded, plan.system) if plan.system.result_file else None
+            rows = RowBuffer(file, plan.grid, types)
             self._save = lambda: self._close(rows)
             try:
                 for name in plan.order:

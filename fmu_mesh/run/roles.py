@@ -15,6 +15,7 @@ from pathlib import Path
 
 import msgspec
 
+from ..config.loading import LoadedConfig
 from ..errors import ConfigurationError, FmuError, FmuMeshError, StepFailed
 from ..instances.call_guard import CallWatch, Guarded
 from ..instances.configuration import load
@@ -42,7 +43,7 @@ from ..wire.views import LogLine, MeshStatus
 from .events import End, Event, Log, Ready, Status
 from .preparing import Options, prepare, zenoh_section
 from .process import SIGNAL_RECEIVED, die_with_parent, ended_by_signals
-from .results import result_opener
+from .results import open_result
 from .wiring import is_socket, wiring
 
 __all__ = ["BY_HAND", "run_master", "run_node"]
@@ -234,9 +235,9 @@ def run_master(
             master.interrupt(reason)
         try:
             if RECORDER in plan.nodes:
-                open_file = result_opener(config_file, plan.system, folder if child else None)
+                file = open_result(LoadedConfig(config, config_file), plan.system, folder if child else None)
                 with Recorder(
-                    plan.nodes[RECORDER], session, open_file, lambda: master.has_begun, launch=_launch(run)
+                    plan.nodes[RECORDER], session, file, lambda: master.has_begun, launch=_launch(run)
                 ) as recorder:
                     master.run()
             else:

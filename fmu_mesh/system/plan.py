@@ -102,7 +102,6 @@ class NodePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         initialization: how these loops are iterated.
         links_in: links that end here.
         links_out: links that start here.
-        result_file: absolute path of the result CSV (for the recorder).
         restarts: how many times the run was restarted.
         shared_memory: whether processes of one host exchange messages through shared memory.
     """
@@ -122,7 +121,6 @@ class NodePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     links_out: tuple[Link, ...]
     loops: tuple[Loop, ...] = ()
     initialization: InitializationConfig = InitializationConfig()
-    result_file: str | None = None
     recorded: tuple[tuple[str, str], ...] = ()
     limits: LimitsConfig = LimitsConfig()
     shared_memory: bool = True
@@ -220,7 +218,6 @@ def _digest(system: System, nodes: dict[str, NodePlan], contents: Mapping[str, s
     agreed = [
         replace(
             node,
-            result_file=None,
             limits=LimitsConfig(),
             instances=tuple(
                 replace(instance, fmu="", section=instance.section.agreed()) for instance in node.instances
@@ -334,7 +331,6 @@ def _node(
         links_out=tuple(link for link in links if link.source_node == node),
         loops=tuple(loop for loop in plan.initialization.loops if node in loop.nodes),
         initialization=config.initialization,
-        result_file=plan.system.result_file if node == RECORDER else None,
         recorded=plan.system.recorded if node == RECORDER else (),
         limits=config.limits,
         shared_memory=config.zenoh.shared_memory,

@@ -29,6 +29,7 @@ from fmu_mesh.system.connections import (
 from fmu_mesh.system.couplings import coupled_connections
 from fmu_mesh.system.grouping import automatic_nodes
 from fmu_mesh.system.linear_inputs import check_extrapolation
+from fmu_mesh.system.recording import result_endings, result_format
 from fmu_mesh.system.start_values import forbidden_start_values, resolve_start_values, sized
 from fmu_mesh.text import nearest_file, shown
 from fmu_mesh.variables.model_description import ModelDescription, Value
@@ -37,11 +38,6 @@ from fmu_mesh.variables.value_types import element_name, is_text
 __all__ = ["Connection", "System", "SystemInstance", "build"]
 
 _RESERVED_NAME = "mesh"
-
-_OTHER_FORMATS = frozenset(
-    (".arrow", ".bag", ".db3", ".feather", ".h5", ".hdf5", ".json", ".mat", ".npz", ".ods", ".parquet", ".xls", ".xlsx")
-)
-"""Endings of formats that are not written. The programs for them could not open a CSV with such a name."""
 
 
 class SystemInstance(msgspec.Struct, frozen=True):
@@ -71,7 +67,7 @@ class System(msgspec.Struct, frozen=True):
         instances: in the order of the file.
         recorded: the recorded outputs as (instance, variable), in the order of the result columns. Each element of an
             array is a column, as `y[1,2]`.
-        result_file: absolute path of the result CSV, or None if nothing is recorded.
+        result_file: absolute path of the result file, or None if nothing is recorded.
         warnings: findings that do not prevent a run, such as connections between different units.
     """
 
@@ -297,10 +293,9 @@ def _result_file(loaded: LoadedConfig, findings: Findings) -> str | None:
         return None
     if is_folder:
         findings.add("record.file", f"the folder '{text}'", "a file, or null to record nothing")
-    elif path.suffix.lower() in _OTHER_FORMATS:
-        findings.add(
-            "record.file", f"'{text}', a format that is not written", "a name ending in .csv, or .mcap for a bag"
-        )
+    elif result_format(path) is None:
+        endings = " or ".join(result_endings())
+        findings.add("record.file", f"'{text}', a format that is not written", f"a name ending in {endings}")
     return str(path)
 
 

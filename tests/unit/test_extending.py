@@ -14,6 +14,7 @@ import pytest
 
 from fmu_mesh import plugins
 from fmu_mesh.errors import ConfigurationError
+from fmu_mesh.instances import registry
 from fmu_mesh.instances.configuration import parse
 from tests.helpers import Launched, Place
 
@@ -185,7 +186,7 @@ def forgotten() -> Iterator[Callable[[], None]]:
 
     def forget() -> None:
         plugins._own.cache_clear()
-        plugins._all.cache_clear()
+        registry._names.cache_clear()
 
     forget()
     yield forget
@@ -210,16 +211,10 @@ def test_other_packages_are_looked_for_only_where_a_key_is_not_ours(monkeypatch:
 
 
 @pytest.mark.usefixtures("forgotten")
-@pytest.mark.parametrize("installation", ["older", "absent"])
 def test_an_installation_that_is_older_than_its_source_is_told_how_to_install_again(
-    monkeypatch: pytest.MonkeyPatch, installation: str
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    def distribution(name: str) -> metadata.Distribution:
-        if installation == "absent":
-            raise metadata.PackageNotFoundError(name)
-        return metadata.Distribution.at(ROOT)  # no metadata there, so no entry points
-
-    monkeypatch.setattr(metadata, "distribution", distribution)
+    monkeypatch.setattr(plugins, "_FILE", "no_such_package-*.dist-info/entry_points.txt")
 
     with pytest.raises(ConfigurationError, match="older than its source") as caught:
         parse(FMU_ONLY, Path("a.yaml"))
