@@ -9,17 +9,28 @@ from __future__ import annotations
 import argparse
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NoReturn
 
 from .. import files
-from ..config.base import ENDPOINT_PATTERN
+from ..config.base import ENDPOINT_PATTERN, Endpoint
 from ..config.mesh import MAX_WINDOW
 from ..errors import ConfigurationError, LoadFailed
+from ..run.options import Options, settings
 from ..text import listed, nearest, nearest_file
 
-__all__ = ["CommandParser", "add_command", "add_window", "count", "endpoint", "no_fmu", "number", "positive_seconds"]
+__all__ = [
+    "CommandParser",
+    "add_command",
+    "add_options",
+    "count",
+    "endpoint",
+    "no_fmu",
+    "number",
+    "positive_seconds",
+    "read_options",
+]
 
 Parsers = Sequence[argparse.ArgumentParser]
 
@@ -80,10 +91,45 @@ def add_command(
     return parser
 
 
-def add_window(parser: argparse.ArgumentParser) -> None:
-    """The option `--window`."""
-    text = "how many points a node may run ahead; 1 is lockstep; auto: where instances are fast, many"
-    parser.add_argument("--window", type=_window, metavar="N", help=text)
+def add_options(
+    parser: argparse._ActionsContainer,
+    *names: str,
+    defaults: Mapping[str, str] | None = None,
+    metavars: Mapping[str, str] | None = None,
+) -> None:
+    """Add flags for options of a run, as `Options` describes them.
+
+    Args:
+        parser: the parser of a command, or a group of its flags.
+        names: the fields of `Options`.
+        defaults: by field, what holds where the flag is not given, for the help.
+        metavars: by field, what stands for its value where that is not what `Options` says.
+    """
+    for name in names:
+        setting = settings()[name]
+        flag, kind = setting.flag, setting.type
+        default = (defaults or {}).get(name)
+        text = setting.help + (f"; default: {default}" if default is not None else "")
+        details: dict[str, Any] = {"dest": name, "help": text.replace("%", "%%")}
+        if kind is bool:
+            parser.add_argument(flag.name, action="store_true", **details)
+            continue
+        details |= {"metavar": (metavars or {}).get(name, flag.metavar), "type": _READERS[kind]}
+        if setting.repeatable:
+            details |= {"action": "append", "default": []}
+        if flag.bare is not None:
+            details |= {"nargs": "?", "const": flag.bare, "type": _trace_file}
+        parser.add_argument(flag.name, **details)
+
+
+def read_options(arguments: argparse.Namespace) -> Options:
+    """The options that a command was given, of those that it has."""
+    given: dict[str, Any] = {}
+    for name, setting in settings().items():
+        if hasattr(arguments, name):
+            value = getattr(arguments, name)
+            given[name] = tuple(value) if setting.repeatable else value
+    return Options(**given)
 
 
 def number(text: str) -> float:
@@ -128,6 +174,12 @@ def no_fmu(path: Path, error: LoadFailed) -> ConfigurationError:
     return ConfigurationError(error.message, hint=hint)
 
 
+def _trace_file(text: str) -> Path:
+    if not text.endswith(".json"):
+        raise argparse.ArgumentTypeError(f"'{text}' is no .json file; write --profile after the other arguments")
+    return Path(text)
+
+
 def _window(text: str) -> int | Literal["auto"]:
     if text == "auto":
         return "auto"
@@ -150,3 +202,13 @@ def _read(text: str) -> float:
         return float(text)
     except ValueError:
         raise argparse.ArgumentTypeError(f"'{text}' is no number") from None
+
+
+_READERS: dict[Any, Callable[[str], object]] = {
+    int: _window,
+    float: number,
+    str: str,
+    Path: Path,
+    Endpoint: endpoint,
+}
+"""How the value of an option is read, by its type."""

@@ -9,14 +9,14 @@ from typing import Any
 
 from ..config.schema import schema_text
 from ..instances.registry import check_engines
-from ..run.preparing import Options, prepare
+from ..run.preparing import prepare
 from ..system.grouping import automatic_nodes
 from ..system.initialization_plan import Loop
 from ..system.plan import Plan
 from ..system.system import Connection, SystemInstance
 from ..text import listed, shown
 from ..variables.model_description import Variable
-from .arguments import add_command, add_window
+from .arguments import add_command, add_options, read_options
 from .output.display import say
 from .output.tables import pairs, table
 
@@ -29,17 +29,14 @@ def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.Arg
     """Add the commands of this module."""
     check = add_command(commands, "check", "check a configuration and show its plan; run nothing", [common])
     check.add_argument("config", type=Path, metavar="CONFIG", help="the configuration file")
-    add_window(check)
-    check.add_argument(
-        "--set", action="append", default=[], metavar="INSTANCE.VARIABLE=VALUE", help="another start value; repeatable"
-    )
+    add_options(check.add_argument_group("instead of what CONFIG says"), "window", "start_values")
     check.set_defaults(run_command=_check)
     schema = add_command(commands, "schema", "print the JSON Schema of configurations", [common])
     schema.set_defaults(run_command=_schema)
 
 
 def _check(arguments: argparse.Namespace) -> int:
-    plan = prepare(arguments.config, Options(start_values=tuple(arguments.set), window=arguments.window), say)
+    plan = prepare(arguments.config, read_options(arguments), say)
     print("\n".join(plan_page(plan)))
     check_engines(plan.system, str(arguments.config))
     print(f"\nOK: {arguments.config} can run.")

@@ -6,7 +6,6 @@ its bursts of steps, the sending at the end of each, and its waits; the summary 
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -19,40 +18,21 @@ from ...system.plan import RECORDER, Plan
 from ...wire.time_profile import GRANT, MeshProfile, NodeProfile
 from .tables import table
 
-__all__ = ["add_profile", "critical_path", "profile_page", "show_profile", "summary_of", "trace"]
+__all__ = ["critical_path", "profile_page", "show_profile", "summary_of", "trace"]
 
-_TABLE_ONLY = Path()
 _HOLDERS = {RECORDER: "the recorder", "@clock": "the wall clock", "@pause": "a pause"}
 _LITTLE = 0.1
 """A share of the time that is not worth following."""
 
 
-def add_profile(parser: argparse.ArgumentParser) -> None:
-    """Add the option; its value is None, `_TABLE_ONLY`, or the trace file to write."""
-    parser.add_argument(
-        "--profile",
-        nargs="?",
-        const=_TABLE_ONLY,
-        type=_trace_file,
-        metavar="FILE.json",
-        help="show where the time went, and write it as a trace file for Perfetto",
-    )
-
-
-def _trace_file(text: str) -> Path:
-    if not text.endswith(".json"):
-        raise argparse.ArgumentTypeError(f"'{text}' is no .json file; write --profile after the other arguments")
-    return Path(text)
-
-
 def show_profile(plan: Plan, profile: MeshProfile, seconds: float, file: Path) -> None:
-    """Print the table of a run that took ``seconds``, and write the trace file if one is wanted.
+    """Print the table of a run that took ``seconds``, and write the trace file unless it is `Path()`.
 
     Raises:
         ConfigurationError: the file cannot be written.
     """
     print("\n".join(profile_page(plan, profile)))
-    if file == _TABLE_ONLY:
+    if file == Path():
         return
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
