@@ -25,8 +25,8 @@ from ..run.process import ended_by_signals
 from ..run.results import result_opener
 from ..run.roles import BY_HAND, run_master, run_node
 from ..system.plan import Plan
-from ..wire.router import run_router
 from ..wire.runtime import enter_run_folder, fmu_folder, leave_run_folder, remove_stale_folders, run_folder
+from ..wire.session import run_router
 from ..wire.time_profile import MeshProfile
 from ..wire.views import LogLine
 from .arguments import add_command, add_options, count, endpoint, read_options
