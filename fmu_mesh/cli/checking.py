@@ -7,7 +7,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from ..config.schema import schema_text
+from ..config.mesh import Config
+from ..config.structure import schema_text
 from ..instances.registry import check_engines
 from ..run.preparing import prepare
 from ..system.grouping import automatic_nodes
@@ -44,7 +45,7 @@ def _check(arguments: argparse.Namespace) -> int:
 
 
 def _schema(_arguments: argparse.Namespace) -> int:
-    sys.stdout.write(schema_text())
+    sys.stdout.write(schema_text(Config))
     return 0
 
 

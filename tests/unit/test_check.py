@@ -12,7 +12,8 @@ from msgspec.structs import replace
 
 from fmu_mesh.cli.checking import plan_page
 from fmu_mesh.cli.main import main
-from fmu_mesh.config.schema import json_schema
+from fmu_mesh.config.mesh import Config
+from fmu_mesh.config.structure import json_schema
 from fmu_mesh.errors import Finding
 from fmu_mesh.run.preparing import prepare
 
@@ -222,4 +223,4 @@ def test_every_kept_configuration_can_run(
 
 def test_schema_prints_the_json_schema(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["schema"]) == 0
-    assert json.loads(capsys.readouterr().out) == json_schema()
+    assert json.loads(capsys.readouterr().out) == json_schema(Config)

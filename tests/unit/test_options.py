@@ -12,7 +12,8 @@ from fmu_mesh.cli.arguments import add_options, read_options
 from fmu_mesh.cli.main import command_parser
 from fmu_mesh.config.findings import Findings
 from fmu_mesh.config.loading import parse
-from fmu_mesh.config.schema import json_schema
+from fmu_mesh.config.mesh import Config
+from fmu_mesh.config.structure import json_schema
 from fmu_mesh.run.options import Options, settings, with_options
 
 TEXT = """\
@@ -54,7 +55,7 @@ def test_a_command_reads_the_options_that_it_has() -> None:
 
 
 def test_the_help_of_a_flag_is_the_description_of_its_key() -> None:
-    definitions = json_schema()["$defs"]
+    definitions = json_schema(Config)["$defs"]
     assert isinstance(definitions, dict)
     sections = {"simulation": "SimulationConfig", "zenoh": "ZenohConfig", "record": "RecordConfig"}
     for setting in settings().values():
