@@ -1,7 +1,6 @@
-"""What the commands have in common: how one is added, and arguments that say what is wrong with them.
+"""The common parts of all commands: adding one, its options, and readers of values with clear errors.
 
-A name of a function that stands as `type=` shows in argparse's own message for a text that is no number, so these have
-messages of their own.
+argparse shows the name of a reader function in its own message for a wrong value, so these raise messages of their own.
 """
 
 from __future__ import annotations
@@ -38,18 +37,18 @@ _NEGATIVE = re.compile(r"-(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?$|-\.?
 
 
 class CommandParser(argparse.ArgumentParser):
-    """A parser whose errors are one sentence, as all others: a page of options hides what is wrong."""
+    """A parser whose errors are one sentence. The usage that argparse prints would hide it."""
 
-    def __init__(self, *arguments: Any, **options: Any) -> None:  # noqa: ANN401 those of argparse
+    def __init__(self, *arguments: Any, **options: Any) -> None:  # noqa: ANN401 the arguments of argparse
         super().__init__(*arguments, **options)
-        self._negative_number_matcher = _NEGATIVE  # argparse takes -1e-3 and -inf for options
+        self._negative_number_matcher = _NEGATIVE  # by default argparse takes -1e-3 and -inf for options
 
     def error(self, message: str) -> NoReturn:
-        """End with exit code 2 and with what is wrong."""
+        """Exit with code 2 and one sentence about the error."""
         name, _, what = message.removeprefix("argument ").partition(": ")
         hint = None
         if name == "the following arguments are required":
-            # argparse names those that may be left out, too, if they come last.
+            # argparse also lists optional ones at the end.
             free = [str(action.metavar) for action in self._get_positional_actions() if action.nargs in ("*", "?")]
             needed = " and ".join(one for one in what.split(", ") if one not in free)
             text, hint = f"`{self.prog}` needs {needed}", f"`{self.prog} --help` tells more."
@@ -61,7 +60,7 @@ class CommandParser(argparse.ArgumentParser):
         self.exit(problem.exit_code, f"fmu-mesh: {problem}\n")
 
     def unknown(self, argument: str, others: Mapping[str, CommandParser]) -> ConfigurationError:
-        """What to say to an argument that this command does not have; ``others`` are all commands."""
+        """The error for an argument that this command does not have; ``others`` are all commands."""
         if not argument.startswith("-"):
             return ConfigurationError(f"`{self.prog}` takes no '{argument}'", hint=f"`{self.prog} --help` tells more.")
         name = argument.partition("=")[0]
@@ -78,14 +77,14 @@ class CommandParser(argparse.ArgumentParser):
 
     @property
     def option_names(self) -> list[str]:
-        """The options that its help shows."""
+        """The options in its help."""
         return [name for name, action in self._option_string_actions.items() if action.help != argparse.SUPPRESS]
 
 
 def add_command(
     commands: argparse._SubParsersAction[Any], name: str, text: str, parents: Parsers
 ) -> argparse.ArgumentParser:
-    """A command whose own help begins with the line that the list of all commands has for it."""
+    """Add a command; ``text`` is its line in the list of commands and the first line of its own help."""
     description = f"{text[0].upper()}{text[1:]}."
     parser: argparse.ArgumentParser = commands.add_parser(name, parents=parents, help=text, description=description)
     return parser
@@ -102,8 +101,8 @@ def add_options(
     Args:
         parser: the parser of a command, or a group of its flags.
         names: the fields of `Options`.
-        defaults: by field, what holds where the flag is not given, for the help.
-        metavars: by field, what stands for its value where that is not what `Options` says.
+        defaults: by field, the default value for the help.
+        metavars: by field, the name of the value in the help, if it differs from that in `Options`.
     """
     for name in names:
         setting = settings()[name]
@@ -123,7 +122,7 @@ def add_options(
 
 
 def read_options(arguments: argparse.Namespace) -> Options:
-    """The options that a command was given, of those that it has."""
+    """The options from the arguments of a command."""
     given: dict[str, Any] = {}
     for name, setting in settings().items():
         if hasattr(arguments, name):
@@ -149,7 +148,7 @@ def positive_seconds(text: str) -> float:
 
 
 def count(text: str) -> int:
-    """A whole number of 1 or more."""
+    """A positive whole number."""
     value = _whole(text)
     if value < 1:
         raise argparse.ArgumentTypeError(f"'{text}' is not a whole number of 1 or more")
@@ -164,7 +163,7 @@ def endpoint(text: str) -> str:
 
 
 def no_fmu(path: Path, error: LoadFailed) -> ConfigurationError:
-    """What to say where an FMU was asked for, and something else, or nothing, is there."""
+    """The error for a path that should be an FMU and is something else, or nothing."""
     hint = error.hint
     if not files.exists(path):
         near = nearest_file(path)
@@ -190,7 +189,7 @@ def _window(text: str) -> int | Literal["auto"]:
 
 
 def _whole(text: str) -> int:
-    """A whole number; 0 for what is none, which no option here takes."""
+    """A whole number; 0, which no option here allows, for any other text."""
     try:
         return int(text)
     except ValueError:
@@ -211,4 +210,4 @@ _READERS: dict[Any, Callable[[str], object]] = {
     Path: Path,
     Endpoint: endpoint,
 }
-"""How the value of an option is read, by its type."""
+"""The reader of a value by its type."""

@@ -1,4 +1,4 @@
-"""`check` and `schema`: what a configuration means, and what it may look like."""
+"""`check` and `schema`: the plan of a configuration, and its JSON Schema."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ..system.grouping import automatic_nodes
 from ..system.initialization_plan import Loop
 from ..system.plan import Plan
 from ..system.system import Connection, SystemInstance
-from ..text import listed, shown
+from ..text import listed, short_number, short_path, shown
 from ..variables.model_description import Variable
 from .arguments import add_command, add_options, read_options
 from .output.display import say
@@ -28,7 +28,7 @@ _PROBLEM_CHARACTERS = 100
 
 def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.ArgumentParser) -> None:
     """Add the commands of this module."""
-    check = add_command(commands, "check", "check a configuration and show its plan; run nothing", [common])
+    check = add_command(commands, "check", "check a configuration and show its plan, without running it", [common])
     check.add_argument("config", type=Path, metavar="CONFIG", help="the configuration file")
     add_options(check.add_argument_group("instead of what CONFIG says"), "window", "start_values")
     check.set_defaults(run_command=_check)
@@ -73,12 +73,12 @@ def _head(plan: Plan) -> list[str]:
     simulation, grid = plan.system.config.simulation, plan.grid
     factor = simulation.real_time_factor
     window = f"{plan.window} points" if plan.window > 1 else "1 point: lockstep"
-    end = f"{_number(grid.stop_time)} s in {grid.last_point}" if grid.stop_time is not None else "an open end in"
-    times = f"{_number(grid.start_time)} s to {end} steps of"
+    end = f"{short_number(grid.stop_time)} s in {grid.last_point}" if grid.stop_time is not None else "an open end in"
+    times = f"{short_number(grid.start_time)} s to {end} steps of"
     return pairs(
         [
             ("Mesh", plan.system.config.mesh),
-            ("Simulation", f"{times} {_number(grid.step_size)} s"),
+            ("Simulation", f"{times} {short_number(grid.step_size)} s"),
             ("Algorithm", simulation.algorithm),
             ("Window", window),
             ("Speed", f"{factor:g} times real time" if factor else "as fast as possible"),
@@ -91,7 +91,7 @@ def _instances(plan: Plan) -> list[str]:
         [
             instance.name,
             _model(instance),
-            f"step {_number(instance.step_points * plan.grid.step_size)} s",
+            f"step {short_number(instance.step_points * plan.grid.step_size)} s",
             "a process of its own" if instance.node == instance.name else f"group {instance.node}",
             _start_values(instance),
         ]
@@ -101,7 +101,7 @@ def _instances(plan: Plan) -> list[str]:
 
 
 def _solver(instance: SystemInstance) -> str:
-    """How a model-exchange FMU is solved; of co-simulation, which has its own solver, the tolerance that it is told."""
+    """The solver of a model-exchange FMU, or the tolerance for the own solver of a co-simulation FMU."""
     if instance.description.kind == "co_simulation":
         told = instance.options.tolerance
         return f", tolerance {told:g}" if told is not None else ""
@@ -111,7 +111,7 @@ def _solver(instance: SystemInstance) -> str:
 
 
 def _model(instance: SystemInstance) -> str:
-    """The file of an instance, and what it is a model of."""
+    """The file of an instance, and its kind."""
     description = instance.description
     if instance.hosted is None:
         return f"{Path(instance.fmu).name} (FMI {description.fmi_version}{_solver(instance)})"
@@ -138,7 +138,7 @@ def _connections(plan: Plan) -> list[str]:
 
 
 def _free_inputs(plan: Plan) -> list[str]:
-    """What keeps its start value unless somebody sets it; a connection that was forgotten shows here."""
+    """Inputs that keep their start values unless they are set: a forgotten connection is visible here."""
     connected = {(c.target_instance, c.target.name) for c in plan.connections}
     lines = []
     for name, instance in plan.system.instances.items():
@@ -151,12 +151,12 @@ def _free_inputs(plan: Plan) -> list[str]:
 
 
 def _arithmetic(c: Connection) -> str:
-    """What a connection calculates; empty if it hands the value on as it is."""
+    """The formula of a connection; empty if it copies the value."""
     if (c.factor, c.offset) == (1.0, 0.0):
         return ""
-    product = f"{_number(c.factor)} * {c.source_name}" if c.factor != 1.0 else c.source_name
+    product = f"{short_number(c.factor)} * {c.source_name}" if c.factor != 1.0 else c.source_name
     sign = "-" if c.offset < 0.0 else "+"
-    sum_ = f"{product} {sign} {_number(abs(c.offset))}" if c.offset else product
+    sum_ = f"{product} {sign} {short_number(abs(c.offset))}" if c.offset else product
     return f"{c.target_name} = {sum_}"
 
 
@@ -169,7 +169,7 @@ def _order(plan: Plan) -> list[str]:
 
 
 def _groups(plan: Plan) -> list[str]:
-    """What `group: auto` does or would do, and why, for each cycle that it concerns."""
+    """For each cycle, what `group: auto` does or would do, and why."""
     config, instances = plan.system.config, plan.system.instances
     edges = [(c.source_instance, c.target_instance) for c in plan.connections]
     automatic = automatic_nodes(config, edges, {name: own.description for name, own in instances.items()})
@@ -194,7 +194,7 @@ def _remedy(nodes: int, automatic: int) -> str:
 
 
 def _initialization(plan: Plan) -> list[str]:
-    """What becomes known when, and which outputs are iterated together."""
+    """The levels in which outputs are computed, and which ones are iterated together."""
     loops = {loop.first: loop for loop in plan.initialization.loops}
     levels: dict[int, list[str]] = {}
     by_order = sorted(plan.initialization.levels.items(), key=lambda item: plan.order.index(item[0][0]))
@@ -225,7 +225,7 @@ def _recorded(plan: Plan) -> list[str]:
         described = instances[name].description.variable_of(variable)
         type_ = described.type_name.partition("[")[0] if described is not None else ""
         rows.append([f"{name}.{variable}", type_, _unit(described).strip()])
-    return [*table(rows, indent=2), f"  into {_short(plan.system.result_file)}"]
+    return [*table(rows, indent=2), f"  into {short_path(plan.system.result_file)}"]
 
 
 def _warnings(plan: Plan) -> list[str]:
@@ -240,14 +240,3 @@ def _warnings(plan: Plan) -> list[str]:
 
 def _unit(variable: Variable | None) -> str:
     return f" {variable.unit}" if variable is not None and variable.unit else ""
-
-
-def _number(value: float) -> str:
-    return f"{value:.12g}"
-
-
-def _short(path: str) -> str:
-    try:
-        return str(Path(path).relative_to(Path.cwd()))
-    except ValueError:
-        return path

@@ -1,6 +1,6 @@
-"""`run`: one FMU as a free-running node, paced by the wall clock and without a configuration file.
+"""`run`: one FMU as a free-running node in real time, without a configuration file.
 
-It is a mesh of one instance, whose configuration is made here from the options, so everything else is as in any mesh.
+Owns the configuration of this mesh of one instance; everything else is as for any mesh.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from .running import close, run_launcher
 __all__ = ["add_commands"]
 
 _SIMULATION = {"real_time_factor": 1.0, "update_period": 0.01, "catch_up": 1.0}
-"""What the configuration says about time unless options replace it."""
+"""The keys of `simulation` with other defaults than in a file; options replace them."""
 
 
 def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.ArgumentParser) -> None:
@@ -101,7 +101,7 @@ def _launch(plan: Plan, file: Path, options: Options, arguments: argparse.Namesp
 def _configuration(
     arguments: argparse.Namespace, name: str, options: Options, description: ModelDescription
 ) -> dict[str, Any]:
-    """The configuration of a mesh of one instance, as it would stand in a file, before options replace its keys."""
+    """The configuration of a mesh of one instance as a file would have it, before options replace its keys."""
     step_size = description.default_experiment.step_size
     if step_size is None and options.step_size is None:
         raise ConfigurationError(f"'{arguments.fmu}' has no default step size.", hint="Give one with --step-size.")

@@ -1,4 +1,4 @@
-"""`launch`, `node`, `master`, `gateway` and `router`: the commands that run something."""
+"""`launch`, `node`, `master`, `gateway` and `router`: the commands that start processes of a mesh."""
 
 from __future__ import annotations
 
@@ -42,33 +42,33 @@ def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.Arg
     launch = add_command(commands, "launch", "run a mesh: one process per node, and the master", [common])
     _add_config(launch, "paused", "view", "video", "profile")
     launch.add_argument("--local", action="store_true", help="run everything in this one process")
-    launch.add_argument("--plot", type=Path, metavar="FILE.png", help="plot the result when done")
+    launch.add_argument("--plot", type=Path, metavar="FILE.png", help="plot the result at the end")
     launch.add_argument(
         "--restarts",
         type=count,
         default=0,
         metavar="N",
-        help="start again from the first point when a node or the master is lost, N times at most",
+        help="restart from the first point when a node or the master is lost, at most N times",
     )
     launch.add_argument("--no-progress", action="store_true", help="no progress line")
     launch.set_defaults(run_command=_launch)
 
-    node = add_command(commands, "node", "run one node by hand", [common])
+    node = add_command(commands, "node", "start one node manually", [common])
     _add_config(node, "view", "video")
     node.add_argument("node", metavar="INSTANCE", help="name of the instance, or of its group")
     node.add_argument("--plan", type=Path, help=argparse.SUPPRESS)
     node.add_argument("--run", default=BY_HAND, help=argparse.SUPPRESS)
     node.set_defaults(run_command=_node)
 
-    master = add_command(commands, "master", "run the master and the recorder by hand", [common])
+    master = add_command(commands, "master", "start the master and the recorder manually", [common])
     _add_config(master, "paused", "profile")
-    master.add_argument("--plot", type=Path, metavar="FILE.png", help="plot the result when done")
+    master.add_argument("--plot", type=Path, metavar="FILE.png", help="plot the result at the end")
     master.add_argument("--no-progress", action="store_true", help="no progress line")
     master.add_argument("--events", action="store_true", help=argparse.SUPPRESS)
     master.add_argument("--run", default=BY_HAND, help=argparse.SUPPRESS)
     master.set_defaults(run_command=_master)
 
-    gateway = add_command(commands, "gateway", "run the gateway to ROS by hand", [common])
+    gateway = add_command(commands, "gateway", "start the gateway to ROS manually", [common])
     _add_config(gateway)
     gateway.add_argument("--events", action="store_true", help=argparse.SUPPRESS)
     gateway.add_argument("--run", default=BY_HAND, help=argparse.SUPPRESS)
@@ -93,10 +93,10 @@ def _add_config(parser: argparse.ArgumentParser, *options: str) -> None:
 
 
 def _options(arguments: argparse.Namespace) -> Options:
-    """The options of a command; what `--view` and `--video` ask for can be done here.
+    """The options of a command.
 
     Raises:
-        ConfigurationError: it cannot.
+        ConfigurationError: `--view` or `--video` is not possible on this host.
     """
     options = read_options(arguments)
     if options.view and options.video is not None:

@@ -1,7 +1,7 @@
 """The configuration file, version 1, as frozen Structs (design: "The configuration file").
 
-Owns the shape and the documentation of the file, from which the JSON Schema is made. Reading YAML and telling
-what is wrong with it is `fmu_mesh.config.loading`; what the names in it mean is `fmu_mesh.system.system`.
+Owns the keys of the file and their descriptions, from which the JSON Schema and the help of options are made. Reading a
+file is `fmu_mesh.config.loading`; what the names in it mean is `fmu_mesh.system.system`.
 """
 
 from __future__ import annotations
@@ -331,5 +331,5 @@ class Config(Base, frozen=True, kw_only=True):
     version: Annotated[Literal[1], Meta(description="Version of this file format.")] = 1
 
     def is_strict(self, instance: InstanceConfig) -> bool:
-        """Whether what FMI forbids is an error for an instance of this mesh."""
+        """Whether a violation of FMI is an error, and not a warning, for an instance of this mesh."""
         return instance.strict if instance.strict is not None else self.strict

@@ -1,6 +1,6 @@
-"""`--profile`: where the time of a run went, as a table, and as a trace file that Chrome and Perfetto show.
+"""`--profile`: where the time of a run went, as a table and as a trace file for Chrome and Perfetto.
 
-Owns what a person sees of a `MeshProfile`. A trace file is JSON in the Trace Event Format: one process per node, with
+Owns how a `MeshProfile` is shown. A trace file is JSON in the Trace Event Format: one process per node, with
 its bursts of steps, the sending at the end of each, and its waits; the summary is in it as `otherData.fmu_mesh`.
 """
 
@@ -22,7 +22,7 @@ __all__ = ["critical_path", "profile_page", "show_profile", "summary_of", "trace
 
 _HOLDERS = {RECORDER: "the recorder", "@clock": "the wall clock", "@pause": "a pause"}
 _LITTLE = 0.1
-"""A share of the time that is not worth following."""
+"""Shares of the time below this one are ignored."""
 
 
 def show_profile(plan: Plan, profile: MeshProfile, seconds: float, file: Path) -> None:
@@ -80,7 +80,7 @@ def _other_s(node: NodeProfile) -> float:
 
 
 def critical_path(plan: Plan, profile: MeshProfile) -> list[str]:
-    """Who waits for whom, from the node that waits most to the one that sets the pace, in words."""
+    """Which node waits for which, from the one that waits most to the one that sets the pace, in words."""
     nodes = {node.node: node for node in profile.nodes if node.seconds > 0.0}
     if not nodes:
         return []
@@ -129,7 +129,7 @@ def _waiting(node: NodeProfile) -> float:
 
 
 def _holder(profile: MeshProfile) -> str | None:
-    """What held the grant longest."""
+    """The instance, or other cause, that held the grant back for the longest time."""
     return max(profile.held_s, key=lambda holder: profile.held_s[holder], default=None)
 
 
@@ -200,7 +200,7 @@ def trace(plan: Plan, profile: MeshProfile, seconds: float) -> dict[str, Any]:
 
 
 def _named(number: int, node: NodeProfile) -> list[dict[str, Any]]:
-    """What the viewer calls a node; process ids of several hosts could be equal, so nodes are numbered."""
+    """The names of a node in the viewer. Process ids of two hosts can be equal, so nodes are numbered."""
     text = f"{node.node} (process {node.pid} on {node.host})"
     return [
         {"ph": "M", "name": "process_name", "pid": number, "tid": 1, "args": {"name": text}},

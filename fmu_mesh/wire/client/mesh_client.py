@@ -7,7 +7,6 @@ program can do (docs/key-space.md), with deadlines and with names instead of key
 
 from __future__ import annotations
 
-import re
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -18,7 +17,7 @@ import msgspec
 import zenoh
 
 from ...errors import ConfigurationError, DeadlineExceeded, MeshLost, MessageRefused
-from ...text import listed, nearest
+from ...text import fits, listed, nearest
 from ..keys import Keys
 from ..messages import decode_json
 from ..session import Question, answer_of, answers, reason_of
@@ -223,16 +222,16 @@ class MeshClient:
         instance, _, name = reference.partition(".")
         names = self.info().instances
         if not name:
-            if not any(_fits(instance, candidate) for candidate in names):
+            if not any(fits(instance, candidate) for candidate in names):
                 instance = "INSTANCE"
             raise ConfigurationError(
                 f"'{reference}' names no variable.", hint=f"Write '{instance}.VARIABLE', or '{instance}.*' for all."
             )
-        instances = [candidate for candidate in names if _fits(instance, candidate)]
+        instances = [candidate for candidate in names if fits(instance, candidate)]
         if not instances:
             raise self._unknown_instance(instance)
         found = [target for candidate in instances for target in self._variables(candidate)]
-        matching = [target for target in found if _fits(name, target.variable.name)]
+        matching = [target for target in found if fits(name, target.variable.name)]
         if not matching:
             where = (
                 f"instance '{instances[0]}' has" if len(instances) == 1 else f"the instances {listed(instances)} have"
@@ -296,13 +295,6 @@ def key_expression(text: str) -> zenoh.KeyExpr:
     except zenoh.ZError as error:
         reason = reason_of(error).rpartition("`: ")[2].removesuffix(".")
         raise ConfigurationError(f"'{text}' is no key expression: {reason}") from error
-
-
-def _fits(pattern: str, name: str) -> bool:
-    """Whether a name is the pattern, in which `*` stands for any characters."""
-    if "*" not in pattern:
-        return pattern == name
-    return re.fullmatch(".*".join(map(re.escape, pattern.split("*"))), name) is not None
 
 
 def _not_understood(who: str, error: MessageRefused) -> ConfigurationError:
