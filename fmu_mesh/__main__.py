@@ -1,10 +1,10 @@
-"""The command `fmu-mesh`, and `python -m fmu_mesh`: Ctrl-C has its exit code even while the command is being loaded."""
+"""The command `fmu-mesh`, and `python -m fmu_mesh`. Ctrl-C gives its exit code even during the imports."""
 
 import sys
 
 
 def main() -> int:
-    """Load the command, which takes memory and half a second, and run it; returns the exit code."""
+    """Import the command, which takes memory and half a second, and run it; returns the exit code."""
     try:
         from .cli.limits import FEWEST_MIB, address_space_problem  # noqa: PLC0415 an interrupt must find us here
 
@@ -22,6 +22,6 @@ def main() -> int:
 
 if __name__ == "__main__":
     if not sys.flags.safe_path:
-        # `python -m` looks for modules in the current folder first; the command `fmu-mesh` does not, and both are one.
+        # `python -m` searches modules in the current folder first; `fmu-mesh` does not, and both must behave alike.
         del sys.path[0]
     raise SystemExit(main())

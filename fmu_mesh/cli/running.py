@@ -1,4 +1,4 @@
-"""`launch`, `node`, `master`, `gateway` and `router`: the commands that run something."""
+"""`launch`, `node`, `master`, `gateway` and `router`: the commands that start processes of a mesh."""
 
 from __future__ import annotations
 
@@ -18,17 +18,18 @@ from ..run.events import End, Event, EventWriter, Ready
 from ..run.gateway_role import run_gateway
 from ..run.launcher import Launcher
 from ..run.local import LocalMesh
-from ..run.preparing import Options, prepare
+from ..run.options import Options
+from ..run.preparing import prepare
 from ..run.process import ended_by_signals
 from ..run.roles import BY_HAND, run_master, run_node
 from ..system.plan import Plan
-from ..wire.router import run_router
 from ..wire.runtime import enter_run_folder, fmu_folder, leave_run_folder, remove_stale_folders, run_folder
+from ..wire.session import run_router
 from ..wire.time_profile import MeshProfile
 from ..wire.views import LogLine
-from .arguments import add_command, add_window, count, endpoint, number
+from .arguments import add_command, add_options, count, endpoint, read_options
 from .output.display import Display, say, stdout_as_stderr, summary, warn
-from .output.profile_table import add_profile, show_profile
+from .output.profile_table import show_profile
 from .plotting import check_plot, plot_results, plotted_where_it_ends
 
 __all__ = ["add_commands", "close", "run_launcher"]
@@ -37,41 +38,35 @@ __all__ = ["add_commands", "close", "run_launcher"]
 def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.ArgumentParser) -> None:
     """Add the commands of this module."""
     launch = add_command(commands, "launch", "run a mesh: one process per node, and the master", [common])
-    _add_config(launch)
+    _add_config(launch, "paused", "view", "video", "profile")
     launch.add_argument("--local", action="store_true", help="run everything in this one process")
-    _add_paused(launch)
-    launch.add_argument("--plot", type=Path, metavar="FILE.png", help="plot the result when done")
+    launch.add_argument("--plot", type=Path, metavar="FILE.png", help="plot the result at the end")
     launch.add_argument(
         "--restarts",
         type=count,
         default=0,
         metavar="N",
-        help="start again from the first point when a node or the master is lost, N times at most",
+        help="restart from the first point when a node or the master is lost, at most N times",
     )
     launch.add_argument("--no-progress", action="store_true", help="no progress line")
-    _add_showing(launch)
-    add_profile(launch)
     launch.set_defaults(run_command=_launch)
 
-    node = add_command(commands, "node", "run one node by hand", [common])
-    _add_config(node)
+    node = add_command(commands, "node", "start one node manually", [common])
+    _add_config(node, "view", "video")
     node.add_argument("node", metavar="INSTANCE", help="name of the instance, or of its group")
-    _add_showing(node)
     node.add_argument("--plan", type=Path, help=argparse.SUPPRESS)
     node.add_argument("--run", default=BY_HAND, help=argparse.SUPPRESS)
     node.set_defaults(run_command=_node)
 
-    master = add_command(commands, "master", "run the master and the recorder by hand", [common])
-    _add_config(master)
-    _add_paused(master)
-    master.add_argument("--plot", type=Path, metavar="FILE.png", help="plot the result when done")
+    master = add_command(commands, "master", "start the master and the recorder manually", [common])
+    _add_config(master, "paused", "profile")
+    master.add_argument("--plot", type=Path, metavar="FILE.png", help="plot the result at the end")
     master.add_argument("--no-progress", action="store_true", help="no progress line")
-    add_profile(master)
     master.add_argument("--events", action="store_true", help=argparse.SUPPRESS)
     master.add_argument("--run", default=BY_HAND, help=argparse.SUPPRESS)
     master.set_defaults(run_command=_master)
 
-    gateway = add_command(commands, "gateway", "run the gateway to ROS by hand", [common])
+    gateway = add_command(commands, "gateway", "start the gateway to ROS manually", [common])
     _add_config(gateway)
     gateway.add_argument("--events", action="store_true", help=argparse.SUPPRESS)
     gateway.add_argument("--run", default=BY_HAND, help=argparse.SUPPRESS)
@@ -83,78 +78,28 @@ def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.Arg
         type=endpoint,
         action="append",
         metavar="ENDPOINT",
-        help="listen there; repeatable; default: tcp/127.0.0.1:7447",
+        help="endpoint where others can connect; repeatable; default: tcp/127.0.0.1:7447",
     )
     router.set_defaults(run_command=_router)
 
 
-def _add_config(parser: argparse.ArgumentParser) -> None:
+def _add_config(parser: argparse.ArgumentParser, *options: str) -> None:
     parser.add_argument("config", type=Path, metavar="CONFIG", help="the configuration file")
-    add_window(parser)
-    parser.add_argument(
-        "--set", action="append", default=[], metavar="INSTANCE.VARIABLE=VALUE", help="another start value; repeatable"
-    )
-    parser.add_argument(
-        "--real-time-factor",
-        type=number,
-        metavar="F",
-        help="1: wall clock; 2: twice as fast; 0: as fast as possible; default: that of the configuration",
-    )
-    parser.add_argument(
-        "--output", type=Path, metavar="FILE", help="another result file; its ending chooses the format"
-    )
-    parser.add_argument(
-        "--connect",
-        type=endpoint,
-        action="append",
-        default=[],
-        metavar="ENDPOINT",
-        help="connect there, such as tcp/HOST:PORT, instead of to zenoh.connect of the configuration; repeatable",
-    )
-    parser.add_argument(
-        "--listen",
-        type=endpoint,
-        action="append",
-        default=[],
-        metavar="ENDPOINT",
-        help="let the master listen there, such as at tcp/0.0.0.0:7447, instead of at zenoh.listen; repeatable",
-    )
-
-
-def _add_showing(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--view", action="store_true", help="show the world of the physics engine in a window")
-    parser.add_argument(
-        "--video", type=Path, metavar="FILE.mp4", help="make a film of that world, .mp4 or .gif; needs no screen"
-    )
-
-
-def _showing(arguments: argparse.Namespace) -> Showing:
-    """What `--view` and `--video` ask for."""
-    video: Path | None = getattr(arguments, "video", None)
-    showing = Showing(view=getattr(arguments, "view", False), video=video.absolute() if video is not None else None)
-    if showing.view and showing.video is not None:
-        raise ConfigurationError("--view and --video do not go together", hint="Leave one of them out.")
-    return showing
-
-
-def _add_paused(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--paused", action="store_true", help="rest at the first point until `resume`, `step` or `play`"
-    )
+    instead = parser.add_argument_group("instead of what CONFIG says")
+    add_options(instead, "window", "start_values", "real_time_factor", "output", "listen", "connect")
+    add_options(parser, *options)
 
 
 def _options(arguments: argparse.Namespace) -> Options:
-    return Options(
-        start_values=tuple(arguments.set),
-        window=arguments.window,
-        real_time_factor=arguments.real_time_factor,
-        output=arguments.output,
-        connect=tuple(arguments.connect),
-        listen=tuple(arguments.listen),
-        profile=getattr(arguments, "profile", None) is not None,
-        showing=_showing(arguments),
-        paused=getattr(arguments, "paused", False),
-    )
+    """The options of a command.
+
+    Raises:
+        ConfigurationError: `--view` or `--video` is not possible on this host.
+    """
+    options = read_options(arguments)
+    if options.view and options.video is not None:
+        raise ConfigurationError("--view and --video do not go together", hint="Leave one of them out.")
+    return options
 
 
 def _launch(arguments: argparse.Namespace) -> int:
@@ -181,7 +126,7 @@ def _launch(arguments: argparse.Namespace) -> int:
             end = _run_processes(plan, arguments, options, display)
             point, seconds, rows, profile = end.status.point, end.seconds, end.rows, end.profile
     if profile is not None:
-        show_profile(plan, profile, seconds, arguments.profile)
+        show_profile(plan, profile, seconds, options.profile or Path())
     if arguments.video is not None:
         print(f"video: {arguments.video}")
     close(plan, point, seconds, rows, arguments.plot)
@@ -296,7 +241,7 @@ def _master(arguments: argparse.Namespace) -> int:
     ):
         run_master(arguments.config, options, show, plan=plan)
     if ends[0].profile is not None:
-        show_profile(plan, ends[0].profile, ends[0].seconds, arguments.profile)
+        show_profile(plan, ends[0].profile, ends[0].seconds, options.profile or Path())
     close(plan, ends[0].status.point, ends[0].seconds, ends[0].rows, arguments.plot)
     return 0
 

@@ -1,7 +1,7 @@
-"""A configuration file to a `LoadedConfig`: its structure is right, or all that is wrong with it is told.
+"""Reading a configuration file: the result is a valid structure, or an error with all findings.
 
-Owns the reading of the file, the short form of connections and the options that override start values. What
-the names in the file mean is `fmu_mesh.system.system`.
+Owns the short form of connections and the start values of the command line. What the names in the file mean is
+`fmu_mesh.system.system`.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ _SHORT_FORM = "'instance.output -> instance.input', or {from: instance.output, t
 
 
 class LoadedConfig(msgspec.Struct, frozen=True):
-    """A configuration whose structure is right, and where its parts stand in the file.
+    """A configuration with a valid structure, and the line of each of its parts.
 
     Attributes:
         config: the configuration, overrides included.
         file: the file as the user named it.
         lines: line numbers, counted from 1, by path in the file.
-        overrides: the option (`--set pendulum.l=2`) that took the place of what stands at a path.
+        overrides: the option (`--set pendulum.l=2`) that replaced a value, by path in the file.
     """
 
     config: Config
@@ -53,7 +53,7 @@ class LoadedConfig(msgspec.Struct, frozen=True):
         return Findings(str(self.file), self.lines, self.overrides)
 
     def locate(self, path: str) -> int | None:
-        """The line of ``path``, or of the nearest place around it."""
+        """The line of ``path``, or of the innermost part of the file around it that has one."""
         return locate(self.lines, path)
 
     def finding(self, path: str, found: str, expected: str, suggestion: str | None = None) -> Finding:
@@ -61,9 +61,9 @@ class LoadedConfig(msgspec.Struct, frozen=True):
         return Finding(str(self.file), path, found, expected, suggestion, self.locate(path))
 
     def resolve(self, relative: str) -> Path:
-        """The absolute path of a path that stands in the file.
+        """The absolute path for a path in the file, which is relative to the folder of the file.
 
-        The folder is resolved, the name is not: a link such as `/dev/stdout` stays what it is.
+        Links in the folder are resolved, the last part is not: `/dev/stdout` stays `/dev/stdout`.
         """
         path = self.file.absolute().parent / relative
         return path.parent.resolve() / path.name
@@ -72,26 +72,30 @@ class LoadedConfig(msgspec.Struct, frozen=True):
 def load(path: Path, overrides: Sequence[str], kinds: Kinds) -> LoadedConfig:
     """Read a configuration file.
 
+    Example:
+        >>> load(Path("configs/pendulum_delay.yaml"), ["pendulum.l=2"]).config.mesh
+        'pendulum_delay'
+
     Args:
         path: the YAML file.
         overrides: start values of the command line, each `instance.variable=value` with a YAML scalar.
         kinds: the kinds of instances.
 
     Raises:
-        ConfigurationError: the file cannot be read, or its structure is wrong; carries all findings.
+        ConfigurationError: the file cannot be read, or its structure is wrong; has all findings.
     """
     loaded, findings = examine(path, overrides, kinds)
     return _right(loaded, findings)
 
 
 def examine(path: Path, overrides: Sequence[str], kinds: Kinds) -> tuple[LoadedConfig, Findings]:
-    """As `load`, but go on where the structure is wrong: give what is left, and the findings.
+    """As `load`, but return a partial configuration with the findings instead of raising an error.
 
-    Hand both to `system.build`, which checks the meaning of what is left and raises one error with everything. With
-    findings the configuration holds placeholders (an empty `fmu`, a step size that is NaN) and must not be run.
+    Pass both to `system.build`, which checks the meaning of the rest and raises one error with all findings. A partial
+    configuration has placeholders (an empty `fmu`, a step size of NaN) and must not be run.
 
     Raises:
-        ConfigurationError: the file cannot be read, or too little of it is left.
+        ConfigurationError: the file cannot be read, or too little of it is valid.
     """
     findings = Findings(str(path))
     text = _text(path, findings)
@@ -100,10 +104,10 @@ def examine(path: Path, overrides: Sequence[str], kinds: Kinds) -> tuple[LoadedC
 
 
 def parse(text: str, path: Path, overrides: Sequence[str], kinds: Kinds) -> LoadedConfig:
-    """As `load`, with the text of the file at hand; ``path`` is what relative paths and errors refer to.
+    """As `load`, with the text of the file as an argument; relative paths and errors refer to ``path``.
 
     Raises:
-        ConfigurationError: the structure is wrong; carries all findings.
+        ConfigurationError: the structure is wrong; has all findings.
     """
     loaded, findings = _examine(text, path, overrides, kinds)
     return _right(loaded, findings)
@@ -137,7 +141,7 @@ def _examine(text: str, path: Path, overrides: Sequence[str], kinds: Kinds) -> t
 
 
 def _text(path: Path, findings: Findings) -> str:
-    """The text of the file; empty after a finding."""
+    """The text of the file; empty if there is a finding."""
     try:
         with path.open("rb") as file:
             data = file.read(MAXIMUM_BYTES + 1)
@@ -166,7 +170,7 @@ def _text(path: Path, findings: Findings) -> str:
 
 
 def _with_long_connections(data: dict[str, Plain], findings: Findings) -> dict[str, Plain]:
-    """``data`` with every connection in its long form; what cannot be read is noted and has empty ends."""
+    """``data`` with every connection in the long form. An invalid one is a finding and gets empty ends."""
     connections = data.get("connections")
     if not isinstance(connections, list):
         return data
@@ -222,7 +226,7 @@ def _kind_meant(keys: AbstractSet[str], kinds: Kinds) -> str | None:
 
 
 def _arrow_meant(connection: Plain) -> str | None:
-    """The short form that somebody who wrote another arrow may have meant."""
+    """The short form with the right arrow, for a text with another one."""
     if not isinstance(connection, str):
         return None
     forwards = [end.strip() for end in _OTHER_ARROW.split(connection)]
@@ -236,7 +240,7 @@ def _arrow_meant(connection: Plain) -> str | None:
 def _with_overrides(
     data: dict[str, Plain], overrides: Sequence[str], replaced: dict[str, str], findings: Findings
 ) -> dict[str, Plain]:
-    """``data`` with the start values of the command line; notes in ``replaced`` which option went where."""
+    """``data`` with the start values of the command line; adds each option to ``replaced``."""
     instances = data.get("instances")
     if not isinstance(instances, dict):
         return data

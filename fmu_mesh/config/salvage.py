@@ -1,7 +1,7 @@
-"""What is left of a configuration when everything that is wrong with its structure is taken out.
+"""A partial configuration: the valid parts of a file whose structure is wrong.
 
-Owns the placeholders that stand for what was taken out, so that the meaning of the rest can be checked and one error
-can show all findings. Such a configuration is never run.
+Owns the placeholders for the invalid parts. With them the meaning of the valid parts can be checked, and one error
+shows all findings. A partial configuration is never run.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def salvage(data: Plain, wrong: AbstractSet[str], sections: Mapping[str, type[In
 
 
 def _without(value: Plain, wrong: AbstractSet[str], path: str) -> Plain:
-    """``value`` without its wrong entries; a wrong list item is null, so that the others keep their places."""
+    """``value`` without its wrong entries; a wrong list item becomes null, so that the others keep their index."""
     if isinstance(value, dict):
         places = {key: f"{path}.{key}" if path else key for key in value}
         return {

@@ -20,7 +20,8 @@ from ..wire.keys import MASTER, Keys
 from ..wire.runtime import leave_run_folder, run_folder, socket_endpoint
 from ..wire.session import Wiring, close_session, open_session
 from .events import Event, Ready
-from .preparing import Options, prepare
+from .options import Options
+from .preparing import prepare
 from .process import die_with_parent, ended_by_signals
 
 __all__ = ["run_gateway"]

@@ -25,7 +25,7 @@ from ..wire.session import LEASE_MS
 from ..wire.views import GOING_ON
 from .child import Child, StopWatch, how_it_ended, own_command
 from .events import End, Event, Ready, Status, decode_event
-from .preparing import Options
+from .options import Options
 from .results import rows_left, what_is_kept
 
 __all__ = ["Launcher", "Output"]

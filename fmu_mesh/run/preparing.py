@@ -5,54 +5,25 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from collections.abc import Set as AbstractSet
 from pathlib import Path
-from typing import Literal
 
 import msgspec
-from msgspec.structs import replace
 
 from .. import files
 from ..config.findings import Findings
 from ..config.instance_sections import InstanceSection, key_of, placed
 from ..config.loading import LoadedConfig
-from ..config.mesh import ZenohConfig
 from ..errors import Finding, LoadFailed
 from ..instances.configuration import examine
-from ..instances.contract import Showing
 from ..instances.registry import check_showing, content, describe, expected_model
 from ..ros.gateway.mapping import resolve as resolve_ros
 from ..system.plan import Plan, make_plan
 from ..system.system import build
 from ..text import nearest_file
 from ..variables.model_description import ModelDescription
+from .options import Options, with_options
 from .results import check_results
 
-__all__ = ["Options", "planned", "prepare", "zenoh_section"]
-
-
-class Options(msgspec.Struct, frozen=True):
-    """What the command line changes of a configuration.
-
-    Attributes:
-        start_values: `instance.variable=value` each.
-        window: in points, or `auto`, instead of the configured one.
-        real_time_factor: simulated over wall-clock time instead of the configured one; 0 for as fast as possible.
-        output: the result file instead of the configured one.
-        connect: Zenoh endpoints instead of the configured ones.
-        listen: likewise, where the master can be reached besides its socket.
-        profile: whether the nodes measure where their time goes.
-        showing: whether and how a physics engine shows its world.
-        paused: whether the run starts at rest at its first point.
-    """
-
-    start_values: tuple[str, ...] = ()
-    window: int | Literal["auto"] | None = None
-    real_time_factor: float | None = None
-    output: Path | None = None
-    connect: tuple[str, ...] = ()
-    listen: tuple[str, ...] = ()
-    profile: bool = False
-    showing: Showing = Showing()
-    paused: bool = False
+__all__ = ["planned", "prepare"]
 
 
 def prepare(
@@ -82,7 +53,7 @@ def planned(
     Raises:
         ConfigurationError: with everything that is wrong with it or its FMUs.
     """
-    loaded = _with_options(loaded, options)
+    loaded = with_options(loaded, options, findings)
     if not len(findings):  # otherwise the world may be what is wrong
         check_showing(loaded.config.instances, options.showing)
     descriptions, unreadable = _descriptions(loaded, findings.places, tell)
@@ -93,28 +64,6 @@ def planned(
     sections = loaded.config.instances
     contents = {name: content(Path(own.fmu), sections[name]) for name, own in system.instances.items()}
     return make_plan(system, file=str(loaded.file), contents=contents)
-
-
-def zenoh_section(loaded: LoadedConfig, options: Options) -> ZenohConfig:
-    """The `zenoh` section, with the endpoints of the command line if there are any."""
-    section = loaded.config.zenoh
-    return replace(
-        section, connect=list(options.connect) or section.connect, listen=list(options.listen) or section.listen
-    )
-
-
-def _with_options(loaded: LoadedConfig, options: Options) -> LoadedConfig:
-    config = replace(loaded.config, zenoh=zenoh_section(loaded, options))
-    if options.window is not None:
-        config = replace(config, simulation=replace(config.simulation, window=options.window))
-    if (factor := options.real_time_factor) is not None:
-        config = replace(config, simulation=replace(config.simulation, real_time_factor=factor))
-        overrides = {"simulation.real_time_factor": f"--real-time-factor {factor:g}"}
-        loaded = replace(loaded, overrides={**loaded.overrides, **overrides})
-    if options.output is not None:
-        config = replace(config, record=replace(config.record, file=str(options.output.absolute())))
-        loaded = replace(loaded, overrides={**loaded.overrides, "record.file": f"--output {options.output}"})
-    return replace(loaded, config=config)
 
 
 def _descriptions(

@@ -41,7 +41,8 @@ from ..wire.runtime import (
 from ..wire.session import RouterLink, close_session, open_session, own_endpoints
 from ..wire.views import LogLine, MeshStatus
 from .events import End, Event, Log, Ready, Status
-from .preparing import Options, prepare, zenoh_section
+from .options import Options, with_options
+from .preparing import prepare
 from .process import SIGNAL_RECEIVED, die_with_parent, ended_by_signals
 from .results import open_result
 from .wiring import is_socket, wiring
@@ -86,7 +87,7 @@ class _NodeProcess:
     def __init__(self, config_file: Path, plan: NodePlan, options: Options, folder: Path, launch: str | None) -> None:
         self._config_file = config_file
         self._plan = plan
-        self._zenoh = zenoh_section(load(config_file), options)
+        self._zenoh = with_options(load(config_file), options).config.zenoh
         self._folder = folder
         self._launch = launch
         self._options = options

@@ -22,7 +22,8 @@ from fmu_mesh.instances.gazebo.gazebo_kind import GazeboClassicConfig
 from fmu_mesh.instances.gazebo.gazebo_world import describe_gazebo_world, load_gazebo_world
 from fmu_mesh.rings.ring import Ring
 from fmu_mesh.run.local import LocalMesh
-from fmu_mesh.run.preparing import Options, prepare
+from fmu_mesh.run.options import Options
+from fmu_mesh.run.preparing import prepare
 from fmu_mesh.simtime import TimeGrid
 from fmu_mesh.system.layout import Layout
 from tests.helpers import FMUS

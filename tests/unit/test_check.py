@@ -12,7 +12,7 @@ from msgspec.structs import replace
 
 from fmu_mesh.cli.checking import plan_page
 from fmu_mesh.cli.main import main
-from fmu_mesh.config.schema import json_schema
+from fmu_mesh.config.structure import json_schema
 from fmu_mesh.errors import Finding
 from fmu_mesh.instances.configuration import installed_config
 from fmu_mesh.run.preparing import prepare

@@ -192,6 +192,12 @@ STRUCTURE = [
         id="text for a mapping",
     ),
     pytest.param(
+        changed("a: 1,", "a: [1, {b: 2}],"),
+        "mesh.yaml:4: instances.pendulum.start_values.a[1]: a mapping; "
+        "expected a number, text, true or false, or a list",
+        id="a mapping in an array of start values",
+    ),
+    pytest.param(
         changed('"der(a,2)": 0.5', "der(a,2): 0.5").replace("2)", "'2)'"),
         "mesh.yaml:4: instances.pendulum.start_values.der(a: 'der(a' without a value; "
         "expected quotes around a name with a comma inside { }",

@@ -9,7 +9,7 @@ import pytest
 import yaml
 from jsonschema import Draft202012Validator
 
-from fmu_mesh.config.schema import json_schema, schema_text
+from fmu_mesh.config.structure import json_schema, schema_text
 from fmu_mesh.instances.configuration import installed_config
 
 FOLDER = Path(__file__).parents[2] / "configs"

@@ -22,7 +22,7 @@ from ...wire.client.readings import latecomers
 from ...wire.keys import Keys
 from ...wire.messages import decode_json
 from ...wire.refusals import Refusals
-from ...wire.session import ask, undeclare_all
+from ...wire.session import Question, ask, undeclare_all
 from ...wire.values import decode_stamp, encode_time, encode_value, json_encoding
 from ...wire.views import MeshInfo
 from ..messages.assembling import Assembler, Disassembler
@@ -150,7 +150,7 @@ class Gateway:
         """Let the master, which may be a moment late, stay at the end until the last sample has come here."""
         key = self._keys.mesh_key("info")
         try:
-            answer = ask(self._mesh, key, None, self._patience_s, "the master", over=lambda: self._leaving)
+            answer = ask(self._mesh, Question(key, "the master", self._patience_s), lambda: self._leaving)
         except MeshLost:
             if not self._leaving:
                 raise

@@ -19,7 +19,7 @@ from ...errors import FmuMeshError
 from ...variables.model_description import Value, Variable
 from ...wire.keys import Keys
 from ...wire.messages import decode_json
-from ...wire.session import ask
+from ...wire.session import Question, ask
 from ...wire.values import encode_value
 from ..messages.cdr import Codec, Message
 from ..messages.definitions import MessageTypes
@@ -147,8 +147,9 @@ class ParameterServices:
         """The current value, or what the mesh says to a new one, and the reason where it says no."""
         key = self._keys.variable(parameter.instance, "param", parameter.variable.name)
         payload = encode_value(value) if value is not None else None
+        question = Question(key, f"'{parameter.name}'", _ANSWER_S, payload)
         try:
-            return decode_json(ask(self._mesh, key, payload, _ANSWER_S, f"'{parameter.name}'"), object), ""
+            return decode_json(ask(self._mesh, question), object), ""
         except FmuMeshError as error:
             return None, error.message
 

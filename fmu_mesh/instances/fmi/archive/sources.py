@@ -98,11 +98,12 @@ def compile_sources(path: Path, model: ModelDescription, terms: Terms, tell: Cal
 
 
 def cache_folder() -> Path:
-    """The user's own folder for what can be made again: ``$FMU_MESH_CACHE_DIR``, else below ``$XDG_CACHE_HOME``."""
+    """The user's own folder for what can be made again: ``$FMU_MESH_CACHE_DIR``, else ``fmu_mesh`` in their cache."""
     if chosen := os.environ.get("FMU_MESH_CACHE_DIR"):
         return Path(chosen)
-    base = os.environ.get("XDG_CACHE_HOME")
-    return (Path(base) if base else Path.home() / ".cache") / "fmu_mesh"
+    from platformdirs import user_cache_path  # noqa: PLC0415 only FMUs of sources need it
+
+    return user_cache_path("fmu_mesh")
 
 
 def _has_binaries(folder: Path) -> bool:
