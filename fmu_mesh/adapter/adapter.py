@@ -23,12 +23,12 @@ from typing import Any, Literal, Self
 from ..errors import FmuError
 from ..instances.call_guard import floating_point_changed, kept_state, restore_floating_point
 from ..instances.fmi import FmuInstance, LogMessage, open_instance, read_description
-from ..instances.input_trajectory import Trajectory
+from ..instances.input_trajectory import Samples, Trajectory
 from ..system.start_values import forbidden
 from ..variables.model_description import ModelDescription, Value
 from ..variables.value_types import is_float
 from .argument_checks import Arguments
-from .times import Clock, Instant, RosTime, SecondsClock, Time, clock_from
+from .times import CallerClock, Instant, RosTime, SecondsClock, Time, clock_from
 
 __all__ = ["FMIAdapter"]
 
@@ -85,7 +85,7 @@ class FMIAdapter:
         self._early_inputs: dict[str, dict[Instant, Value]] = {}
         self._initial_inputs: dict[str, Value] = {}
         self._trajectories: dict[str, Trajectory] = {}
-        self._clock: Clock = SecondsClock(0.0)
+        self._clock: CallerClock = SecondsClock(0.0)
         self._elapsed = Fraction(0)
         self._point = 0
         self._folder = folder = Path(tempfile.mkdtemp(prefix="fmu_mesh-"))
@@ -362,7 +362,7 @@ class FMIAdapter:
     def _begin_trajectory(self, name: str, *, initial: bool) -> Trajectory:
         """A new trajectory, whose first value is the initial one at 0.0 if ``initial`` is true."""
         linear = self._interpolate_input and is_float(self._arguments.inputs[name].type)
-        self._trajectories[name] = trajectory = Trajectory(linear=linear)
+        self._trajectories[name] = trajectory = Trajectory(Samples(linear))
         if initial:
             trajectory.add(0.0, self._initial_inputs[name])
         return trajectory

@@ -11,7 +11,17 @@ from typing import Protocol, runtime_checkable
 
 import msgspec
 
-__all__ = ["Clock", "Instant", "Nanoseconds", "RosStamp", "RosTime", "SecondsClock", "Time", "clock_from", "instant_of"]
+__all__ = [
+    "CallerClock",
+    "Instant",
+    "Nanoseconds",
+    "RosStamp",
+    "RosTime",
+    "SecondsClock",
+    "Time",
+    "clock_from",
+    "instant_of",
+]
 
 _NANO = 1_000_000_000
 
@@ -54,7 +64,7 @@ def instant_of(time: RosTime | RosStamp) -> Nanoseconds:
     return Nanoseconds(int(time.nanoseconds))
 
 
-class Clock(Protocol):
+class CallerClock(Protocol):
     """The caller's clock against the FMU's, which starts at 0.0."""
 
     def to_fmu(self, time: Instant) -> float | None:
@@ -74,7 +84,7 @@ class Clock(Protocol):
         ...
 
 
-def clock_from(start: Instant) -> Clock:
+def clock_from(start: Instant) -> CallerClock:
     """The clock that says ``start`` when the FMU's says 0.0."""
     return NanosecondsClock(start.nanoseconds) if isinstance(start, Nanoseconds) else SecondsClock(start)
 

@@ -13,7 +13,14 @@ from pathlib import Path
 import pytest
 
 from fmu_mesh.errors import FmuError, InitializationFailed, StepFailed
-from fmu_mesh.instances.call_guard import CallWatch, floating_point_changed, kept_state, restore_floating_point
+from fmu_mesh.instances.call_guard import (
+    CallWatch,
+    current_function,
+    floating_point_changed,
+    kept_state,
+    restore_floating_point,
+)
+from fmu_mesh.instances.fmi.calls import FmpyCalls
 from tests.helpers import DEADLINE_S
 
 UPWARD, DOWNWARD, TOWARD_ZERO = 0x800, 0x400, 0xC00  # of x86; other processors have other numbers
@@ -46,14 +53,22 @@ def watch(overruns: Overruns) -> Iterator[CallWatch]:
     watch.close()
 
 
-def test_a_call_that_meets_its_deadline_is_told_with_the_function_on_the_stack(
-    watch: CallWatch, overruns: Overruns
-) -> None:
-    def _call(fname: str) -> None:  # as FMPy names it
-        assert overruns.there.wait(DEADLINE_S), fname
+class Hanging:
+    """Stands for FMPy's object of an FMU, whose call returns when the watch has found that it is late."""
+
+    def __init__(self, overruns: Overruns) -> None:
+        self.component = 0
+        self._overruns = overruns
+
+    def enterInitializationMode(self) -> None:  # noqa: N802 as FMPy names it
+        assert self._overruns.there.wait(DEADLINE_S)
+
+
+def test_a_call_that_meets_its_deadline_is_told_with_the_function_of_fmi(watch: CallWatch, overruns: Overruns) -> None:
+    fmu = FmpyCalls(Hanging(overruns), "fmi2", {})
 
     with watch.calling("plant", InitializationFailed, "call", 0.05):
-        _call("fmi2EnterInitializationMode")
+        fmu.enterInitializationMode()
 
     (error,) = overruns.found
     assert type(error) is InitializationFailed
@@ -61,6 +76,31 @@ def test_a_call_that_meets_its_deadline_is_told_with_the_function_on_the_stack(
     assert error.message.endswith("s from fmi2EnterInitializationMode; its process is ended")
     assert error.hint is not None
     assert "`timeouts.call`" in error.hint
+    assert current_function(threading.get_ident()) is None
+
+
+def test_a_function_is_named_by_its_prefix_unless_it_has_another_name() -> None:
+    class Slave:
+        component = 0
+
+        def __init__(self) -> None:
+            self.named: list[str | None] = []
+
+        def instantiate(self) -> None:
+            self.named.append(current_function(threading.get_ident()))
+
+        setupExperiment = fmi2GetFMUstate = instantiate  # noqa: N815 as FMPy names them
+
+    slave = Slave()
+    fmu = FmpyCalls(slave, "fmi2", {"instantiate": "fmi2Instantiated"})
+
+    fmu.instantiate()
+    fmu.setupExperiment()
+    fmu.fmi2GetFMUstate()
+    slave.component = 7
+
+    assert slave.named == ["fmi2Instantiated", "fmi2SetupExperiment", "fmi2GetFMUstate"]
+    assert fmu.component == 7
 
 
 def test_calls_in_time_are_not_told_however_many_they_are(watch: CallWatch, overruns: Overruns) -> None:
