@@ -7,7 +7,8 @@ import locale
 import os
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -20,8 +21,9 @@ from fmu_mesh.instances.call_guard import (
     kept_state,
     restore_floating_point,
 )
+from fmu_mesh.instances.fmi import Fmi2Instance, read_description
 from fmu_mesh.instances.fmi.calls import FmpyCalls
-from tests.helpers import DEADLINE_S
+from tests.helpers import DEADLINE_S, FMUS
 
 UPWARD, DOWNWARD, TOWARD_ZERO = 0x800, 0x400, 0xC00  # of x86; other processors have other numbers
 
@@ -152,3 +154,20 @@ def test_folder_locale_rounding_and_signal_handlers_are_kept(tmp_path: Path) -> 
         assert interrupts == [signal.SIGTERM]
     finally:
         signal.signal(signal.SIGTERM, before)
+
+
+def test_a_call_that_sets_or_gets_values_has_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    named: list[str | None] = []
+    call: Callable[..., int] = Fmi2Instance._call
+
+    def noted(*arguments: object) -> int:
+        named.append(current_function(threading.get_ident()))
+        return call(*arguments)
+
+    monkeypatch.setattr(Fmi2Instance, "_call", noted)
+    path = FMUS / "Gain.fmu"
+    with closing(Fmi2Instance(path, "gain", read_description(path), tmp_path)) as gain:
+        gain.enter_initialization(0.0, None, {"u": 2.0})
+        gain.get_values(["y"])
+
+    assert named == ["fmi2SetReal", "fmi2GetReal"]

@@ -83,7 +83,7 @@ def check_window() -> None:
 class Film:
     """A film file.
 
-    An incomplete film is unreadable: until it is complete, its file is `<name>.unfinished.mp4` in the same folder. A run
+    A film is unreadable until it is complete. Until then, its file is `<name>.unfinished.mp4` in the same folder. A run
     that ends before the first step writes no film, and does not touch an older one.
 
     Args:
