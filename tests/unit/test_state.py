@@ -11,7 +11,7 @@ from typing import Any, cast
 import pytest
 
 from fmu_mesh.config.mesh import TimeoutsConfig
-from fmu_mesh.errors import FmuError, FmuMeshError
+from fmu_mesh.errors import FmuError, FmuMeshError, TerminationRequested
 from fmu_mesh.instances.call_guard import CallWatch, Guarded
 from fmu_mesh.instances.contract import Instance
 from fmu_mesh.instances.fmi import FmuInstance, open_instance, read_description, stepped
@@ -50,7 +50,7 @@ def no_overrun(error: FmuError) -> None:
 class Stepped:
     """``Guarded(TimedInputs(...))`` of an FMU at its first point, with inputs that no ring has."""
 
-    def __init__(self, fmu: Path, folder: Path, kind: Kind, watch: CallWatch) -> None:
+    def __init__(self, fmu: Path, folder: Path, kind: Kind, watch: CallWatch, start_values: dict[str, Value]) -> None:
         self.timed: TimedInputs | None = None
         self.watch = watch
         description = read_description(fmu, kind=kind)
@@ -62,7 +62,7 @@ class Stepped:
 
         timeouts = TimeoutsConfig(call=DEADLINE_S, step=DEADLINE_S)
         self.instance = Guarded("m", open_, watch, timeouts)
-        self.instance.enter_initialization(0.0, 100.0, {})
+        self.instance.enter_initialization(0.0, 100.0, start_values)
         self.instance.exit_initialization()
         self.instance.bind(Ring(Layout.of([]), 64), (self.outputs,), TimeGrid(0.0, 0.1, 400), 1)
 
@@ -80,9 +80,9 @@ class Stepped:
 
 
 @contextmanager
-def stepped_fmu(fmu: Path, folder: Path, kind: Kind) -> Iterator[Stepped]:
+def stepped_fmu(fmu: Path, folder: Path, kind: Kind, **start_values: Value) -> Iterator[Stepped]:
     with closing(CallWatch(no_overrun)) as watch:
-        made = Stepped(fmu, folder, kind, watch)
+        made = Stepped(fmu, folder, kind, watch, start_values)
         with closing(made.instance):
             yield made
 
@@ -137,6 +137,19 @@ def test_an_fmu_of_fmi_1_has_no_state_and_says_so_by_its_name(event_fmu: EventFm
         one.instance.get_state()
 
     assert raised.value.instance == "m"
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_a_model_that_has_asked_to_end_is_not_stepped_again_after_its_state_was_taken(
+    version: Version, event_fmu: EventFmu, tmp_path: Path
+) -> None:
+    with stepped_fmu(event_fmu("Stairs", version), tmp_path, "model_exchange", end=2) as one:
+        with pytest.raises(TerminationRequested):
+            one.rows(0, 40)
+        one.instance.free_state(one.instance.get_state())
+
+        with pytest.raises(TerminationRequested):
+            one.rows(40, 41)
 
 
 def test_what_is_no_state_is_refused(event_fmu: EventFmu, tmp_path: Path) -> None:

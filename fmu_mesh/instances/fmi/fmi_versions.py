@@ -184,7 +184,7 @@ class Fmi3Values(FmuInstance):
         self._fmu.instantiate(loggingOn=False, logMessage=self._message_came, **self._uses())
 
     def _uses(self) -> dict[str, bool]:
-        """The capabilities of the importer that the FMU is told of."""
+        """Arguments of the instantiation: the features of co-simulation that are used."""
         return {}
 
     def _message_came(self, _environment: int | None, status: int, category: bytes, message: bytes) -> None:

@@ -196,7 +196,7 @@ class FmuInstance(KeepsFmuState, FmuValues):
     # --- shared by the versions
 
     def _tolerance(self) -> float | None:
-        """The tolerance that the FMU is told (FMI 2.0, 2.1.6; FMI 3.0, 2.3.2)."""
+        """The tolerance for the FMU (FMI 2.0, 2.1.6; FMI 3.0, 2.3.2)."""
         return self._options.tolerance or self._description.default_experiment.tolerance
 
     def _bookkeeping(self) -> Bookkeeping:

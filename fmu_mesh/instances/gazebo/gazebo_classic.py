@@ -3,7 +3,7 @@
 One own step from n to n + 1, in pseudocode::
 
     inputs of row n
-    applied effort of every joint = effort, plus effort_command where no actuator stands between; limited
+    applied effort of every joint = effort, plus effort_command if the joint has no actuator; limited
     Gazebo: physics_steps times
         these efforts, and force and moment of every link
         one step of the engine

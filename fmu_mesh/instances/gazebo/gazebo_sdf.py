@@ -139,7 +139,7 @@ def _refuse_includes(world: ET.Element, path: Path) -> None:
 def _refuse_what_gazebo_leaves_out(world: ET.Element, models: tuple[Model, ...], path: Path) -> None:
     """Parts that Gazebo ignores although they change the motion; and names with spaces.
 
-    Spaces end a name in what Gazebo's process is told.
+    A space ends a name in the protocol of Gazebo's process.
     """
     problems = [f"the world '{inner.get('name')}' in a world" for inner in world.findall("world")]
     problems += [f"the joint '{joint.get('name')}' outside of a model" for joint in world.findall("joint")]

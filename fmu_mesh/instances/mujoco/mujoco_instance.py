@@ -3,7 +3,7 @@
 One own step from n to n + 1, in pseudocode::
 
     inputs of row n
-    applied effort of every joint = effort, plus effort_command where no actuator stands between; limited
+    applied effort of every joint = effort, plus effort_command if the joint has no actuator; limited
     physics_steps times:
         force and moment of every driven body, turned into world axes and moved to its centre of mass
         mj_step

@@ -11,8 +11,8 @@ So no two variables have the same name.
 | `<joint>.position`, `.velocity` | output | of a revolute or prismatic joint at the communication point |
 | `<joint>.acceleration` | output | of the engine's last step; 0 before the first |
 | `<joint>.effort_applied` | output | what was applied in the last step, after limits; 0 before the first |
-| `<joint>.effort_command` | input | what a controller asks for: applied, unless an actuator stands between |
-| `<joint>.effort` | input | what is applied besides: the torque of an actuator |
+| `<joint>.effort_command` | input | the effort that a controller asks for; applied if the joint has no actuator |
+| `<joint>.effort` | input | effort that is applied in addition: the torque of an actuator |
 | `<body>.position_x/y/z`, `.orientation_w/x/y/z` | output | of the body's origin in world axes, as a unit quaternion |
 | `<body>.linear_velocity_…`, `.angular_velocity_…` | output | of the body's origin, in world axes |
 | `<body>.wind_…`, `.relative_velocity_…` | output | the wind, and the origin's velocity against it, in body axes |

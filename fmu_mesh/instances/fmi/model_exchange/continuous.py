@@ -35,7 +35,7 @@ _RowBytes = tuple[bytes | list[Any], ...]
 
 
 class ContinuousInstance(FmuInstance):
-    """The part of model exchange that all versions share; a base class that stands before that of the version."""
+    """The part of model exchange that all versions share; to be named before the base class of the version."""
 
     _loop: EventLoop | None = None
     _inputs: Ring | None = None
@@ -107,7 +107,7 @@ class ContinuousInstance(FmuInstance):
         """The solver starts anew where a state is taken, so that going back to the state later changes nothing."""
         loop = self._event_loop()
         time, next_event = loop.place
-        self._checked(lambda: loop.resume(time, next_event))
+        self._checked(loop.restart)
         return Bookkeeping(
             self._step,
             time,
@@ -145,7 +145,11 @@ class ContinuousInstance(FmuInstance):
         return self._loop
 
     def _advance(self, end: float) -> None:
-        """Go on to ``end`` (s)."""
+        """Advance the model to ``end`` (s).
+
+        Raises:
+            TerminationRequested: the model asks to end the simulation before.
+        """
         loop = self._event_loop()
         if loop.terminated or not self._checked(lambda: loop.advance(end)):
             raise TerminationRequested("the FMU asked to end the simulation", instance=self.name)

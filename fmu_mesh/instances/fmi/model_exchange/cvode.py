@@ -38,7 +38,7 @@ _MOST_STALLED: Final = 100
 class CVodeSolver:
     """CVode of SUNDIALS: variable-order BDF with root finding, one internal step per call and never beyond ``stop``.
 
-    So every completed integrator step can be told to the FMU (FMI 2.0, 3.2.2), and no input is extrapolated beyond its
+    So the FMU learns of every completed integrator step (FMI 2.0, 3.2.2), and no input is extrapolated beyond its
     communication step. The absolute tolerances are the relative one times the nominal values (FMI 2.0, 3.2.1).
 
     Args:
@@ -185,7 +185,7 @@ class _Sundials:
     """The functions of SUNDIALS that `CVodeSolver` calls, from the libraries that FMPy ships."""
 
     def __init__(self) -> None:
-        from fmpy.sundials import libraries  # noqa: PLC0415 its libraries are loaded on import: only for who needs them
+        from fmpy.sundials import libraries  # noqa: PLC0415 the import loads the libraries: only if needed
 
         pointer, real, integer = ctypes.c_void_p, ctypes.c_double, ctypes.c_int
         core, cvode = libraries.sundials_core, libraries.sundials_cvode

@@ -7,7 +7,7 @@
         tell the FMU that the step is completed
         if a state, step or time event happened:
             event mode; update the discrete states until they converge; continuous-time mode
-            the solver begins anew
+            the solver starts anew
 
 Owns events and modes. It knows neither variables nor rings, nor the version of FMI.
 """
@@ -37,7 +37,7 @@ class EventLoop:
         calls: the functions of the model.
         settings: of the solver.
         tell_completed_steps: whether the FMU needs to know of completed integrator steps.
-        stop_time: the stop time that the FMU was told, in s; its time is never set to a later one.
+        stop_time: the stop time of the FMU in s; its time is never set to a later one.
         clocks: the clocks of the model.
 
     Attributes:
@@ -94,7 +94,7 @@ class EventLoop:
         self._equations.follow(line)
 
     def advance(self, end: float) -> bool:
-        """Go on to the time ``end`` in s; False if the FMU asked to end the simulation before."""
+        """Advance to the time ``end`` in s; False if the FMU asked to end the simulation before."""
         while resolvable(self._time, end):
             self._advance_once(end)
             if self.terminated:
@@ -111,7 +111,11 @@ class EventLoop:
         self.terminated = False
         self._equations.follow(None)
         self._time, self._next_event = time, next_event
-        self._solver.restart(time)
+        self.restart()
+
+    def restart(self) -> None:
+        """Let the solver start anew here."""
+        self._solver.restart(self._time)
 
     def close(self) -> None:
         """Free the solver."""
