@@ -29,6 +29,7 @@ from ..rings.array_elements import scaled
 from ..rings.ring import Ring
 from ..simtime import TimeGrid
 from ..system.algebraic_loop import FixedPoint
+from ..system.coupling_rule import CouplingRule
 from ..system.initialization_plan import Loop, Tear
 from ..system.layout import Layout
 from ..system.plan import Plan
@@ -348,10 +349,10 @@ class _Member:
         self._do_step = self.instance.do_step
         for c in self.connections:
             read, points = members[c.source_instance].reader(c.source_name)
-            late = self.plan.step_points if c.delay else 0
+            lead = CouplingRule(c.delay or 0, points, self._points).lead
             same = (c.factor, c.offset) == (1.0, 0.0)
             change = None if same else partial(scaled, factor=c.factor, offset=c.offset)
-            self._feeds.append(_Feed(read, points, late, change, self._inputs.writer(c.target_name)))
+            self._feeds.append(_Feed(read, points, lead, change, self._inputs.writer(c.target_name)))
 
     def reader(self, variable: str) -> tuple[Callable[[int], Value], int]:
         """An output as a function of the own step, and how many points that has.
@@ -362,11 +363,11 @@ class _Member:
 
     def step_from(self, point: int) -> None:
         """Take the own step that ends at ``point + 1``, if there is one, with the inputs that the delays prescribe."""
-        end = point + 1
-        if end % self._points:
+        if (point + 1) % self._points:
             return
-        for read, points, late, change, write in self._feeds:
-            value = read((end - late) // points)
+        start = self.step * self._points
+        for read, points, lead, change, write in self._feeds:
+            value = read((start + lead) // points)  # `CouplingRule.row_for`, without a call
             write(0, value if change is None else change(value))
         self._do_step(self.step)
         if floating_point_changed():
@@ -375,11 +376,11 @@ class _Member:
 
 
 class _Feed(NamedTuple):
-    """How an input gets its value: ``read`` a source whose steps have ``points``, ``late`` points before the end."""
+    """How an input gets its value: ``read`` a row of the source; see `CouplingRule` for ``points`` and ``lead``."""
 
     read: Callable[[int], Value]
     points: int
-    late: int
+    lead: int
     change: Callable[[Value], Value] | None
     write: Callable[[int, Value], None]
 
