@@ -1,7 +1,7 @@
 """Recording into MCAP: a file that `ros2 bag` and Foxglove read as ROS messages, by simulation time.
 
 Owns which topics a recording has and how rows become messages. What a topic is and how it is named is
-`fmu_mesh.ros.gateway.topics`; who hands over the rows does not matter.
+`fmu_mesh.ros.messages.topics`; who hands over the rows does not matter.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from ...files import Kept, open_alone
 from ...variables.value_types import nested, split_element
 from ..gateway.mapping import message_types
 from ..gateway.resolver import Resolver
-from ..gateway.topics import Descriptions, RosPlan, Topic
 from ..messages.assembling import Assembler
 from ..messages.cdr import Codec
 from ..messages.definitions import CLOCK, MessageTypes
 from ..messages.stamp import nanoseconds, to_stamp
+from ..messages.topics import Descriptions, RosPlan, Topic
 
 __all__ = ["BagTopics", "McapFile", "bag_topics", "is_bag"]
 

@@ -23,9 +23,8 @@ from ...wire.keys import Keys, escape, unescape
 from ...wire.session import Wiring, close_session, open_session, undeclare_all
 from ...wire.values import json_encoding
 from ...wire.views import RosView
-from ..node.clock_watch import two_clocks
 
-__all__ = ["RosLink"]
+__all__ = ["RosLink", "two_clocks"]
 
 log = logging.getLogger(__name__)
 
@@ -40,6 +39,14 @@ _BRIDGED_CLOCKS = "@/*/@ros2_lv/MP/clock/**"
 _GATEWAYS = "@/*/@fmu_mesh/*/*/*"
 
 _WHO = {"ros2dds": ("the bridge", "zenoh-bridge-ros2dds"), "rmw_zenoh": ("the router", "rmw_zenohd")}
+
+
+def two_clocks(other: str, setting: str) -> str:
+    """The warning that ``other`` publishes `/clock` as well; ``setting`` stops this process from publishing it."""
+    return (
+        f"{other} publishes /clock, too, so the time of nodes with use_sim_time jumps between the two. "
+        f"Let only one of them publish it (here: {setting}), or keep them in different ROS domains."
+    )
 
 
 class RosLink:

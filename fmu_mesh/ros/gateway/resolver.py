@@ -14,10 +14,10 @@ from ...config.mesh import Config, RosConfig, RosTopicConfig
 from ...system.driven import driven_inputs
 from ...text import listed, nearest
 from ...variables.model_description import Variable
-from ..messages.definitions import MessageTypes, default_type
-from ..messages.fitting import Entry, check_fields, why_not_carried
+from ..messages.definitions import MessageTypes
+from ..messages.fitting import TopicEntry, check_topic, default_type
 from ..messages.ros_names import absolute, name_problems, ros_name, topic_problem
-from .topics import Descriptions, Direction, Kind, Parameter, Port, RosPlan, Topic
+from ..messages.topics import Descriptions, Direction, Kind, NodeParameter, Port, RosPlan, Topic
 
 __all__ = ["Resolver"]
 
@@ -54,6 +54,7 @@ class Resolver:
                 topics.append(topic)
         step_size, rate = self._config.simulation.step_size, self._section.clock_rate
         return RosPlan(
+            types=self._types,
             topics=tuple(topics),
             parameters=tuple(self._parameters()),
             node=self._section.node or ros_name(self._config.mesh),
@@ -62,21 +63,21 @@ class Resolver:
             time_source=next(self._time_sources(), None),
         )
 
-    def _entries(self) -> Iterator[Entry]:
+    def _entries(self) -> Iterator[TopicEntry]:
         if self._section.topics is None:
             for instance in self._config.instances:
-                yield Entry(RosTopicConfig(variable=instance), "ros", "ros")
+                yield TopicEntry(RosTopicConfig(variable=instance), "ros", "ros")
             return
         for index, entry in enumerate(self._section.topics):
             path = f"ros.topics[{index}]"
             if isinstance(entry, str):
-                yield Entry(RosTopicConfig(variable=entry), path, path)
+                yield TopicEntry(RosTopicConfig(variable=entry), path, path)
             else:
-                yield Entry(entry, path, f"{path}.variable")
+                yield TopicEntry(entry, path, f"{path}.variable")
 
     # --- topics
 
-    def _topics(self, entry: Entry) -> Iterator[Topic]:
+    def _topics(self, entry: TopicEntry) -> Iterator[Topic]:
         item = entry.item
         if (item.variable is None) == (not item.fields):
             found = "neither `variable` nor `fields`" if item.variable is None else "both `variable` and `fields`"
@@ -88,7 +89,7 @@ class Resolver:
         else:
             yield from self._single(entry, item.variable)
 
-    def _all_of_instance(self, entry: Entry, instance: str) -> Iterator[Topic]:
+    def _all_of_instance(self, entry: TopicEntry, instance: str) -> Iterator[Topic]:
         item = entry.item
         if item.type is not None:
             found = f"one type for all topics of the instance '{instance}'"
@@ -112,7 +113,7 @@ class Resolver:
                 own = replace(item, topic=topic, variable=f"{instance}.{variable.name}")
                 yield from self._single(replace(entry, item=own), f"{instance}.{variable.name}")
 
-    def _single(self, entry: Entry, reference: str) -> Iterator[Topic]:
+    def _single(self, entry: TopicEntry, reference: str) -> Iterator[Topic]:
         found = self._port(reference, _DATA, entry.variable_path)
         if found is None:
             return
@@ -132,7 +133,7 @@ class Resolver:
             return
         yield from self._topic(entry, name, message, (port,), direction)
 
-    def _message_of_fields(self, entry: Entry) -> Iterator[Topic]:
+    def _message_of_fields(self, entry: TopicEntry) -> Iterator[Topic]:
         item = entry.item
         if item.topic is None or item.type is None:
             key = "topic" if item.topic is None else "type"
@@ -152,32 +153,26 @@ class Resolver:
             yield from self._topic(entry, item.topic, item.type, tuple(ports), next(iter(directions)))
 
     def _topic(
-        self, entry: Entry, name: str, message: str, ports: tuple[Port, ...], direction: Direction
+        self, entry: TopicEntry, name: str, message: str, ports: tuple[Port, ...], direction: Direction
     ) -> Iterator[Topic]:
         full_name = absolute(name, self._section.namespace)
-        problem = topic_problem(full_name)
-        if problem is not None:
+        before = len(self._findings)
+        if (problem := topic_problem(full_name)) is not None:
             expected = "letters, digits, underscores and slashes, no part that starts with a digit"
             self._findings.add(f"{entry.path}.topic", f"'{name}': {problem}", expected)
-        before = len(self._findings)
-        check_fields(entry, message, ports, direction, self._types, self._findings)
-        if problem is None and len(self._findings) == before:
-            topic = Topic(
-                name=full_name,
-                message=message,
-                direction=direction,
-                ports=ports,
-                profile=entry.item.profile or self._section.profile,
-                stamped=self._types.has_header(message),
-                frame_id=entry.item.frame_id,
-                reliability=entry.item.reliability,
-                constants=tuple(entry.item.constants.items()),
-            )
-            if (reason := why_not_carried(topic, self._types)) is not None:
-                found = f"'{message}' for '{full_name}': {reason}"
-                self._findings.add(f"{entry.path}.type", found, "messages that can be sent and received")
-            else:
-                yield topic
+        topic = Topic(
+            name=full_name,
+            message=message,
+            direction=direction,
+            ports=ports,
+            profile=entry.item.profile or self._section.profile,
+            frame_id=entry.item.frame_id,
+            reliability=entry.item.reliability,
+            constants=tuple(entry.item.constants.items()),
+        )
+        check_topic(entry, topic, self._types, self._findings)
+        if len(self._findings) == before:
+            yield topic
 
     # --- variables
 
@@ -219,13 +214,13 @@ class Resolver:
         points = max(1, round(step / base)) if step is not None and base > 0 else 1
         return Port(field, instance, variable, kind, points)
 
-    def _parameters(self) -> Iterator[Parameter]:
+    def _parameters(self) -> Iterator[NodeParameter]:
         for instance, description in self._descriptions.items():
             own = [variable for variable in description.with_causality("parameter") if not variable.shape]
             unusable = {name for problem in name_problems(v.name for v in own) for name in problem.variables}
             for variable in own:
                 if variable.name not in unusable:
-                    yield Parameter(f"{ros_name(instance)}.{ros_name(variable.name)}", instance, variable)
+                    yield NodeParameter(f"{ros_name(instance)}.{ros_name(variable.name)}", instance, variable)
 
     def _time_sources(self) -> Iterator[Port]:
         for instance, description in self._descriptions.items():

@@ -15,10 +15,10 @@ import numpy as np
 
 from ...variables.model_description import Value
 from ...variables.value_types import flattened, nested
-from ..gateway.topics import Port, Topic
 from .cdr import CdrError, Codec, Message
 from .definitions import HEADER, Array, Basic, FieldType, MessageTypes, Nested, Sequence, path_parts
 from .stamp import from_stamp, to_stamp
+from .topics import Port, Topic
 
 __all__ = ["Assembler", "Disassembler"]
 
@@ -136,6 +136,7 @@ class Disassembler:
     def __init__(self, topic: Topic, types: MessageTypes) -> None:
         self.topic = topic
         self._codec = Codec(types, topic.message)
+        self._stamped = types.has_header(topic.message)
         self._paths = [path_parts(port.path) for port in topic.ports]
 
     def values(self, data: bytes) -> tuple[list[Value], float | None]:
@@ -154,7 +155,7 @@ class Disassembler:
             except IndexError as error:
                 raise CdrError(f"it has no '{port.path}'") from error
             values.append(_in_shape(value, port))
-        if not self.topic.stamped:
+        if not self._stamped:
             return values, None
         stamp = message["header"]["stamp"]
         time = from_stamp(stamp["sec"], stamp["nanosec"])
