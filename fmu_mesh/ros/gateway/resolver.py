@@ -1,6 +1,6 @@
-"""From entries of the `ros` section to topics: every name in them resolved, or all that is wrong with them told.
+"""From the entries of the `ros` section to topics: resolves their names, or reports every problem with them.
 
-What passes here can be sent and received: a message of every topic is made on trial. Knows neither Zenoh nor FMPy.
+A topic that passes can be sent and received. Knows neither Zenoh nor FMPy.
 """
 
 from __future__ import annotations
@@ -21,12 +21,20 @@ from ..messages.topics import Descriptions, Direction, Kind, NodeParameter, Port
 
 __all__ = ["Resolver"]
 
-_BY_HAND = "a name by hand: {topic: /a_name, variable: %s}"
+_CHOOSE_NAME = "a name by hand: {topic: /a_name, variable: %s}"
 _DATA = "data"
 
 
 class Resolver:
-    """Resolves the topics of one section; what is wrong goes to ``findings``."""
+    """Resolves the topics of one section.
+
+    Args:
+        config: the configuration.
+        section: its section `ros`, or another one in its place.
+        descriptions: the model descriptions by instance name.
+        types: the message types.
+        findings: where the findings go.
+    """
 
     def __init__(
         self,
@@ -46,7 +54,7 @@ class Resolver:
         self._messages: dict[str, tuple[str, str]] = {}
 
     def plan(self) -> RosPlan:
-        """The plan; with findings it is not complete."""
+        """The plan; after findings it is incomplete."""
         topics = []
         for entry in self._entries():
             for topic in self._topics(entry):
@@ -104,7 +112,7 @@ class Resolver:
         ]
         problems = name_problems(variable.name for variable in wanted)
         for problem in problems:
-            expected = _BY_HAND % f"'{instance}.{problem.variables[0]}'"
+            expected = _CHOOSE_NAME % f"'{instance}.{problem.variables[0]}'"
             self._findings.add(entry.variable_path, f"in '{instance}' {problem}", expected)
         unusable = {name for problem in problems for name in problem.variables}
         for variable in wanted:
@@ -122,7 +130,7 @@ class Resolver:
         if name is None:
             problems = name_problems([port.variable.name])
             for problem in problems:
-                self._findings.add(entry.variable_path, str(problem), _BY_HAND % f"'{reference}'")
+                self._findings.add(entry.variable_path, str(problem), _CHOOSE_NAME % f"'{reference}'")
             if problems:
                 return
             name = f"{ros_name(port.instance)}/{ros_name(port.variable.name)}"
@@ -194,7 +202,7 @@ class Resolver:
         return None
 
     def _variable(self, reference: str, path: str) -> Variable | None:
-        """The variable that `instance.variable` names; None after a finding, or where the FMU could not be read."""
+        """The variable with the name `instance.variable`; None after a finding, or if the FMU could not be read."""
         instance, dot, name = reference.partition(".")
         names = list(self._config.instances)
         if instance not in names:
@@ -237,7 +245,7 @@ class Resolver:
         message, owner = self._messages.setdefault(topic.name, (topic.message, owners))
         if first is not owners:
             found = f"the topic '{topic.name}' for {owners} and for {first}"
-            self._findings.add(path, found, _BY_HAND % owners.partition(",")[0])
+            self._findings.add(path, found, _CHOOSE_NAME % owners.partition(",")[0])
         elif message != topic.message:
             found = f"the topic '{topic.name}' with '{topic.message}' for {owners}, and with '{message}' for {owner}"
             self._findings.add(path, found, "one message type for one topic")
