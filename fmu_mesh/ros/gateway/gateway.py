@@ -30,9 +30,9 @@ from ...wire.views import MeshInfo
 from ..messages.assembling import Assembler, Disassembler
 from ..messages.cdr import CdrError
 from ..messages.topics import Port, RosPlan, Topic
+from .clock_progress import ClockPublisher, Progress, WarnOnce, WatchedVariable, clock_topic
 from .parameters import ParameterServices
 from .profile import Profile
-from .progress import ClockPublisher, Progress, WarnOnce, WatchedVariable, clock_topic
 from .rmw_zenoh import RmwZenoh
 from .ros2dds import Ros2Dds
 
