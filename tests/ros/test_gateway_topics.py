@@ -317,7 +317,7 @@ def test_names_that_collide_or_start_with_a_digit_are_told_with_all_else_that_is
 
     texts = [str(finding) for finding in findings]
     assert len(texts) == 3
-    assert "in 'pendulum' the variables 'b.x', 'b_x' all become 'b_x'; expected a name by hand" in texts[0]
+    assert "in 'pendulum' the variables 'b.x', 'b_x' all become 'b_x'; expected a name of your choice" in texts[0]
     assert "{topic: /a_name, variable: 'pendulum.b.x'}" in texts[0]
     assert "the variable '1st' becomes '1st', which starts with a digit" in texts[1]
     assert "the unknown variable 'nothing'" in texts[2]

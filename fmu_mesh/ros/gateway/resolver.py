@@ -21,8 +21,9 @@ from ..messages.topics import Descriptions, Direction, Kind, NodeParameter, Port
 
 __all__ = ["Resolver"]
 
-_CHOOSE_NAME = "a name by hand: {topic: /a_name, variable: %s}"
+_CHOOSE_NAME = "a name of your choice: {topic: /a_name, variable: %s}"
 _DATA = "data"
+_KINDS: Mapping[str, Kind] = {"output": "out", "local": "local", "input": "in"}
 
 
 class Resolver:
@@ -122,10 +123,9 @@ class Resolver:
                 yield from self._single(replace(entry, item=own), f"{instance}.{variable.name}")
 
     def _single(self, entry: TopicEntry, reference: str) -> Iterator[Topic]:
-        found = self._port(reference, _DATA, entry.variable_path)
-        if found is None:
+        port = self._port(reference, _DATA, entry.variable_path)
+        if port is None:
             return
-        port, direction = found
         name = entry.item.topic
         if name is None:
             problems = name_problems([port.variable.name])
@@ -139,7 +139,7 @@ class Resolver:
             text = f"'{reference}' of the type {port.variable.type}, which no message of std_msgs carries"
             self._findings.add(entry.variable_path, text, "a message in `type` and its field in `fields`")
             return
-        yield from self._topic(entry, name, message, (port,), direction)
+        yield from self._topic(entry, name, message, (port,))
 
     def _message_of_fields(self, entry: TopicEntry) -> Iterator[Topic]:
         item = entry.item
@@ -147,22 +147,18 @@ class Resolver:
             key = "topic" if item.topic is None else "type"
             self._findings.add(f"{entry.path}.{key}", f"no `{key}`", f"a {key}: several variables share this message")
             return
-        ports = []
+        found = [self._port(own, field, f"{entry.path}.fields.{field}") for field, own in item.fields.items()]
+        ports = [port for port in found if port is not None]
         directions: dict[Direction, str] = {}
-        for field, reference in item.fields.items():
-            found = self._port(reference, field, f"{entry.path}.fields.{field}")
-            if found is not None:
-                ports.append(found[0])
-                directions.setdefault(found[1], reference)
+        for port in ports:
+            directions.setdefault(port.direction, f"{port.instance}.{port.variable.name}")
         if len(directions) > 1:
             text = f"the output '{directions['out']}' and the input '{directions['in']}' in one message"
             self._findings.add(f"{entry.path}.fields", text, "a topic for each direction")
         elif len(ports) == len(item.fields):
-            yield from self._topic(entry, item.topic, item.type, tuple(ports), next(iter(directions)))
+            yield from self._topic(entry, item.topic, item.type, tuple(ports))
 
-    def _topic(
-        self, entry: TopicEntry, name: str, message: str, ports: tuple[Port, ...], direction: Direction
-    ) -> Iterator[Topic]:
+    def _topic(self, entry: TopicEntry, name: str, message: str, ports: tuple[Port, ...]) -> Iterator[Topic]:
         full_name = absolute(name, self._section.namespace)
         before = len(self._findings)
         if (problem := topic_problem(full_name)) is not None:
@@ -171,7 +167,7 @@ class Resolver:
         topic = Topic(
             name=full_name,
             message=message,
-            direction=direction,
+            direction=ports[0].direction,
             ports=ports,
             profile=entry.item.profile or self._section.profile,
             frame_id=entry.item.frame_id,
@@ -184,22 +180,19 @@ class Resolver:
 
     # --- variables
 
-    def _port(self, reference: str, field: str, path: str) -> tuple[Port, Direction] | None:
-        instance = reference.partition(".")[0]
+    def _port(self, reference: str, field: str, path: str) -> Port | None:
+        """The variable with the name ``reference`` in a field; None after a finding."""
         variable = self._variable(reference, path)
-        match variable.causality if variable is not None else None:
-            case "output" | "local" as causality:
-                assert variable is not None
-                return self._as_port(instance, variable, "out" if causality == "output" else "local", field), "out"
-            case "input" if reference not in self._driven:
-                assert variable is not None
-                return self._as_port(instance, variable, "in", field), "in"
-            case "input":
-                self._findings.add(path, f"the connected input '{reference}'", self._driven[reference])
-            case str(causality):
-                expected = "an output, a local variable or an input; parameters are parameters in ROS, too"
-                self._findings.add(path, f"'{reference}', a {causality}", expected)
-        return None
+        if variable is None:
+            return None
+        if variable.causality == "input" and reference in self._driven:
+            self._findings.add(path, f"the connected input '{reference}'", self._driven[reference])
+            return None
+        if variable.causality not in _KINDS:
+            expected = "an output, a local variable or an input; parameters are parameters in ROS, too"
+            self._findings.add(path, f"'{reference}', a {variable.causality}", expected)
+            return None
+        return self._as_port(reference.partition(".")[0], variable, field)
 
     def _variable(self, reference: str, path: str) -> Variable | None:
         """The variable with the name `instance.variable`; None after a finding, or if the FMU could not be read."""
@@ -217,10 +210,10 @@ class Resolver:
             self._findings.add(path, found, f"one of {listed(near)}", nearest(name, near))
         return variable
 
-    def _as_port(self, instance: str, variable: Variable, kind: Kind, field: str) -> Port:
+    def _as_port(self, instance: str, variable: Variable, field: str) -> Port:
         step, base = self._config.instances[instance].step_size, self._config.simulation.step_size
         points = max(1, round(step / base)) if step is not None and base > 0 else 1
-        return Port(field, instance, variable, kind, points)
+        return Port(field, instance, variable, _KINDS[variable.causality], points)
 
     def _parameters(self) -> Iterator[NodeParameter]:
         for instance, description in self._descriptions.items():
@@ -234,8 +227,7 @@ class Resolver:
         for instance, description in self._descriptions.items():
             for variable in description.with_causality("output", "local", "input"):
                 if variable.type not in ("String", "Binary"):
-                    kinds: Mapping[str, Kind] = {"output": "out", "local": "local", "input": "in"}
-                    yield self._as_port(instance, variable, kinds[variable.causality], "")
+                    yield self._as_port(instance, variable, "")
 
     # --- the whole
 

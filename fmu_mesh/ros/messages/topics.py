@@ -38,6 +38,11 @@ class Port(msgspec.Struct, frozen=True):
     kind: Kind
     step_points: int = 1
 
+    @property
+    def direction(self) -> Direction:
+        """The direction of its topic."""
+        return "in" if self.kind == "in" else "out"
+
 
 class Topic(msgspec.Struct, frozen=True):
     """One topic.

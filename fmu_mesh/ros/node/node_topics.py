@@ -24,7 +24,7 @@ from ..messages.definitions import MAX_ELEMENTS, path_parts
 from ..messages.fitting import default_type
 from ..messages.ros_names import topic_problem
 from ..messages.stamp import in_nanoseconds
-from ..messages.topics import Direction, Port, Topic
+from ..messages.topics import Port, Topic
 from .rclpy_modules import message_class, time_message
 from .variable_parameters import names_of
 
@@ -156,10 +156,10 @@ def _own_topics(variable: Variable, name: str, *, stamped: bool) -> list[Topic]:
 
 def _topic(name: str, message: str, fields: Mapping[str, Variable]) -> Topic:
     """A topic whose variables, by the paths of their fields, are all inputs or all outputs."""
-    directions: set[Direction] = {"in" if own.causality == "input" else "out" for own in fields.values()}
-    [direction] = directions
-    ports = tuple(Port(path, "", variable, direction) for path, variable in fields.items())
-    return Topic(name, message, direction, ports)
+    ports = tuple(
+        Port(path, "", variable, "in" if variable.causality == "input" else "out") for path, variable in fields.items()
+    )
+    return Topic(name, message, ports[0].direction, ports)
 
 
 def _mapped(entry: str, ends: Mapping[str, Variable], problems: list[str]) -> Topic | None:
