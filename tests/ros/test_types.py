@@ -11,12 +11,12 @@ import pytest
 from fmu_mesh.errors import ConfigurationError
 from fmu_mesh.ros.messages.definitions import Basic, MessageTypes, UnknownField, UnknownType
 from fmu_mesh.ros.messages.fitting import carries, default_type
-from fmu_mesh.variables.value_types import TYPES
+from fmu_mesh.variables.value_types import TYPES as FMI_TYPES
 
 SHARE = Path(sys.prefix) / "share"
 """Where the packages of ROS from PyPI put what the generators of ROS have computed."""
 
-MESSAGES = MessageTypes("kilted")
+TYPES = MessageTypes("kilted")
 
 
 def test_every_hash_equals_the_one_of_ros_itself() -> None:
@@ -25,7 +25,7 @@ def test_every_hash_equals_the_one_of_ros_itself() -> None:
         pytest.skip("ROS is not installed: pip install '.[test-ros]'")
     theirs = {entry["type_name"]: entry["hash_string"] for file in files for entry in _hashes(file)}
 
-    ours = {name: MESSAGES.type_hash(name) for name in theirs if name in MESSAGES}
+    ours = {name: TYPES.type_hash(name) for name in theirs if name in TYPES}
 
     assert "geometry_msgs/msg/TwistStamped" in ours
     assert ours == {name: theirs[name] for name in ours}
@@ -45,16 +45,16 @@ def test_the_hash_of_a_service_equals_the_one_of_ros_itself() -> None:
 def test_a_field_is_found_by_its_path() -> None:
     message = "geometry_msgs/msg/PoseWithCovarianceStamped"
 
-    assert MESSAGES.field(message, "pose.covariance[35]") == Basic("float64")
-    assert MESSAGES.field(message, "header.stamp.sec") == Basic("int32")
-    assert MESSAGES.has_header(message)
-    assert not MESSAGES.has_header("std_msgs/msg/Float64")
+    assert TYPES.field(message, "pose.covariance[35]") == Basic("float64")
+    assert TYPES.field(message, "header.stamp.sec") == Basic("int32")
+    assert TYPES.has_header(message)
+    assert not TYPES.has_header("std_msgs/msg/Float64")
 
 
 @pytest.mark.parametrize("path", ["pose.covariance[36]", "pose.x", "pose.pose.position.x.y", "", "header[0]"])
 def test_a_field_that_is_not_there_is_told_with_those_that_are(path: str) -> None:
     with pytest.raises(UnknownField, match="has no field") as caught:
-        MESSAGES.field("geometry_msgs/msg/PoseWithCovarianceStamped", path)
+        TYPES.field("geometry_msgs/msg/PoseWithCovarianceStamped", path)
 
     assert "pose.pose.position.x" in caught.value.names
 
@@ -80,21 +80,21 @@ def test_a_field_that_is_not_there_is_told_with_those_that_are(path: str) -> Non
 )
 def test_an_index_that_is_none_of_the_array_is_told_with_those_that_are(message: str, path: str, reason: str) -> None:
     with pytest.raises(UnknownField) as caught:
-        MESSAGES.field(message, path)
+        TYPES.field(message, path)
 
     assert str(caught.value).endswith(reason)
 
 
 def test_an_element_of_an_array_of_messages_has_fields_as_any_message() -> None:
-    assert MESSAGES.field("tf2_msgs/msg/TFMessage", "transforms[7].transform.rotation.w") == Basic("float64")
-    assert MESSAGES.field("sensor_msgs/msg/JointState", "name[65535]") == Basic("string")
-    assert MESSAGES.field("shape_msgs/msg/SolidPrimitive", "dimensions[2]") == Basic("float64")
-    assert "transforms[0].child_frame_id" in MESSAGES.paths("tf2_msgs/msg/TFMessage")
+    assert TYPES.field("tf2_msgs/msg/TFMessage", "transforms[7].transform.rotation.w") == Basic("float64")
+    assert TYPES.field("sensor_msgs/msg/JointState", "name[65535]") == Basic("string")
+    assert TYPES.field("shape_msgs/msg/SolidPrimitive", "dimensions[2]") == Basic("float64")
+    assert "transforms[0].child_frame_id" in TYPES.paths("tf2_msgs/msg/TFMessage")
 
 
 def test_an_unknown_type_is_told() -> None:
     with pytest.raises(UnknownType, match="'std_msgs/msg/Flot64'"):
-        MESSAGES.fields("std_msgs/msg/Flot64")
+        TYPES.fields("std_msgs/msg/Flot64")
 
 
 def test_a_custom_definition_is_as_good_as_one_of_ros() -> None:
@@ -120,10 +120,10 @@ def test_a_wrong_custom_definition_is_refused(name: str, text: str, reason: str)
 
 
 def test_every_fmi_type_has_a_message_that_carries_it() -> None:
-    for kind in set(TYPES) - {"Binary"}:
+    for kind in set(FMI_TYPES) - {"Binary"}:
         message = default_type(kind)
         assert message is not None
-        leaf = MESSAGES.field(message, "data")
+        leaf = TYPES.field(message, "data")
         assert isinstance(leaf, Basic)
         assert carries(leaf.kind, kind)
         assert carries(kind, leaf.kind)
