@@ -46,7 +46,7 @@ class Managed(Protocol):
     def close(self) -> bool: ...
 
 
-def create_node(name: str = NODE_NAME, **options: Any) -> RosNode:  # noqa: ANN401, C901 options of rclpy; a class, not one function
+def create_node(name: str = NODE_NAME, **options: Any) -> RosNode:  # noqa: ANN401 those of rclpy
     """Create a lifecycle node that runs an FMU or is the gateway of a mesh.
 
     Call `rclpy.init` before it. The attribute `managed` of the node is its `Managed`; call `managed.close()` before
@@ -63,14 +63,18 @@ def create_node(name: str = NODE_NAME, **options: Any) -> RosNode:  # noqa: ANN4
         >>> node = create_node("pendulum", namespace="/lab")  # doctest: +SKIP
         >>> executor.add_node(node)  # doctest: +SKIP
     """
+    return _node_class()(name, **options)
+
+
+def _node_class() -> Any:  # noqa: ANN401, C901 a type of rclpy; a class, not one function
+    """The class of the node; it is defined in a function because its base class exists only where ROS is."""
     lifecycle: Any = ros_module("rclpy.lifecycle")
     answer = lifecycle.TransitionCallbackReturn
 
-    # The base class can be imported only where ROS is, so the class is defined here.
     class FmuLifecycleNode(lifecycle.LifecycleNode):  # type: ignore[misc]  # rclpy has no types where ROS is missing
         """A lifecycle node whose transitions are those of `managed`."""
 
-        def __init__(self) -> None:
+        def __init__(self, name: str, **options: object) -> None:
             super().__init__(name, **options)
             descriptor = ros_module("rcl_interfaces.msg").ParameterDescriptor
             for parameter, (default, description) in PARAMETERS.items():
@@ -106,7 +110,7 @@ def create_node(name: str = NODE_NAME, **options: Any) -> RosNode:  # noqa: ANN4
             self.managed.configure()
 
         def _answer(self, transition: Callable[[], None]) -> object:
-            """Make a transition. An error in the configuration logs the reason and keeps the state of the node."""
+            """Make a transition. An `FmuMeshError` is logged and keeps the state, unless the FMU has failed."""
             try:
                 transition()
             except FmuMeshError as error:
@@ -119,7 +123,7 @@ def create_node(name: str = NODE_NAME, **options: Any) -> RosNode:  # noqa: ANN4
                 return answer.ERROR
             return answer.SUCCESS
 
-    return FmuLifecycleNode()
+    return FmuLifecycleNode
 
 
 def _wrong_arguments(error: Exception) -> str:
