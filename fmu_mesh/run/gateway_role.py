@@ -9,12 +9,10 @@ from pathlib import Path
 from ..config.loading import LoadedConfig
 from ..errors import ConfigurationError, Interrupted
 from ..instances.configuration import load
-from ..ros.gateway.gateway import Gateway
+from ..ros.gateway.gateway import Gateway, open_profiles
 from ..ros.gateway.link import RosLink
-from ..ros.gateway.mapping import message_types, resolve
-from ..ros.gateway.serving import open_profiles, parameter_services
-from ..ros.gateway.topics import RosPlan
-from ..ros.messages.definitions import MessageTypes
+from ..ros.gateway.mapping import resolve
+from ..ros.messages.topics import RosPlan
 from ..system.plan import Plan
 from ..wire.keys import MASTER, Keys
 from ..wire.runtime import leave_run_folder, run_folder, socket_endpoint
@@ -54,7 +52,7 @@ def run_gateway(config_file: Path, options: Options, emit: Callable[[Event], Non
             f"{config_file}: with the profile rclpy a ROS node is the gateway",
             hint=f"Start it: python -m fmu_mesh.ros.node --ros-args -p config:={config_file}",
         )
-    types, ros_plan = _ros_plan(loaded, plan)
+    ros_plan = _ros_plan(loaded, plan)
     folder = run_folder(loaded.config.mesh, run)
     interrupted: list[str] = []
     gateway: Gateway | None = None
@@ -76,15 +74,13 @@ def run_gateway(config_file: Path, options: Options, emit: Callable[[Event], Non
         ros = open_session(wiring)
         stack.callback(close_session, ros)
         keys = Keys(loaded.config.zenoh.key_prefix, loaded.config.mesh)
-        profiles = stack.enter_context(open_profiles(section, ros, types, ros_plan))
-        stack.enter_context(parameter_services(ros_plan, types, mesh, keys, profiles))
+        profiles = stack.enter_context(open_profiles(section, ros, ros_plan, mesh, keys))
         link = RosLink(section, ros, mesh, keys, clock=ros_plan.clock_points is not None)
         stack.callback(link.close)
         link.open()
-        patience_s = loaded.config.timeouts.start
-        gateway = Gateway(ros_plan, types, mesh, keys, plan.grid, profiles, patience_s)
+        gateway = Gateway(ros_plan, mesh, keys, plan.grid, profiles)
         stack.callback(gateway.close)
-        gateway.open()
+        gateway.open(loaded.config.timeouts.start)
         emit(Ready((*section.connect, *section.listen)))
         if not interrupted:
             gateway.run()
@@ -92,15 +88,13 @@ def run_gateway(config_file: Path, options: Options, emit: Callable[[Event], Non
             raise Interrupted(interrupted[0])
 
 
-def _ros_plan(loaded: LoadedConfig, plan: Plan) -> tuple[MessageTypes, RosPlan]:
+def _ros_plan(loaded: LoadedConfig, plan: Plan) -> RosPlan:
     """The topics of a configuration that was checked before."""
     findings = loaded.findings()
-    types = message_types(loaded, findings)
     ros_plan = resolve(loaded, {name: own.description for name, own in plan.system.instances.items()}, findings)
     findings.raise_any()
-    assert types is not None
     assert ros_plan is not None
-    return types, ros_plan
+    return ros_plan
 
 
 def _client_endpoints(loaded: LoadedConfig) -> tuple[str, ...]:

@@ -22,11 +22,10 @@ from ...text import listed, nearest, nearest_file
 from ...variables.model_description import Value
 from ...variables.value_types import nested
 from ...wire.views import InstanceInfo
-from ..gateway.mapping import message_types
+from ..gateway.mapping import descriptions_of, message_types
 from ..gateway.resolver import Resolver
-from ..gateway.seen import descriptions_of
-from ..gateway.topics import Port, Topic
 from ..messages.definitions import MessageTypes, path_parts
+from ..messages.topics import Port, Topic
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader

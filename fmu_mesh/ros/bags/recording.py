@@ -1,6 +1,6 @@
 """Recording into MCAP, which `ros2 bag` and Foxglove read as ROS messages, by simulation time.
 
-Owns which topics a recording has, and how rows become messages. `fmu_mesh.ros.gateway.topics` says what a topic is.
+Owns which topics a recording has, and how rows become messages. `fmu_mesh.ros.messages.topics` says what a topic is.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from ...system.recording import Recording
 from ...variables.value_types import nested
 from ..gateway.mapping import message_types
 from ..gateway.resolver import Resolver
-from ..gateway.topics import RosPlan, Topic
 from ..messages.assembling import Assembler
 from ..messages.cdr import Codec
 from ..messages.definitions import CLOCK, MessageTypes
 from ..messages.stamp import nanoseconds, to_stamp
+from ..messages.topics import RosPlan, Topic
 
 __all__ = ["McapFile"]
 
