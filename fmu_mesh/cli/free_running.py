@@ -6,7 +6,6 @@ It is a mesh of one instance, whose configuration is made here from the options,
 from __future__ import annotations
 
 import argparse
-import os
 import re
 from pathlib import Path
 from typing import Any
@@ -19,13 +18,12 @@ from ..config.loading import LoadedConfig, parse
 from ..errors import ConfigurationError, LoadFailed
 from ..instances.fmi import read_description
 from ..run.launcher import Launcher
-from ..run.preparing import Options, planned
-from ..system.plan import Plan
+from ..run.options import Options
+from ..run.preparing import planned
 from ..variables.model_description import ModelDescription
-from ..wire.runtime import remove_run_folder, run_folder
 from .arguments import add_command, endpoint, no_fmu, number
 from .output.display import Display, warn
-from .running import close, run_launcher
+from .running import finish, run_launcher
 
 __all__ = ["add_commands"]
 
@@ -103,20 +101,11 @@ def _run(arguments: argparse.Namespace) -> int:
     options = Options(start_values=tuple(f"{name}.{change}" for change in arguments.set))
     text = msgspec.json.encode(_configuration(arguments, name, description)).decode()
     loaded = _named_by_options(parse(text, arguments.fmu, options.start_values), name, arguments)
-    plan = planned(loaded, loaded.findings(), options)
-    warn(plan)
-    file = run_folder(plan.system.config.mesh, str(os.getpid())) / "run.yaml"
-    try:
-        file.write_text(text, encoding="utf-8")
-        return _launch(plan, file, options, arguments)
-    finally:
-        remove_run_folder(file.parent)
-
-
-def _launch(plan: Plan, file: Path, options: Options, arguments: argparse.Namespace) -> int:
-    with Display(plan, show_progress=not arguments.no_progress) as display:
-        end = run_launcher(Launcher(plan, file, options, display.event, display.output))
-    close(plan, end.status.point, end.seconds, end.rows, None)
+    run = planned(loaded, loaded.findings(), options)
+    warn(run.plan)
+    with Display(run.plan, show_progress=not arguments.no_progress) as display:
+        outcome = run_launcher(Launcher(run, display.event, display.output))
+    finish(run.plan, outcome, arguments)
     return 0
 
 

@@ -19,7 +19,8 @@ from ..system.system import System
 from ..text import listed
 from ..variables.model_description import ModelDescription
 from .contract import Instance
-from .fmi import FmuInstance, LogMessage, Terms, compile_sources, content_of, read_description
+from .fmi import FmuInstance, LogMessage, Terms, content_of
+from .fmi import describe as describe_fmu
 from .fmi import open_instance as open_fmu
 from .fmi import stepped as stepped_fmu
 from .gazebo import GazeboClassicInstance, check_gazebo_classic, describe_gazebo_world
@@ -72,9 +73,7 @@ def describe(
         case PidConfig():
             return describe_pid()
         case _:
-            description = read_description(path, terms, config.kind)
-            compile_sources(path, description, terms, tell)
-            return description
+            return describe_fmu(path, terms, config.kind, tell)
 
 
 def content(path: Path, config: AnyInstanceConfig) -> str:
@@ -106,8 +105,9 @@ def expected_model(config: AnyInstanceConfig) -> str:
     return "an FMI 1.0, 2.0 or 3.0 FMU for this platform"
 
 
-def open_instance(
+def open_instance(  # noqa: PLR0913, PLR0917 an instance and its surroundings
     item: InstancePlan,
+    description: ModelDescription,
     folder: Path,
     log: Callable[[LogMessage], None],
     terms: Terms,
@@ -117,6 +117,7 @@ def open_instance(
 
     Args:
         item: what the plan says of it.
+        description: what `describe` returned for it.
         folder: an existing private folder for files.
         log: called with every message of the FMU or engine.
         terms: what an FMU has to keep to.
@@ -137,10 +138,7 @@ def open_instance(
         case PidConfig():
             return PidInstance(item.name)
         case None:
-            path = Path(item.fmu)
-            kind = item.kind if item.kind in ("co_simulation", "model_exchange") else "auto"
-            description = read_description(path, terms, kind)
-            return open_fmu(path, item.name, description, folder, log, terms, item.options)
+            return open_fmu(Path(item.fmu), item.name, description, folder, log, terms, item.options)
 
 
 def stepped(instance: Instance, item: InstancePlan) -> Instance:

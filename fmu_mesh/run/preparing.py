@@ -1,55 +1,29 @@
-"""From a configuration file to a plan: everything is checked here, before anything is spawned."""
+"""From a configuration file to the plan of a run. Everything is checked here, before any process is started."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Literal
 
-import msgspec
 from msgspec.structs import replace
 
 from .. import files
 from ..config.findings import Findings
 from ..config.loading import LoadedConfig, examine
-from ..config.mesh import AnyInstanceConfig, GazeboClassicConfig, InstanceConfig, MujocoConfig, PidConfig, ZenohConfig
+from ..config.mesh import AnyInstanceConfig, GazeboClassicConfig, InstanceConfig, MujocoConfig, PidConfig
 from ..errors import Finding, LoadFailed
 from ..instances.fmi import Terms
-from ..instances.registry import Showing, check_showing, content, describe, expected_model
+from ..instances.registry import check_showing, content, describe, expected_model
 from ..ros.gateway.mapping import resolve as resolve_ros
 from ..system.plan import Plan, make_plan
 from ..system.system import build
 from ..text import nearest_file
 from ..variables.model_description import ModelDescription
+from .options import Options
 from .results import check_results
+from .run_plan import RunPlan
 
-__all__ = ["Options", "planned", "prepare", "zenoh_section"]
-
-
-class Options(msgspec.Struct, frozen=True):
-    """What the command line changes of a configuration.
-
-    Attributes:
-        start_values: `instance.variable=value` each.
-        window: in points, or `auto`, instead of the configured one.
-        real_time_factor: simulated over wall-clock time instead of the configured one; 0 for as fast as possible.
-        output: the result file instead of the configured one.
-        connect: Zenoh endpoints instead of the configured ones.
-        listen: likewise, where the master can be reached besides its socket.
-        profile: whether the nodes measure where their time goes.
-        showing: whether and how a physics engine shows its world.
-        paused: whether the run starts at rest at its first point.
-    """
-
-    start_values: tuple[str, ...] = ()
-    window: int | Literal["auto"] | None = None
-    real_time_factor: float | None = None
-    output: Path | None = None
-    connect: tuple[str, ...] = ()
-    listen: tuple[str, ...] = ()
-    profile: bool = False
-    showing: Showing = Showing()
-    paused: bool = False
+__all__ = ["Options", "plan_run", "planned", "prepare"]
 
 
 def prepare(
@@ -57,15 +31,24 @@ def prepare(
     options: Options = Options(),  # noqa: B008 a frozen Struct
     tell: Callable[[str], None] = lambda _text: None,
 ) -> Plan:
+    """As `plan_run`, for callers that need only the plan of the mesh."""
+    return plan_run(path, options, tell).plan
+
+
+def plan_run(
+    path: Path,
+    options: Options = Options(),  # noqa: B008 a frozen Struct
+    tell: Callable[[str], None] = lambda _text: None,
+) -> RunPlan:
     """Read, check and plan the configuration at ``path``.
 
     Args:
         path: the YAML file.
         options: what the command line changes.
-        tell: called with what takes its time, such as compiling an FMU, before it begins.
+        tell: called before something that takes long, such as compiling an FMU.
 
     Raises:
-        ConfigurationError: with everything that is wrong with it or its FMUs.
+        ConfigurationError: the configuration or an FMU is wrong; carries all findings.
     """
     loaded, findings = examine(path, options.start_values)
     return planned(loaded, findings, options, tell)
@@ -73,11 +56,11 @@ def prepare(
 
 def planned(
     loaded: LoadedConfig, findings: Findings, options: Options, tell: Callable[[str], None] = lambda _text: None
-) -> Plan:
+) -> RunPlan:
     """Check and plan a configuration whose structure was examined; ``findings`` are those of its structure.
 
     Raises:
-        ConfigurationError: with everything that is wrong with it or its FMUs.
+        ConfigurationError: the configuration or an FMU is wrong; carries all findings.
     """
     loaded = _with_options(loaded, options)
     descriptions, unreadable = _descriptions(loaded, tell)
@@ -88,19 +71,16 @@ def planned(
     check_showing(system, options.showing)
     sections = loaded.config.instances
     contents = {name: content(Path(own.fmu), sections[name]) for name, own in system.instances.items()}
-    return make_plan(system, file=str(loaded.file), contents=contents)
-
-
-def zenoh_section(loaded: LoadedConfig, options: Options) -> ZenohConfig:
-    """The `zenoh` section, with the endpoints of the command line if there are any."""
-    section = loaded.config.zenoh
-    return replace(
-        section, connect=list(options.connect) or section.connect, listen=list(options.listen) or section.listen
-    )
+    plan = make_plan(system, file=str(loaded.file), contents=contents)
+    return RunPlan(loaded, options, plan, contents)
 
 
 def _with_options(loaded: LoadedConfig, options: Options) -> LoadedConfig:
-    config = replace(loaded.config, zenoh=zenoh_section(loaded, options))
+    section = loaded.config.zenoh
+    zenoh = replace(
+        section, connect=list(options.connect) or section.connect, listen=list(options.listen) or section.listen
+    )
+    config = replace(loaded.config, zenoh=zenoh)
     if options.window is not None:
         config = replace(config, simulation=replace(config.simulation, window=options.window))
     if (factor := options.real_time_factor) is not None:

@@ -7,7 +7,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from ..config.findings import Findings
-from ..config.loading import LoadedConfig, load
+from ..config.loading import LoadedConfig
 from ..errors import ConfigurationError
 from ..files import open_alone
 from ..recorder.csv_file import CsvFile, cut_after_last_row
@@ -30,17 +30,17 @@ def check_results(loaded: LoadedConfig, system: System) -> None:
         _topics(loaded, system)
 
 
-def result_opener(config_file: Path, system: System, folder: Path | None = None) -> OpenResult:
+def result_opener(loaded: LoadedConfig, system: System, folder: Path | None = None) -> OpenResult:
     """What opens the result file of a run: an MCAP if it is called so, else a CSV.
 
     Args:
-        config_file: the configuration file.
+        loaded: the configuration.
         system: what it means.
         folder: of the run, where somebody asks `rows_left` if this process is killed.
     """
 
     def open_result(path: Path, columns: Sequence[tuple[str, VariableType]]) -> ResultFile:
-        file = McapFile(path, columns, _topics(load(config_file), system)) if is_bag(path) else CsvFile(path, columns)
+        file = McapFile(path, columns, _topics(loaded, system)) if is_bag(path) else CsvFile(path, columns)
         return NotedFile(file, folder) if folder is not None else file
 
     return open_result

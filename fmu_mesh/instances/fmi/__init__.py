@@ -2,7 +2,7 @@
 
 from .archive.archive import Terms, content_of, sha256_of
 from .archive.reading import read_description
-from .archive.sources import compile_sources
+from .archive.sources import describe
 from .co_simulation.fmi1 import Fmi1Instance
 from .co_simulation.fmi2 import Fmi2Instance
 from .co_simulation.fmi3 import Fmi3Instance
@@ -16,8 +16,8 @@ __all__ = [
     "FmuInstance",
     "LogMessage",
     "Terms",
-    "compile_sources",
     "content_of",
+    "describe",
     "open_instance",
     "read_description",
     "sha256_of",
