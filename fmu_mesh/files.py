@@ -110,12 +110,13 @@ def sha256_of(path: Path) -> str:
         return sha256_of_open(file)
 
 
-def sha256_of_open(file: BufferedReader) -> str:
-    """Calculate the SHA-256 of a file that is open, for `sha256_of`, too; moves its position."""
-    file.seek(0)
-    digest = hashlib.file_digest(file, "sha256").hexdigest()
-    _hashes[_version(os.fstat(file.fileno()))] = digest
-    return digest
+def sha256_of_open(file: BufferedReader, *, again: bool = False) -> str:
+    """As `sha256_of`, for a file that is open; ``again``: read it even if its hash is known. Moves its position."""
+    version = _version(os.fstat(file.fileno()))
+    if again or version not in _hashes:
+        file.seek(0)
+        _hashes[version] = hashlib.file_digest(file, "sha256").hexdigest()
+    return _hashes[version]
 
 
 class OwnFile(FileIO):
