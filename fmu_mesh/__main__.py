@@ -7,7 +7,9 @@ def main() -> int:
     """Import the command, which takes memory and half a second, and run it; returns the exit code."""
     try:
         from .cli.limits import FEWEST_MIB, address_space_problem  # noqa: PLC0415 an interrupt must find us here
+        from .wire.last_exit import LastExit  # noqa: PLC0415 as above
 
+        last_exit = LastExit()
         if (problem := address_space_problem(FEWEST_MIB)) is not None:
             print(f"fmu-mesh: {problem}", file=sys.stderr)
             return problem.exit_code
@@ -17,7 +19,7 @@ def main() -> int:
 
         print("fmu-mesh: interrupted", file=sys.stderr)
         return Interrupted.exit_code
-    return command()
+    return last_exit.with_code(command())
 
 
 if __name__ == "__main__":

@@ -20,8 +20,7 @@ import os
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from functools import cache
-from io import FileIO
+from io import BufferedReader, FileIO
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -30,11 +29,25 @@ from .errors import ConfigurationError
 if TYPE_CHECKING:
     from _typeshed import ReadableBuffer
 
-__all__ = ["Kept", "OwnFile", "exists", "is_file", "is_folder", "open_alone", "replaced", "sha256_of", "unwritable"]
+__all__ = [
+    "Kept",
+    "OwnFile",
+    "exists",
+    "is_file",
+    "is_folder",
+    "open_alone",
+    "replaced",
+    "sha256_of",
+    "sha256_of_open",
+    "unwritable",
+]
 
 _DRAFT = ".starting"
 _TRIES = 10
 """Attempts to open a file that other processes rename or remove at the same time."""
+
+_hashes: dict[tuple[int, ...], str] = {}
+"""The SHA-256 of files that this process has read."""
 
 
 class Kept(NamedTuple):
@@ -113,9 +126,20 @@ def replaced(path: Path) -> Iterator[Path]:
 
 
 def sha256_of(path: Path) -> str:
-    """The SHA-256 of a file as hexadecimal digits; a process reads a file once, unless it changes."""
-    status = path.stat()
-    return _sha256(path, status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns)
+    """The SHA-256 of a file in hexadecimal digits; it is calculated once per process, unless the file changes."""
+    if (known := _hashes.get(_version(path.stat()))) is not None:
+        return known
+    with path.open("rb") as file:
+        return sha256_of_open(file)
+
+
+def sha256_of_open(file: BufferedReader, *, again: bool = False) -> str:
+    """As `sha256_of`, for a file that is open; ``again``: read it even if its hash is known. Moves its position."""
+    version = _version(os.fstat(file.fileno()))
+    if again or version not in _hashes:
+        file.seek(0)
+        _hashes[version] = hashlib.file_digest(file, "sha256").hexdigest()
+    return _hashes[version]
 
 
 class OwnFile(FileIO):
@@ -163,10 +187,9 @@ class OwnFile(FileIO):
         self.truncate(0)
 
 
-@cache
-def _sha256(path: Path, *_version: int) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+def _version(status: os.stat_result) -> tuple[int, ...]:
+    """What changes if a file changes."""
+    return status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns
 
 
 def _open_locked(path: Path) -> tuple[int, Path | None]:

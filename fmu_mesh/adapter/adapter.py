@@ -398,7 +398,7 @@ class FMIAdapter:
                     yield
         except FmuError as error:
             if stepping:
-                error.point, error.time = self._point, self.simulation_time
+                error.at(self._point, self.simulation_time)
             self._mode = "failed"
             raise
         finally:

@@ -6,7 +6,6 @@ Owns the configuration of this mesh of one instance; everything else is as for a
 from __future__ import annotations
 
 import argparse
-import os
 import re
 from pathlib import Path
 from typing import Any
@@ -21,12 +20,10 @@ from ..instances.fmi import read_description
 from ..run.launcher import Launcher
 from ..run.options import Options
 from ..run.preparing import planned
-from ..system.plan import Plan
 from ..variables.model_description import ModelDescription
-from ..wire.runtime import remove_run_folder, run_folder
 from .arguments import add_command, add_options, no_fmu, read_options
 from .output.display import Display, warn
-from .running import close, run_launcher
+from .running import finish, run_launcher
 
 __all__ = ["add_commands"]
 
@@ -81,20 +78,11 @@ def _run(arguments: argparse.Namespace) -> int:
     loaded = parse(text, arguments.fmu, options.start_values)
     named = {place: text.replace(f"--set {name}.", "--set ", 1) for place, text in loaded.overrides.items()}
     loaded = replace(loaded, lines={}, overrides=named)  # nobody has written a file, so findings have no lines
-    plan = planned(loaded, loaded.findings(), options)
-    warn(plan)
-    file = run_folder(plan.system.config.mesh, str(os.getpid())) / "run.yaml"
-    try:
-        file.write_bytes(msgspec.json.encode(plan.system.config))
-        return _launch(plan, file, options, arguments)
-    finally:
-        remove_run_folder(file.parent)
-
-
-def _launch(plan: Plan, file: Path, options: Options, arguments: argparse.Namespace) -> int:
-    with Display(plan, show_progress=not arguments.no_progress) as display:
-        end = run_launcher(Launcher(plan, file, options, display.event, display.output))
-    close(plan, end.status.point, end.seconds, end.rows, None)
+    run = planned(loaded, loaded.findings(), options)
+    warn(run.plan)
+    with Display(run.plan, show_progress=not arguments.no_progress) as display:
+        outcome = run_launcher(Launcher(run, display.event, display.output))
+    finish(run.plan, outcome, arguments)
     return 0
 
 

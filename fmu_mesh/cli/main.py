@@ -36,7 +36,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except FmuMeshError as error:
         if options.debug:
             raise
-        if not error.told:
+        if not error.reported:
             print(f"fmu-mesh: {error}", file=sys.stderr)
         return error.exit_code
     except KeyboardInterrupt:

@@ -64,6 +64,7 @@ class Opening(msgspec.Struct, Generic[Section], frozen=True):
         path: absolute path of the model; `Path()` for a kind without files.
         section: its section of the configuration, without the common keys.
         description: what `Kind.describe` returned for the model, with arrays in the sizes of this instance.
+        content: what `Kind.content` returned when the run was planned; None if that is not known.
         folder: an existing private folder for files. What the instance leaves there is removed after the run.
         limits: how large an FMU may be.
         linear_inputs: the inputs that change linearly within a step; only where the description allows it.
@@ -76,6 +77,7 @@ class Opening(msgspec.Struct, Generic[Section], frozen=True):
     section: Section
     description: ModelDescription
     folder: Path
+    content: str | None = None
     limits: LimitsConfig = LimitsConfig()
     linear_inputs: tuple[LinearInput, ...] = ()
     log: Callable[[LogMessage], None] = lambda _message: None

@@ -162,7 +162,7 @@ def set_input(runner: Runner, name: str, value: Value, time: float | None) -> in
     variable = runner.instance.description.variable(name)
     is_input = variable is not None and variable.causality == "input"
     if is_input and time is not None and not isinstance(runner.instance, TimedInputs):
-        runner.instance = timed = TimedInputs(runner.instance, "hold")
+        timed = runner.wrap(lambda instance: TimedInputs(instance, "hold"))
         timed.start(runner.grid, runner.plan.step_points, runner.step)
     if is_input and isinstance(runner.instance, TimedInputs):
         return runner.instance.add(name, value, time)

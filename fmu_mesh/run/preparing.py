@@ -1,4 +1,4 @@
-"""From a configuration file to a plan: everything is checked here, before anything is spawned."""
+"""From a configuration file to the plan of a run. Everything is checked here, before any process is started."""
 
 from __future__ import annotations
 
@@ -22,8 +22,9 @@ from ..text import nearest_file
 from ..variables.model_description import ModelDescription
 from .options import Options, with_options
 from .results import check_results
+from .run_plan import RunPlan
 
-__all__ = ["planned", "prepare"]
+__all__ = ["plan_run", "planned", "prepare"]
 
 
 def prepare(
@@ -31,15 +32,24 @@ def prepare(
     options: Options = Options(),  # noqa: B008 a frozen Struct
     tell: Callable[[str], None] = lambda _text: None,
 ) -> Plan:
+    """As `plan_run`, for callers that need only the plan of the mesh."""
+    return plan_run(path, options, tell).plan
+
+
+def plan_run(
+    path: Path,
+    options: Options = Options(),  # noqa: B008 a frozen Struct
+    tell: Callable[[str], None] = lambda _text: None,
+) -> RunPlan:
     """Read, check and plan the configuration at ``path``.
 
     Args:
         path: the YAML file.
         options: what the command line changes.
-        tell: called with what takes its time, such as compiling an FMU, before it begins.
+        tell: called before something that takes long, such as compiling an FMU.
 
     Raises:
-        ConfigurationError: with everything that is wrong with it or its FMUs.
+        ConfigurationError: the configuration or an FMU is wrong; carries all findings.
     """
     loaded, findings = examine(path, options.start_values)
     return planned(loaded, findings, options, tell)
@@ -47,11 +57,11 @@ def prepare(
 
 def planned(
     loaded: LoadedConfig, findings: Findings, options: Options, tell: Callable[[str], None] = lambda _text: None
-) -> Plan:
+) -> RunPlan:
     """Check and plan a configuration whose structure was examined; ``findings`` are those of its structure.
 
     Raises:
-        ConfigurationError: with everything that is wrong with it or its FMUs.
+        ConfigurationError: the configuration or an FMU is wrong; carries all findings.
     """
     loaded = with_options(loaded, options, findings)
     if not len(findings):  # otherwise the world may be what is wrong
@@ -63,7 +73,8 @@ def planned(
     check_results(loaded, system)
     sections = loaded.config.instances
     contents = {name: content(Path(own.fmu), sections[name]) for name, own in system.instances.items()}
-    return make_plan(system, file=str(loaded.file), contents=contents)
+    plan = make_plan(system, file=str(loaded.file), contents=contents)
+    return RunPlan(loaded, options, plan, contents)
 
 
 def _descriptions(

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import re
-from typing import Any, Final, Literal
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 from numpy.typing import DTypeLike
@@ -53,8 +53,11 @@ VariableType = Literal[
 PlainValue = float | int | bool | str | list[Any]
 """A value as in YAML and JSON: an array as nested lists, row by row; Binary as base64; NaN, INF, -INF as text."""
 
-Value = float | int | bool | str | bytes | list[Any]
-"""A value in Python: an array as nested lists, row by row; Binary as bytes."""
+if TYPE_CHECKING:
+    Value = float | int | bool | str | bytes | list[Any]
+else:
+    Value = Any  # msgspec cannot decode a union of str and bytes, although MessagePack tells them apart
+"""A value as Python has it: an array as nested lists, row by row; Binary as bytes."""
 
 DTYPES: Final[dict[VariableType, DTypeLike]] = {
     "Float64": np.float64,

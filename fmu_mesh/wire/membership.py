@@ -31,7 +31,7 @@ from .refusals import payload_of
 from .session import Question, RouterLink, ask, tokens
 from .shared_memory import Offer, SharedInbox, SharedOutlet, available
 
-__all__ = ["Admission", "Membership", "Ready", "Registration", "Welcome", "shared_inbox"]
+__all__ = ["Admission", "Membership", "NodeReady", "Registration", "Welcome", "shared_inbox"]
 
 T = TypeVar("T")
 
@@ -72,7 +72,7 @@ class Hello(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     offer: Offer | None = None
 
 
-class Ready(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class NodeReady(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What a node says about itself when its links work.
 
     Attributes:
@@ -251,7 +251,7 @@ class Membership:
             question = Question(keys.hello(node), f"node '{node}'", deadline_s, hello)
             answer = ask(self._session, question, self._has_nothing_to_join)
             shared = shared and answer == _SHARED
-        ready = msgspec.json.encode(Ready(inbox.offer, shared))
+        ready = msgspec.json.encode(NodeReady(inbox.offer, shared))
         question = Question(keys.ready(plan.node), "the master", deadline_s, ready, answer_s=2 * deadline_s)
         answer = ask(self._session, question, self._has_nothing_to_join)
         welcome = _understood(answer, Welcome)

@@ -368,7 +368,7 @@ def expected_of(drawn: Drawn, plan: Plan) -> list[list[Row]]:
     return reference(drawn, [connection.delay or 0 for connection in plan.connections], started(drawn, loops))
 
 
-def run(drawn: Drawn, plan: Plan, mesh: Callable[[Callable[[str], Mixer]], None]) -> list[list[Row]]:
+def run(drawn: Drawn, plan: Plan, mesh: Callable[[Callable[[str], Mixer]], object]) -> list[list[Row]]:
     mixers = [Mixer(drawn, plan, number) for number in range(len(drawn.steps))]
     by_name = {name_of(number): mixer for number, mixer in enumerate(mixers)}
     mesh(by_name.__getitem__)

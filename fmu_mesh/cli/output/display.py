@@ -15,7 +15,8 @@ from rich.console import Console
 from rich.markup import escape
 
 from ...errors import ErrorReport, FmuMeshError, from_report
-from ...run.events import End, Event, Log, Ready, Status
+from ...run.events import Event, Log, Reachable, Status
+from ...run.outcome import Outcome
 from ...run.wiring import is_socket, leaves_host
 from ...system.plan import Plan
 from ...text import short_path
@@ -70,7 +71,7 @@ class Display:
     def event(self, event: Event) -> None:
         """Show one event of the master."""
         match event:
-            case Ready(endpoints):
+            case Reachable(endpoints):
                 self._endpoints = endpoints
                 self._warn()
                 if not self._waits_for_nodes:
@@ -79,9 +80,9 @@ class Display:
                 self._status(status)
             case Log(line):
                 self.log(line)
-            case End(ended_by=ErrorReport() as report):
+            case Outcome(ended_by=ErrorReport() as report):
                 self.ended(from_report(report))
-            case End():
+            case Outcome():
                 pass
 
     def _show_address(self) -> None:
@@ -186,11 +187,12 @@ def stdout_as_stderr() -> Iterator[None]:
         os.close(stdout)
 
 
-def summary(plan: Plan, *, point: int, seconds: float, rows: int, result_file: str | None) -> list[str]:
+def summary(plan: Plan, outcome: Outcome) -> list[str]:
     """The closing lines of a run; the last one is `20000 points in 1.234 s: 16207 points/s, real-time factor 32.4`."""
     lines = []
-    if result_file is not None:
-        lines.append(f"result: {short_path(result_file)} ({rows} rows)")
+    if outcome.file is not None:
+        lines.append(f"result: {short_path(outcome.file)} ({outcome.rows} rows)")
+    point, seconds = outcome.point, outcome.seconds
     rate = point / seconds if seconds > 0 else 0.0
     factor = rate * plan.grid.step_size
     lines.append(f"{point} points in {seconds:.3f} s: {rate:.0f} points/s, real-time factor {factor:.3g}")

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from ..contract import LogMessage
     from .archive.archive import Terms, content_of, sha256_of
     from .archive.reading import read_description
-    from .archive.sources import compile_sources
+    from .archive.sources import describe
     from .co_simulation.fmi1 import Fmi1Instance
     from .co_simulation.fmi2 import Fmi2Instance
     from .co_simulation.fmi3 import Fmi3Instance
@@ -25,8 +25,8 @@ __all__ = [
     "FmuInstance",
     "LogMessage",
     "Terms",
-    "compile_sources",
     "content_of",
+    "describe",
     "open_instance",
     "read_description",
     "sha256_of",
@@ -40,8 +40,8 @@ _MODULES = {
     "FmuInstance": ".fmu_instance",
     "LogMessage": "..contract",
     "Terms": ".archive.archive",
-    "compile_sources": ".archive.sources",
     "content_of": ".archive.archive",
+    "describe": ".archive.sources",
     "open_instance": ".opening",
     "read_description": ".archive.reading",
     "sha256_of": ".archive.archive",

@@ -159,13 +159,9 @@ class FmuKind(Kind[FmuConfig]):
     ) -> ModelDescription:
         """Read the model description; compile the FMU if it has no binary for this platform."""
         from .archive.archive import Terms  # noqa: PLC0415  FMPy is slow to import
-        from .archive.reading import read_description  # noqa: PLC0415  as above
-        from .archive.sources import compile_sources  # noqa: PLC0415  as above
+        from .archive.sources import describe  # noqa: PLC0415  as above
 
-        terms = Terms(limits, section.sha256)
-        description = read_description(path, terms, section.kind)
-        compile_sources(path, description, terms, tell)
-        return description
+        return describe(path, Terms(limits, section.sha256), section.kind, tell)
 
     def content(self, path: Path) -> str:
         """A SHA-256 of the archive, or of all files of an unpacked FMU."""
@@ -185,7 +181,7 @@ class FmuKind(Kind[FmuConfig]):
             retry_discarded_steps=section.retry_discarded_steps,
             linear_inputs=opening.linear_inputs,
         )
-        terms = Terms(opening.limits, section.sha256)
+        terms = Terms(opening.limits, section.sha256, opening.content)
         instance = open_instance(opening.path, opening.name, description, opening.folder, opening.log, terms, options)
         return stepped(instance, options)
 
