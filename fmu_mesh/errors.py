@@ -136,6 +136,11 @@ class FmuMeshError(Exception):
         self.hint = f"{self.hint} {hint}" if self.hint and hint else self.hint or hint
         return self
 
+    def instead_of_hint(self, hint: str) -> Self:
+        """Replace the hint; returns this error."""
+        self.hint = hint
+        return self
+
     def already_reported(self) -> Self:
         """Note that another process has shown this error, so that this one does not; returns this error."""
         self.reported = True

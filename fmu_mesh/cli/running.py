@@ -133,9 +133,8 @@ def _run_processes(run: RunPlan, most_restarts: int, display: Display) -> Outcom
             if run.restarts == most_restarts or type(error) is not MeshLost:
                 raise
             run = replace(run, restarts=run.restarts + 1)
-            error.hint = None
             again = f"The run starts again from its first point (restart {run.restarts} of {most_restarts})."
-            say(str(error.with_hint(again)))
+            say(str(error.instead_of_hint(again)))
 
 
 def run_launcher(launcher: Launcher) -> Outcome:

@@ -43,11 +43,9 @@ from ..wire.shared_memory import SharedInbox, available
 from ..wire.time_profile import TIME_LINE_ENTRIES, MeshProfile
 from ..wire.values import json_encoding
 from ..wire.views import GOING_ON, Command, CommandAnswer, MeshInfo, MeshState, MeshStatus
-from .followers import Followers
-from .grant_watch import CLOCK, PAUSE, GrantWatch
-from .members import Members, spoken
+from .members import Followers, Members, spoken
 from .mesh_server import STATUS_S, Events, MasterServer, mesh_info
-from .pacing import Clock, Pacer, Reach
+from .pacing import CLOCK, PAUSE, GrantWatch, Pacer, Reach, RunClock
 
 __all__ = ["Master", "MasterSettings"]
 
@@ -125,7 +123,7 @@ class Master:
         self._pacer = Pacer(plan, config.simulation.real_time_factor)
         self._reach = Reach(plan.window)
         self._stepping = [number for number, node in enumerate(self._nodes) if node != RECORDER]
-        self._clock = Clock()
+        self._clock = RunClock()
         self._published = 0.0
         self._moved = time.monotonic()
         shares = config.zenoh.shared_memory and available()

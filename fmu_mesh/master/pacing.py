@@ -1,4 +1,4 @@
-"""The wall clock of a run: how long it took, how far it may be, and how far ahead of the slowest."""
+"""The wall clock of a run: how long it took, how far it may be, how far ahead of the slowest; what holds the grant."""
 
 from __future__ import annotations
 
@@ -8,14 +8,20 @@ import time
 from ..system.plan import Plan
 from ..system.window import STEADY_POINTS
 
-__all__ = ["Clock", "Pacer", "Reach"]
+__all__ = ["CLOCK", "PAUSE", "GrantWatch", "Pacer", "Reach", "RunClock"]
+
+CLOCK = "@clock"
+"""Holds the grant where the run keeps to the wall clock."""
+
+PAUSE = "@pause"
+"""Holds the grant while the mesh is paused."""
 
 _STEADY_S = 0.05
 _SPEED_S = 0.01
 _TICK_S = 1e-6
 
 
-class Clock:
+class RunClock:
     """Wall-clock time since the first point; where the mesh rests it is held."""
 
     def __init__(self) -> None:
@@ -111,3 +117,19 @@ class Pacer:
         self.overruns += lost
         self._started += lost / self._rate
         return lost / self._rate
+
+
+class GrantWatch:
+    """Sums up how long what held the grant; `look` at every grant."""
+
+    def __init__(self) -> None:
+        self.held_s: dict[str, float] = {}
+        self._holder: str | None = None
+        self._since = 0.0
+
+    def look(self, holder: str | None) -> None:
+        """From now on ``holder`` keeps the grant from growing; None: it is at the last point."""
+        now = time.perf_counter()
+        if self._holder is not None:
+            self.held_s[self._holder] = self.held_s.get(self._holder, 0.0) + now - self._since
+        self._holder, self._since = holder, now

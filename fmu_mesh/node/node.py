@@ -54,12 +54,11 @@ from ..wire.messages import (
 )
 from ..wire.session import RouterLink
 from .activity import Activity
-from .feeding import connect_feeds
 from .initialization import Initialization
 from .inputs import TimedInputs
 from .links import OutLink
 from .node_server import NodeServer
-from .stepping import LAZY_S, RemoteFeed, Runner, Unit
+from .stepping import LAZY_S, RemoteFeed, Runner, Unit, connect_feeds
 from .streams import PRIORITY
 from .time_measurement import Calls, Profiler
 

@@ -6,7 +6,8 @@ ahead as its inputs and the grant allow, or a cycle of runners, which go point b
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from threading import Lock
 from time import perf_counter
 from typing import TypeVar
@@ -18,11 +19,11 @@ from ..rings.ring import Ring
 from ..rings.transfer import Transfer
 from ..simtime import TimeGrid
 from ..system.layout import Layout
-from ..system.plan import InstancePlan
+from ..system.plan import InstancePlan, NodePlan
 from ..wire.frames import FrameReceiver
 from .links import OutLink
 
-__all__ = ["LAZY_S", "LocalFeed", "RemoteFeed", "Runner", "Unit"]
+__all__ = ["LAZY_S", "LocalFeed", "RemoteFeed", "Runner", "Unit", "connect_feeds"]
 
 _BURST_S = 0.001
 """A burst of steps ends after about this time, so that its rows are sent and messages are looked at."""
@@ -298,3 +299,42 @@ class Unit:
             for link in runner.out_links:
                 limit = min(limit, max(runner.step + 1, link.sent + link.capacity - 1) * link.link.step_points)
         return limit
+
+
+def connect_feeds(plan: NodePlan, runners: Mapping[str, Runner]) -> dict[int, tuple[FrameReceiver, list[RemoteFeed]]]:
+    """Give all runners their feeds; returns who receives the frames of each link, by its index, and what they feed."""
+    remote: dict[int, tuple[FrameReceiver, list[RemoteFeed]]] = {}
+    for link in plan.links_in:
+        fed: list[RemoteFeed] = []
+        fits = partial(_fit, fed)
+        remote[link.index] = (FrameReceiver(link, f"node '{plan.node}'", plan.ring_rows, fits), fed)
+    receivers = {
+        receiver.link.source: (receiver, feeds) for receiver, feeds in remote.values() if not receiver.link.initial_only
+    }
+    for runner in runners.values():
+        for feed in runner.plan.feeds:
+            points = runner.plan.step_points
+            if feed.source in runners:
+                source = runners[feed.source]
+                local = Transfer(
+                    feed,
+                    source.outputs.layout,
+                    runner.inputs,
+                    source_points=source.plan.step_points,
+                    target_points=points,
+                )
+                runner.local_feeds.append(LocalFeed(source, local))
+            else:
+                receiver, feeds = receivers[feed.source]
+                link = receiver.link
+                transfer = Transfer(
+                    feed, link.layout, runner.inputs, source_points=link.step_points, target_points=points
+                )
+                feeds.append(RemoteFeed(receiver, runner, transfer))
+                runner.remote_feeds.append(feeds[-1])
+    return remote
+
+
+def _fit(feeds: Sequence[RemoteFeed], end: int) -> bool:
+    """Whether the source's rows before own step ``end`` overwrite no input that was not used yet."""
+    return all(feed.transfer.ready(end) - feed.target.step <= feed.target.inputs.rows for feed in feeds)

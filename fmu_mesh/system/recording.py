@@ -21,12 +21,17 @@ from fmu_mesh.plugins import plugin, plugin_names
 from fmu_mesh.variables.model_description import ModelDescription
 from fmu_mesh.variables.value_types import VariableType
 
-__all__ = ["Recording", "ResultFile", "ResultFormat", "result_endings", "result_format"]
+__all__ = ["Recording", "ResultFile", "ResultFormat", "has_unknown_ending", "result_endings", "result_format"]
 
 _GROUP = "fmu_mesh.recorders"
 _DEFAULT = "csv"
 _PLAIN = ("", "txt")
 """Endings that ask for no format in particular; a number, as in `result.2`, does not either."""
+
+_OTHER_FORMATS = frozenset(
+    ("arrow", "bag", "db3", "feather", "h5", "hdf5", "json", "mat", "npz", "ods", "parquet", "xls", "xlsx")
+)
+"""Endings of known formats that nobody may have installed. The programs for them could not open a CSV."""
 
 
 class Recording(msgspec.Struct, frozen=True):
@@ -149,19 +154,30 @@ class ResultFile(Protocol):
 
 
 def result_format(path: str | Path) -> ResultFormat | None:
-    """The format of a result file of this name, or None if no installed package writes it.
+    """The format of a result file of this name, or None if its ending is that of a format that no package writes.
 
-    A name without an ending is that of a CSV.
+    A name without an ending is that of a CSV, and so is one with any other ending (see `has_unknown_ending`).
 
     Raises:
         ConfigurationError: two packages write this format, or the package cannot be imported.
     """
-    ending = Path(path).suffix.removeprefix(".").lower()
-    if ending in _PLAIN or ending.isdecimal():
-        ending = _DEFAULT
-    return cast("ResultFormat | None", plugin(_GROUP, ending))
+    ending = _ending(path)
+    found = plugin(_GROUP, ending)
+    if found is None and ending not in _OTHER_FORMATS:
+        found = plugin(_GROUP, _DEFAULT)
+    return cast("ResultFormat | None", found)
+
+
+def has_unknown_ending(path: str | Path) -> bool:
+    """Whether no installed package writes files with this ending."""
+    return plugin(_GROUP, _ending(path)) is None
 
 
 def result_endings() -> list[str]:
     """The endings that result files can have, such as `.csv`, ours first."""
     return [f".{name}" for name in plugin_names(_GROUP)]
+
+
+def _ending(path: str | Path) -> str:
+    ending = Path(path).suffix.removeprefix(".").lower()
+    return _DEFAULT if ending in _PLAIN or ending.isdecimal() else ending

@@ -29,7 +29,7 @@ from fmu_mesh.system.connections import (
 from fmu_mesh.system.couplings import coupled_connections
 from fmu_mesh.system.grouping import automatic_nodes
 from fmu_mesh.system.linear_inputs import check_extrapolation
-from fmu_mesh.system.recording import result_endings, result_format
+from fmu_mesh.system.recording import has_unknown_ending, result_endings, result_format
 from fmu_mesh.system.start_values import forbidden_start_values, resolve_start_values, sized
 from fmu_mesh.text import nearest_file, shown
 from fmu_mesh.variables.model_description import ModelDescription, Value
@@ -130,6 +130,7 @@ def build(
     forbidden_start_values(config, descriptions, warnings, strict=False)
     unit_warnings(connections, descriptions, warnings)
     _needed_tools(config, descriptions, warnings)
+    _ending_warning(loaded, result_file, warnings)
     return System(config, grid, instances, connections, recorded, result_file, tuple(warnings))
 
 
@@ -297,6 +298,14 @@ def _result_file(loaded: LoadedConfig, findings: Findings) -> str | None:
         endings = " or ".join(result_endings())
         findings.add("record.file", f"'{text}', a format that is not written", f"a name ending in {endings}")
     return str(path)
+
+
+def _ending_warning(loaded: LoadedConfig, result_file: str | None, warnings: Findings) -> None:
+    """Warn of an ending that nobody offers: it still gives a CSV, as in version 0.1."""
+    if result_file is not None and has_unknown_ending(result_file):
+        found = f"'{loaded.config.record.file}', an ending of no installed format, so the file becomes a CSV"
+        endings = " or ".join(result_endings())
+        warnings.add("record.file", found, f"a name ending in {endings}; from version 0.3 on this is an error")
 
 
 def _check_zenoh(loaded: LoadedConfig, findings: Findings) -> None:

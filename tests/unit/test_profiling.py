@@ -11,7 +11,7 @@ import pytest
 
 from fmu_mesh.cli.main import main
 from fmu_mesh.cli.output.profile_table import critical_path, profile_page, show_profile, trace
-from fmu_mesh.master.grant_watch import GrantWatch
+from fmu_mesh.master.pacing import GrantWatch
 from fmu_mesh.run.preparing import prepare
 from fmu_mesh.system.plan import RECORDER, Plan
 from fmu_mesh.wire.time_profile import GRANT, Burst, MeshProfile, NodeProfile, UnitProfile, Wait

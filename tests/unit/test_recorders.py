@@ -80,12 +80,12 @@ def test_an_ending_that_nobody_offers_is_a_finding_that_lists_what_is_installed(
     offer("tables", "table", "fmu_mesh.recorder.csv_file:CsvFile")
     config = write_config(tmp_path, record={"file": "pair.parquet"})
 
-    codes = main(["check", str(config)]), main(["launch", str(config), "--output", "pair.jsonl"])
+    codes = main(["check", str(config)]), main(["launch", str(config), "--output", "pair.json"])
 
     errors = capsys.readouterr().err
     assert codes == (2, 2)
     assert "'pair.parquet', a format that is not written; expected a name ending in .csv or .mcap or .table" in errors
-    assert "--output pair.jsonl: " in errors
+    assert "--output pair.json: " in errors
 
 
 def test_two_packages_with_one_ending_are_both_named(offer: Offer) -> None:

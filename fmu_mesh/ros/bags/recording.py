@@ -52,7 +52,6 @@ class McapFile:
         path: the file. Its folder is made; the first row replaces an older file.
         columns: (`instance.variable`, type) of every column that `write` is given.
         plan: the topics, and how often the clock ticks.
-        types: the message types of the topics.
 
     Attributes:
         path: the file.
@@ -63,7 +62,7 @@ class McapFile:
         ConfigurationError: the file cannot be written, or the package `mcap` is not installed.
     """
 
-    def __init__(self, path: Path, columns: Sequence[tuple[str, str]], plan: RosPlan, types: MessageTypes) -> None:
+    def __init__(self, path: Path, columns: Sequence[tuple[str, str]], plan: RosPlan) -> None:
         writer = _writer_class()
         self.path = path
         self.rows = 0
@@ -72,7 +71,7 @@ class McapFile:
         self._own = open_alone(path)
         self._file = BufferedWriter(self._own, _BUFFER_BYTES)
         self._mcap = writer(self._file)
-        self._types = types
+        self._types = types = plan.types
         self._schemas: dict[str, int] = {}
         self._topics = [
             _RecordedTopic(topic, index, self._channel(topic.name, topic.message), types) for topic in plan.topics
@@ -95,7 +94,7 @@ class McapFile:
         found = _topics(recording, findings)
         findings.raise_any()
         assert found is not None  # or there is a finding
-        return cls(path, recording.columns, *found)
+        return cls(path, recording.columns, found)
 
     @staticmethod
     def keep_whole_rows(path: Path, kept: Kept) -> int:  # noqa: ARG004 the contract of a result format
@@ -176,8 +175,8 @@ class _RecordedTopic:
         return self._assembler.make(values, time)
 
 
-def _topics(recording: Recording, findings: Findings) -> tuple[RosPlan, MessageTypes] | None:
-    """The topics that hold the recorded variables, and their message types.
+def _topics(recording: Recording, findings: Findings) -> RosPlan | None:
+    """The topics that hold the recorded variables.
 
     A topic of the `ros` section is recorded as it is if all of its variables are recorded. Every other recorded
     variable has a topic of its own, with the name and the type that the section gives it by default.
@@ -208,7 +207,7 @@ def _topics(recording: Recording, findings: Findings) -> tuple[RosPlan, MessageT
         findings.add("record.file", f"in '{loaded.config.record.file}': {finding.found}", finding.expected)
     if loaded.config.simulation.start_time < 0.0:
         findings.add("record.file", "an MCAP of times before 0, which it cannot hold", "a CSV file, or another start")
-    return replace(plan, topics=(*configured, *others)), types
+    return replace(plan, topics=(*configured, *others))
 
 
 def _whole(recording: Recording, findings: Findings) -> list[tuple[str, str]]:

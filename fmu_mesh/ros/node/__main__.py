@@ -2,7 +2,9 @@
 
 import sys
 
+from ...wire.last_exit import LastExit
 from .entry import main
 
 if __name__ == "__main__":
-    sys.exit(main())
+    last_exit = LastExit()
+    sys.exit(last_exit.with_code(main()))
