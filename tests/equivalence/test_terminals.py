@@ -39,15 +39,8 @@ def started(place: Place, config: Path) -> Place:
     return place
 
 
-def start_pair(place: Place) -> Place:
-    return started(place, write_config(place.folder, stop_time=3600.0, simulation=PACED))
-
-
-@pytest.fixture(scope="module")
-def pair() -> Iterator[Place]:
-    """A place with a mesh that is only looked at."""
-    with Place() as place:
-        yield start_pair(place)
+def start_pair(place: Place) -> None:
+    started(place, write_config(place.folder, stop_time=3600.0, simulation=PACED))
 
 
 @pytest.fixture(scope="module")
@@ -61,8 +54,10 @@ def long_pair() -> Iterator[Place]:
 
 
 @pytest.mark.parametrize("columns", [80, 100, 200])
-def test_top_fits_its_terminal_and_has_one_head_line(pair: Place, columns: int) -> None:
-    with Terminal(pair, "top", "--interval", "0.05", columns=columns) as top:
+def test_top_fits_its_terminal_and_has_one_head_line(place: Place, columns: int) -> None:
+    start_pair(place)
+
+    with Terminal(place, "top", "--interval", "0.05", columns=columns) as top:
         first = top.wait_for("pendulum")
         later = wait_until(
             lambda: shown if (shown := top.shown)[:1] != first[:1] and len(shown) == 5 else None, "a look"
@@ -125,8 +120,10 @@ def test_top_puts_the_terminal_back_as_it_was(place: Place, how: str | signal.Si
         assert top.shows_cursor
 
 
-def test_top_tells_how_many_lines_do_not_fit(pair: Place) -> None:
-    with Terminal(pair, "top", lines=4) as top:
+def test_top_tells_how_many_lines_do_not_fit(place: Place) -> None:
+    start_pair(place)
+
+    with Terminal(place, "top", lines=4) as top:
         shown = top.wait_for("more lines")
 
     assert shown[-1] == "(2 more lines)"
