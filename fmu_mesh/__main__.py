@@ -1,13 +1,15 @@
-"""The command `fmu-mesh`, and `python -m fmu_mesh`: Ctrl-C has its exit code even while the command is being loaded."""
+"""The command `fmu-mesh`, and `python -m fmu_mesh`. Ctrl-C gives its exit code even during the imports."""
 
 import sys
 
 
 def main() -> int:
-    """Load the command, which takes memory and half a second, and run it; returns the exit code."""
+    """Import the command, which takes memory and half a second, and run it; returns the exit code."""
     try:
         from .cli.limits import FEWEST_MIB, address_space_problem  # noqa: PLC0415 an interrupt must find us here
+        from .wire.last_exit import LastExit  # noqa: PLC0415 as above
 
+        last_exit = LastExit()
         if (problem := address_space_problem(FEWEST_MIB)) is not None:
             print(f"fmu-mesh: {problem}", file=sys.stderr)
             return problem.exit_code
@@ -17,11 +19,11 @@ def main() -> int:
 
         print("fmu-mesh: interrupted", file=sys.stderr)
         return Interrupted.exit_code
-    return command()
+    return last_exit.with_code(command())
 
 
 if __name__ == "__main__":
     if not sys.flags.safe_path:
-        # `python -m` looks for modules in the current folder first; the command `fmu-mesh` does not, and both are one.
+        # `python -m` searches modules in the current folder first; `fmu-mesh` does not, and both must behave alike.
         del sys.path[0]
     raise SystemExit(main())

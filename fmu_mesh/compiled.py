@@ -1,4 +1,4 @@
-"""Functions that are compiled while we run: llvmlite makes them of LLVM's own language, without a compiler here."""
+"""Compiling functions at run time: llvmlite compiles LLVM assembly, so this host needs no compiler."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ _POINTER_BYTES: Final = 8
 
 
 class Compiled(NamedTuple):
-    """Where a compiled function begins, and what owns its code: keep it as long as the function is called."""
+    """A compiled function: its address, and the owner of its code, which must live as long as calls are made."""
 
     address: int
     engine: Any
 
 
 def compile_function(name: str, text: str) -> Compiled | None:
-    """Compile ``text``, in LLVM's language, for a machine with 64-bit addresses; None where that is not possible.
+    """Compile a module for a processor with 64-bit addresses; None if this platform cannot.
 
     Args:
-        name: that of the function in the text whose address is wanted.
-        text: one module.
+        name: the function of the module whose address is returned.
+        text: the module in LLVM assembly.
     """
     llvm = _llvm()
     if llvm is None or struct.calcsize("P") != _POINTER_BYTES:
@@ -36,10 +36,10 @@ def compile_function(name: str, text: str) -> Compiled | None:
 
 @cache
 def _llvm() -> Any:  # noqa: ANN401 llvmlite is untyped
-    """llvmlite, loaded when the first function is compiled: most commands do without it."""
+    """llvmlite, or None if it is not installed. Most commands do not need it, so it is imported late."""
     try:
         import llvmlite.binding as llvm  # noqa: PLC0415 as above
-    except ImportError:  # there is none for this platform
+    except ImportError:  # it has no wheel for this platform
         return None
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()

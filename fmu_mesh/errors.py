@@ -9,22 +9,22 @@ FmuMeshError                     1   an internal error
 │   ├── InitializationFailed         a call in or around Initialization Mode failed
 │   │   └── LoopNotConverged         an algebraic loop has no consistent values at the start
 │   └── StepFailed                   fmi2DoStep, or a get or set at a point, failed
-├── MeshLost                     4   a node, the master or the recorder is gone or silent
-│   ├── DeadlineExceeded             a wait met its deadline
+├── MeshLost                     4   a node, the master or the recorder has ended or does not answer
+│   ├── DeadlineExceeded             what a process waited for did not come in time
 │   ├── FrameGap                     a point is missing, or came twice with other values
 │   └── ProtocolBroken               a registered peer sent what the protocol forbids, such as a grant beyond the window
-├── MessageRefused               1   what came over the wire is not understood; it is counted, and the run goes on
+├── MessageRefused               1   a received message is malformed; it is counted, and the run goes on
 ├── Interrupted                130   a person or the parent process asked to end
 └── TerminationRequested         0   an FMU asked to end the simulation: an orderly end, no failure
 ```
 
-Errors carry fields (instance, variable, point, time) and say what to do next. This module knows nothing of the
-modules that raise them.
+Errors carry fields (instance, variable, point, time) and say what to do next. This module does not know the modules
+that raise them.
 """
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import msgspec
 
@@ -50,7 +50,7 @@ __all__ = [
 
 
 class ErrorReport(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """An error as it crosses a process boundary: what `FmuMeshError` carries, and its exit code."""
+    """An error as one process sends it to another: the fields of `FmuMeshError`, its class and its exit code."""
 
     kind: str
     message: str
@@ -66,15 +66,24 @@ class FmuMeshError(Exception):
     """Base of all errors that fmu_mesh raises on purpose.
 
     Args:
-        message: what happened, one or two sentences.
-        instance: the instance it happened to.
-        variable: the variable it is about.
-        point: the communication point index it happened at.
-        time: the simulation time of that point in s.
+        message: what happened, in one or two sentences.
+        instance: name of the instance that failed.
+        variable: name of the variable that the error is about.
+        point: index of the communication point at which it happened.
+        time: simulation time of that point in s.
         hint: what the reader can do next.
 
     Attributes:
-        told: whether somebody else tells the reader already.
+        reported: True if another process has already shown this error.
+
+    The layer that catches an error often knows more than the one that raised it. It adds what it knows and raises the
+    same error again:
+
+    ```python
+    except StepFailed as error:
+        error.at(point, grid.time(point))
+        raise
+    ```
     """
 
     exit_code: ClassVar[int] = 1
@@ -96,7 +105,7 @@ class FmuMeshError(Exception):
         self.point = point
         self.time = time
         self.hint = hint
-        self.told = False
+        self.reported = False
 
     def __str__(self) -> str:
         where = []
@@ -112,8 +121,28 @@ class FmuMeshError(Exception):
         text = f"{', '.join(where)}: {self.message}" if where else self.message
         return f"{text.rstrip('.')}. {self.hint}" if self.hint else text
 
+    def at(self, point: int, time: float) -> Self:
+        """Set the communication point and its time in s; returns this error."""
+        self.point, self.time = point, time
+        return self
+
+    def saying(self, message: str) -> Self:
+        """Replace the message; returns this error."""
+        self.message = message
+        return self
+
+    def with_hint(self, hint: str | None) -> Self:
+        """Append a sentence to the hint; returns this error."""
+        self.hint = f"{self.hint} {hint}" if self.hint and hint else self.hint or hint
+        return self
+
+    def already_reported(self) -> Self:
+        """Note that another process has shown this error, so that this one does not; returns this error."""
+        self.reported = True
+        return self
+
     def report(self) -> ErrorReport:
-        """This error in a form that can be sent to another process."""
+        """Convert this error to a value that can be sent to another process."""
         return ErrorReport(
             kind=type(self).__name__,
             message=self.message,
@@ -127,15 +156,15 @@ class FmuMeshError(Exception):
 
 
 class Finding(msgspec.Struct, frozen=True):
-    """One thing that is wrong with a configuration.
+    """One error in a configuration.
 
     Attributes:
-        file: the file it stands in.
-        path: the place in the file, such as `connections[2].to`; empty for the file as a whole.
-        found: what stands there.
-        expected: what would be right; empty where what was found says it.
-        suggestion: the nearest right name, if there is one.
-        line: the line in the file, counted from 1, if known.
+        file: the file that has the error.
+        path: the place in the file, such as `connections[2].to`; empty if the whole file is meant.
+        found: what the file has there.
+        expected: what it should have; empty if `found` already says so.
+        suggestion: the nearest valid name, if there is one.
+        line: number of the line, counted from 1; None if it is not known.
     """
 
     file: str
@@ -153,9 +182,9 @@ class Finding(msgspec.Struct, frozen=True):
 
 
 class ConfigurationError(FmuMeshError):
-    """A file, an option or a command is wrong. Carries every finding, not only the first.
+    """A file, an option or a command is wrong. Carries all findings, not only the first.
 
-    A single finding may be the message; others are listed below it.
+    If there is one finding, it may be the message itself. Other findings are listed below the message.
     """
 
     exit_code = 2
@@ -170,7 +199,7 @@ class ConfigurationError(FmuMeshError):
 
 
 class CallRefused(FmuMeshError, ValueError):
-    """A program called the library in the wrong mode, or with a wrong name, type or time. The call changed nothing."""
+    """The library was called in the wrong mode, or with a wrong name, type or time. The call had no effect."""
 
     exit_code = 2
 
@@ -190,25 +219,25 @@ class InitializationFailed(FmuError):
 
 
 class LoopNotConverged(InitializationFailed):
-    """Outputs that depend on each other came to no consistent values at the start; names them and the residuals."""
+    """The iteration of an algebraic loop at the start did not converge; names the outputs and the residuals."""
 
 
 class StepFailed(FmuError):
-    """`fmi2DoStep`, or a get or set at a point, failed; only closing the instance is allowed now."""
+    """`fmi2DoStep`, or a get or set at a point, failed. Afterwards the instance can only be closed."""
 
 
 class MeshLost(FmuMeshError):
-    """A node, the master or the recorder is gone or silent."""
+    """A node, the master or the recorder has ended or does not answer."""
 
     exit_code = 4
 
 
 class DeadlineExceeded(MeshLost):
-    """A wait met its deadline."""
+    """What a process waited for did not come before the deadline."""
 
 
 class FrameGap(MeshLost):
-    """A point is missing from a sequence of frames, or came twice with other values."""
+    """A point is missing from a sequence of frames, or arrived twice with different values."""
 
 
 class ProtocolBroken(MeshLost):
@@ -216,11 +245,11 @@ class ProtocolBroken(MeshLost):
 
 
 class MessageRefused(FmuMeshError):
-    """What came over the wire is malformed, or comes from nobody who may send it. Ends no run."""
+    """A received message is malformed, or its sender may not send it. The run goes on."""
 
 
 class Interrupted(FmuMeshError):
-    """A person, or the parent process, asked to end."""
+    """A person or the parent process asked this process to end."""
 
     exit_code = 130
 
@@ -228,7 +257,7 @@ class Interrupted(FmuMeshError):
 class TerminationRequested(FmuMeshError):
     """An FMU asked to end the simulation during the step from `point` (FMI 2.0, 4.2.3; FMI 3.0, 4.2.1).
 
-    That is no failure: all instances go on to this point, and the run ends there with exit code 0.
+    This is not a failure: all other instances step to the same point, and the run ends there with exit code 0.
     """
 
     exit_code = 0
@@ -253,7 +282,7 @@ _BY_KIND: dict[str, type[FmuMeshError]] = {
 
 
 def from_report(report: ErrorReport) -> FmuMeshError:
-    """The error that another process reported, as an exception of the same kind."""
+    """Convert the report of another process back to an exception of the same class."""
     if report.kind == ConfigurationError.__name__:
         return ConfigurationError(report.message, hint=report.hint)
     return _BY_KIND.get(report.kind, FmuMeshError)(

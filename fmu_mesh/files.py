@@ -1,13 +1,13 @@
-"""Files that one process writes alone, and that stay as they were until there is something to write; hashes of files.
+"""Files with a single writer that stay unchanged until the first write; hashes of files.
 
-Knows nothing of their format. A run opens and locks its result file at the start, so that a path that cannot be
-written and a second run are refused before anything happens, and writes to it from its first point on:
+Knows nothing of their format. A run opens and locks its result file at its start: a path that cannot be written and a
+second run are refused before the first point. It writes from the first point on:
 
-* A file that exists is opened and locked, and emptied by the first bytes. It stays the same file: its permissions,
-  its owner, links to it and a `tail -f` keep working, and a folder that is read-only does not matter.
-* A file that does not exist begins as an empty `<name>.starting` beside it, which is locked as well, and gets its name
-  with the first bytes. A run that ends before them removes it; if the run was killed, the next one does.
-* A device or a pipe is just written.
+* An existing file is opened and locked, and truncated by the first write. It stays the same file: permissions, owner,
+  links and a `tail -f` keep working, also in a read-only folder.
+* A new file begins as an empty `<name>.starting` beside it, which is locked, too, and is renamed by the first write. A
+  run that ends earlier removes it; if the run was killed, the next one removes it.
+* A device or a pipe is written directly.
 
 `docs/adr/0050-a-result-replaces-the-last-one-at-its-first-point.md` says why.
 """
@@ -20,8 +20,7 @@ import os
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from functools import cache
-from io import FileIO
+from io import BufferedReader, FileIO
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -30,44 +29,58 @@ from .errors import ConfigurationError
 if TYPE_CHECKING:
     from _typeshed import ReadableBuffer
 
-__all__ = ["Kept", "OwnFile", "exists", "is_file", "is_folder", "open_alone", "replaced", "sha256_of"]
+__all__ = [
+    "Kept",
+    "OwnFile",
+    "exists",
+    "is_file",
+    "is_folder",
+    "open_alone",
+    "replaced",
+    "sha256_of",
+    "sha256_of_open",
+    "unwritable",
+]
 
 _DRAFT = ".starting"
 _TRIES = 10
-"""How often to look again for a file that others rename or remove at the same moment."""
+"""Attempts to open a file that other processes rename or remove at the same time."""
+
+_hashes: dict[tuple[int, ...], str] = {}
+"""The SHA-256 of files that this process has read."""
 
 
 class Kept(NamedTuple):
-    """What of a file survives the end of its process, however it ends: ``rows`` in the first ``size`` bytes."""
+    """The part of a file that survives the death of its process: ``rows`` in the first ``size`` bytes."""
 
     rows: int = 0
     size: int = 0
 
 
 def exists(path: Path) -> bool:
-    """Whether something is there.
+    """Whether the path exists.
 
-    Unlike `Path.exists`, this and the two below say no where nobody can look, because a name is too long or a folder
-    is closed to this user; who then opens the path is told why.
+    Unlike those of `Path`, this and the two below return False if the path cannot be examined: a name that is too
+    long, or a folder without permission. Opening the path then raises the error with its reason.
     """
     return os.path.exists(path)  # noqa: PTH110 see above
 
 
 def is_file(path: Path) -> bool:
-    """Whether a file is there."""
+    """Whether the path is a file."""
     return os.path.isfile(path)  # noqa: PTH113 see `exists`
 
 
 def is_folder(path: Path) -> bool:
-    """Whether a folder is there."""
+    """Whether the path is a folder."""
     return os.path.isdir(path)  # noqa: PTH112 see `exists`
 
 
 def open_alone(path: Path) -> OwnFile:
-    """Open a result file for one writer: two runs of one configuration would write into each other's rows.
+    """Open a result file for a single writer: two runs of one configuration would mix their rows.
 
     Args:
-        path: the file; its folder is made, what is in it stays until the first bytes are written.
+        path: the file. Its folder is created; its content stays until the first write.
 
     Raises:
         ConfigurationError: another run writes it, or it cannot be written.
@@ -82,11 +95,23 @@ def open_alone(path: Path) -> OwnFile:
         raise ConfigurationError(f"the result file '{path}' cannot be written: {error.strerror}") from error
 
 
+def unwritable(path: Path, error: OSError) -> ConfigurationError:
+    """The error for a result file that could be opened, but not be written to its end."""
+    return ConfigurationError(
+        f"the result file '{path}' cannot be written: {error.strerror}",
+        hint="The run has ended there. Make room, or choose another file with --output.",
+    )
+
+
 @contextmanager
 def replaced(path: Path) -> Iterator[Path]:
-    """Inside, where to write a file that is of no use until it is complete; it gets its name at the end.
+    """A path for writing a file that is useless until it is complete; the end of the block renames it to ``path``.
 
-    If that fails, an older file stays as it was. A device or a pipe is written itself.
+    After an error in the block an older file stays unchanged. A device or a pipe is written directly.
+
+    Example:
+        >>> with replaced(Path("plot.png")) as draft:
+        ...     draft.write_bytes(picture)
     """
     target = Path(os.path.realpath(path))
     if target.exists() and not target.is_file():
@@ -101,16 +126,26 @@ def replaced(path: Path) -> Iterator[Path]:
 
 
 def sha256_of(path: Path) -> str:
-    """The SHA-256 of a file as hexadecimal digits; a process reads a file once, unless it changes."""
-    status = path.stat()
-    return _sha256(path, status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns)
+    """The SHA-256 of a file in hexadecimal digits; it is calculated once per process, unless the file changes."""
+    if (known := _hashes.get(_version(path.stat()))) is not None:
+        return known
+    with path.open("rb") as file:
+        return sha256_of_open(file)
+
+
+def sha256_of_open(file: BufferedReader, *, again: bool = False) -> str:
+    """As `sha256_of`, for a file that is open; ``again``: read it even if its hash is known. Moves its position."""
+    version = _version(os.fstat(file.fileno()))
+    if again or version not in _hashes:
+        file.seek(0)
+        _hashes[version] = hashlib.file_digest(file, "sha256").hexdigest()
+    return _hashes[version]
 
 
 class OwnFile(FileIO):
-    """An open file that nobody else writes; made by `open_alone`.
+    """An open file with a single writer, from `open_alone`.
 
-    A write that failed is not the last word of a full disk: all writes after it fail as well, so that there is never a
-    gap in the file.
+    After a failed write all later ones fail, too, even if the disk has room again: the file never has a gap.
 
     Attributes:
         size: bytes written so far.
@@ -125,7 +160,7 @@ class OwnFile(FileIO):
         self.size = 0
 
     def write(self, data: ReadableBuffer, /) -> int:
-        """Write bytes; returns how many, which may be fewer than there are."""
+        """Write bytes; returns how many were written, which may be fewer than given."""
         if self._failure is not None:
             raise self._failure
         try:
@@ -139,7 +174,7 @@ class OwnFile(FileIO):
         return written
 
     def close(self) -> None:
-        """Close the file; without a byte written, nothing has changed."""
+        """Close the file; if nothing was written, an older file is unchanged and no new one appears."""
         if not self.closed and self._untouched and self._draft is not None:
             with suppress(OSError):
                 self._draft.unlink()
@@ -152,17 +187,16 @@ class OwnFile(FileIO):
         self.truncate(0)
 
 
-@cache
-def _sha256(path: Path, *_version: int) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+def _version(status: os.stat_result) -> tuple[int, ...]:
+    """What changes if a file changes."""
+    return status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns
 
 
 def _open_locked(path: Path) -> tuple[int, Path | None]:
-    """The descriptor of a file, and its draft if there is no such file yet.
+    """The descriptor of a file, and the path of its draft if the file does not exist yet.
 
     Raises:
-        BlockingIOError: somebody else has locked it.
+        BlockingIOError: another process has locked it.
         OSError: it cannot be opened.
     """
     draft = Path(f"{os.path.realpath(path)}{_DRAFT}")
@@ -182,7 +216,7 @@ def _open_locked(path: Path) -> tuple[int, Path | None]:
                     return descriptor, None
                 if not path.exists():
                     return descriptor, draft
-                draft.unlink()  # between the two looks another run has begun, and given its file the name
+                draft.unlink()  # another run has started meanwhile and renamed its own draft
         except BaseException:
             os.close(descriptor)
             raise
@@ -196,11 +230,11 @@ def _lock(descriptor: int) -> None:
     except BlockingIOError:
         raise
     except OSError:
-        return  # a file system without locks
+        return  # the file system has no locks
 
 
 def _is_at(path: Path, descriptor: int) -> bool:
-    """Whether what is open is what the path leads to, and not something that was renamed or removed since."""
+    """Whether the open file is still the one at the path, and was not renamed or removed."""
     try:
         return os.path.samestat(path.stat(), os.fstat(descriptor))
     except FileNotFoundError:
@@ -208,7 +242,7 @@ def _is_at(path: Path, descriptor: int) -> bool:
 
 
 def _remove(draft: Path) -> None:
-    """Remove a draft that a run has left that was killed."""
+    """Remove the draft of a run that was killed."""
     with suppress(OSError), draft.open("r+b") as file:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         draft.unlink()

@@ -1,6 +1,6 @@
 """Simulation time: a communication point is an integer, its time is one multiplication.
 
-This module owns the arithmetic between points and seconds, so that no other module ever adds step sizes up.
+This module owns the arithmetic between points and seconds. No other module adds up step sizes.
 """
 
 from __future__ import annotations
@@ -14,16 +14,20 @@ from numpy.typing import NDArray
 __all__ = ["ENDLESS", "TimeGrid", "step_within", "steps_between"]
 
 ENDLESS = 2**53
-"""The last point of a run without an end; above it, the product of a point and the step size is no longer exact."""
+"""Last point of a run without a stop time. Beyond it a point has no exact double any more."""
 
 
 class TimeGrid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The communication points `0 .. last_point` of a run: `t = start_time + point * step_size`.
 
+    Example:
+        >>> TimeGrid(start_time=0.0, step_size=0.002, last_point=20000).time(812)
+        1.624
+
     Attributes:
         start_time: time of point 0 in s.
         step_size: base communication step size in s, greater than 0.
-        last_point: index of the last communication point; `ENDLESS` for a run that goes on until it is stopped.
+        last_point: index of the last communication point; `ENDLESS` for a run without a stop time.
     """
 
     start_time: float
@@ -35,20 +39,20 @@ class TimeGrid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return self.start_time + point * self.step_size
 
     def times(self, first: int, end: int) -> NDArray[np.float64]:
-        """The times of the points ``first .. end - 1`` in s, each as `time` computes it."""
+        """The times of the points ``first .. end - 1`` in s, bit for bit those of `time`; shape `(end - first,)`."""
         times: NDArray[np.float64] = self.start_time + np.arange(first, end, dtype=np.float64) * self.step_size
         return times
 
     @property
     def stop_time(self) -> float | None:
-        """The time of the last point in s; None for a run without an end."""
+        """The time of the last point in s; None for a run without a stop time."""
         return self.time(self.last_point) if self.last_point < ENDLESS else None
 
     def told_stop_time(self, points: int) -> float | None:
-        """The stop time in s that an FMU is told whose own steps take ``points`` points; None for a run without an end.
+        """The stop time in s for the setup of an FMU whose steps take ``points`` points; None without a stop time.
 
-        An FMU adds up what it is given, the start of a step and its size: 1999 * 0.01 + 0.01 is 20.000000000000004. So
-        it is told the end of its last step where that is later than `stop_time`, which it is by rounding only.
+        An FMU adds the start of a step and its size, and 1999 * 0.01 + 0.01 is 20.000000000000004. So it gets the end
+        of its last step if rounding makes that later than `stop_time`.
         """
         if self.stop_time is None:
             return None
@@ -57,24 +61,27 @@ class TimeGrid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def step_within(time: float, step_size: float, end: float) -> float:
-    """``step_size``, or a little less where rounding would bring a step from ``time`` past ``end`` (all in s).
+    """``step_size``, reduced by rounding errors so that ``time`` plus the result is at most ``end`` (all in s).
 
-    For the parts of a step: the sum of ``time`` and the returned size is never greater than ``end``. Only rounding is
-    corrected: without it, the step must end at ``end`` or before.
+    For the parts of a step. Only rounding is corrected: in exact arithmetic the step must end at ``end`` or earlier.
     """
     if time + step_size <= end:
         return step_size
     rest = end - time
-    # The difference itself is rounded, too: 0.04 + (0.11 - 0.04) is greater than 0.11.
+    # The difference is rounded, too: 0.04 + (0.11 - 0.04) is greater than 0.11.
     return rest if time + rest <= end else math.nextafter(rest, 0.0)
 
 
 def steps_between(start: float, stop: float, step_size: float) -> int | None:
-    """How many steps of ``step_size`` lie between ``start`` and ``stop`` (s), or None if it is not a whole number.
+    """The number of steps of ``step_size`` between ``start`` and ``stop`` (s), or None if it is not a whole number.
 
     Decimal numbers have no exact binary form: 40 s are 20,000.000000000004 steps of 2 ms, and from 1000000.1 s to
-    1000000.4 s there are 3.0000000005 steps of 0.1 s. So the quotient may be off a whole number by a few units in its
-    last place, and the two times by a few units in theirs; anything more is a different duration.
+    1000000.4 s there are 3.0000000005 steps of 0.1 s. So the quotient may differ from a whole number by a few units in
+    its last place, and by a few units in the last place of the two times. A larger difference is not rounding.
+
+    Example:
+        >>> steps_between(0.0, 40.0, 0.002)
+        20000
     """
     duration = stop - start
     if not (math.isfinite(duration) and math.isfinite(step_size)) or step_size <= 0.0 or duration < 0.0:

@@ -1,25 +1,26 @@
-"""Text for messages: the nearest right name, names in a list, a value as a reader would write it."""
+"""Text for people: the nearest name, a list of names, a value, a number, a path, and what a pattern matches."""
 
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-__all__ = ["listed", "nearest", "nearest_file", "shown"]
+__all__ = ["fits", "listed", "nearest", "nearest_file", "short_number", "short_path", "shown"]
 
 _LISTED_NAMES = 8
 _SHOWN_CHARACTERS = 60
 
 
 def nearest(name: str, names: Iterable[str]) -> str | None:
-    """The one of ``names`` that ``name`` is most likely a slip of, or None."""
+    """The one of ``names`` that is most similar to ``name``, or None if none is similar."""
     folded: dict[str, str] = {}
     for candidate in names:
         folded.setdefault(candidate.casefold(), candidate)
     wanted = name.casefold()
     close = difflib.get_close_matches(wanted, folded, n=1)
-    if not close and len(wanted) > 1:  # a beginning that fits one name only
+    if not close and len(wanted) > 1:  # the beginning of exactly one name
         longer = [candidate for candidate in folded if candidate.startswith(wanted)]
         close = longer if len(longer) == 1 else []
     return folded[close[0]] if close else None
@@ -35,7 +36,7 @@ def nearest_file(path: Path) -> str | None:
 
 
 def listed(names: Sequence[str], *, nothing: str = "none") -> str:
-    """``names`` as text, cut where it gets long."""
+    """The names, separated by commas; of more than 8 the first ones and how many more there are."""
     if not names:
         return nothing
     rest = len(names) - _LISTED_NAMES
@@ -43,7 +44,7 @@ def listed(names: Sequence[str], *, nothing: str = "none") -> str:
 
 
 def shown(value: object) -> str:
-    """A value of the file as a reader would write it, cut where it gets long."""
+    """A value as a message shows it: at most 60 characters, a mapping and a list only by their kind."""
     match value:
         case None:
             return "nothing (null)"
@@ -58,3 +59,24 @@ def shown(value: object) -> str:
         case _:
             text = str(value)
     return text if len(text) <= _SHOWN_CHARACTERS else f"{text[: _SHOWN_CHARACTERS - 3]}..."
+
+
+def short_number(value: float) -> str:
+    """A number with up to 12 significant digits: what rounding adds to a decimal number is not shown."""
+    return f"{value:.12g}"
+
+
+def short_path(path: str | Path) -> str:
+    """A path relative to the current folder if it is in there."""
+    try:
+        return str(Path(path).relative_to(Path.cwd()))
+    except ValueError:
+        return str(path)
+
+
+def fits(pattern: str, name: str) -> bool:
+    """Whether ``name`` is the pattern, in which only `*` is special and stands for any characters.
+
+    Brackets belong to the names of variables, so these are not the patterns of `fnmatch`.
+    """
+    return re.fullmatch(".*".join(map(re.escape, pattern.split("*"))), name, re.DOTALL) is not None

@@ -20,7 +20,7 @@ from std_msgs.msg import Float64
 
 from fmu_mesh import FMIAdapter
 from fmu_mesh.adapter import Nanoseconds
-from fmu_mesh.ros.node.node_parameters import initialize_from_parameters
+from fmu_mesh.ros.node import initialize_from_parameters
 
 FMUS = Path(__file__).resolve().parents[2] / "fmus"
 STEP = Duration(nanoseconds=20_000_000)

@@ -1,7 +1,7 @@
 """`FMIAdapter`: one FMU for a program that steps it by itself.
 
-Owns the modes, the time reached and the FMU's private folder. Knows nothing of meshes and Zenoh, and of ROS only that
-its times are nanoseconds.
+Owns the modes, the time reached and the FMU's private folder. Knows nothing of meshes and Zenoh; of ROS it knows only
+its times.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from typing import Any, Literal, Self
 from ..errors import FmuError
 from ..instances.call_guard import floating_point_changed, kept_state, restore_floating_point
 from ..instances.fmi import FmuInstance, LogMessage, open_instance, read_description
-from ..instances.input_trajectory import Trajectory
+from ..instances.input_trajectory import Samples, Trajectory
 from ..system.start_values import forbidden
 from ..variables.model_description import ModelDescription, Value
 from ..variables.value_types import is_float
 from .argument_checks import Arguments
-from .times import Clock, Instant, RosTime, SecondsClock, Time, clock_from
+from .times import CallerClock, Instant, RosTime, SecondsClock, Time, clock_from
 
 __all__ = ["FMIAdapter"]
 
@@ -85,7 +85,7 @@ class FMIAdapter:
         self._early_inputs: dict[str, dict[Instant, Value]] = {}
         self._initial_inputs: dict[str, Value] = {}
         self._trajectories: dict[str, Trajectory] = {}
-        self._clock: Clock = SecondsClock(0.0)
+        self._clock: CallerClock = SecondsClock(0.0)
         self._elapsed = Fraction(0)
         self._point = 0
         self._folder = folder = Path(tempfile.mkdtemp(prefix="fmu_mesh-"))
@@ -107,7 +107,7 @@ class FMIAdapter:
 
     @property
     def description(self) -> ModelDescription:
-        """The model description: units, types, start values and all else that is not asked for below."""
+        """The model description, with units, types and start values."""
         return self._description
 
     @property
@@ -127,7 +127,7 @@ class FMIAdapter:
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
-        """Names of all parameters; calculated parameters are not among them, because they cannot be set."""
+        """Names of all parameters that can be set; so there is no calculated parameter."""
         return tuple(self._arguments.parameters)
 
     @property
@@ -353,7 +353,7 @@ class FMIAdapter:
         return when
 
     def _enter(self) -> None:
-        """Let the FMU enter Initialization Mode: as late as possible, because some start values come before it."""
+        """Let the FMU enter Initialization Mode; as late as possible, because some values can only be set before."""
         if not self._entered:
             with self._fmu_called():
                 self._instance.enter_initialization(0.0, None, self._start_values)
@@ -362,7 +362,7 @@ class FMIAdapter:
     def _begin_trajectory(self, name: str, *, initial: bool) -> Trajectory:
         """A new trajectory, whose first value is the initial one at 0.0 if ``initial`` is true."""
         linear = self._interpolate_input and is_float(self._arguments.inputs[name].type)
-        self._trajectories[name] = trajectory = Trajectory(linear=linear)
+        self._trajectories[name] = trajectory = Trajectory(Samples(linear))
         if initial:
             trajectory.add(0.0, self._initial_inputs[name])
         return trajectory
@@ -372,7 +372,7 @@ class FMIAdapter:
         with self._fmu_called():
             self._set_inputs(time)
             self._instance.advance(time, step_size)
-        # Exact, so it never drifts: while the step size stays the same, its float is that of point * step_size.
+        # A Fraction is exact: with a constant step size, its float is point * step_size.
         self._elapsed += Fraction(step_size)
         self._point += 1
 
@@ -384,12 +384,12 @@ class FMIAdapter:
 
     @contextmanager
     def _fmu_called(self) -> Iterator[None]:
-        """Around every call of the FMU: what it does to the process is undone, and a failure is told and noted.
+        """Around every call of the FMU: restore the state of the process, and note a failure.
 
-        In the stepping loop that is the floating-point mode only, as in a mesh: the rest takes longer than a step.
+        When stepping, this restores only the floating-point mode, as in a mesh: the rest takes longer than a step.
         """
         stepping = self._mode == "stepping"
-        own_mode = stepping and floating_point_changed()  # the caller's, which is none of our business
+        own_mode = stepping and floating_point_changed()  # that of the caller, which stays as it is
         try:
             if stepping:
                 yield
@@ -398,7 +398,7 @@ class FMIAdapter:
                     yield
         except FmuError as error:
             if stepping:
-                error.point, error.time = self._point, self.simulation_time
+                error.at(self._point, self.simulation_time)
             self._mode = "failed"
             raise
         finally:

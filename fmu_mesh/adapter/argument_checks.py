@@ -1,6 +1,6 @@
-"""Checking what the caller hands over: names, values and seconds, before anything reaches the FMU.
+"""Checks the arguments of a caller, names, values and times, before they reach the FMU.
 
-Owns the texts of `CallRefused` that are about an argument. Knows nothing of modes and of stepping.
+Owns the texts of `CallRefused` about arguments. Knows nothing of modes and steps.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ __all__ = ["Arguments"]
 
 
 class Arguments:
-    """The variables of one FMU by what can be done with them, and checks that end with `CallRefused`.
+    """The variables of one FMU by their use; a wrong argument raises `CallRefused`.
 
     Args:
         instance: instance name, for messages.
@@ -57,7 +57,7 @@ class Arguments:
         """The variable called ``name``, which can be set before the start."""
         known = self.all.get(name)
         if known is not None and known.may_take_start_value:
-            return known  # what FMI forbids of these is up to the FMU
+            return known  # FMI forbids some of these, but some FMUs accept them
         return self._find(name, self._settable, "settable before the start")
 
     def value(self, variable: Variable, value: Value) -> Value:
@@ -106,7 +106,7 @@ class Arguments:
         return number
 
     def refusal(self, message: str, hint: str | None = None, variable: str | None = None) -> CallRefused:
-        """An error that names this instance."""
+        """A `CallRefused` that names this instance."""
         return CallRefused(message, instance=self.instance, variable=variable, hint=hint)
 
     def _having(self, causality: Causality) -> dict[str, Variable]:
@@ -125,5 +125,5 @@ class Arguments:
 
 
 def _plain(value: object) -> object:
-    """A scalar of numpy, which robot programs are full of, as the Python value it stands for."""
+    """A numpy scalar as the Python value; robot programs use many of them."""
     return value.item() if isinstance(value, np.generic) else value

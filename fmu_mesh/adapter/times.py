@@ -1,7 +1,7 @@
-"""What the caller's clock says: seconds, or the nanoseconds of a ROS clock.
+"""Times of the caller: seconds, or the nanoseconds of a ROS clock.
 
-Owns the two kinds of clock against the FMU's, which is in seconds and starts at 0.0. Knows ROS times by their shape
-only and imports nothing of ROS.
+Owns the conversion to the clock of the FMU, which is in seconds and starts at 0.0. Recognizes ROS times by their
+attributes and imports nothing of ROS.
 """
 
 from __future__ import annotations
@@ -11,20 +11,30 @@ from typing import Protocol, runtime_checkable
 
 import msgspec
 
-__all__ = ["Clock", "Instant", "Nanoseconds", "RosStamp", "RosTime", "SecondsClock", "Time", "clock_from", "instant_of"]
+__all__ = [
+    "CallerClock",
+    "Instant",
+    "Nanoseconds",
+    "RosStamp",
+    "RosTime",
+    "SecondsClock",
+    "Time",
+    "clock_from",
+    "instant_of",
+]
 
 _NANO = 1_000_000_000
 
 
 class Nanoseconds(msgspec.Struct, frozen=True):
-    """A time, or a duration, in whole nanoseconds, where there is no `rclpy.time.Time` at hand."""
+    """A time or a duration in whole nanoseconds, for programs without `rclpy.time.Time`."""
 
     nanoseconds: int
 
 
 @runtime_checkable
 class RosTime(Protocol):
-    """What `rclpy.time.Time`, `rclpy.duration.Duration` and `Nanoseconds` have in common."""
+    """The common part of `rclpy.time.Time`, `rclpy.duration.Duration` and `Nanoseconds`."""
 
     @property
     def nanoseconds(self) -> int:
@@ -34,7 +44,7 @@ class RosTime(Protocol):
 
 @runtime_checkable
 class RosStamp(Protocol):
-    """What the stamp of a message's header is (`builtin_interfaces/Time`)."""
+    """The stamp in the header of a message (`builtin_interfaces/Time`)."""
 
     sec: int
     nanosec: int
@@ -54,8 +64,8 @@ def instant_of(time: RosTime | RosStamp) -> Nanoseconds:
     return Nanoseconds(int(time.nanoseconds))
 
 
-class Clock(Protocol):
-    """The caller's clock against the FMU's, which starts at 0.0."""
+class CallerClock(Protocol):
+    """Converts between the clock of the caller and that of the FMU, which starts at 0.0."""
 
     def to_fmu(self, time: Instant) -> float | None:
         """A time of the caller on the FMU's clock, in s; None if it is not a time of this kind of clock."""
@@ -70,17 +80,17 @@ class Clock(Protocol):
         ...
 
     def resolution(self, time: float) -> float:
-        """How far apart two of the caller's times near the FMU's ``time`` can be (s) and still mean the same."""
+        """The largest difference in s of two equal times of the caller near the FMU's ``time``."""
         ...
 
 
-def clock_from(start: Instant) -> Clock:
-    """The clock that says ``start`` when the FMU's says 0.0."""
+def clock_from(start: Instant) -> CallerClock:
+    """The clock of a caller whose time is ``start`` when the FMU's is 0.0."""
     return NanosecondsClock(start.nanoseconds) if isinstance(start, Nanoseconds) else SecondsClock(start)
 
 
 class SecondsClock:
-    """A caller's clock of seconds.
+    """A clock in seconds.
 
     Args:
         start: the caller's time of the FMU's 0.0, in s.
@@ -111,7 +121,7 @@ class SecondsClock:
 
 
 class NanosecondsClock:
-    """A caller's clock of whole nanoseconds, as ROS has it: exact, whatever its zero is.
+    """A clock in whole nanoseconds, as in ROS: exact for any start.
 
     Args:
         start: the caller's time of the FMU's 0.0, in ns.
@@ -133,5 +143,5 @@ class NanosecondsClock:
         return self._start + round(time * _NANO)
 
     def resolution(self, time: float) -> float:
-        """1 ns: a stamp is the time of a step cut or rounded to whole nanoseconds."""
+        """1 ns: a stamp is the time of a step, truncated or rounded to whole nanoseconds."""
         return 1.0 / _NANO + 8 * math.ulp(time)

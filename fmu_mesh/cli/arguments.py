@@ -1,7 +1,6 @@
-"""What the commands have in common: how one is added, and arguments that say what is wrong with them.
+"""The common parts of all commands: adding one, its options, and readers of values with clear errors.
 
-A name of a function that stands as `type=` shows in argparse's own message for a text that is no number, so these have
-messages of their own.
+argparse shows the name of a reader function in its own message for a wrong value, so these raise messages of their own.
 """
 
 from __future__ import annotations
@@ -9,17 +8,28 @@ from __future__ import annotations
 import argparse
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NoReturn
 
 from .. import files
-from ..config.base import ENDPOINT_PATTERN
+from ..config.base import ENDPOINT_PATTERN, Endpoint
 from ..config.mesh import MAX_WINDOW
 from ..errors import ConfigurationError, LoadFailed
+from ..run.options import Options, settings
 from ..text import listed, nearest, nearest_file
 
-__all__ = ["CommandParser", "add_command", "add_window", "count", "endpoint", "no_fmu", "number", "positive_seconds"]
+__all__ = [
+    "CommandParser",
+    "add_command",
+    "add_options",
+    "count",
+    "endpoint",
+    "no_fmu",
+    "number",
+    "positive_seconds",
+    "read_options",
+]
 
 Parsers = Sequence[argparse.ArgumentParser]
 
@@ -27,18 +37,18 @@ _NEGATIVE = re.compile(r"-(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?$|-\.?
 
 
 class CommandParser(argparse.ArgumentParser):
-    """A parser whose errors are one sentence, as all others: a page of options hides what is wrong."""
+    """A parser whose errors are one sentence. The usage that argparse prints would hide it."""
 
-    def __init__(self, *arguments: Any, **options: Any) -> None:  # noqa: ANN401 those of argparse
+    def __init__(self, *arguments: Any, **options: Any) -> None:  # noqa: ANN401 the arguments of argparse
         super().__init__(*arguments, **options)
-        self._negative_number_matcher = _NEGATIVE  # argparse takes -1e-3 and -inf for options
+        self._negative_number_matcher = _NEGATIVE  # by default argparse takes -1e-3 and -inf for options
 
     def error(self, message: str) -> NoReturn:
-        """End with exit code 2 and with what is wrong."""
+        """Exit with code 2 and one sentence about the error."""
         name, _, what = message.removeprefix("argument ").partition(": ")
         hint = None
         if name == "the following arguments are required":
-            # argparse names those that may be left out, too, if they come last.
+            # argparse also lists optional ones at the end.
             free = [str(action.metavar) for action in self._get_positional_actions() if action.nargs in ("*", "?")]
             needed = " and ".join(one for one in what.split(", ") if one not in free)
             text, hint = f"`{self.prog}` needs {needed}", f"`{self.prog} --help` tells more."
@@ -50,7 +60,7 @@ class CommandParser(argparse.ArgumentParser):
         self.exit(problem.exit_code, f"fmu-mesh: {problem}\n")
 
     def unknown(self, argument: str, others: Mapping[str, CommandParser]) -> ConfigurationError:
-        """What to say to an argument that this command does not have; ``others`` are all commands."""
+        """The error for an argument that this command does not have; ``others`` are all commands."""
         if not argument.startswith("-"):
             return ConfigurationError(f"`{self.prog}` takes no '{argument}'", hint=f"`{self.prog} --help` tells more.")
         name = argument.partition("=")[0]
@@ -67,23 +77,58 @@ class CommandParser(argparse.ArgumentParser):
 
     @property
     def option_names(self) -> list[str]:
-        """The options that its help shows."""
+        """The options in its help."""
         return [name for name, action in self._option_string_actions.items() if action.help != argparse.SUPPRESS]
 
 
 def add_command(
     commands: argparse._SubParsersAction[Any], name: str, text: str, parents: Parsers
 ) -> argparse.ArgumentParser:
-    """A command whose own help begins with the line that the list of all commands has for it."""
+    """Add a command; ``text`` is its line in the list of commands and the first line of its own help."""
     description = f"{text[0].upper()}{text[1:]}."
     parser: argparse.ArgumentParser = commands.add_parser(name, parents=parents, help=text, description=description)
     return parser
 
 
-def add_window(parser: argparse.ArgumentParser) -> None:
-    """The option `--window`."""
-    text = "how many points a node may run ahead; 1 is lockstep; auto: where instances are fast, many"
-    parser.add_argument("--window", type=_window, metavar="N", help=text)
+def add_options(
+    parser: argparse._ActionsContainer,
+    *names: str,
+    defaults: Mapping[str, str] | None = None,
+    metavars: Mapping[str, str] | None = None,
+) -> None:
+    """Add flags for options of a run, as `Options` describes them.
+
+    Args:
+        parser: the parser of a command, or a group of its flags.
+        names: the fields of `Options`.
+        defaults: by field, the default value for the help.
+        metavars: by field, the name of the value in the help, if it differs from that in `Options`.
+    """
+    for name in names:
+        setting = settings()[name]
+        flag, kind = setting.flag, setting.type
+        default = (defaults or {}).get(name)
+        text = setting.help + (f"; default: {default}" if default is not None else "")
+        details: dict[str, Any] = {"dest": name, "help": text.replace("%", "%%")}
+        if kind is bool:
+            parser.add_argument(flag.name, action="store_true", **details)
+            continue
+        details |= {"metavar": (metavars or {}).get(name, flag.metavar), "type": _READERS[kind]}
+        if setting.repeatable:
+            details |= {"action": "append", "default": []}
+        if flag.bare is not None:
+            details |= {"nargs": "?", "const": flag.bare, "type": _trace_file}
+        parser.add_argument(flag.name, **details)
+
+
+def read_options(arguments: argparse.Namespace) -> Options:
+    """The options from the arguments of a command."""
+    given: dict[str, Any] = {}
+    for name, setting in settings().items():
+        if hasattr(arguments, name):
+            value = getattr(arguments, name)
+            given[name] = tuple(value) if setting.repeatable else value
+    return Options(**given)
 
 
 def number(text: str) -> float:
@@ -103,7 +148,7 @@ def positive_seconds(text: str) -> float:
 
 
 def count(text: str) -> int:
-    """A whole number of 1 or more."""
+    """A positive whole number."""
     value = _whole(text)
     if value < 1:
         raise argparse.ArgumentTypeError(f"'{text}' is not a whole number of 1 or more")
@@ -118,7 +163,7 @@ def endpoint(text: str) -> str:
 
 
 def no_fmu(path: Path, error: LoadFailed) -> ConfigurationError:
-    """What to say where an FMU was asked for, and something else, or nothing, is there."""
+    """The error for a path that should be an FMU and is something else, or nothing."""
     hint = error.hint
     if not files.exists(path):
         near = nearest_file(path)
@@ -126,6 +171,12 @@ def no_fmu(path: Path, error: LoadFailed) -> ConfigurationError:
     elif path.suffix in (".yaml", ".yml"):
         hint = f"A configuration is run by `fmu-mesh launch {path}`."
     return ConfigurationError(error.message, hint=hint)
+
+
+def _trace_file(text: str) -> Path:
+    if not text.endswith(".json"):
+        raise argparse.ArgumentTypeError(f"'{text}' is no .json file; write --profile after the other arguments")
+    return Path(text)
 
 
 def _window(text: str) -> int | Literal["auto"]:
@@ -138,7 +189,7 @@ def _window(text: str) -> int | Literal["auto"]:
 
 
 def _whole(text: str) -> int:
-    """A whole number; 0 for what is none, which no option here takes."""
+    """A whole number; 0, which no option here allows, for any other text."""
     try:
         return int(text)
     except ValueError:
@@ -150,3 +201,13 @@ def _read(text: str) -> float:
         return float(text)
     except ValueError:
         raise argparse.ArgumentTypeError(f"'{text}' is no number") from None
+
+
+_READERS: dict[Any, Callable[[str], object]] = {
+    int: _window,
+    float: number,
+    str: str,
+    Path: Path,
+    Endpoint: endpoint,
+}
+"""The reader of a value by its type."""

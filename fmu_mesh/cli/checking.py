@@ -1,4 +1,4 @@
-"""`check` and `schema`: what a configuration means, and what it may look like."""
+"""`check` and `schema`: the plan of a configuration, and its JSON Schema."""
 
 from __future__ import annotations
 
@@ -7,16 +7,17 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from ..config.schema import schema_text
+from ..config.structure import schema_text
+from ..instances.configuration import installed_config
 from ..instances.registry import check_engines
-from ..run.preparing import Options, prepare
+from ..run.preparing import prepare
 from ..system.grouping import automatic_nodes
 from ..system.initialization_plan import Loop
 from ..system.plan import Plan
 from ..system.system import Connection, SystemInstance
-from ..text import listed, shown
+from ..text import listed, short_number, short_path, shown
 from ..variables.model_description import Variable
-from .arguments import add_command, add_window
+from .arguments import add_command, add_options, read_options
 from .output.display import say
 from .output.tables import pairs, table
 
@@ -27,27 +28,24 @@ _PROBLEM_CHARACTERS = 100
 
 def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.ArgumentParser) -> None:
     """Add the commands of this module."""
-    check = add_command(commands, "check", "check a configuration and show its plan; run nothing", [common])
+    check = add_command(commands, "check", "check a configuration and show its plan, without running it", [common])
     check.add_argument("config", type=Path, metavar="CONFIG", help="the configuration file")
-    add_window(check)
-    check.add_argument(
-        "--set", action="append", default=[], metavar="INSTANCE.VARIABLE=VALUE", help="another start value; repeatable"
-    )
+    add_options(check.add_argument_group("instead of what CONFIG says"), "window", "start_values")
     check.set_defaults(run_command=_check)
     schema = add_command(commands, "schema", "print the JSON Schema of configurations", [common])
     schema.set_defaults(run_command=_schema)
 
 
 def _check(arguments: argparse.Namespace) -> int:
-    plan = prepare(arguments.config, Options(start_values=tuple(arguments.set), window=arguments.window), say)
+    plan = prepare(arguments.config, read_options(arguments), say)
     print("\n".join(plan_page(plan)))
-    check_engines(plan.system, str(arguments.config))
+    check_engines(plan.system.config.instances, str(arguments.config))
     print(f"\nOK: {arguments.config} can run.")
     return 0
 
 
 def _schema(_arguments: argparse.Namespace) -> int:
-    sys.stdout.write(schema_text())
+    sys.stdout.write(schema_text(installed_config()))
     return 0
 
 
@@ -75,12 +73,12 @@ def _head(plan: Plan) -> list[str]:
     simulation, grid = plan.system.config.simulation, plan.grid
     factor = simulation.real_time_factor
     window = f"{plan.window} points" if plan.window > 1 else "1 point: lockstep"
-    end = f"{_number(grid.stop_time)} s in {grid.last_point}" if grid.stop_time is not None else "an open end in"
-    times = f"{_number(grid.start_time)} s to {end} steps of"
+    end = f"{short_number(grid.stop_time)} s in {grid.last_point}" if grid.stop_time is not None else "an open end in"
+    times = f"{short_number(grid.start_time)} s to {end} steps of"
     return pairs(
         [
             ("Mesh", plan.system.config.mesh),
-            ("Simulation", f"{times} {_number(grid.step_size)} s"),
+            ("Simulation", f"{times} {short_number(grid.step_size)} s"),
             ("Algorithm", simulation.algorithm),
             ("Window", window),
             ("Speed", f"{factor:g} times real time" if factor else "as fast as possible"),
@@ -92,8 +90,8 @@ def _instances(plan: Plan) -> list[str]:
     rows = [
         [
             instance.name,
-            _model(instance),
-            f"step {_number(instance.step_points * plan.grid.step_size)} s",
+            _model(plan, instance),
+            f"step {short_number(instance.step_points * plan.grid.step_size)} s",
             "a process of its own" if instance.node == instance.name else f"group {instance.node}",
             _start_values(instance),
         ]
@@ -102,22 +100,10 @@ def _instances(plan: Plan) -> list[str]:
     return table(rows, indent=2)
 
 
-def _solver(instance: SystemInstance) -> str:
-    """How a model-exchange FMU is solved; of co-simulation, which has its own solver, the tolerance that it is told."""
-    if instance.description.kind == "co_simulation":
-        told = instance.options.tolerance
-        return f", tolerance {told:g}" if told is not None else ""
-    solver = instance.options.solver
-    tolerance = f" {solver.relative_tolerance:g}" if solver.name == "cvode" else ""
-    return f" model exchange, {solver.name}{tolerance}"
-
-
-def _model(instance: SystemInstance) -> str:
-    """The file of an instance, and what it is a model of."""
-    description = instance.description
-    if instance.hosted is None:
-        return f"{Path(instance.fmu).name} (FMI {description.fmi_version}{_solver(instance)})"
-    return f"{Path(instance.fmu).name or description.model_name} ({description.generation_tool})"
+def _model(plan: Plan, instance: SystemInstance) -> str:
+    """The file of an instance, and what computes it."""
+    summary = plan.system.config.instances[instance.name].summary(instance.description)
+    return f"{Path(instance.fmu).name or instance.description.model_name} ({summary})"
 
 
 def _start_values(instance: SystemInstance) -> str:
@@ -140,7 +126,7 @@ def _connections(plan: Plan) -> list[str]:
 
 
 def _free_inputs(plan: Plan) -> list[str]:
-    """What keeps its start value unless somebody sets it; a connection that was forgotten shows here."""
+    """Inputs that keep their start values unless they are set: a forgotten connection is visible here."""
     connected = {(c.target_instance, c.target.name) for c in plan.connections}
     lines = []
     for name, instance in plan.system.instances.items():
@@ -153,12 +139,12 @@ def _free_inputs(plan: Plan) -> list[str]:
 
 
 def _arithmetic(c: Connection) -> str:
-    """What a connection calculates; empty if it hands the value on as it is."""
+    """The formula of a connection; empty if it copies the value."""
     if (c.factor, c.offset) == (1.0, 0.0):
         return ""
-    product = f"{_number(c.factor)} * {c.source_name}" if c.factor != 1.0 else c.source_name
+    product = f"{short_number(c.factor)} * {c.source_name}" if c.factor != 1.0 else c.source_name
     sign = "-" if c.offset < 0.0 else "+"
-    sum_ = f"{product} {sign} {_number(abs(c.offset))}" if c.offset else product
+    sum_ = f"{product} {sign} {short_number(abs(c.offset))}" if c.offset else product
     return f"{c.target_name} = {sum_}"
 
 
@@ -171,7 +157,7 @@ def _order(plan: Plan) -> list[str]:
 
 
 def _groups(plan: Plan) -> list[str]:
-    """What `group: auto` does or would do, and why, for each cycle that it concerns."""
+    """For each cycle, what `group: auto` does or would do, and why."""
     config, instances = plan.system.config, plan.system.instances
     edges = [(c.source_instance, c.target_instance) for c in plan.connections]
     automatic = automatic_nodes(config, edges, {name: own.description for name, own in instances.items()})
@@ -196,7 +182,7 @@ def _remedy(nodes: int, automatic: int) -> str:
 
 
 def _initialization(plan: Plan) -> list[str]:
-    """What becomes known when, and which outputs are iterated together."""
+    """The levels in which outputs are computed, and which ones are iterated together."""
     loops = {loop.first: loop for loop in plan.initialization.loops}
     levels: dict[int, list[str]] = {}
     by_order = sorted(plan.initialization.levels.items(), key=lambda item: plan.order.index(item[0][0]))
@@ -227,7 +213,7 @@ def _recorded(plan: Plan) -> list[str]:
         described = instances[name].description.variable_of(variable)
         type_ = described.type_name.partition("[")[0] if described is not None else ""
         rows.append([f"{name}.{variable}", type_, _unit(described).strip()])
-    return [*table(rows, indent=2), f"  into {_short(plan.system.result_file)}"]
+    return [*table(rows, indent=2), f"  into {short_path(plan.system.result_file)}"]
 
 
 def _warnings(plan: Plan) -> list[str]:
@@ -242,14 +228,3 @@ def _warnings(plan: Plan) -> list[str]:
 
 def _unit(variable: Variable | None) -> str:
     return f" {variable.unit}" if variable is not None and variable.unit else ""
-
-
-def _number(value: float) -> str:
-    return f"{value:.12g}"
-
-
-def _short(path: str) -> str:
-    try:
-        return str(Path(path).relative_to(Path.cwd()))
-    except ValueError:
-        return path

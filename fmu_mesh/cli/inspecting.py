@@ -1,9 +1,8 @@
-"""`inspect`: what one FMU is, without running anything of it."""
+"""`inspect`: the properties of one FMU. Nothing of it is executed."""
 
 from __future__ import annotations
 
 import argparse
-import fnmatch
 import shutil
 import sys
 import textwrap
@@ -16,7 +15,7 @@ import msgspec
 
 from ..errors import ConfigurationError, LoadFailed
 from ..instances.fmi import read_description, sha256_of
-from ..text import nearest, shown
+from ..text import fits, nearest, short_number, shown
 from ..variables.model_description import Causality, Kind, ModelDescription, Variable
 from .arguments import add_command, no_fmu
 from .output.tables import pairs
@@ -24,7 +23,7 @@ from .output.tables import pairs
 __all__ = ["Inspection", "add_commands", "inspect_fmu", "inspection_page"]
 
 _SHOWN_VARIABLES: Final = 20
-"""Variables of one causality that a page lists by itself."""
+"""Variables of one causality on a page without `--all`."""
 
 _NARROWEST: Final = 60
 _WIDE: Final = 120
@@ -48,14 +47,14 @@ _CAPABILITIES: Final = (
 
 
 class Inspection(msgspec.Struct, frozen=True, omit_defaults=False):
-    """What `inspect --json` prints; documented in `docs/commands.md`.
+    """The output of `inspect --json`; documented in `docs/commands.md`.
 
     Attributes:
         file: the path as it was given.
         sha256: of the archive, as hexadecimal digits; null for a folder.
         bytes: size of the archive; null for a folder.
         runs_here: whether it can run on this platform.
-        problems: what is wrong or odd, in words; the first says why it cannot run here, if it cannot.
+        problems: violations and warnings as text; if it cannot run here, the first one says why.
         description: the model description.
     """
 
@@ -69,21 +68,23 @@ class Inspection(msgspec.Struct, frozen=True, omit_defaults=False):
 
 def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.ArgumentParser) -> None:
     """Add the commands of this module."""
-    inspect = add_command(commands, "inspect", "show what an FMU is; run nothing", [common])
+    inspect = add_command(commands, "inspect", "show the properties of an FMU, without running it", [common])
     inspect.add_argument("fmu", type=Path, metavar="MODEL.fmu", help="the FMU, or the folder of an unpacked one")
     inspect.add_argument(
         "variables",
         nargs="*",
         metavar="VARIABLE",
-        help="only these variables, all of them; * stands for any characters",
+        help="show only these variables; * stands for any characters",
     )
-    inspect.add_argument("--all", action="store_true", help=f"all variables, not {_SHOWN_VARIABLES} of each causality")
+    inspect.add_argument(
+        "--all", action="store_true", help=f"show all variables instead of {_SHOWN_VARIABLES} of each causality"
+    )
     inspect.add_argument("--json", action="store_true", help="print everything as JSON")
     inspect.set_defaults(run_command=_inspect)
 
 
 def inspect_fmu(path: Path) -> Inspection:
-    """Read everything that can be known of an FMU without loading it.
+    """Read all properties of an FMU without loading it.
 
     Raises:
         ConfigurationError: it cannot be read; says why.
@@ -93,7 +94,9 @@ def inspect_fmu(path: Path) -> Inspection:
         try:
             description = read_description(path)
         except LoadFailed as error:
-            description = read_description(path, to_run=False)  # if it can be read, the page says why it cannot run
+            description = read_description(
+                path, to_run=False
+            )  # if the description can be read, the page says why the FMU cannot run
             reasons = (str(error),)
     except LoadFailed as error:
         raise no_fmu(path, error) from error
@@ -110,16 +113,16 @@ def inspect_fmu(path: Path) -> Inspection:
 def inspection_page(
     inspection: Inspection, width: int, patterns: Sequence[str] = (), *, everything: bool = False
 ) -> list[str]:
-    """The page about an FMU, in lines of at most ``width`` columns unless a name is longer.
+    """The page about an FMU, in lines of at most ``width`` columns, unless a name is longer.
 
     Args:
-        inspection: what was found.
+        inspection: the properties of the FMU.
         width: in columns.
-        patterns: names of variables, with `*` for any characters; if there are some, only these are shown.
+        patterns: names of variables, with `*` for any characters; if given, only these are shown.
         everything: whether all variables are listed.
     """
     description = inspection.description
-    chosen = [v for v in description.variables if not patterns or any(_fits(v.name, pattern) for pattern in patterns)]
+    chosen = [v for v in description.variables if not patterns or any(fits(pattern, v.name) for pattern in patterns)]
     lines = [] if patterns else [*_facts(inspection, width), *_problems(inspection, width)]
     for causality, title in _CAUSALITIES:
         members = [variable for variable in chosen if variable.causality == causality]
@@ -139,18 +142,13 @@ def _inspect(arguments: argparse.Namespace) -> int:
         return 0
     names = [variable.name for variable in inspection.description.variables]
     for pattern in arguments.variables:
-        if not any(_fits(name, pattern) for name in names):
+        if not any(fits(pattern, name) for name in names):
             near = nearest(pattern, names)
             hint = f"Did you mean '{near}'?" if near else None
             raise ConfigurationError(f"'{arguments.fmu}' has no variable '{pattern}'", hint=hint)
     width = max(_NARROWEST, shutil.get_terminal_size((_WIDE, 0)).columns)
     print("\n".join(inspection_page(inspection, width, arguments.variables, everything=arguments.all)))
     return 0
-
-
-def _fits(name: str, pattern: str) -> bool:
-    """Whether a name is the pattern, in which only `*` is special: brackets belong to names."""
-    return name == pattern or fnmatch.fnmatchcase(name, pattern.replace("[", "[[]").replace("?", "[?]"))
 
 
 def _facts(inspection: Inspection, width: int) -> list[str]:
@@ -165,7 +163,7 @@ def _facts(inspection: Inspection, width: int) -> list[str]:
         if (count := len(description.with_causality(causality)))
     ]
     times = [
-        f"{what} {_number(value)} s"
+        f"{what} {short_number(value)} s"
         for what, value in (
             ("start", experiment.start_time),
             ("stop", experiment.stop_time),
@@ -176,7 +174,7 @@ def _facts(inspection: Inspection, width: int) -> list[str]:
     states = [f"{description.continuous_states} continuous"] if description.continuous_states else []
     if indicators := description.event_indicators:
         states.append(f"{indicators} event indicator{'s' if indicators > 1 else ''}")
-    times += [f"tolerance {_number(experiment.tolerance)}"] if experiment.tolerance is not None else []
+    times += [f"tolerance {short_number(experiment.tolerance)}"] if experiment.tolerance is not None else []
     size = f" ({inspection.bytes} bytes)" if inspection.bytes is not None else " (a folder)"
     facts = [
         ("File", f"{inspection.file}{size}"),
@@ -215,7 +213,7 @@ def _problems(inspection: Inspection, width: int) -> list[str]:
 
 
 def _wrapped(line: str, width: int, indent: str) -> list[str]:
-    """Paths and hashes stay in one piece, so that they can be copied."""
+    """Wrap a line without breaking paths and hashes, so that they can be copied."""
     return textwrap.wrap(
         line,
         width,
@@ -228,10 +226,10 @@ def _wrapped(line: str, width: int, indent: str) -> list[str]:
 
 
 def _variables(variables: Sequence[Variable], width: int) -> list[str]:
-    """One line for each: name, type, variability, start value with unit; then what fits of the description."""
+    """One line each: name, type, variability, start value with unit, and as much of the description as fits."""
     rows = [[v.name, v.type_name, v.variability, _start(v), " ".join((v.description or "").split())] for v in variables]
     widest = [max(len(row[column]) for row in rows) for column in range(4)]
-    # One very long name does not push everything else off the page.
+    # A very long name must not move the other columns off the page.
     widest[0] = min(widest[0], width // 2)
     lines = []
     for row in rows:
@@ -242,7 +240,7 @@ def _variables(variables: Sequence[Variable], width: int) -> list[str]:
 
 
 def _cut(line: str, width: int, least: int) -> str:
-    """The line without the end of its description, or without all of it if there is no room."""
+    """The line with a shortened description, or without it on a narrow page."""
     return f"{line[: width - 3].rstrip()}..." if width - 3 > least + 10 else line[:least].rstrip()
 
 
@@ -257,10 +255,6 @@ def _start(variable: Variable) -> str:
         case bytes() as data:
             text = shown(b64encode(data).decode())
         case start:
-            item = next((item for item, number in variable.items if number == start), None)
+            item = next((item for item, value in variable.items if value == start), None)
             text = f"{item} ({start})" if item is not None else shown(start)
     return f"= {text} {unit}".rstrip()
-
-
-def _number(value: float) -> str:
-    return f"{value:.12g}"

@@ -1,7 +1,7 @@
-"""The limit of the address space (`ulimit -v`): whether a command can run within it, before it fails somewhere inside.
+"""The limit of the address space (`ulimit -v`): checks before a command starts that it is large enough.
 
-Below what is needed, each library fails in a way of its own: a traceback of an import, a panic, an abort. Knows a
-command by its name only, so that it can be asked before anything large is imported.
+With too little, each library fails in its own way: a traceback of an import, a panic, an abort. Knows only the name of
+a command and imports nothing large, so that the check itself works.
 """
 
 from __future__ import annotations
@@ -14,21 +14,21 @@ from ..errors import ConfigurationError
 __all__ = ["FEWEST_MIB", "address_space_problem", "needed_mib", "out_of_memory"]
 
 FEWEST_MIB = 300
-"""What any command needs in MiB: `check` reserves 200 where it was measured (two processors), `plot` 270."""
+"""Need of any command in MiB. Measured on two processors: `check` 200, `plot` 270."""
 _SESSION_MIB = 1024
-"""With a Zenoh session, whose threads reserve most of it: `top` 790 there."""
+"""Need of a Zenoh session, mostly for the stacks of its threads. Measured: `top` 790."""
 _LOCAL_MIB = 660
-"""A run in one process: 630 there."""
+"""Need of a run in one process. Measured: 630."""
 _RUN_MIB = 1700
-"""A master or a node, and so all that starts them: 1540 there; they use about a tenth of it."""
+"""Need of a master, a node, and of what starts them. Measured: 1540, of which about a tenth is used."""
 _WITHOUT_SESSION = ("check", "schema", "inspect", "plot")
 _RUNS = ("launch", "run", "node", "master", "gateway")
 _NO_MEMORY = ("can't start new thread", "failed to map segment", "Cannot allocate memory")
-"""What errors say that are of other types than MemoryError."""
+"""Texts in other errors than MemoryError that mean a lack of memory."""
 
 
 def needed_mib(command: str, *, local: bool) -> int:
-    """How much address space each process of a command needs in MiB; ``local`` is a run in one process."""
+    """The address space that each process of a command needs, in MiB; ``local`` is a run in one process."""
     if command in _WITHOUT_SESSION:
         return FEWEST_MIB
     if command in _RUNS:
@@ -37,7 +37,7 @@ def needed_mib(command: str, *, local: bool) -> int:
 
 
 def address_space_problem(mib: int) -> ConfigurationError | None:
-    """What to say where a process may not have so much address space: where the limit is, and what to do."""
+    """The error if the limit is below ``mib``, with the limit and what to do; None if it is not."""
     limit = _limit()
     if limit is None or limit >= mib << 20:
         return None
@@ -48,7 +48,7 @@ def address_space_problem(mib: int) -> ConfigurationError | None:
 
 
 def out_of_memory(error: BaseException) -> ConfigurationError | None:
-    """What to say if ``error`` means that there is no memory left; None if it means something else."""
+    """The error to show if ``error`` means a lack of memory; None if it means something else."""
     if not (
         isinstance(error, MemoryError)
         or (isinstance(error, OSError) and error.errno == errno.ENOMEM)
@@ -62,7 +62,7 @@ def out_of_memory(error: BaseException) -> ConfigurationError | None:
 
 
 def _limit() -> int | None:
-    """The most address space of this process in bytes, or None."""
+    """The limit of the address space of this process in bytes, or None."""
     limit, _ = resource.getrlimit(resource.RLIMIT_AS)
     return limit if limit != resource.RLIM_INFINITY else None
 

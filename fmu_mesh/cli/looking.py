@@ -1,6 +1,6 @@
-"""`ls`, `status`, `info`, `get`, `set`, `watch`, `wait`, `pause`, `resume`, `step` and `stop`: looking into a mesh.
+"""`ls`, `status`, `info`, `get`, `set`, `watch`, `wait`, `pause`, `resume`, `step` and `stop`: a running mesh.
 
-Owns what these commands print; what they ask is `fmu_mesh.wire.client.mesh_client`.
+Owns what these commands print. `fmu_mesh.wire.client.mesh_client` queries the mesh.
 """
 
 from __future__ import annotations
@@ -55,12 +55,12 @@ def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.Arg
 
     ls = add("ls", _ls, "list meshes, instances and variables")
     ls.add_argument("name", nargs="?", metavar="NAME", help="a mesh, or an instance, whose variables are listed")
-    ls.add_argument("-l", "--long", action="store_true", help="the variables of every instance, too")
-    status = add("status", _status, "show how far a mesh or an instance is")
+    ls.add_argument("-l", "--long", action="store_true", help="also list the variables of every instance")
+    status = add("status", _status, "show the state and progress of a mesh or an instance")
     status.add_argument(
         "key", nargs="?", metavar="KEY", help="a mesh or an instance, by name or key; default: every mesh"
     )
-    info = add("info", _info, "show what a mesh or an instance is")
+    info = add("info", _info, "show information about a mesh or an instance")
     info.add_argument("key", metavar="KEY", help="a mesh or an instance, by name or key")
     get = add("get", _get, "show current values")
     get.add_argument("key", nargs="+", metavar="KEY", help=_REFERENCE)
@@ -70,7 +70,9 @@ def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.Arg
     watch = add("watch", _watch, "show every value of variables until the mesh ends")
     watch.add_argument("key", nargs="+", metavar="KEY", help=_REFERENCE)
     watch.add_argument("--count", type=count, metavar="N", help="end after N values")
-    wait = add_command(commands, "wait", "wait until a mesh runs, or is in another state", [common, reaching(_WAIT_S)])
+    wait = add_command(
+        commands, "wait", "wait until a mesh is running, or in another state", [common, reaching(_WAIT_S)]
+    )
     wait.add_argument("mesh", nargs="?", metavar="MESH", help="name or key of the mesh; default: the only one")
     wait.add_argument(
         "--state",
@@ -82,10 +84,10 @@ def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.Arg
     wait.add_argument("--json", action="store_true", help="JSON, as `status` prints it")
     wait.set_defaults(run_command=_wait)
     for name, text in (
-        ("pause", "hold a mesh at a point"),
-        ("resume", "let a paused mesh run on"),
-        ("step", "let a mesh run for some points and hold it there"),
-        ("stop", "end a mesh"),
+        ("pause", "pause a mesh at a point"),
+        ("resume", "resume a paused mesh"),
+        ("step", "run a mesh for some points and pause it again"),
+        ("stop", "end the run of a mesh"),
     ):
         parser = add(name, _command, text)
         parser.add_argument("mesh", metavar="MESH", help="name or key of the mesh")
@@ -94,7 +96,7 @@ def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.Arg
 
 
 def reaching(timeout_s: float = _TIMEOUT_S) -> argparse.ArgumentParser:
-    """The options of all commands that reach running meshes; ``timeout_s`` is the deadline of a question in s."""
+    """The options of all commands for running meshes; ``timeout_s`` is the default deadline of a query in s."""
     options = argparse.ArgumentParser(add_help=False)
     options.add_argument(
         "--connect",
@@ -109,7 +111,7 @@ def reaching(timeout_s: float = _TIMEOUT_S) -> argparse.ArgumentParser:
         type=positive_seconds,
         default=timeout_s,
         metavar="S",
-        help=f"deadline of every question in s ({timeout_s:g})",
+        help=f"deadline of every query in s ({timeout_s:g})",
     )
     return options
 
@@ -162,7 +164,7 @@ def _ls(arguments: argparse.Namespace, meshes: Meshes) -> int:
 
 
 def _ls_nothing(absence: FmuMeshError, *, as_json: bool) -> int:
-    """No mesh is an answer, too: the hint does not mix with it."""
+    """No mesh is not an error. The hint goes to standard error, apart from the output."""
     if as_json:
         print("[]")
     print(f"fmu-mesh: {absence}", file=sys.stderr)
@@ -254,14 +256,14 @@ def _watch(arguments: argparse.Namespace, meshes: Meshes) -> int:
                 else:
                     print("  ".join(cell for cell in cells(reading) if cell), flush=True)
         except KeyboardInterrupt:
-            # At once: taking leave of others in order can take long, and they see that this process is gone.
+            # At once: closing a session in order can take long, and the others notice that this process is gone.
             sys.stdout.flush()
             os._exit(Interrupted.exit_code)
     return 0
 
 
 def _selected(references: list[str], meshes: Meshes) -> list[tuple[MeshClient, list[Target]]]:
-    """The variables that references mean, each once, by mesh."""
+    """The variables of the references by mesh, without duplicates."""
     found: dict[str, tuple[MeshClient, dict[str, Target]]] = {}
     for reference in references:
         client = meshes.one(reference)
@@ -286,7 +288,7 @@ def _command(arguments: argparse.Namespace, meshes: Meshes) -> int:
 
 
 def _wait(arguments: argparse.Namespace) -> int:
-    # A mesh that has a note is there, or about to go; an endpoint may come later.
+    # A mesh with a note is running or about to end; an endpoint may appear later.
     patience_s = arguments.timeout if arguments.connect else min(arguments.timeout, _TIMEOUT_S)
     with Meshes(arguments.connect, patience_s) as meshes:
         status = wait_for(meshes, arguments.mesh, arguments.state, arguments.timeout)

@@ -36,7 +36,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except FmuMeshError as error:
         if options.debug:
             raise
-        if not error.told:
+        if not error.reported:
             print(f"fmu-mesh: {error}", file=sys.stderr)
         return error.exit_code
     except KeyboardInterrupt:
@@ -49,7 +49,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(options: argparse.Namespace) -> int:
-    """Run the command; where there was no memory, that is a problem of this host, and no internal one."""
+    """Run the command. A lack of memory is a problem of this host and not an internal error."""
     _start_logging(os.environ.get("FMU_MESH_LOG") or "WARNING")
     if (lack := address_space_problem(needed_mib(options.command, local=getattr(options, "local", False)))) is not None:
         raise lack
@@ -64,20 +64,22 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _start_logging(level: str) -> None:
-    """What the modules log goes to standard error, from this level on."""
+    """Log messages of this level and above go to standard error."""
     names = logging.getLevelNamesMapping()
     if level.upper() not in names:
         raise ConfigurationError(
             f"FMU_MESH_LOG is '{level}', which is no level.", hint="There are DEBUG, INFO, WARNING, ERROR and CRITICAL."
         )
     logging.basicConfig(level=names[level.upper()], format="%(name)s: %(levelname)s: %(message)s")
-    logging.getLogger("matplotlib").setLevel(logging.ERROR)  # a folder of its own that it misses is nobody's concern
+    logging.getLogger("matplotlib").setLevel(
+        logging.ERROR
+    )  # its warning about a missing folder of its own does not concern the user
 
 
 def _parsed(
     given: Sequence[str], parser: CommandParser, commands: Mapping[str, CommandParser]
 ) -> argparse.Namespace | ConfigurationError:
-    """The command and its arguments, or what is wrong with them."""
+    """The command and its arguments, or the error in them."""
     if given and not given[0].startswith("-") and given[0] not in commands:
         return _unknown(given[0], commands)
     options, others = parser.parse_known_args(given)
@@ -88,7 +90,7 @@ def _parsed(
 
 
 def _unknown(name: str, commands: Iterable[str]) -> ConfigurationError:
-    """What to say to something that is no command, such as a file that something is to be done with."""
+    """The error for a first argument that is not a command, such as a file."""
     suffix = Path(name).suffix
     near = nearest(name, commands)
     if suffix in (".yaml", ".yml", ".fmu"):
@@ -99,7 +101,7 @@ def _unknown(name: str, commands: Iterable[str]) -> ConfigurationError:
 
 
 def command_parser() -> tuple[CommandParser, Mapping[str, CommandParser]]:
-    """The parser, and those of all commands by their names."""
+    """The parser, and the parsers of all commands by name."""
     parser = CommandParser(
         prog="fmu-mesh",
         description="A service mesh for co-simulation: FMUs as Zenoh nodes under one master.",

@@ -1,4 +1,4 @@
-"""`play`: a recorded bag as input of a running mesh."""
+"""`play`: sends the messages of a recorded bag to the inputs of a running mesh."""
 
 from __future__ import annotations
 
@@ -6,12 +6,13 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from ..config.loading import load
 from ..errors import ConfigurationError
+from ..instances.configuration import load
 from ..ros.bags.playing import grid_of, play, schedule
 from ..ros.bags.reading import Bag, chosen_topics
 from ..wire.client.reaching import Meshes
-from .arguments import add_command, endpoint, number, positive_seconds
+from .arguments import add_command, number
+from .looking import reaching
 
 __all__ = ["add_commands"]
 
@@ -20,7 +21,9 @@ _TIMEOUT_S = 60.0
 
 def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.ArgumentParser) -> None:
     """Add the command of this module."""
-    command = add_command(commands, "play", "feed a recorded bag into the inputs of a mesh", [common])
+    command = add_command(
+        commands, "play", "play a recorded bag into the inputs of a mesh", [common, reaching(_TIMEOUT_S)]
+    )
     command.add_argument("bag", type=Path, metavar="BAG", help="an MCAP file, or the folder of a `ros2 bag`")
     command.add_argument("mesh", nargs="?", metavar="MESH", help="name or key of the mesh; default: the only one")
     command.add_argument(
@@ -28,22 +31,19 @@ def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.Arg
         action="append",
         default=[],
         metavar="TOPIC[:FIELD]=INSTANCE.VARIABLE",
-        help="what goes where; repeatable; default: the topics that the mesh subscribes to",
+        help="a topic and its input; repeatable; default: the topics that the mesh subscribes to",
     )
     command.add_argument(
         "--start", type=number, metavar="T", help="simulation time of the first message in s; default: its stamp"
     )
     command.add_argument(
-        "--stamps", choices=("header", "log"), default="header", help="header stamps where there are some, or log times"
+        "--stamps",
+        choices=("header", "log"),
+        default="header",
+        help="use header stamps where messages have them, or log times (header)",
     )
     command.add_argument(
-        "--config", type=Path, metavar="CONFIG", help="the configuration, where it is not on this host"
-    )
-    command.add_argument(
-        "--connect", type=endpoint, action="append", default=[], metavar="ENDPOINT", help="where the mesh is"
-    )
-    command.add_argument(
-        "--timeout", type=positive_seconds, default=_TIMEOUT_S, metavar="S", help="deadline of every wait in s (60)"
+        "--config", type=Path, metavar="CONFIG", help="the configuration, if that of the mesh is not on this host"
     )
     command.set_defaults(run_command=_play)
 

@@ -1,4 +1,4 @@
-"""`plot`: a result file as a picture; what is read, and which units its variables have. How it looks is `drawing`."""
+"""`plot`: reads a result file and the units of its variables, and draws them with `drawing`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,9 @@ from typing import Any, TextIO
 import numpy as np
 
 from ..errors import ConfigurationError, FmuMeshError
+from ..recorder.csv_file import CsvFile
 from ..system.plan import Plan
+from ..system.recording import result_format
 from ..system.system import System
 from ..text import listed, nearest, nearest_file
 from ..variables.model_description import Variable
@@ -29,16 +31,18 @@ _TIME = "time"
 _WORDS = {"true": 1.0, "false": 0.0, "": float("nan"), '""': float("nan")}
 _QUOTED = re.compile(r'"(?:[^"]|"")*"')
 _DIMENSIONLESS = ("1", "-")
-"""Units that say that there is none."""
+"""Units that mean no unit."""
 
 
 def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.ArgumentParser) -> None:
     """Add the command of this module."""
-    plot = add_command(commands, "plot", "draw a result file", [common])
+    plot = add_command(commands, "plot", "plot a result file", [common])
     plot.add_argument("results", type=Path, metavar="RESULTS.csv", help="the result file")
-    plot.add_argument("--output", type=Path, metavar="FILE.png", help="default: beside the result file")
     plot.add_argument(
-        "--variables", nargs="+", metavar="INSTANCE.VARIABLE", help="draw only these; default: all of the file"
+        "--output", type=Path, metavar="FILE.png", help="file of the picture; default: beside the result file"
+    )
+    plot.add_argument(
+        "--variables", nargs="+", metavar="INSTANCE.VARIABLE", help="plot only these; default: all of the file"
     )
     plot.set_defaults(run_command=_plot)
 
@@ -53,11 +57,11 @@ def _plot(arguments: argparse.Namespace) -> int:
 
 
 def check_plot(plot: Path, result: str | None) -> None:
-    """Make sure that a plot can be drawn, before a run whose end is to be one.
+    """Check before a run that its result can be plotted at its end.
 
     Args:
-        plot: the picture.
-        result: the result file to draw, or None where nothing is recorded.
+        plot: the file of the picture.
+        result: the result file, or None if nothing is recorded.
 
     Raises:
         ConfigurationError: matplotlib is not installed, it has no such format, or the result cannot be drawn.
@@ -70,12 +74,12 @@ def check_plot(plot: Path, result: str | None) -> None:
         raise ConfigurationError(f"a plot cannot be written as '{plot}'.", hint="Name it .png, .svg or .pdf.")
     if result is None:
         raise ConfigurationError("nothing is recorded, so there is nothing to plot.", hint="Name a file with --output.")
-    if Path(result).suffix == ".mcap":
-        raise _is_mcap(Path(result))
+    _require_csv(Path(result))
 
 
-def _is_mcap(path: Path) -> ConfigurationError:
-    return ConfigurationError(f"'{path}' is an MCAP, and plots are drawn from CSV.", hint="Record into a .csv file.")
+def _require_csv(path: Path) -> None:
+    if result_format(path) not in (CsvFile, None):
+        raise ConfigurationError(f"'{path}' is no CSV, and plots are drawn from CSV.", hint="Record into a .csv file.")
 
 
 def _require_matplotlib() -> None:
@@ -84,7 +88,7 @@ def _require_matplotlib() -> None:
 
 
 def plot_results(result: Path, plot: Path, plan: Plan) -> None:
-    """Draw the result file of a run. Its plan tells the units, and each has axes of its own.
+    """Draw the result file of a run, with one axes for each unit of its plan.
 
     Raises:
         ConfigurationError: the result cannot be read, or the plot cannot be written.
@@ -160,8 +164,7 @@ def read_results(path: Path, wanted: Sequence[str] | None = None) -> Results:
     Raises:
         ConfigurationError: there is no such file or variable, or it is no result file; says in which line.
     """
-    if path.suffix == ".mcap":
-        raise _is_mcap(path)
+    _require_csv(path)
     try:
         with path.open(encoding="utf-8", newline="") as file:
             names, first, values = _read(path, file)

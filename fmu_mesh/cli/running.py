@@ -1,9 +1,8 @@
-"""`launch`, `node`, `master`, `gateway` and `router`: the commands that run something."""
+"""`launch`, `node`, `master`, `gateway` and `router`: the commands that start processes of a mesh."""
 
 from __future__ import annotations
 
 import argparse
-import os
 import signal
 import sys
 import threading
@@ -11,72 +10,60 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
+from msgspec.structs import replace
+
 from ..errors import ConfigurationError, FmuError, FmuMeshError, MeshLost
-from ..instances.fmi import LogMessage
-from ..instances.mujoco import check_film, check_window
-from ..instances.registry import Showing
-from ..run.events import End, Event, EventWriter, Ready
+from ..run.events import Event, EventWriter, Reachable
 from ..run.gateway_role import run_gateway
-from ..run.launcher import Launcher
-from ..run.local import LocalMesh
-from ..run.preparing import Options, prepare
+from ..run.launcher import PLANNED, Launcher
+from ..run.options import Options
+from ..run.outcome import Outcome
+from ..run.preparing import plan_run
 from ..run.process import ended_by_signals
-from ..run.results import result_opener
-from ..run.roles import BY_HAND, run_master, run_node
+from ..run.roles import run_local, run_master, run_node
+from ..run.run_plan import RunPlan, read_node, read_run
 from ..system.plan import Plan
-from ..wire.router import run_router
-from ..wire.runtime import enter_run_folder, fmu_folder, leave_run_folder, remove_stale_folders, run_folder
-from ..wire.time_profile import MeshProfile
-from ..wire.views import LogLine
-from .arguments import add_command, add_window, count, endpoint, number
+from ..wire.session import run_router
+from .arguments import add_command, add_options, count, endpoint, read_options
 from .output.display import Display, say, stdout_as_stderr, summary, warn
-from .output.profile_table import add_profile, show_profile
+from .output.profile_table import show_profile
 from .plotting import check_plot, plot_results, plotted_where_it_ends
 
-__all__ = ["add_commands", "close", "run_launcher"]
+__all__ = ["add_commands", "finish", "run_launcher"]
 
 
 def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.ArgumentParser) -> None:
     """Add the commands of this module."""
     launch = add_command(commands, "launch", "run a mesh: one process per node, and the master", [common])
-    _add_config(launch)
+    _add_config(launch, "paused", "view", "video", "profile")
     launch.add_argument("--local", action="store_true", help="run everything in this one process")
-    _add_paused(launch)
-    launch.add_argument("--plot", type=Path, metavar="FILE.png", help="plot the result when done")
+    launch.add_argument("--plot", type=Path, metavar="FILE.png", help="plot the result at the end")
     launch.add_argument(
         "--restarts",
         type=count,
         default=0,
         metavar="N",
-        help="start again from the first point when a node or the master is lost, N times at most",
+        help="restart from the first point when a node or the master is lost, at most N times",
     )
     launch.add_argument("--no-progress", action="store_true", help="no progress line")
-    _add_showing(launch)
-    add_profile(launch)
     launch.set_defaults(run_command=_launch)
 
-    node = add_command(commands, "node", "run one node by hand", [common])
-    _add_config(node)
+    node = add_command(commands, "node", "start one node manually", [common])
+    _add_config(node, "view", "video")
     node.add_argument("node", metavar="INSTANCE", help="name of the instance, or of its group")
-    _add_showing(node)
-    node.add_argument("--plan", type=Path, help=argparse.SUPPRESS)
-    node.add_argument("--run", default=BY_HAND, help=argparse.SUPPRESS)
+    node.add_argument(PLANNED, action="store_true", help=argparse.SUPPRESS)
     node.set_defaults(run_command=_node)
 
-    master = add_command(commands, "master", "run the master and the recorder by hand", [common])
-    _add_config(master)
-    _add_paused(master)
-    master.add_argument("--plot", type=Path, metavar="FILE.png", help="plot the result when done")
+    master = add_command(commands, "master", "start the master and the recorder manually", [common])
+    _add_config(master, "paused", "profile")
+    master.add_argument("--plot", type=Path, metavar="FILE.png", help="plot the result at the end")
     master.add_argument("--no-progress", action="store_true", help="no progress line")
-    add_profile(master)
-    master.add_argument("--events", action="store_true", help=argparse.SUPPRESS)
-    master.add_argument("--run", default=BY_HAND, help=argparse.SUPPRESS)
+    master.add_argument(PLANNED, action="store_true", help=argparse.SUPPRESS)
     master.set_defaults(run_command=_master)
 
-    gateway = add_command(commands, "gateway", "run the gateway to ROS by hand", [common])
+    gateway = add_command(commands, "gateway", "start the gateway to ROS manually", [common])
     _add_config(gateway)
-    gateway.add_argument("--events", action="store_true", help=argparse.SUPPRESS)
-    gateway.add_argument("--run", default=BY_HAND, help=argparse.SUPPRESS)
+    gateway.add_argument(PLANNED, action="store_true", help=argparse.SUPPRESS)
     gateway.set_defaults(run_command=_gateway)
 
     router = add_command(commands, "router", "run a Zenoh router", [common])
@@ -85,80 +72,28 @@ def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.Arg
         type=endpoint,
         action="append",
         metavar="ENDPOINT",
-        help="listen there; repeatable; default: tcp/127.0.0.1:7447",
+        help="endpoint where others can connect; repeatable; default: tcp/127.0.0.1:7447",
     )
     router.set_defaults(run_command=_router)
 
 
-def _add_config(parser: argparse.ArgumentParser) -> None:
+def _add_config(parser: argparse.ArgumentParser, *options: str) -> None:
     parser.add_argument("config", type=Path, metavar="CONFIG", help="the configuration file")
-    add_window(parser)
-    parser.add_argument(
-        "--set", action="append", default=[], metavar="INSTANCE.VARIABLE=VALUE", help="another start value; repeatable"
-    )
-    parser.add_argument(
-        "--real-time-factor",
-        type=number,
-        metavar="F",
-        help="1: wall clock; 2: twice as fast; 0: as fast as possible; default: that of the configuration",
-    )
-    parser.add_argument("--output", type=Path, metavar="FILE", help="another result file, .csv or .mcap")
-    parser.add_argument(
-        "--connect",
-        type=endpoint,
-        action="append",
-        default=[],
-        metavar="ENDPOINT",
-        help="connect there, such as tcp/HOST:PORT, instead of to zenoh.connect of the configuration; repeatable",
-    )
-    parser.add_argument(
-        "--listen",
-        type=endpoint,
-        action="append",
-        default=[],
-        metavar="ENDPOINT",
-        help="let the master listen there, such as at tcp/0.0.0.0:7447, instead of at zenoh.listen; repeatable",
-    )
-
-
-def _add_showing(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--view", action="store_true", help="show the world of the physics engine in a window")
-    parser.add_argument(
-        "--video", type=Path, metavar="FILE.mp4", help="make a film of that world, .mp4 or .gif; needs no screen"
-    )
-
-
-def _showing(arguments: argparse.Namespace) -> Showing:
-    """What `--view` and `--video` ask for, if it can be done here."""
-    video: Path | None = getattr(arguments, "video", None)
-    showing = Showing(view=getattr(arguments, "view", False), video=video.absolute() if video is not None else None)
-    if showing.view and showing.video is not None:
-        raise ConfigurationError("--view and --video do not go together", hint="Leave one of them out.")
-    if showing.view:
-        check_window()
-    if showing.video is not None:
-        check_film(showing.video)
-    return showing
-
-
-def _add_paused(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--paused", action="store_true", help="rest at the first point until `resume`, `step` or `play`"
-    )
+    instead = parser.add_argument_group("instead of what CONFIG says")
+    add_options(instead, "window", "start_values", "real_time_factor", "output", "listen", "connect")
+    add_options(parser, *options)
 
 
 def _options(arguments: argparse.Namespace) -> Options:
-    return Options(
-        start_values=tuple(arguments.set),
-        window=arguments.window,
-        real_time_factor=arguments.real_time_factor,
-        output=arguments.output,
-        connect=tuple(arguments.connect),
-        listen=tuple(arguments.listen),
-        profile=getattr(arguments, "profile", None) is not None,
-        showing=_showing(arguments),
-        paused=getattr(arguments, "paused", False),
-    )
+    """The options of a command.
+
+    Raises:
+        ConfigurationError: two of them cannot be combined.
+    """
+    options = read_options(arguments)
+    if options.view and options.video is not None:
+        raise ConfigurationError("--view and --video do not go together", hint="Leave one of them out.")
+    return options
 
 
 def _launch(arguments: argparse.Namespace) -> int:
@@ -170,44 +105,40 @@ def _launch(arguments: argparse.Namespace) -> int:
     if arguments.restarts and (arguments.local or options.paused):
         other = "--local" if arguments.local else "--paused"
         raise ConfigurationError(f"--restarts and {other} do not go together", hint="Leave one of them out.")
-    plan = prepare(arguments.config, options, say)
-    warn(plan)
-    if arguments.plot is not None:
-        check_plot(arguments.plot, plan.system.result_file)
-    profile: MeshProfile | None = None
+    run = _planned(arguments, options)
     with (
-        plotted_where_it_ends(plan, arguments.plot),
-        Display(plan, show_progress=not arguments.no_progress) as display,
+        plotted_where_it_ends(run.plan, arguments.plot),
+        Display(run.plan, show_progress=not arguments.no_progress) as display,
     ):
-        if arguments.local:
-            point, seconds, rows = _run_local(plan, arguments.config, display, options.showing)
-        else:
-            end = _run_processes(plan, arguments, options, display)
-            point, seconds, rows, profile = end.status.point, end.seconds, end.rows, end.profile
-    if profile is not None:
-        show_profile(plan, profile, seconds, arguments.profile)
-    if arguments.video is not None:
-        print(f"video: {arguments.video}")
-    close(plan, point, seconds, rows, arguments.plot)
+        outcome = _run_local(run, display) if arguments.local else _run_processes(run, arguments.restarts, display)
+    finish(run.plan, outcome, arguments)
     return 0
 
 
-def _run_processes(plan: Plan, arguments: argparse.Namespace, options: Options, display: Display) -> End:
-    """Run the mesh, and again from its first point as often as `--restarts` allows if a process of it is lost."""
-    restarts = 0
+def _planned(arguments: argparse.Namespace, options: Options) -> RunPlan:
+    """Plan the run of a command, and check what it shows at the end."""
+    run = plan_run(arguments.config, options, say)
+    warn(run.plan)
+    if arguments.plot is not None:
+        check_plot(arguments.plot, run.plan.system.result_file)
+    return run
+
+
+def _run_processes(run: RunPlan, most_restarts: int, display: Display) -> Outcome:
+    """Run the mesh; if a process of it is lost, run it again from its first point, as often as `--restarts` allows."""
     while True:
-        launcher = Launcher(plan, arguments.config, options, display.event, display.output, restarts=restarts)
         try:
-            return run_launcher(launcher)
+            return run_launcher(Launcher(run, display.event, display.output))
         except MeshLost as error:
-            if restarts == arguments.restarts or type(error) is not MeshLost:
+            if run.restarts == most_restarts or type(error) is not MeshLost:
                 raise
-            restarts += 1
-            error.hint = f"The run starts again from its first point (restart {restarts} of {arguments.restarts})."
-            say(str(error))
+            run = replace(run, restarts=run.restarts + 1)
+            error.hint = None
+            again = f"The run starts again from its first point (restart {run.restarts} of {most_restarts})."
+            say(str(error.with_hint(again)))
 
 
-def run_launcher(launcher: Launcher) -> End:
+def run_launcher(launcher: Launcher) -> Outcome:
     """Run it; Ctrl-C and SIGTERM end the run instead of this process."""
 
     def interrupt(_number: int, _frame: FrameType | None) -> None:
@@ -221,97 +152,64 @@ def run_launcher(launcher: Launcher) -> End:
             signal.signal(number, handler)
 
 
-def _run_local(plan: Plan, config: Path, display: Display, showing: Showing) -> tuple[int, float, int]:
-    def log(message: LogMessage) -> None:
-        line = LogLine(message.instance, message.status, message.category, message.message, mesh.point)
-        display.log(line)
-
-    def clean_up() -> None:
-        mesh.clean_up()
-        leave_run_folder(folder)
-
-    def end(error: FmuError) -> None:
-        """The thread in the FMU cannot be got back."""
-        clean_up()
+def _run_local(run: RunPlan, display: Display) -> Outcome:
+    def show_hang(error: FmuError) -> None:
         display.flush(str(error))
         print(f"fmu-mesh: {error}", file=sys.stderr, flush=True)
-        os._exit(error.exit_code)
 
-    remove_stale_folders()
-    folder = run_folder(plan.system.config.mesh, BY_HAND)
-    enter_run_folder(folder, f"local {os.getpid()}")
-    fmus = fmu_folder(folder)
-    fmus.mkdir(parents=True, exist_ok=True)
-    mesh = LocalMesh(
-        plan,
-        log,
-        display.progress,
-        on_hang=end,
-        parent=fmus,
-        showing=showing,
-        open_result=result_opener(config, plan.system),
-    )
-    try:
-        with stdout_as_stderr(), ended_by_signals(mesh.interrupt, clean_up, watch_stdin=False):
-            mesh.run()
-    finally:
-        leave_run_folder(folder)
-    if mesh.ended_by is not None:
-        display.ended(mesh.ended_by)
-    return mesh.point, mesh.seconds, mesh.rows
+    with stdout_as_stderr():
+        outcome = run_local(run, display.log, display.progress, show_hang)
+    display.event(outcome)
+    return outcome
 
 
-def close(plan: Plan, point: int, seconds: float, rows: int, plot: Path | None) -> None:
-    """Plot if wanted, and print the summary."""
-    result = plan.system.result_file
-    if plot is not None and result is not None:
-        plot_results(Path(result), plot, plan)
-    for line in summary(plan, point=point, seconds=seconds, rows=rows, result_file=result):
+def finish(plan: Plan, outcome: Outcome, arguments: argparse.Namespace) -> None:
+    """Show what the options of the command ask for, and print the summary."""
+    if outcome.profile is not None:
+        show_profile(plan, outcome.profile, outcome.seconds, arguments.profile)
+    if (video := getattr(arguments, "video", None)) is not None:
+        print(f"video: {video}")
+    plot = getattr(arguments, "plot", None)
+    if plot is not None and outcome.file is not None:
+        plot_results(Path(outcome.file), plot, plan)
+    for line in summary(plan, outcome):
         print(line)
 
 
 def _node(arguments: argparse.Namespace) -> int:
-    run_node(arguments.config, arguments.node, _options(arguments), plan_file=arguments.plan, run=arguments.run)
+    if arguments.planned:
+        run_node(read_node(arguments.config, arguments.node))
+    else:
+        run_node(plan_run(arguments.config, _options(arguments)).node(arguments.node))
     return 0
 
 
 def _master(arguments: argparse.Namespace) -> int:
-    options = _options(arguments)
-    if arguments.events:
+    if arguments.planned:
         try:
-            run_master(arguments.config, options, EventWriter(), run=arguments.run)
+            run_master(read_run(arguments.config), EventWriter())
         except FmuMeshError as error:
-            return error.exit_code  # the launcher has the event, and tells
+            raise error.already_reported()  # noqa: B904 the launcher has the event and shows it
         return 0
-    plan = prepare(arguments.config, options, say)
-    warn(plan)
-    if arguments.plot is not None:
-        check_plot(arguments.plot, plan.system.result_file)
-    ends: list[End] = []
-
-    def show(event: Event) -> None:
-        display.event(event)
-        if isinstance(event, End):
-            ends.append(event)
-
+    run = _planned(arguments, _options(arguments))
     with (
-        plotted_where_it_ends(plan, arguments.plot),
-        Display(plan, show_progress=not arguments.no_progress, waits_for_nodes=False) as display,
+        plotted_where_it_ends(run.plan, arguments.plot),
+        Display(run.plan, show_progress=not arguments.no_progress, waits_for_nodes=False) as display,
     ):
-        run_master(arguments.config, options, show, plan=plan)
-    if ends[0].profile is not None:
-        show_profile(plan, ends[0].profile, ends[0].seconds, arguments.profile)
-    close(plan, ends[0].status.point, ends[0].seconds, ends[0].rows, arguments.plot)
+        outcome = run_master(run, display.event)
+    finish(run.plan, outcome, arguments)
     return 0
 
 
 def _gateway(arguments: argparse.Namespace) -> int:
     def show(event: Event) -> None:
-        if isinstance(event, Ready):
+        if isinstance(event, Reachable):
             print(f"topics of ROS at {', '.join(event.endpoints)}", flush=True)
 
-    emit = EventWriter() if arguments.events else show
-    run_gateway(arguments.config, _options(arguments), emit, run=arguments.run)
+    if arguments.planned:
+        run_gateway(read_run(arguments.config), EventWriter())
+    else:
+        run_gateway(plan_run(arguments.config, _options(arguments)), show)
     return 0
 
 

@@ -1,7 +1,7 @@
 """`top`: a live table of all instances of a mesh.
 
-Owns what changes from one look to the next: rates and shares are those of the time between two looks, and those since
-the first point where there was only one; and what of the table fits into a terminal.
+Owns the rates and shares, which are those between two looks (at the first look those since the first point), and which
+columns fit into a terminal.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ _INTERVAL_S = 1.0
 _HEADING = ["instance", "state", "point", "time", "step time", "wait", "points/s", "factor", "restarts", "activity"]
 _LEAST_NAME: Final = 12
 _GOOD_NAME: Final = 32
-"""A name of this length is worth more than the columns that can be left out, but for the state."""
+"""Up to this length a name is more important than the columns that can be left out, except the state."""
 _LEAST_ACTIVITY: Final = 20
 _DISPENSABLE: Final = ("time", "factor", "restarts", "state")
-"""Columns that are left out where there is no room, in this order: the head line tells of times and of the state."""
+"""Columns that are left out on a narrow terminal, in this order; the head line has the time and the state."""
 
 Look = tuple[MeshStatus, dict[str, InstanceStatus]]
 
@@ -42,7 +42,7 @@ def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.Arg
     """Add the command of this module."""
     top = add_command(commands, "top", "show a live table of all instances of a mesh", [common, reaching()])
     top.add_argument("mesh", nargs="?", metavar="MESH", help="name or key of the mesh, if there are several")
-    top.add_argument("--once", action="store_true", help="show it once, and end")
+    top.add_argument("--once", action="store_true", help="show it once and exit")
     top.add_argument(
         "--interval", type=positive_seconds, default=_INTERVAL_S, metavar="S", help="time between two looks in s (1)"
     )
@@ -94,12 +94,12 @@ def _follow(client: MeshClient, interval_s: float, *, as_json: bool) -> int:
 
 
 def page(look: Look, before: Look | None = None, *, width: int | None = None) -> list[str]:
-    """The lines of one look; with the one before it, what happened since then.
+    """The lines of one look.
 
     Args:
-        look: what was seen.
-        before: what was seen the last time.
-        width: columns that a line may have; None: as many as it takes.
+        look: the status of the mesh and of its instances.
+        before: that of the last look, for rates; None at the first one.
+        width: largest width in columns; None: no limit.
     """
     status, instances = look
     step_size = status.real_time_factor / status.points_per_second if status.points_per_second else 0.0
@@ -122,7 +122,7 @@ def page(look: Look, before: Look | None = None, *, width: int | None = None) ->
 
 
 def _lines(parts: Sequence[str], width: int) -> list[str]:
-    """Parts with commas between them, in as many lines as it takes."""
+    """Parts with commas between them, in as many lines as needed."""
     lines = [parts[0]]
     for part in parts[1:]:
         if len(lines[-1]) + len(part) + 3 > width:
@@ -134,7 +134,7 @@ def _lines(parts: Sequence[str], width: int) -> list[str]:
 
 
 def _fitted(rows: list[list[str]], width: int) -> list[str]:
-    """The table in ``width`` columns: without what can be done without, with short names, the activity as it fits."""
+    """The table in ``width`` columns: without dispensable columns, with short names and a cut activity."""
     heading = list(_HEADING)
     rows = [list(row) for row in rows]
     longest = max(len(row[0]) for row in (heading, *rows))

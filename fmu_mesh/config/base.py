@@ -1,4 +1,4 @@
-"""What all sections of the configuration file are made of: names, patterns, and the Struct they derive from."""
+"""The common parts of all sections of the configuration file: types of values, patterns, and the base Struct."""
 
 from __future__ import annotations
 
@@ -39,10 +39,10 @@ Sha256 = Annotated[
 Endpoint = Annotated[str, Meta(pattern=ENDPOINT_PATTERN, title="a Zenoh endpoint such as tcp/192.168.1.2:7447")]
 DeadlineSeconds = Annotated[float, Meta(gt=0)]
 
-# What editors should know but `system.build` checks: these errors are shown together with those of the names.
+# For the JSON Schema only. `system.build` checks these, so that such errors are shown together with wrong names.
 POSITIVE = {"exclusiveMinimum": 0}
 NOT_NEGATIVE = {"minimum": 0}
 
 
 class Base(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Every section is frozen and refuses unknown fields; `kw_only` is repeated: it is not inherited."""
+    """Base of every section: frozen, without unknown fields. A subclass repeats `kw_only`, which is not inherited."""

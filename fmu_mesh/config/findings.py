@@ -1,6 +1,6 @@
-"""How findings about one configuration file are collected and placed.
+"""A collection of findings about one configuration file.
 
-Owns the way from a path in the file (`connections[2].to`) to its line. Knows nothing of what is checked.
+Owns how a path in the file (`connections[2].to`) becomes a line number. Does not know what is checked.
 """
 
 from __future__ import annotations
@@ -13,12 +13,18 @@ __all__ = ["Findings", "locate"]
 
 
 class Findings:
-    """Collects what is wrong with one file.
+    """All findings about one file.
+
+    Example:
+        >>> findings = Findings("mesh.yaml", {"mesh": 1})
+        >>> findings.add("mesh", "7", "a name")
+        >>> print(*findings)
+        mesh.yaml:1: mesh: 7; expected a name
 
     Args:
         file: the file as the user named it.
         lines: line numbers, counted from 1, by path in the file.
-        replaced: the command line options that took the place of what the file says, by path in the file.
+        replaced: the options that replace a value of the file, by path in the file.
     """
 
     def __init__(
@@ -32,7 +38,7 @@ class Findings:
         self._settled: frozenset[str] = frozenset()
 
     def add(self, path: str, found: str, expected: str, suggestion: str | None = None) -> None:
-        """Note that ``found`` stands at ``path``, or in an option, where ``expected`` would be right."""
+        """Add a finding: the file, or an option, has ``found`` at ``path`` instead of ``expected``."""
         if any(_same_place(path, settled) for settled in self._settled):
             return
         self._places.add(path)
@@ -41,7 +47,7 @@ class Findings:
         self._items.append(Finding(self._file, option or path, found, expected, suggestion, line))
 
     def merge(self, findings: Iterable[Finding]) -> None:
-        """Take over earlier findings; what is added from now on at, in or around their places only follows them."""
+        """Add earlier findings. Later ones at, inside or around their places are ignored as consequences."""
         for finding in findings:
             self._items.append(finding)
             self._places.add(finding.path)
@@ -51,11 +57,11 @@ class Findings:
 
     @property
     def places(self) -> frozenset[str]:
-        """The paths of all findings, also where an option took the place of what the file says."""
+        """The paths of all findings, also of those about options."""
         return frozenset(self._places)
 
     def line(self, path: str) -> int | None:
-        """The line of ``path``, or of the nearest place around it."""
+        """The line of ``path``, or of the innermost part of the file around it that has one."""
         return locate(self._lines, path)
 
     def __len__(self) -> int:
@@ -65,7 +71,7 @@ class Findings:
         return iter(self._items)
 
     def raise_any(self) -> None:
-        """End with all findings, in the order of the lines, if there are any.
+        """Raise one error with all findings in the order of their lines; do nothing if there are none.
 
         Raises:
             ConfigurationError: there is at least one finding.
@@ -77,7 +83,7 @@ class Findings:
 
 
 def locate(lines: Mapping[str, int], path: str) -> int | None:
-    """The line of ``path``, or of the nearest place around it that has one; None if there is none."""
+    """The line of ``path``, or of the innermost part around it that has one; None if there is none."""
     while path:
         if path in lines:
             return lines[path]
@@ -86,6 +92,6 @@ def locate(lines: Mapping[str, int], path: str) -> int | None:
 
 
 def _same_place(path: str, other: str) -> bool:
-    """Whether one of two paths is the other one, or in it."""
+    """Whether one of two paths is equal to the other one or inside it."""
     short, long = sorted((path, other), key=len)
     return long.startswith(short) and long[len(short) : len(short) + 1] in ("", ".", "[")

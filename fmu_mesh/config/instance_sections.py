@@ -1,59 +1,47 @@
-"""The sections of instances in the configuration file: FMUs, worlds of physics engines, controllers.
+"""What the section of an instance in a configuration file may say, whatever its kind.
 
-Which kind a section is, its keys say: `fmu`, `mujoco`, `gazebo_classic` or `controller`.
+Each kind of instance has a Struct for its section, beside the kind itself (`fmu_mesh.instances.contract.Kind`). This
+module has what all of them share: the common keys, what lower layers ask of any section, and the couplings of physics
+engines. It knows no kind.
 """
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Annotated, Any, ClassVar, Literal, Protocol, Self, TypeVar, cast
 
+import msgspec
 from msgspec import Meta
+from msgspec.structs import replace
 
-from fmu_mesh.config.base import POSITIVE, Base, Name, Sha256
+from fmu_mesh.config.base import POSITIVE, Base, Name
+from fmu_mesh.config.findings import Findings
+from fmu_mesh.variables.model_description import ModelDescription
 from fmu_mesh.variables.value_types import PlainValue
 
 __all__ = [
     "KIND",
     "ActuatorConfig",
-    "AnyInstanceConfig",
+    "Actuators",
     "ControllerConfig",
-    "EngineConfig",
+    "Controllers",
+    "FluidDynamics",
     "FluidDynamicsConfig",
-    "GazeboClassicConfig",
-    "HostConfig",
-    "InstanceConfig",
-    "MujocoConfig",
-    "PidConfig",
-    "SolverConfig",
+    "Group",
+    "Host",
+    "InstanceSection",
+    "Kinds",
+    "PhysicsSection",
+    "StartValues",
+    "StepSize",
+    "key_of",
+    "keys_of",
+    "placed",
 ]
 
-
-class SolverConfig(Base, frozen=True, kw_only=True):
-    """How the continuous states of a model-exchange FMU are solved."""
-
-    name: Annotated[
-        Literal["cvode", "euler"],
-        Meta(description="cvode: variable step and order, finds events exactly; euler: fixed steps, for checks."),
-    ] = "cvode"
-    relative_tolerance: Annotated[
-        float | None,
-        Meta(
-            description="Relative tolerance of cvode; default: that of the FMU's default experiment, or 1e-6.",
-            extra_json_schema=POSITIVE,
-            examples=[1e-6],
-        ),
-    ] = None
-    maximum_step_size: Annotated[
-        float | None,
-        Meta(
-            description="Longest step of the solver in s; default: the instance's own step size.",
-            extra_json_schema=POSITIVE,
-        ),
-    ] = None
-
-
 KIND = "@kind"
-"""What tells the kinds of instances apart once a file is read; nobody writes it, the keys of a section say it."""
+"""The tag field of the sections. A file does not have it: there the kind of an instance follows from its keys."""
 
 StartValues = Annotated[
     dict[str, PlainValue],
@@ -73,61 +61,113 @@ Group = Annotated[Name | None, Meta(description="Instances of one group share on
 Host = Annotated[str | None, Meta(description="Host the node is meant to run on; `launch` starts those without.")]
 
 
-class InstanceConfig(Base, frozen=True, kw_only=True, tag_field=KIND, tag="fmu"):
-    """One instance of an FMU."""
+Section = TypeVar("Section", bound="InstanceSection")
 
-    fmu: Annotated[
-        str,
-        Meta(
-            title="the path of an FMU",
-            description="Path of the .fmu file, or of an unpacked one, relative to this file.",
-        ),
-    ]
-    kind: Annotated[
-        Literal["auto", "co_simulation", "model_exchange"],
-        Meta(description="Which kind of the FMU to use; auto: co-simulation if it has both."),
-    ] = "auto"
-    solver: Annotated[SolverConfig, Meta(description="The solver of a model-exchange FMU.")] = SolverConfig()
-    tolerance: Annotated[
-        float | None,
-        Meta(
-            description="Relative tolerance that a co-simulation FMU of FMI 2.0 or 3.0 is told for its own solver; "
-            "default: that of its default experiment, if it has one. For model exchange: `solver.relative_tolerance`.",
-            extra_json_schema=POSITIVE,
-            examples=[1e-6],
-        ),
-    ] = None
-    retry_discarded_steps: Annotated[
-        bool,
-        Meta(
-            description="Whether a step that an FMI 2.0 FMU discards is tried again in smaller ones; then its state is "
-            "kept before every step. FMI 1.0 and 3.0 need no such wish."
-        ),
-    ] = False
-    start_values: StartValues = {}
-    step_size: StepSize = None
-    group: Group = None
-    host: Host = None
-    interpolation: Annotated[
-        Literal["hold", "linear"] | None,
-        Meta(
-            description="How a value that is sent to an unconnected input with a time in its attachment is used: it "
-            "holds from that time on, or Reals go to it linearly; null: the time is ignored, and it holds from the "
-            "next point on."
-        ),
-    ] = None
-    sha256: Annotated[
-        Sha256 | None, Meta(description="SHA-256 that the .fmu file must have; any other is refused.")
-    ] = None
-    strict: Annotated[
-        bool | None,
-        Meta(description="Whether what FMI forbids is an error for this FMU (default: top level)."),
-    ] = None
+
+class InstanceSection:
+    """Base class of the sections of instances.
+
+    A kind derives its section from `Base` and from this class. The field that has the same name as the kind is the path
+    of the model, unless the section overrides `path` and `agreed`. The section has those of the four common keys that
+    make sense for its kind::
+
+        class TableConfig(Base, InstanceSection, frozen=True, kw_only=True, tag_field=KIND, tag="table"):
+            table: Annotated[str, Meta(description="Path of a CSV file, relative to this file.")]
+            step_size: StepSize = None
+            group: Group = None
+            host: Host = None
+
+    Attributes:
+        start_values: by variable name, as written in the file.
+        step_size: of the instance in s; None: the base step size.
+        group: the group that shares one node; None: none.
+        host: the host that the node is meant to run on; None: the one of `launch`.
+        interpolation: how a timed value for an unconnected input is used; None: its time is ignored.
+        strict: whether what FMI forbids is an error for this instance; None: as the whole configuration says.
+        follows_fmi: whether the rules of FMI apply to the model. If so, a start value that FMI forbids is a warning, or
+            an error where the configuration is strict; otherwise it is always an error.
+    """
+
+    __slots__ = ()
+
+    start_values: Mapping[str, PlainValue] = MappingProxyType({})
+    step_size: float | None = None
+    group: str | None = None
+    host: str | None = None
+    interpolation: Literal["hold", "linear"] | None = None
+    strict: bool | None = None
+    follows_fmi: ClassVar[bool] = False
 
     @property
     def path(self) -> str:
-        """The file of the model, relative to the configuration."""
-        return self.fmu
+        """The file of the model, relative to the configuration; empty for a kind without files."""
+        return str(getattr(self, key_of(self)))
+
+    @property
+    def retries_steps(self) -> bool:
+        """Whether a step that the model discards is repeated in smaller steps."""
+        return False
+
+    def agreed(self) -> Self:
+        """The section without what may differ between hosts, such as the path of the model.
+
+        All processes of a mesh compare a hash of this; the content of the model is compared separately.
+        """
+        return _replaced(self, {key_of(self): ""}) if self.path else self
+
+    def check(self, place: str, description: ModelDescription, findings: Findings) -> None:
+        """Add a finding for every key of this section that does not fit the model.
+
+        Args:
+            place: the path of this section in the file, as `instances.pendulum`.
+            description: the model description.
+            findings: where the findings go.
+        """
+
+    def summary(self, description: ModelDescription) -> str:
+        """In a few words what computes the model, for the page of `fmu-mesh check`."""
+        return description.generation_tool or key_of(self)
+
+
+def key_of(section: InstanceSection | type[InstanceSection]) -> str:
+    """The key that says of which kind a section is: `fmu`, `mujoco`, ..."""
+    return str(cast("msgspec.Struct", section).__struct_config__.tag)
+
+
+def keys_of(section: type[InstanceSection]) -> tuple[str, ...]:
+    """All keys of a section."""
+    return cast("type[msgspec.Struct]", section).__struct_fields__
+
+
+def placed(section: InstanceSection) -> InstanceSection:
+    """A section without the common keys; a plan has what they mean in fields of its own."""
+    return _replaced(section, {"start_values": {}, "step_size": None, "group": None, "host": None})
+
+
+def _replaced(section: Section, values: Mapping[str, Any]) -> Section:
+    struct = cast("Any", section)
+    changed = {key: value for key, value in values.items() if key in keys_of(type(section))}
+    return cast("Section", replace(struct, **changed))
+
+
+class Kinds(Protocol):
+    """The kinds of instances that are installed, as far as reading a configuration needs them."""
+
+    def own(self) -> dict[str, type[InstanceSection]]:
+        """The sections of the kinds that are part of fmu_mesh by key; the usual kind is the first."""
+        ...
+
+    def names(self) -> list[str]:
+        """The keys of all installed kinds, ours first."""
+        ...
+
+    def section(self, key: str) -> type[InstanceSection]:
+        """The section of the kind with one of these `names`.
+
+        Raises:
+            ConfigurationError: its package cannot be imported, or two packages have this key.
+        """
+        ...
 
 
 class CouplingConfig(Base, frozen=True, kw_only=True):
@@ -173,75 +213,11 @@ FluidDynamics = Annotated[
 ]
 
 
-class MujocoConfig(Base, frozen=True, kw_only=True, tag_field=KIND, tag="mujoco"):
-    """A world that the physics engine MuJoCo computes: its joints and bodies are variables."""
+class PhysicsSection(InstanceSection):
+    """Base class of the sections of physics engines: other instances can be coupled to their joints and bodies."""
 
-    mujoco: Annotated[str, Meta(description="Path of the model (MJCF or URDF), relative to this file.")]
-    physics_steps: Annotated[
-        Annotated[int, Meta(ge=1)] | None,
-        Meta(
-            description="Steps of the engine per own step; default: as few as make none longer than the model's "
-            "timestep.",
-        ),
-    ] = None
-    keyframe: Annotated[str | None, Meta(description="The model's keyframe to start from.")] = None
-    controllers: Controllers = []
-    actuators: Actuators = []
-    fluid_dynamics: FluidDynamics = []
-    start_values: StartValues = {}
-    step_size: StepSize = None
-    group: Group = None
-    host: Host = None
+    __slots__ = ()
 
-    @property
-    def path(self) -> str:
-        """The file of the model, relative to the configuration."""
-        return self.mujoco
-
-
-class GazeboClassicConfig(Base, frozen=True, kw_only=True, tag_field=KIND, tag="gazebo_classic"):
-    """A world that the simulator Gazebo classic 11 computes: its joints and links are variables."""
-
-    gazebo_classic: Annotated[str, Meta(description="Path of the SDF world, relative to this file.")]
-    physics_steps: Annotated[
-        Annotated[int, Meta(ge=1)] | None,
-        Meta(
-            description="Steps of the engine per own step; default: as few as make none longer than the world's "
-            "max_step_size.",
-        ),
-    ] = None
-    controllers: Controllers = []
-    actuators: Actuators = []
-    fluid_dynamics: FluidDynamics = []
-    start_values: StartValues = {}
-    step_size: StepSize = None
-    group: Group = None
-    host: Host = None
-
-    @property
-    def path(self) -> str:
-        """The file of the world, relative to the configuration."""
-        return self.gazebo_classic
-
-
-class PidConfig(Base, frozen=True, kw_only=True, tag_field=KIND, tag="controller"):
-    """A controller that needs no FMU."""
-
-    controller: Annotated[
-        Literal["position_pid"],
-        Meta(description="position_pid: gains p, i, d; inputs target, position, velocity; output effort."),
-    ]
-    start_values: StartValues = {}
-    step_size: StepSize = None
-    group: Group = None
-    host: Host = None
-
-    @property
-    def path(self) -> str:
-        """There is no file."""
-        return ""
-
-
-EngineConfig = MujocoConfig | GazeboClassicConfig
-HostConfig = EngineConfig | PidConfig
-AnyInstanceConfig = InstanceConfig | MujocoConfig | GazeboClassicConfig | PidConfig
+    controllers: list[ControllerConfig]
+    actuators: list[ActuatorConfig]
+    fluid_dynamics: list[FluidDynamicsConfig]

@@ -1,20 +1,22 @@
-"""A configuration file to a `LoadedConfig`: its structure is right, or all that is wrong with it is told.
+"""Reading a configuration file: the result is a valid structure, or an error with all findings.
 
-Owns the reading of the file, the short form of connections and the options that override start values. What
-the names in the file mean is `fmu_mesh.system.system`.
+Owns the short form of connections and the start values of the command line. What the names in the file mean is
+`fmu_mesh.system.system`.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from collections.abc import Set as AbstractSet
 from pathlib import Path
 
 import msgspec
 from msgspec import inspect
 
 from fmu_mesh.config.findings import Findings, locate
-from fmu_mesh.config.mesh import KIND, Config
+from fmu_mesh.config.instance_sections import KIND, InstanceSection, Kinds, keys_of
+from fmu_mesh.config.mesh import Config, config_type
 from fmu_mesh.config.salvage import salvage
 from fmu_mesh.config.structure import check
 from fmu_mesh.config.yaml_text import Plain, read
@@ -32,13 +34,13 @@ _SHORT_FORM = "'instance.output -> instance.input', or {from: instance.output, t
 
 
 class LoadedConfig(msgspec.Struct, frozen=True):
-    """A configuration whose structure is right, and where its parts stand in the file.
+    """A configuration with a valid structure, and the line of each of its parts.
 
     Attributes:
         config: the configuration, overrides included.
         file: the file as the user named it.
         lines: line numbers, counted from 1, by path in the file.
-        overrides: the option (`--set pendulum.l=2`) that took the place of what stands at a path.
+        overrides: the option (`--set pendulum.l=2`) that replaced a value, by path in the file.
     """
 
     config: Config
@@ -51,7 +53,7 @@ class LoadedConfig(msgspec.Struct, frozen=True):
         return Findings(str(self.file), self.lines, self.overrides)
 
     def locate(self, path: str) -> int | None:
-        """The line of ``path``, or of the nearest place around it."""
+        """The line of ``path``, or of the innermost part of the file around it that has one."""
         return locate(self.lines, path)
 
     def finding(self, path: str, found: str, expected: str, suggestion: str | None = None) -> Finding:
@@ -59,50 +61,55 @@ class LoadedConfig(msgspec.Struct, frozen=True):
         return Finding(str(self.file), path, found, expected, suggestion, self.locate(path))
 
     def resolve(self, relative: str) -> Path:
-        """The absolute path of a path that stands in the file.
+        """The absolute path for a path in the file, which is relative to the folder of the file.
 
-        The folder is resolved, the name is not: a link such as `/dev/stdout` stays what it is.
+        Links in the folder are resolved, the last part is not: `/dev/stdout` stays `/dev/stdout`.
         """
         path = self.file.absolute().parent / relative
         return path.parent.resolve() / path.name
 
 
-def load(path: Path, overrides: Sequence[str] = ()) -> LoadedConfig:
+def load(path: Path, overrides: Sequence[str], kinds: Kinds) -> LoadedConfig:
     """Read a configuration file.
+
+    Example:
+        >>> load(Path("configs/pendulum_delay.yaml"), ["pendulum.l=2"]).config.mesh
+        'pendulum_delay'
 
     Args:
         path: the YAML file.
         overrides: start values of the command line, each `instance.variable=value` with a YAML scalar.
+        kinds: the kinds of instances.
 
     Raises:
-        ConfigurationError: the file cannot be read, or its structure is wrong; carries all findings.
+        ConfigurationError: the file cannot be read, or its structure is wrong; has all findings.
     """
-    loaded, findings = examine(path, overrides)
+    loaded, findings = examine(path, overrides, kinds)
     return _right(loaded, findings)
 
 
-def examine(path: Path, overrides: Sequence[str] = ()) -> tuple[LoadedConfig, Findings]:
-    """As `load`, but go on where the structure is wrong: give what is left, and the findings.
+def examine(path: Path, overrides: Sequence[str], kinds: Kinds) -> tuple[LoadedConfig, Findings]:
+    """As `load`, but return a partial configuration with the findings instead of raising an error.
 
-    Hand both to `system.build`, which checks the meaning of what is left and raises one error with everything. With
-    findings the configuration holds placeholders (an empty `fmu`, a step size that is NaN) and must not be run.
+    Pass both to `system.build`, which checks the meaning of the rest and raises one error with all findings. A partial
+    configuration has placeholders (an empty `fmu`, a step size of NaN) and must not be run.
 
     Raises:
-        ConfigurationError: the file cannot be read, or too little of it is left.
+        ConfigurationError: the file cannot be read, or too little of it is valid.
     """
     findings = Findings(str(path))
     text = _text(path, findings)
     findings.raise_any()
-    return _examine(text, path, overrides)
+    return _examine(text, path, overrides, kinds)
 
 
-def parse(text: str, path: Path, overrides: Sequence[str] = ()) -> LoadedConfig:
-    """As `load`, with the text of the file at hand; ``path`` is what relative paths and errors refer to.
+def parse(text: str, path: Path, overrides: Sequence[str], kinds: Kinds) -> LoadedConfig:
+    """As `load`, with the text of the file as an argument; relative paths and errors refer to ``path``.
 
     Raises:
-        ConfigurationError: the structure is wrong; carries all findings.
+        ConfigurationError: the structure is wrong; has all findings.
     """
-    loaded, findings = _examine(text, path, overrides)
+    loaded, findings = _examine(text, path, overrides, kinds)
     return _right(loaded, findings)
 
 
@@ -111,7 +118,7 @@ def _right(loaded: LoadedConfig, findings: Findings) -> LoadedConfig:
     return loaded
 
 
-def _examine(text: str, path: Path, overrides: Sequence[str]) -> tuple[LoadedConfig, Findings]:
+def _examine(text: str, path: Path, overrides: Sequence[str], kinds: Kinds) -> tuple[LoadedConfig, Findings]:
     lines: dict[str, int] = {}
     replaced: dict[str, str] = {}
     findings = Findings(str(path), lines, replaced)
@@ -120,11 +127,13 @@ def _examine(text: str, path: Path, overrides: Sequence[str]) -> tuple[LoadedCon
         if not len(findings):
             findings.add("", "nothing (null)", "a mapping with mesh, simulation and instances")
         findings.raise_any()
+    sections = kinds.own()
     if isinstance(data, dict):
         data = _with_long_connections(data, findings)
-        data = _with_kinds(_with_overrides(data, overrides, replaced, findings))
-    check(data, inspect.type_info(Config), "", findings)
-    config = salvage(data, findings.places) if len(findings) else msgspec.convert(data, Config)
+        data = _with_kinds(_with_overrides(data, overrides, replaced, findings), sections, kinds, findings)
+    type_ = config_type(tuple(sections.values()))
+    check(data, inspect.type_info(type_), "", findings)
+    config = salvage(data, findings.places, sections) if len(findings) else msgspec.convert(data, type_)
     if config is None:
         findings.raise_any()
     assert config is not None  # without a finding there is a configuration
@@ -132,7 +141,7 @@ def _examine(text: str, path: Path, overrides: Sequence[str]) -> tuple[LoadedCon
 
 
 def _text(path: Path, findings: Findings) -> str:
-    """The text of the file; empty after a finding."""
+    """The text of the file; empty if there is a finding."""
     try:
         with path.open("rb") as file:
             data = file.read(MAXIMUM_BYTES + 1)
@@ -161,7 +170,7 @@ def _text(path: Path, findings: Findings) -> str:
 
 
 def _with_long_connections(data: dict[str, Plain], findings: Findings) -> dict[str, Plain]:
-    """``data`` with every connection in its long form; what cannot be read is noted and has empty ends."""
+    """``data`` with every connection in the long form. An invalid one is a finding and gets empty ends."""
     connections = data.get("connections")
     if not isinstance(connections, list):
         return data
@@ -179,23 +188,45 @@ def _with_long_connections(data: dict[str, Plain], findings: Findings) -> dict[s
     return {**data, "connections": written}
 
 
-def _with_kinds(data: dict[str, Plain]) -> dict[str, Plain]:
-    """``data`` with the kind of every instance, as its keys say it: that of an FMU where they say nothing."""
+def _with_kinds(
+    data: dict[str, Plain], sections: dict[str, type[InstanceSection]], kinds: Kinds, findings: Findings
+) -> dict[str, Plain]:
+    """``data`` with the kind of every instance, as its keys say it: the usual kind where they do not.
+
+    Kinds of other packages are looked for only where an instance has no key of ours; those that are found are added to
+    ``sections``.
+    """
     instances = data.get("instances")
     if not isinstance(instances, dict):
         return data
+    usual = next(iter(sections))
     written: dict[str, Plain] = {}
     for name, instance in instances.items():
-        if isinstance(instance, dict):
-            kind = next((key for key in ("fmu", "mujoco", "gazebo_classic", "controller") if key in instance), "fmu")
-            written[name] = {**instance, KIND: kind}
-        else:
+        if not isinstance(instance, dict):
             written[name] = instance
+            continue
+        key = next((key for key in sections if key in instance), None)
+        if key is None and (others := instance.keys() - set(keys_of(sections[usual]))):
+            key = _kind_meant(others, kinds)
+            if key is None:
+                expected = f"one of the keys {listed(kinds.names())}"
+                findings.add(f"instances.{name}", "no key of an installed kind of instance", expected)
+            else:
+                sections.setdefault(key, kinds.section(key))
+        written[name] = {**instance, KIND: key or usual}
     return {**data, "instances": written}
 
 
+def _kind_meant(keys: AbstractSet[str], kinds: Kinds) -> str | None:
+    """The kind that one of the keys is, or is most likely a slip of."""
+    names = kinds.names()
+    exact = [name for name in names if name in keys]
+    near = [name for key in sorted(keys) if (name := nearest(key, names)) is not None]
+    return next(iter([*exact, *near]), None)
+
+
 def _arrow_meant(connection: Plain) -> str | None:
-    """The short form that somebody who wrote another arrow may have meant."""
+    """The short form with the right arrow, for a text with another one."""
     if not isinstance(connection, str):
         return None
     forwards = [end.strip() for end in _OTHER_ARROW.split(connection)]
@@ -209,7 +240,7 @@ def _arrow_meant(connection: Plain) -> str | None:
 def _with_overrides(
     data: dict[str, Plain], overrides: Sequence[str], replaced: dict[str, str], findings: Findings
 ) -> dict[str, Plain]:
-    """``data`` with the start values of the command line; notes in ``replaced`` which option went where."""
+    """``data`` with the start values of the command line; adds each option to ``replaced``."""
     instances = data.get("instances")
     if not isinstance(instances, dict):
         return data

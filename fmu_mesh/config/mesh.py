@@ -1,12 +1,14 @@
 """The configuration file, version 1, as frozen Structs (design: "The configuration file").
 
-Owns the shape and the documentation of the file, from which the JSON Schema is made. Reading YAML and telling
-what is wrong with it is `fmu_mesh.config.loading`; what the names in it mean is `fmu_mesh.system.system`.
+Owns the keys of the file and their descriptions, from which the JSON Schema and the help of options are made. Reading a
+file is `fmu_mesh.config.loading`; what the names in it mean is `fmu_mesh.system.system`.
 """
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from functools import cache, reduce
+from operator import or_
+from typing import Annotated, Any, Literal, cast
 
 import msgspec
 from msgspec import Meta
@@ -23,55 +25,31 @@ from fmu_mesh.config.base import (
     Endpoint,
     Name,
 )
-from fmu_mesh.config.instance_sections import (
-    KIND,
-    ActuatorConfig,
-    AnyInstanceConfig,
-    ControllerConfig,
-    EngineConfig,
-    FluidDynamicsConfig,
-    GazeboClassicConfig,
-    HostConfig,
-    InstanceConfig,
-    MujocoConfig,
-    PidConfig,
-    SolverConfig,
-)
+from fmu_mesh.config.instance_sections import InstanceSection
 from fmu_mesh.config.ros_section import RosConfig, RosProfile, RosTopicConfig
 
 __all__ = [
     "ENDPOINT_PATTERN",
     "KEY_PREFIX_PATTERN",
-    "KIND",
     "MAX_WINDOW",
     "NAME_PATTERN",
     "SHA256_PATTERN",
-    "ActuatorConfig",
-    "AnyInstanceConfig",
     "Config",
     "ConnectionConfig",
-    "ControllerConfig",
-    "EngineConfig",
-    "FluidDynamicsConfig",
-    "GazeboClassicConfig",
-    "HostConfig",
     "InitializationConfig",
-    "InstanceConfig",
     "LimitsConfig",
-    "MujocoConfig",
-    "PidConfig",
     "RecordConfig",
     "RosConfig",
     "RosProfile",
     "RosTopicConfig",
     "SimulationConfig",
-    "SolverConfig",
     "TimeoutsConfig",
     "ZenohConfig",
+    "config_type",
 ]
 
 MAX_WINDOW = 1_000_000
-"""In points; rings hold as many rows."""
+"""In points. A ring holds one row per point of the window."""
 
 
 class SimulationConfig(Base, frozen=True, kw_only=True):
@@ -82,7 +60,7 @@ class SimulationConfig(Base, frozen=True, kw_only=True):
         float | None,
         Meta(
             description="Time of the last communication point in s: start_time plus a multiple of step_size; "
-            "null: it runs until it is stopped."
+            "null: the run goes on until it is stopped."
         ),
     ]
     step_size: Annotated[
@@ -96,21 +74,21 @@ class SimulationConfig(Base, frozen=True, kw_only=True):
     algorithm: Annotated[
         Literal["jacobi", "gauss_seidel"],
         Meta(
-            description="jacobi: every connection has a delay of one point. gauss_seidel: none, "
-            "except on the connections that close a cycle."
+            description="jacobi: every connection has a delay of one point. gauss_seidel: only the connections that "
+            "close a cycle have one."
         ),
     ] = "gauss_seidel"
     window: Annotated[
         Literal["auto"] | Annotated[int, Meta(ge=1, le=MAX_WINDOW)],
         Meta(
             description="How many points a node may run ahead of the slowest; 1 is strict lockstep; "
-            "auto: up to 16384, where the instances are fast."
+            "auto: up to 16384 points, fewer for slow instances."
         ),
     ] = "auto"
     real_time_factor: Annotated[
         float,
         Meta(
-            description="0: as fast as possible; 1: wall clock; 2: twice as fast as the wall clock.",
+            description="Simulation time per wall-clock time; 1: real time; 2: twice as fast; 0: as fast as possible.",
             extra_json_schema=NOT_NEGATIVE,
         ),
     ] = 0.0
@@ -118,31 +96,33 @@ class SimulationConfig(Base, frozen=True, kw_only=True):
         float,
         Meta(
             ge=0,
-            description="With a real_time_factor: wall-clock time in s after which the points that have become due are "
-            "taken together; 0: each as it becomes due.",
+            description="With a real_time_factor: points that are due are stepped together, once per this wall-clock "
+            "time in s; 0: each point when it is due.",
         ),
     ] = 0.0
     catch_up: Annotated[
         Annotated[float, Meta(ge=0)] | None,
         Meta(
-            description="With a real_time_factor: how far in s a run may fall behind the wall clock before it gives up "
-            "what it lost, which `status` counts as overruns; null: it catches up however long that takes."
+            description="With a real_time_factor: largest lag behind the wall clock in s; beyond it, points are "
+            "counted as overruns; null: no limit."
         ),
     ] = None
 
 
 class LimitsConfig(Base, frozen=True, kw_only=True):
-    """How large an FMU may be before it is taken for an attack; no tool comes near the defaults."""
+    """The largest FMU that is accepted. The defaults are far above what tools export."""
 
-    unpacked_bytes: Annotated[int, Meta(ge=1, description="All files of an FMU together, unpacked, in bytes.")] = 2**32
+    unpacked_bytes: Annotated[
+        int, Meta(ge=1, description="Largest total size of the unpacked files of an FMU, in bytes.")
+    ] = 2**32
     ratio: Annotated[
         float,
         Meta(
-            gt=0, description="Size unpacked / size packed, of an FMU that is larger than 64 MiB when it is unpacked."
+            gt=0, description="Largest ratio of unpacked to packed size of an FMU that is larger than 64 MiB unpacked."
         ),
     ] = 200.0
-    entries: Annotated[int, Meta(ge=1, description="Files and folders in an FMU.")] = 100_000
-    description_bytes: Annotated[int, Meta(ge=1, description="A modelDescription.xml, in bytes.")] = 64 * 2**20
+    entries: Annotated[int, Meta(ge=1, description="Largest number of files and folders in an FMU.")] = 100_000
+    description_bytes: Annotated[int, Meta(ge=1, description="Largest modelDescription.xml, in bytes.")] = 64 * 2**20
 
 
 class ConnectionConfig(Base, frozen=True, kw_only=True):
@@ -186,14 +166,14 @@ class ConnectionConfig(Base, frozen=True, kw_only=True):
 
 
 class InitializationConfig(Base, frozen=True, kw_only=True):
-    """How the algebraic loops at the start are iterated: fixed point with under-relaxation."""
+    """How algebraic loops in Initialization Mode are solved: fixed-point iteration with under-relaxation."""
 
     tolerance: Annotated[
         float,
         Meta(
             ge=0,
-            description="A loop is consistent when each of its inputs is off what feeds it by at most this, or by "
-            "this times the value where that is above 1.",
+            description="A loop has converged when each of its inputs differs from its source by at most this, "
+            "absolutely for values up to 1 and relatively above.",
         ),
     ] = 1e-9
     relaxation: Annotated[
@@ -201,11 +181,11 @@ class InitializationConfig(Base, frozen=True, kw_only=True):
         Meta(
             gt=0,
             le=1,
-            description="How far an input goes towards what feeds it in one iteration; 1: all the way. Lower it for "
-            "a loop that does not converge.",
+            description="Fraction of the difference between an input and its source that one iteration removes. "
+            "Lower it for a loop that does not converge.",
         ),
     ] = 1.0
-    iterations: Annotated[int, Meta(ge=1, description="After so many iterations the run ends with an error.")] = 1000
+    iterations: Annotated[int, Meta(ge=1, description="Largest number of iterations; beyond it, the run fails.")] = 1000
 
 
 class RecordConfig(Base, frozen=True, kw_only=True):
@@ -242,16 +222,19 @@ class ZenohConfig(Base, frozen=True, kw_only=True):
     listen: Annotated[
         list[Endpoint],
         Meta(
-            description="Endpoints where other hosts and users can reach the master, too; default: none, only the "
-            "Unix socket in the runtime folder of its user."
+            description="Where other hosts and users can connect to the master, such as tcp/0.0.0.0:7447, besides the "
+            "Unix socket in the user's runtime folder."
         ),
     ] = []
-    connect: Annotated[list[Endpoint], Meta(description="Endpoints of a router or of another host's mesh.")] = []
+    connect: Annotated[
+        list[Endpoint],
+        Meta(description="Where to connect to a router or to the mesh of another host, such as tcp/192.168.1.2:7447."),
+    ] = []
     shared_memory: Annotated[
         bool,
         Meta(
-            description="Whether processes of one host exchange frames and grants through shared memory; false: "
-            "through Zenoh, as those of different hosts do."
+            description="true: processes on the same host exchange frames and grants through shared memory; false: "
+            "through Zenoh, as between hosts."
         ),
     ] = True
     config: Annotated[
@@ -261,11 +244,11 @@ class ZenohConfig(Base, frozen=True, kw_only=True):
 
 
 class TimeoutsConfig(Base, frozen=True, kw_only=True):
-    """The deadline of every kind of wait, in s; meeting it is an error that says what was missing."""
+    """The deadline of every kind of wait, in s. A missed deadline is an error that names what was missing."""
 
     start: Annotated[
         DeadlineSeconds,
-        Meta(description="Until all processes are there and all FMUs are instantiated, in s."),
+        Meta(description="For starting all processes and instantiating all FMUs, in s."),
     ] = 60.0
     initialize: Annotated[
         DeadlineSeconds, Meta(description="From Initialization Mode to the first communication point, in s.")
@@ -277,14 +260,14 @@ class TimeoutsConfig(Base, frozen=True, kw_only=True):
         DeadlineSeconds,
         Meta(
             description="For each call into an FMU before the first communication point, such as fmi2Instantiate, "
-            "in s; less than start and initialize, so that the FMU is named and not only who waits for it."
+            "in s. Keep it below start and initialize: then the error names the FMU."
         ),
     ] = 45.0
     stop: Annotated[
         DeadlineSeconds,
         Meta(
             description="From the last communication point to the end of all processes, in s, "
-            "besides what FMUs take to terminate."
+            "without the time that FMUs take to terminate."
         ),
     ] = 10.0
     terminate: Annotated[
@@ -293,15 +276,15 @@ class TimeoutsConfig(Base, frozen=True, kw_only=True):
     ] = 30.0
 
 
+_INSTANCES = Meta(min_length=1, description="The instances by name; `mesh` is reserved.")
+
+
 class Config(Base, frozen=True, kw_only=True):
     """A mesh: its instances, connections, and how it runs (version 1)."""
 
     mesh: Annotated[Name, Meta(description="Name of the mesh; part of every key.")]
     simulation: SimulationConfig
-    instances: Annotated[
-        dict[Name, AnyInstanceConfig],
-        Meta(min_length=1, description="The instances by name; `mesh` is reserved."),
-    ]
+    instances: Annotated[dict[Name, InstanceSection], _INSTANCES]
     group: Annotated[
         Literal["auto"] | None,
         Meta(
@@ -309,9 +292,7 @@ class Config(Base, frozen=True, kw_only=True):
             "null: every instance without a group has a node of its own."
         ),
     ] = None
-    connections: Annotated[
-        list[ConnectionConfig], Meta(description="What flows from which output to which input.")
-    ] = []
+    connections: Annotated[list[ConnectionConfig], Meta(description="From which output to which input values go.")] = []
     initialization: InitializationConfig = InitializationConfig()
     record: RecordConfig = RecordConfig()
     zenoh: ZenohConfig = ZenohConfig()
@@ -320,13 +301,36 @@ class Config(Base, frozen=True, kw_only=True):
     strict: Annotated[
         bool,
         Meta(
-            description="Whether what FMI forbids is an error instead of a warning: problems that a strict validation "
-            "finds in an FMU, and start values of variables that have none."
+            description="true: what FMI forbids is an error instead of a warning, such as an invalid model description "
+            "or a start value for a variable that may not have one."
         ),
     ] = False
     ros: Annotated[RosConfig | None, Meta(description="Topics for ROS 2; null: none.")] = None
     version: Annotated[Literal[1], Meta(description="Version of this file format.")] = 1
 
-    def is_strict(self, instance: InstanceConfig) -> bool:
-        """Whether what FMI forbids is an error for an instance of this mesh."""
-        return instance.strict if instance.strict is not None else self.strict
+    def is_strict(self, section: InstanceSection) -> bool:
+        """Whether a violation of FMI is an error, and not a warning, for an instance of this mesh."""
+        return section.follows_fmi and (self.strict if section.strict is None else section.strict)
+
+
+@cache
+def config_type(sections: tuple[type[InstanceSection], ...]) -> type[Config]:
+    """The `Config` that a file is converted to, and that its JSON Schema is made from.
+
+    `Config` itself knows no kind of instance, so msgspec needs a hook to decode it; this one needs none.
+
+    Args:
+        sections: the sections of the kinds that instances may have, the usual kind first.
+    """
+    union: Any = reduce(or_, sections)
+    instances: Any = Annotated[dict[Name, union], _INSTANCES]
+    made = msgspec.defstruct(
+        "Config",
+        [("instances", instances)],
+        bases=(Config,),
+        namespace={"__doc__": Config.__doc__},
+        frozen=True,
+        forbid_unknown_fields=True,
+        kw_only=True,
+    )
+    return cast("type[Config]", made)

@@ -1,4 +1,4 @@
-"""The section `ros` of the configuration file: what ROS 2 sees of a mesh."""
+"""The section `ros` of a configuration file: which topics a mesh has in ROS 2, and how ROS is reached."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ RosProfile = Literal["ros2dds", "rmw_zenoh", "rclpy"]
 
 
 class RosTopicConfig(Base, frozen=True, kw_only=True):
-    """One ROS topic; outputs are published, unconnected inputs subscribed. The short form is `instance.variable`."""
+    """A ROS topic: outputs are published, unconnected inputs are subscribed. The short form is `instance.variable`."""
 
     topic: Annotated[
         str | None,
@@ -36,21 +36,21 @@ class RosTopicConfig(Base, frozen=True, kw_only=True):
     fields: Annotated[
         dict[str, str],
         Meta(
-            description="Several variables in one message: `instance.variable` by the field that it goes into.",
+            description="Several variables in one message: `instance.variable` by its field in the message.",
             examples=[{"twist.linear.x": "path_filter.v"}],
         ),
     ] = {}
     constants: Annotated[
         dict[str, str | float | int | bool],
         Meta(
-            description="What every published message has besides, by field, such as the name of a frame.",
+            description="Values that are the same in every published message, by field, such as the name of a frame.",
             examples=[{"transforms[0].child_frame_id": "base_link"}],
         ),
     ] = {}
-    profile: Annotated[RosTopicProfile | None, Meta(description="Another profile than that of the mesh.")] = None
-    frame_id: Annotated[
-        str, Meta(description="frame_id of the header, where the message or one of its elements has one.")
-    ] = ""
+    profile: Annotated[RosTopicProfile | None, Meta(description="Profile of this topic; default: that of `ros`.")] = (
+        None
+    )
+    frame_id: Annotated[str, Meta(description="frame_id of every header in the message.")] = ""
     reliability: Annotated[
         Literal["reliable", "best_effort"],
         Meta(description="Reliability in ROS; a best-effort publisher needs a best-effort subscription here."),
@@ -58,31 +58,31 @@ class RosTopicConfig(Base, frozen=True, kw_only=True):
 
 
 class RosConfig(Base, frozen=True, kw_only=True):
-    """What ROS 2 sees of the mesh, without ROS on this side."""
+    """The gateway to ROS 2, which needs no ROS on this host."""
 
     profile: Annotated[
         RosProfile,
         Meta(
-            description="ros2dds: as zenoh-bridge-ros2dds expects it, for ROS on DDS; rmw_zenoh: as ROS nodes on "
-            "rmw_zenoh expect it; rclpy: as topics of a ROS node, `python -m fmu_mesh.ros.node` with this file."
+            description="ros2dds: through zenoh-bridge-ros2dds, for ROS on DDS; rmw_zenoh: directly, for ROS on "
+            "rmw_zenoh; rclpy: through a ROS node, `python -m fmu_mesh.ros.node` with this file."
         ),
     ] = "ros2dds"
     topics: Annotated[
         list[str | RosTopicConfig] | None,
         Meta(description="The topics; default: all outputs and all unconnected inputs of all instances."),
     ] = None
-    connect: Annotated[list[Endpoint], Meta(description="Where the bridge or the router of rmw_zenoh is.")] = (
+    connect: Annotated[list[Endpoint], Meta(description="Endpoints of the bridge, or of the router of rmw_zenoh.")] = (
         msgspec.field(default_factory=lambda: ["tcp/127.0.0.1:7447"])
     )
     listen: Annotated[
-        list[Endpoint], Meta(description="Endpoints where a bridge can connect to, instead of or beside `connect`.")
+        list[Endpoint], Meta(description="Endpoints that a bridge can connect to, instead of `connect` or in addition.")
     ] = []
-    node: Annotated[str | None, Meta(description="Name of the node in ROS; default: the name of the mesh.")] = None
+    node: Annotated[str | None, Meta(description="Name of the ROS node; default: the name of the mesh.")] = None
     namespace: Annotated[str, Meta(description="Namespace of the node and of its topics.")] = "/"
-    domain: Annotated[int, Meta(ge=0, le=232, description="ROS_DOMAIN_ID; used by rmw_zenoh.")] = 0
+    domain: Annotated[int, Meta(ge=0, le=232, description="ROS_DOMAIN_ID; used with rmw_zenoh only.")] = 0
     distribution: Annotated[
         Literal["humble", "jazzy", "kilted", "lyrical"],
-        Meta(description="The ROS 2 distribution whose message definitions and hashes hold."),
+        Meta(description="The ROS 2 distribution whose message definitions and type hashes are used."),
     ] = "jazzy"
     clock_rate: Annotated[
         float | None,
@@ -94,7 +94,7 @@ class RosConfig(Base, frozen=True, kw_only=True):
     messages: Annotated[
         dict[str, str],
         Meta(
-            description="Custom message types: the path of the .msg file, relative to this file, by the full name.",
+            description="Custom message types: the path of each .msg file, relative to this file, by the full name.",
             examples=[{"lab_msgs/msg/Wheel": "msg/Wheel.msg"}],
         ),
     ] = {}

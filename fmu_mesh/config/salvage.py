@@ -1,18 +1,20 @@
-"""What is left of a configuration when everything that is wrong with its structure is taken out.
+"""A partial configuration: the valid parts of a file whose structure is wrong.
 
-Owns the placeholders that stand for what was taken out, so that the meaning of the rest can be checked and one error
-can show all findings. Such a configuration is never run.
+Owns the placeholders for the invalid parts. With them the meaning of the valid parts can be checked, and one error
+shows all findings. A partial configuration is never run.
 """
 
 from __future__ import annotations
 
 import math
 import re
+from collections.abc import Mapping
 from collections.abc import Set as AbstractSet
 
 import msgspec
 
-from fmu_mesh.config.mesh import KIND, Config
+from fmu_mesh.config.instance_sections import KIND, InstanceSection
+from fmu_mesh.config.mesh import Config, config_type
 from fmu_mesh.config.yaml_text import Plain
 
 __all__ = ["salvage"]
@@ -23,10 +25,15 @@ _CONTAINERS = re.compile(
 _TIMES = ("start_time", "stop_time", "step_size")
 
 
-def salvage(data: Plain, wrong: AbstractSet[str]) -> Config | None:
+def salvage(data: Plain, wrong: AbstractSet[str], sections: Mapping[str, type[InstanceSection]]) -> Config | None:
     """The configuration without what stands at the paths ``wrong``; None if too little is left.
 
-    A missing or wrong time is NaN, a missing FMU an empty path, a wrong connection has two empty ends.
+    A missing or wrong time is NaN, a missing model an empty path, a wrong connection has two empty ends.
+
+    Args:
+        data: what the file says.
+        wrong: the places of all findings.
+        sections: the sections of the kinds of instances by key, the usual kind first.
     """
     if not isinstance(data, dict):
         return None
@@ -39,17 +46,17 @@ def salvage(data: Plain, wrong: AbstractSet[str]) -> Config | None:
                 **rest,
                 "mesh": rest.get("mesh", "mesh"),
                 "simulation": _simulation(rest.get("simulation"), wrong),
-                "instances": _with_fmu(rest.get("instances")),
+                "instances": _with_models(rest.get("instances"), sections),
                 "connections": _with_ends(rest.get("connections", [])),
             },
-            Config,
+            config_type(tuple(sections.values())),
         )
     except msgspec.ValidationError:
         return None
 
 
 def _without(value: Plain, wrong: AbstractSet[str], path: str) -> Plain:
-    """``value`` without its wrong entries; a wrong list item is null, so that the others keep their places."""
+    """``value`` without its wrong entries; a wrong list item becomes null, so that the others keep their index."""
     if isinstance(value, dict):
         places = {key: f"{path}.{key}" if path else key for key in value}
         return {
@@ -77,28 +84,21 @@ def _simulation(section: Plain, wrong: AbstractSet[str]) -> dict[str, Plain]:
     return {**times, **(section if isinstance(section, dict) else {}), **unknown}
 
 
-def _with_fmu(section: Plain) -> dict[str, Plain]:
+def _with_models(section: Plain, sections: Mapping[str, type[InstanceSection]]) -> dict[str, Plain]:
     instances = section if isinstance(section, dict) else {}
-    return {
-        name: _with_model(instance) if isinstance(instance, dict) else {KIND: "fmu", "fmu": ""}
-        for name, instance in instances.items()
-    }
-
-
-def _with_model(instance: dict[str, Plain]) -> dict[str, Plain]:
-    """``instance`` with an empty path where its model is missing; without a controller it is an FMU that is missing."""
-    match instance.get(KIND):
-        case "mujoco":
-            return {"mujoco": "", **instance}
-        case "gazebo_classic":
-            return {"gazebo_classic": "", **instance}
-        case "controller" if "controller" not in instance:
-            shared: dict[str, Plain] = {key: instance[key] for key in ("step_size", "group", "host") if key in instance}
-            return {KIND: "fmu", "fmu": "", **shared}
-        case "controller":
-            return instance
-        case _:
-            return {"fmu": "", **instance}
+    usual = next(iter(sections))
+    written: dict[str, Plain] = {}
+    for name, instance in instances.items():
+        given = instance if isinstance(instance, dict) else {KIND: usual}
+        key = str(given[KIND])
+        with_path: dict[str, Plain] = {key: "", **given}
+        try:
+            msgspec.convert(with_path, sections[key])
+        except msgspec.ValidationError:  # a kind without a file, or one that misses something else
+            shared: dict[str, Plain] = {key: given[key] for key in ("step_size", "group", "host") if key in given}
+            with_path = {KIND: usual, usual: "", **shared}
+        written[name] = with_path
+    return written
 
 
 def _with_ends(section: Plain) -> list[Plain]:

@@ -1,46 +1,57 @@
-"""Plain values to frozen Structs, with every deviation found and not only the first.
+"""What a Struct allows: every deviation of a plain value from it, and its JSON Schema.
 
-Owns the comparison of plain values with the types of msgspec Structs: unknown and missing keys, wrong types,
-patterns and ranges. Numbers are strict: neither text nor truth values, NaN and infinity are numbers. Knows
-nothing of what the values mean.
+Owns the comparison of plain values with the types of msgspec Structs: unknown and missing keys, wrong types, patterns
+and ranges. Text, truth values, NaN and infinity are not numbers. Knows nothing of what the values mean.
+
+`docs/adr/0055-the-structure-of-a-file-is-checked-by-our-own-code.md` says why this is not `jsonschema`.
 """
 
 from __future__ import annotations
 
+import json
 import math
 import re
 from collections.abc import Sequence
 from types import NoneType
+from typing import Any
 
+import msgspec
 from msgspec import inspect
 
 from fmu_mesh.config.findings import Findings
+from fmu_mesh.config.instance_sections import KIND
 from fmu_mesh.config.yaml_text import Plain
 from fmu_mesh.text import listed, nearest, shown
 
-__all__ = ["check", "describe"]
+__all__ = ["SCHEMA_ID", "check", "describe", "json_schema", "schema_text"]
 
-_WORDS: dict[type[inspect.Type], str] = {
-    inspect.StrType: "text",
-    inspect.BoolType: "true or false",
-    inspect.NoneType: "null",
-    inspect.ListType: "a list",
+_PLAIN: dict[type[inspect.Type], tuple[type, str]] = {
+    inspect.StrType: (str, "text"),
+    inspect.BoolType: (bool, "true or false"),
+    inspect.NoneType: (NoneType, "null"),
+    inspect.ListType: (list, "a list"),
+    inspect.DictType: (dict, "a mapping"),
 }
-_PYTHON_TYPES: dict[type[inspect.Type], type] = {
-    inspect.StrType: str,
-    inspect.BoolType: bool,
-    inspect.NoneType: NoneType,
+"""The types without further limits: the class of their values, and how a message calls them."""
+
+SCHEMA_ID = "urn:fmu-mesh:configuration:1"
+
+_SHORT_CONNECTION = {
+    "title": "instance.output -> instance.input",
+    "description": "The short form of a connection, such as `pendulum.a -> delay.x`.",
+    "type": "string",
+    "pattern": r"^\s*[A-Za-z_][A-Za-z0-9_-]*\..*\S\s*->\s*[A-Za-z_][A-Za-z0-9_-]*\..*\S\s*$",
 }
 
 
 def check(value: Plain, kind: inspect.Type, path: str, findings: Findings) -> None:
-    """Note every way in which ``value`` is not of the type ``kind``.
+    """Add a finding for everything in ``value`` that the type ``kind`` does not allow.
 
     Args:
         value: the plain value at ``path``.
         kind: the type as `msgspec.inspect.type_info` gives it.
-        path: the place of the value in the file.
-        findings: where deviations go.
+        path: the place of the value in the file, such as `connections[2].to`.
+        findings: collects them.
     """
     match kind:
         case inspect.Metadata(type=inspect.StrType() as text) if not _fits(value, text):
@@ -63,7 +74,7 @@ def check(value: Plain, kind: inspect.Type, path: str, findings: Findings) -> No
 
 
 def describe(kind: inspect.Type) -> str:
-    """What a value of the type ``kind`` is, in words."""
+    """What a value of the type ``kind`` is, for a message: `a finite number >= 0 or null`."""
     match kind:
         case inspect.Metadata():
             words = str((kind.extra_json_schema or {}).get("title") or describe(kind.type))
@@ -85,9 +96,47 @@ def describe(kind: inspect.Type) -> str:
             words = f"text that matches {pattern}"
         case inspect.StructType():
             words = f"a mapping with {listed([field.encode_name for field in kind.fields])}"
+        case inspect.AnyType():
+            words = "a number, text, true or false, or a list"
         case _:
-            words = _WORDS.get(type(kind), "a mapping")
+            words = _PLAIN[type(kind)][1]
     return words
+
+
+def json_schema(config_type: type[msgspec.Struct]) -> dict[str, object]:
+    """The JSON Schema (draft 2020-12) of the configuration file, by which editors complete and check it.
+
+    What names mean is beyond a schema: `fmu_mesh.system.system` can still refuse a file that is valid by it.
+
+    Args:
+        config_type: the Struct of the whole file.
+    """
+    (reference,), definitions = msgspec.json.schema_components([config_type])
+    config = definitions[config_type.__name__]
+    config["properties"]["connections"]["items"] = {
+        "anyOf": [_SHORT_CONNECTION, config["properties"]["connections"]["items"]]
+    }
+    _without_kinds(config, definitions)
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "$id": SCHEMA_ID,
+        "title": "fmu_mesh configuration",
+        "$ref": reference["$ref"],
+        "$defs": definitions,
+    }
+
+
+def _without_kinds(config: dict[str, Any], definitions: dict[str, Any]) -> None:
+    """Remove the tag of the instance sections: the program adds it after it has read a file."""
+    del config["properties"]["instances"]["additionalProperties"]["discriminator"]
+    for section in definitions.values():
+        if section["properties"].pop(KIND, None) is not None:
+            section["required"].remove(KIND)
+
+
+def schema_text(config_type: type[msgspec.Struct]) -> str:
+    """The JSON Schema as the text of a file, such as `configs/schema.json`."""
+    return json.dumps(json_schema(config_type), indent=2, ensure_ascii=False) + "\n"
 
 
 def _check_struct(value: dict[str, Plain], kind: inspect.StructType, path: str, findings: Findings) -> None:
@@ -138,7 +187,7 @@ def _check_union(value: Plain, kind: inspect.UnionType, path: str, findings: Fin
 
 
 def _is_of_kind(value: dict[str, Plain], option: inspect.Type) -> bool:
-    """Whether ``option`` is the Struct that a mapping of a tagged union says it is."""
+    """Whether ``option`` is the Struct whose tag a mapping has."""
     return isinstance(option, inspect.StructType) and (
         option.tag_field is not None and value.get(option.tag_field) == option.tag
     )
@@ -153,7 +202,7 @@ def _words(kind: inspect.Type) -> Sequence[str]:
 
 
 def _fits(value: Plain, kind: inspect.Type) -> bool:
-    """Whether a value that is neither a mapping nor a list is of the type ``kind``."""
+    """Whether a value is of the type ``kind``, without a look into mappings and lists."""
     match kind:
         case inspect.LiteralType():
             fits = any(type(value) is type(word) and value == word for word in kind.values)
@@ -162,12 +211,12 @@ def _fits(value: Plain, kind: inspect.Type) -> bool:
             fits = number and _within(value, kind)
         case inspect.IntType():
             fits = type(value) is int and _within(value, kind)
-        case inspect.AnyType():  # an element of a list of values, which may be a list itself
+        case inspect.AnyType():  # an element of an array of start values, which may be an array itself
             fits = isinstance(value, bool | int | float | str | list)
         case inspect.StrType(pattern=str(pattern)):
             fits = isinstance(value, str) and re.fullmatch(pattern, value) is not None
         case _:
-            fits = isinstance(value, _PYTHON_TYPES.get(type(kind), ()))
+            fits = type(kind) in _PLAIN and isinstance(value, _PLAIN[type(kind)][0])
     return fits
 
 

@@ -1,7 +1,7 @@
-"""Errors of YAML syntax in the words of somebody who writes a configuration.
+"""Errors of YAML syntax in plain words, for somebody who writes a configuration.
 
-Owns what an error of the parser is called, and the line of its cause: a bracket or a quote that is not closed is
-noticed lines after it was opened. Knows nothing of what the values mean.
+Owns the words for the errors of the parser, and the line of their cause: the parser reports an open bracket or quote
+many lines after it was opened. Knows nothing of what the values mean.
 """
 
 from __future__ import annotations
@@ -61,16 +61,16 @@ _IN_WORDS = {
     r"incompatible YAML": ("another version of YAML", _YAML),
     r"while scanning a quoted scalar": ("a line '---' or '...' between quotes", "the closing quote before it"),
 }
-"""What errors are called in words: what is there, and what is expected."""
+"""By pattern of the parser's message: what was found, and what was expected."""
 
 
 class SyntaxProblem(msgspec.Struct, frozen=True):
-    """What is wrong with a text, in words.
+    """An error of syntax in plain words.
 
     Attributes:
-        line: the line of its cause, counted from 1.
-        found: what is there.
-        expected: what would be right.
+        line: the line of the cause, counted from 1.
+        found: what the text has there.
+        expected: what would be valid.
     """
 
     line: int
@@ -79,7 +79,7 @@ class SyntaxProblem(msgspec.Struct, frozen=True):
 
 
 def in_words(error: YAMLError, text: str) -> SyntaxProblem:
-    """What the parser's ``error`` in ``text`` means to somebody who wrote the text."""
+    """The cause of an ``error`` of the parser in ``text``, in plain words."""
     if isinstance(error, ReaderError):
         line = text.count("\n", 0, error.position) + 1
         return SyntaxProblem(line, f"the character U+{error.character:04X}", "characters that can be printed")
@@ -92,7 +92,7 @@ def in_words(error: YAMLError, text: str) -> SyntaxProblem:
 
 
 def _where_it_began(problem: str, opened: int, at: StringMark, text: str) -> SyntaxProblem | None:
-    """What is wrong before the place where the parser knew no more; ``opened`` is where what it was reading began."""
+    """A cause before the place where the parser stopped; ``opened`` is the line where the current part began."""
     line = at.line + 1
     if "unexpected end of stream while scanning a quoted" in problem:
         return SyntaxProblem(opened, "a quote that is not closed", "the same quote at the end of the text")
@@ -109,7 +109,7 @@ def _where_it_began(problem: str, opened: int, at: StringMark, text: str) -> Syn
 
 
 def _where_it_is(problem: str, line: int, text: str) -> SyntaxProblem:
-    if "<document start>" in problem:  # noticed after the line that it is about
+    if "<document start>" in problem:  # reported for a later line
         line = next((number for number, one in enumerate(text.splitlines(), 1) if one.startswith("%")), line)
     for pattern, (found, expected) in _IN_WORDS.items():
         if match := re.search(pattern, problem):
@@ -118,7 +118,7 @@ def _where_it_is(problem: str, line: int, text: str) -> SyntaxProblem:
 
 
 def _innermost_bracket(text: str, at: StringMark) -> tuple[str, int] | None:
-    """The bracket that was open at a place, and its line."""
+    """The innermost bracket that is open at a place, and its line."""
     opened: list[tuple[str, int]] = []
     for token in _tokens(text):
         if token.start_mark.index >= at.index:
@@ -132,7 +132,7 @@ def _innermost_bracket(text: str, at: StringMark) -> tuple[str, int] | None:
 
 
 def _unclosed_bracket(bracket: str, opened: int, line: int, problem: str) -> SyntaxProblem:
-    """A bracket that another one closes, that nothing closes, or between whose entries a comma is missing."""
+    """A bracket that is closed by the wrong one or not at all, or whose entries lack a comma."""
     closing = _CLOSING[bracket]
     if other := re.search(r"(?:got|found) '([}\])])'", problem):
         where = f" in line {line}" if line != opened else ""
@@ -148,7 +148,7 @@ def _unclosed_bracket(bracket: str, opened: int, line: int, problem: str) -> Syn
 
 
 def _quote_over_lines(text: str, line: int) -> int | None:
-    """Where a quoted text begins that ends in ``line``, after which the parser knew no more, and began before it."""
+    """The first line of a quoted text that ends in ``line``, where the parser stopped, but began in an earlier one."""
     last: ScalarToken | None = None
     for token in _tokens(text):
         if isinstance(token, ScalarToken) and token.end_mark.line + 1 <= line:
@@ -159,13 +159,13 @@ def _quote_over_lines(text: str, line: int) -> int | None:
 
 
 def _tokens(text: str) -> Iterator[Token]:
-    """The tokens of a text, as far as the parser knows them."""
+    """The tokens of a text up to its first error."""
     with contextlib.suppress(YAMLError, ValueError, OverflowError):
         yield from YAML(typ="safe", pure=True).scan(text)
 
 
 def _unexpected_colon(lines: list[str], at: StringMark) -> SyntaxProblem:
-    """A ': ' where none can be: the second one in a line, one too far right, or after a line that has none."""
+    """An unexpected ': ': the second one in a line, in a line too far right, or after a line without one."""
     own, number = lines[at.line], at.line + 1
     if re.search(r":\s", own[: at.column]):
         return SyntaxProblem(number, "a second ': ' in one line", "quotes around text with ': ' in it")

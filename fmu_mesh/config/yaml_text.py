@@ -1,8 +1,8 @@
 """YAML text to plain values with line numbers: mappings, lists, text, numbers, truth values, null.
 
-Owns the YAML 1.2 core schema and the limits that a text has to keep (invariant 7 of the design): depth, size
-after aliases are expanded, one document, no tags. ruamel.yaml splits the text into events and constructs
-nothing. Knows nothing of what the values mean.
+Owns the YAML 1.2 core schema and the limits of a text (invariant 7 of the design): depth, size after aliases are
+expanded, one document, no tags. ruamel.yaml only splits the text into events; it creates no objects. Knows nothing of
+what the values mean.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ __all__ = ["MAXIMUM_DEPTH", "MAXIMUM_VALUES", "Plain", "read"]
 Plain = None | bool | int | float | str | list["Plain"] | dict[str, "Plain"]
 
 MAXIMUM_DEPTH = 16
-"""How deep mappings and lists may be nested; the configuration needs five levels."""
+"""Largest depth of nested mappings and lists; the configuration needs five levels."""
 MAXIMUM_VALUES = 200_000
-"""How many values a text may hold once its aliases are expanded."""
+"""Largest number of values after aliases are expanded."""
 
 _INTEGER = re.compile(r"[-+]?[0-9]+|0o[0-7]+|0x[0-9a-fA-F]+")
 _FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)")
@@ -48,9 +48,9 @@ _WORDS: dict[str, bool | None] = {
 }
 _NO_BLANK = re.compile(r"[^:]+:[^:]+")
 _CORE_TAGS = "tag:yaml.org,2002:"
-"""What the parser makes of `!!`."""
-_LONGEST_INTEGER = 40  # characters; leading zeros are rare
-_INTEGERS = range(-(2**63), 2**64)  # of 64 bits; what is beyond is a float, and text in another base
+"""The parser replaces `!!` by this."""
+_LONGEST_INTEGER = 40  # characters: a longer text takes long to convert and is a float anyway
+_INTEGERS = range(-(2**63), 2**64)  # 64 bits; a decimal number beyond is a float, one in another base text
 
 
 def read(text: str, findings: Findings, lines: dict[str, int]) -> Plain:
@@ -58,9 +58,9 @@ def read(text: str, findings: Findings, lines: dict[str, int]) -> Plain:
 
     Args:
         text: the text; one document.
-        findings: where everything that is wrong with it goes. After a syntax error or a broken limit the
-            value is None, after any other finding it is what can be used.
-        lines: filled with the line, counted from 1, of every path (`connections[2].to`).
+        findings: collects everything that is wrong with it. After a syntax error or a broken limit the value is None;
+            after any other finding it has all valid parts.
+        lines: gets the line, counted from 1, of every path (`connections[2].to`).
     """
     try:
         return _Reader(text, findings, lines).document()
@@ -70,7 +70,7 @@ def read(text: str, findings: Findings, lines: dict[str, int]) -> Plain:
         problem = in_words(error, text)
         lines[""] = problem.line
         findings.add("", problem.found, problem.expected)
-    except (ValueError, OverflowError):  # ruamel.yaml lets those of `chr` through
+    except (ValueError, OverflowError):  # ruamel.yaml does not catch the errors of `chr`
         findings.add("", "an escape sequence that is no character", "YAML 1.2")
     return None
 
@@ -91,7 +91,7 @@ def resolve(text: str) -> Plain:
 
 
 class _Refused(Exception):
-    """The text breaks a limit; the finding is noted."""
+    """The text breaks a limit; the finding was added."""
 
 
 class _Reader:
@@ -151,7 +151,7 @@ class _Reader:
         values: dict[str, Plain] = {}
         while not isinstance(event := next(self._events), MappingEndEvent):
             key = self._key(event, path, depth)
-            if key is None:  # told, and so is nothing that follows from it
+            if key is None:  # a finding; its value gets no more of them
                 self._value(next(self._events), path, depth + 1)
                 continue
             place = f"{path}.{key}" if path else key
@@ -179,7 +179,7 @@ class _Reader:
     def _text(self, event: ScalarEvent, path: str) -> str:
         text = str(event.value)
         with contextlib.suppress(UnicodeDecodeError):
-            # JSON escapes a character as two halves; a half that is alone stands for nothing.
+            # JSON escapes a character as two surrogates; a single one is no character.
             whole = text.encode("utf-16-le", "surrogatepass").decode("utf-16-le")
             if "\0" not in whole:
                 return whole

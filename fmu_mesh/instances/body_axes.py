@@ -1,8 +1,8 @@
 """Frames of a rigid body: velocities into its axes, and a force at its origin as a force at its centre of mass.
 
 A rotation is the nine numbers of a row-major matrix whose columns are the body's axes in world axes, as MuJoCo's
-`xmat` has them: it takes a vector from body axes to world axes. The few products are written out on plain floats: every
-machine adds them in this order, whatever its linear algebra library does.
+`xmat` has them: it takes a vector from body axes to world axes. The products are written out on plain floats, so that
+every machine adds them in the same order.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
-"""What an FMU may do to the process that it runs in: nothing that another FMU, or the mesh, would notice.
+"""Protects a process from its FMUs: no call may run forever, and none may change the state of the process.
 
-Owns the deadline of every call outside the hot loop, and the state of the process that a call could change: working
-directory, locale, floating-point environment, and the signal handlers that end a run. A `Guarded` instance sees to both
-and hands `do_step` through as it is; the hot loop looks for a changed floating-point mode itself. What a call that met
-its deadline means for the process is decided by who owns the process.
+Owns the deadline of every call outside the stepping loop, and the state of the process that a call could change:
+working directory, locale, floating-point environment, and the signal handlers that end a run. A `Guarded` instance does
+both for every call but `do_step`; the stepping loop itself checks the floating-point mode. The owner of the process
+decides what happens after a missed deadline.
 """
 
 from __future__ import annotations
@@ -12,12 +12,11 @@ import ctypes
 import locale
 import os
 import signal
-import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager
-from typing import Final
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any, Final, TypeVar
 
 import msgspec
 
@@ -25,52 +24,59 @@ from ..config.mesh import TimeoutsConfig
 from ..errors import FmuError, InitializationFailed, LoadFailed, StepFailed
 from ..rings.ring import Ring
 from ..simtime import TimeGrid
-from ..variables.model_description import ModelDescription, Value
 from .contract import Instance
+from .instance_wrapper import AroundInstance
 
 __all__ = [
     "DEFAULT_MODE",
     "CallWatch",
     "Guarded",
+    "call_named",
+    "current_function",
     "floating_point_changed",
     "kept_state",
     "restore_floating_point",
 ]
 
+Result = TypeVar("Result")
+
 _LOOK_S: Final = 0.25
 _SIGNALS: Final = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGPIPE") if hasattr(signal, name))
 
-# In the default mode 1 + half an ulp is 1 (ties to even) and so is 1 - a quarter; each directed rounding changes one of
-# them. The sum of two subnormal numbers is 0 where operands or results are flushed to zero. Variables, not literals:
-# Python calculates with literals when it compiles.
+# In the default mode, 1 + half an ulp is 1 (ties to even) and so is 1 - a quarter; each directed rounding mode changes
+# one of the two. The sum of two subnormal numbers is 0 if operands or results are flushed to zero. These are variables,
+# because Python evaluates expressions of literals when it compiles.
 DEFAULT_MODE: Final = (1.0, 2.0**-53, 2.0**-54, 5e-324)
 _ONE, _HALF_ULP, _QUARTER_ULP, _TINY = DEFAULT_MODE
 
+_functions: dict[int, str] = {}
+"""The FMI function that a thread is in, by the identifier of the thread."""
+
 _libm = ctypes.CDLL(None)
 _ENVIRONMENT_BYTES: Final = 512
-"""More than a `fenv_t` has anywhere."""
+"""More than the size of `fenv_t` on any platform."""
 _ACTION_BYTES: Final = 512
-"""More than a `struct sigaction` has anywhere."""
+"""More than the size of `struct sigaction` on any platform."""
 _DEFAULT_ENVIRONMENT: Final = ctypes.c_void_p(-1)
 """`FE_DFL_ENV` of the C libraries on x86 and ARM."""
 
 
 def floating_point_changed() -> bool:
-    """Whether this thread rounds otherwise than to nearest, or flushes subnormal numbers to zero; costs some 50 ns."""
+    """Whether this thread does not round to nearest, or flushes subnormal numbers to zero; takes about 50 ns."""
     return _ONE + _HALF_ULP - _QUARTER_ULP != _ONE or not _TINY + _TINY
 
 
 def restore_floating_point() -> None:
-    """Back to the default environment of C (C17, 7.6): round to nearest, subnormal numbers, no traps."""
+    """Restore the default environment of C (C17, 7.6): round to nearest, subnormal numbers, no traps."""
     _libm.fesetenv(_DEFAULT_ENVIRONMENT)
 
 
 @contextmanager
 def kept_state(*, keep_mode: bool = False) -> Iterator[None]:
-    """What a call inside does to the state of the process is undone at the end.
+    """Restore the state of the process at the end of the block.
 
     Args:
-        keep_mode: whether the floating-point mode is afterwards what it was before; else it is the default one.
+        keep_mode: True restores the floating-point mode of before; False sets the default mode.
     """
     folder, language = _working_directory(), locale.setlocale(locale.LC_ALL)
     actions = [(number, _action(number)) for number in _SIGNALS]
@@ -90,7 +96,7 @@ def kept_state(*, keep_mode: bool = False) -> Iterator[None]:
 
 
 def _action(number: int) -> ctypes.Array[ctypes.c_char]:
-    """What happens at a signal, as C has it: Python does not know of handlers that others have installed."""
+    """The action of C at a signal: Python does not know of handlers that a library has installed."""
     action = ctypes.create_string_buffer(_ACTION_BYTES)
     _libm.sigaction(number, None, action)
     return action
@@ -99,12 +105,12 @@ def _action(number: int) -> ctypes.Array[ctypes.c_char]:
 def _working_directory() -> str | None:
     try:
         return os.getcwd()  # noqa: PTH109 `Path.cwd` is the same and slower
-    except FileNotFoundError:  # it was removed
+    except FileNotFoundError:  # the folder was removed
         return None
 
 
 class _Call(msgspec.Struct, frozen=True):
-    """A call that is under way; ``kind`` is the error that its failure is."""
+    """A call that has not returned; ``kind`` is the error to report if it misses its deadline."""
 
     instance: str
     kind: type[FmuError]
@@ -114,10 +120,16 @@ class _Call(msgspec.Struct, frozen=True):
 
 
 class CallWatch:
-    """Watches the calls of one thread; a call that meets its deadline is handed to ``on_overrun`` on another thread.
+    """Watches the calls of one thread; reports a call that misses its deadline on another thread.
+
+    Example:
+        >>> with closing(CallWatch(report)) as watch:
+        ...     with watch.calling("pendulum", StepFailed, "step", 30.0):
+        ...         fmu.enterEventMode()  # after 30 s, `report` gets an error that names this function
 
     Args:
-        on_overrun: gets the error that says which instance, call and point; should not return into the run.
+        on_overrun: called with the error, which says the instance, the call and the point. The watched thread is still
+            in the call.
     """
 
     def __init__(self, on_overrun: Callable[[FmuError], None]) -> None:
@@ -133,18 +145,18 @@ class CallWatch:
 
     @contextmanager
     def calling(self, instance: str, kind: type[FmuError], setting: str, limit_s: float) -> Iterator[None]:
-        """While inside, an FMU may be called, for ``limit_s`` at most; ``setting`` is where the limit comes from."""
+        """Around one call of an FMU, of ``limit_s`` at most; ``setting`` is the key of `timeouts` with this limit."""
         self._call = _Call(instance, kind, setting, limit_s, time.monotonic())
         self._notify()
         try:
             with kept_state():
                 yield
         finally:
-            self._call = None  # the thread finds out when it looks
+            self._call = None  # the watching thread reads this when it wakes up
 
     @contextmanager
     def stepping(self, position: Callable[[], tuple[str, int]], limit_s: float) -> Iterator[None]:
-        """While inside, ``position`` (the instance that steps, and its point) must change every ``limit_s``."""
+        """Around many steps: ``position`` (the instance that steps, and its point) has to change every ``limit_s``."""
         self._position, self._step_limit_s = position, limit_s
         self._notify()
         try:
@@ -153,7 +165,7 @@ class CallWatch:
             self._position = None
 
     def close(self) -> None:
-        """Watch no more."""
+        """Stop watching."""
         self._closed = True
         self._notify()
         if threading.current_thread() is not self._thread:
@@ -189,7 +201,7 @@ class CallWatch:
 
     @staticmethod
     def _patience(call: _Call | None, position: object) -> float | None:
-        """How long nothing can be late, in s; None: until something changes."""
+        """Time in s until the next deadline can be missed; None: no call is watched."""
         if call is not None:
             return max(0.0, call.started + call.limit_s - time.monotonic())
         return _LOOK_S if position is not None else None
@@ -204,27 +216,31 @@ class CallWatch:
 
 
 def current_function(thread: int) -> str | None:
-    """The FMI function that a thread is in through FMPy, read from its stack; None if it is in none."""
-    frame = sys._current_frames().get(thread)  # noqa: SLF001 documented, for exactly this
-    while frame is not None:
-        if frame.f_code.co_name == "_call" and isinstance(name := frame.f_locals.get("fname"), str):
-            return name
-        frame = frame.f_back
-    return None
+    """The FMI function that a thread is in; None if it is in none, or in one of the compiled calls of a step."""
+    return _functions.get(thread)
 
 
-class Guarded:
-    """An instance whose calls outside the hot loop are watched, and leave the state of the process alone.
+def call_named(name: str, function: Callable[..., Result], *arguments: Any, **keywords: Any) -> Result:  # noqa: ANN401 those of any function
+    """Call ``function``, which `current_function` gives the name ``name`` until it returns."""
+    thread = threading.get_ident()
+    _functions[thread] = name
+    try:
+        return function(*arguments, **keywords)
+    finally:
+        _functions.pop(thread, None)
+
+
+class Guarded(AroundInstance[Instance]):
+    """An instance whose calls have a deadline and leave the state of the process unchanged; `do_step` is as it was.
 
     Args:
         name: instance name.
-        open_: instantiates it; a call like the others.
-        watch: who watches.
-        timeouts: the limits.
+        open_: makes the instance; a call with a deadline like the others.
+        watch: watches the deadlines.
+        timeouts: the deadlines.
 
     Attributes:
-        instance: the instance itself.
-        do_step: that of the instance, without anything around it.
+        do_step: that of the inner instance: `CallWatch.stepping` watches the steps.
     """
 
     def __init__(self, name: str, open_: Callable[[], Instance], watch: CallWatch, timeouts: TimeoutsConfig) -> None:
@@ -233,48 +249,23 @@ class Guarded:
         self._timeouts = timeouts
         self._running = False
         with watch.calling(name, LoadFailed, "call", timeouts.call):
-            self.instance = open_()
-        self.do_step: Callable[[int], None] = self.instance.do_step
-
-    @property
-    def description(self) -> ModelDescription:
-        """The model description."""
-        return self.instance.description
-
-    def enter_initialization(
-        self, start_time: float, stop_time: float | None, start_values: Mapping[str, Value]
-    ) -> None:
-        """Set ``start_values`` and enter Initialization Mode."""
-        with self._calling():
-            self.instance.enter_initialization(start_time, stop_time, start_values)
-
-    def exit_initialization(self) -> None:
-        """Leave Initialization Mode."""
-        with self._calling():
-            self.instance.exit_initialization()
-
-    def set_values(self, values: Mapping[str, Value]) -> None:
-        """Set variables by name."""
-        with self._calling():
-            self.instance.set_values(values)
-
-    def get_values(self, names: Sequence[str]) -> list[Value]:
-        """Current values of variables by name."""
-        with self._calling():
-            return self.instance.get_values(names)
+            super().__init__(open_())
+        self.do_step: Callable[[int], None] = self._instance.do_step
 
     def bind(self, inputs: Ring, outputs: Sequence[Ring], grid: TimeGrid, points: int, step: int = 0) -> None:
         """Let `do_step` work on these rings."""
-        with self._calling():
-            self.instance.bind(inputs, outputs, grid, points, step)
+        super().bind(inputs, outputs, grid, points, step)
         self._running = True
 
     def close(self) -> None:
-        """Terminate if allowed, free the instance and remove its files; one limit for all of it."""
+        """Terminate if allowed, free the instance and remove its files; one deadline for all of it."""
         with self._watch.calling(self._name, FmuError, "terminate", self._timeouts.terminate):
-            self.instance.close()
+            self._instance.close()
 
-    def _calling(self) -> AbstractContextManager[None]:
+    def _forward(self, call: Callable[..., Result], *arguments: Any) -> Result:  # noqa: ANN401 those of any method
         if self._running:
-            return self._watch.calling(self._name, StepFailed, "step", self._timeouts.step)
-        return self._watch.calling(self._name, InitializationFailed, "call", self._timeouts.call)
+            watched = self._watch.calling(self._name, StepFailed, "step", self._timeouts.step)
+        else:
+            watched = self._watch.calling(self._name, InitializationFailed, "call", self._timeouts.call)
+        with watched:
+            return call(*arguments)

@@ -1,19 +1,165 @@
-"""The Protocol that a local FMU, a physics engine and a test double implement, and how such an instance is stepped."""
+"""The contract of a kind of instance, and of an instance: how a model is described, opened and stepped.
+
+A kind is found by its key through the entry points `fmu_mesh.instances` (`fmu_mesh.instances.registry`); FMUs and the
+physics engines are found in the same way as the kinds of other packages. `docs/extending.md` shows how to write one.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Protocol
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Generic, Protocol, TypeVar, runtime_checkable
 
+import msgspec
+
+from ..config.instance_sections import InstanceSection
+from ..config.mesh import LimitsConfig
 from ..rings.ring import Ring
 from ..simtime import TimeGrid
+from ..system.linear_inputs import LinearInput
 from ..variables.model_description import ModelDescription, Value
 
-__all__ = ["Instance", "KeepsState"]
+__all__ = ["Instance", "KeepsFiles", "KeepsState", "Kind", "LogMessage", "Opening", "Showing"]
+
+Section = TypeVar("Section", bound=InstanceSection)
+
+
+class LogMessage(msgspec.Struct, frozen=True):
+    """One message of a model or its engine (for an FMU: FMI 2.0, 2.1.5; FMI 3.0, 2.3.1).
+
+    Attributes:
+        instance: instance name.
+        status: `OK`, `Warning`, `Error`, ... in the words of FMI.
+        step: the own step of the instance in which the message came; -1 before the first step.
+    """
+
+    instance: str
+    status: str
+    category: str
+    message: str
+    step: int
+
+
+class Showing(msgspec.Struct, frozen=True):
+    """Whether and how the world of a physics engine is shown.
+
+    Attributes:
+        view: in a window.
+        video: the file of a film, or None.
+    """
+
+    view: bool = False
+    video: Path | None = None
+
+    def __bool__(self) -> bool:
+        return self.view or self.video is not None
+
+
+class Opening(msgspec.Struct, Generic[Section], frozen=True):
+    """What a kind gets to open an instance.
+
+    Attributes:
+        name: instance name.
+        path: absolute path of the model; `Path()` for a kind without files.
+        section: its section of the configuration, without the common keys.
+        description: what `Kind.describe` returned for the model, with arrays in the sizes of this instance.
+        content: what `Kind.content` returned when the run was planned; None if that is not known.
+        folder: an existing private folder for files. What the instance leaves there is removed after the run.
+        limits: how large an FMU may be.
+        linear_inputs: the inputs that change linearly within a step; only where the description allows it.
+        log: call it with every message of the model, on the thread that calls the instance.
+        showing: only given to a kind with `can_be_shown`.
+    """
+
+    name: str
+    path: Path
+    section: Section
+    description: ModelDescription
+    folder: Path
+    content: str | None = None
+    limits: LimitsConfig = LimitsConfig()
+    linear_inputs: tuple[LinearInput, ...] = ()
+    log: Callable[[LogMessage], None] = lambda _message: None
+    showing: Showing = Showing()
+
+
+class Kind(ABC, Generic[Section]):
+    """A kind of instances: what its section of a configuration may say, and how its models are described and opened.
+
+    An entry point of the group `fmu_mesh.instances` names an object of such a class; its name is the key of the kind in
+    a configuration.
+
+    Call sequence, in the process that plans a run: `check_showing` if somebody wants to see the world, then `describe`
+    for each model and `content` for each file; `check_engine` only for `fmu-mesh check`. Then `open` in the process
+    that runs the instance, which may be on another host. Every process that reads a configuration with this key imports
+    the module of the kind, so import slow libraries within the methods.
+
+    Attributes:
+        section: the Struct of the section; its tag is the key of the kind.
+        expected: in words, what the file of a model is: "a CSV file with a column `time`".
+        can_be_shown: whether `--view` and `--video` can show its instances.
+    """
+
+    section: type[Section]
+    expected: str = "a file of this kind"
+    can_be_shown: bool = False
+
+    @abstractmethod
+    def describe(
+        self, path: Path, section: Section, limits: LimitsConfig, tell: Callable[[str], None]
+    ) -> ModelDescription:
+        """The model description of the model at ``path``.
+
+        Two calls with the same file and section return the same description, on every host.
+
+        Args:
+            path: absolute path of the model; `Path()` for a kind without files.
+            section: the section of an instance, without the common keys.
+            limits: how large an FMU may be.
+            tell: call it with one sentence before anything that takes several seconds.
+
+        Raises:
+            LoadFailed: the model cannot be read; says why. It becomes a finding about the configuration.
+        """
+
+    @abstractmethod
+    def content(self, path: Path) -> str:
+        """A SHA-256 of all files that the model consists of; an empty text for a kind without files.
+
+        It does not depend on where the files are. Processes on several hosts compare it.
+
+        Raises:
+            OSError, LoadFailed: a file cannot be read.
+        """
+
+    def check_engine(self) -> None:
+        """Check that this host can run such instances; nothing is checked by default.
+
+        Raises:
+            LoadFailed: it cannot; says why, with a hint what to install.
+        """
+        return
+
+    def check_showing(self, showing: Showing) -> None:  # noqa: ARG002  for those who can show something
+        """Check that this host can show what ``showing`` asks for; called only with `can_be_shown`.
+
+        Raises:
+            ConfigurationError: it cannot; says why.
+        """
+        return
+
+    @abstractmethod
+    def open(self, opening: Opening[Section]) -> Instance:
+        """Open an instance; the caller closes it.
+
+        Raises:
+            LoadFailed: it cannot be opened; says why.
+        """
 
 
 class Instance(Protocol):
-    """One instance, called from one thread only.
+    """One instance of a model. Call it from one thread only.
 
     Call sequence: `enter_initialization`, then `set_values` and `get_values` as often as needed, then
     `exit_initialization`; then `bind`, and `do_step` at consecutive points of its own, with `set_values` and
@@ -35,7 +181,7 @@ class Instance(Protocol):
         ...
 
     def exit_initialization(self) -> None:
-        """Leave Initialization Mode; outputs are valid from now on."""
+        """Leave Initialization Mode. Outputs are valid from now on."""
         ...
 
     def set_values(self, values: Mapping[str, Value]) -> None:
@@ -47,10 +193,16 @@ class Instance(Protocol):
         ...
 
     def bind(self, inputs: Ring, outputs: Sequence[Ring], grid: TimeGrid, points: int, step: int = 0) -> None:
-        """Let `do_step` read inputs from and write outputs to these rings; write the current outputs as row ``step``.
+        """Choose the rings that `do_step` works on, and write the current outputs to row ``step`` of the output rings.
 
-        An own step takes ``points`` points of ``grid``; own step ``n`` starts at the time of point ``n * points``. All
-        output rings have the same number of rows. May be called again between steps, with other rings.
+        May be called again between two steps, with other rings.
+
+        Args:
+            inputs: `do_step` reads from it the connected inputs, which are the columns of its layout.
+            outputs: `do_step` writes to them the outputs of their layouts; all have the same number of rows.
+            grid: the communication points of the run.
+            points: how many points of ``grid`` one own step takes; own step ``n`` starts at point ``n * points``.
+            step: the number of the next own step.
         """
         ...
 
@@ -58,41 +210,50 @@ class Instance(Protocol):
         """Set the inputs of row ``step``, advance to own step ``step + 1``, write the outputs to row ``step + 1``.
 
         Raises:
-            TerminationRequested: the FMU asks to end the simulation; the step is not taken, and no other may be.
+            TerminationRequested: the FMU asks to end the simulation. The step does not count; no other may follow.
         """
         ...
 
     def close(self) -> None:
-        """Terminate if allowed, free the instance and remove its files. Never raises; may be called twice."""
+        """Terminate if allowed, free the instance and remove its files. Never raises. May be called twice."""
+        ...
+
+
+@runtime_checkable
+class KeepsFiles(Protocol):
+    """An instance with files on the disk that must go even if it hangs in a call and can never be closed."""
+
+    def remove_files(self) -> None:
+        """Remove the files. Called from another thread, just before the process is ended."""
         ...
 
 
 class KeepsState(Protocol):
-    """An instance that can go back to where it was, also in another process (FMI 2.0, 2.1.8; FMI 3.0, 2.2.10).
+    """An instance whose state can be saved and restored, also in another process (FMI 2.0, 2.1.8; FMI 3.0, 2.2.10).
 
-    Only where the model description says so: `can_get_and_set_state`, and `can_serialize_state` for the last two.
-    To be called between two calls of `do_step`.
+    The model description says so with `can_get_and_set_state`, and with `can_serialize_state` for the last two methods.
+    Call them between two calls of `do_step`.
 
     Raises:
         FmuError: the FMU cannot, or failed to.
     """
 
     def get_state(self) -> object:
-        """Everything that the instance is now; `free_state` it some time."""
+        """Save the complete current state. Give it to `free_state` when it is not needed any more."""
         ...
 
     def set_state(self, state: object) -> None:
-        """Be again what ``state`` was; the next `do_step` is the one that would have been the next then."""
+        """Restore a state of `get_state`. The next `do_step` continues from there."""
         ...
 
     def free_state(self, state: object) -> None:
-        """Give the memory of a state back to the FMU."""
+        """Free the memory of a state."""
         ...
 
     def serialize_state(self, state: object) -> bytes:
-        """The state in a form that outlives the process."""
+        """The state as bytes, which another process can use."""
         ...
 
     def deserialize_state(self, data: bytes) -> object:
-        """The state that an instance of the same FMU has serialized."""
+        """The state from the bytes that an instance of the same model has made."""
         ...

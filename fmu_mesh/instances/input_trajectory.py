@@ -1,31 +1,54 @@
-"""What an input is when: values with times, in between constant or linear."""
+"""The value of an input over time: values with times, in between constant or linear."""
 
 from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
+from typing import Any
+
+import msgspec
 
 from ..variables.model_description import Value
 
-__all__ = ["Trajectory"]
+__all__ = ["Samples", "Trajectory"]
+
+
+class Samples(msgspec.Struct, frozen=True):
+    """The content of a trajectory: values with rising times in s."""
+
+    linear: bool
+    times: tuple[float, ...] = ()
+    values: tuple[Any, ...] = ()
 
 
 class Trajectory:
-    """Values of one input over the FMU's time. Read it at rising times: what is past then is forgotten.
+    """Values of one input over the FMU's time. Read it at rising times: it forgets values that are past.
+
+    Example:
+        >>> trajectory = Trajectory(Samples(linear=True))
+        >>> trajectory.add(0.0, 1.0)
+        >>> trajectory.add(2.0, 3.0)
+        >>> trajectory.value(1.0, resolution=1e-9)
+        2.0
 
     Args:
-        linear: linear between two times, or else constant.
+        samples: the first values, and whether the input is linear between two times or constant.
     """
 
-    def __init__(self, *, linear: bool) -> None:
-        self._linear = linear
-        self._times: list[float] = []
-        self._values: list[Value] = []
+    def __init__(self, samples: Samples) -> None:
+        self._linear = samples.linear
+        self._times: list[float] = list(samples.times)
+        self._values: list[Value] = list(samples.values)
+
+    @property
+    def samples(self) -> Samples:
+        """What is not forgotten yet."""
+        return Samples(self._linear, tuple(self._times), tuple(self._values))
 
     def __len__(self) -> int:
         return len(self._times)
 
     def add(self, time: float, value: Value) -> None:
-        """From ``time`` on the input has this value; it replaces an earlier one for the same time."""
+        """The input has this value from ``time`` (s) on; it replaces the value for the same time."""
         place = bisect_left(self._times, time)
         if place < len(self._times) and self._times[place] == time:
             self._values[place] = value
@@ -34,12 +57,12 @@ class Trajectory:
             self._values.insert(place, value)
 
     def value(self, time: float, resolution: float) -> Value:
-        """The value at ``time``, which must not be before the first one's.
+        """The value at ``time``, which is not before the first time; both in s.
 
-        Times that differ by no more than ``resolution`` are the same: the value of such a time is taken as it is.
+        Times that differ by ``resolution`` or less are equal: the value is then that of this time, not interpolated.
         """
         place = bisect_right(self._times, time + resolution) - 1
-        if place > len(self._times) // 2:  # not at every step, because that would move a long future each time
+        if place > len(self._times) // 2:  # not at every step: it moves all future values
             del self._times[:place], self._values[:place]
             place = 0
         start, value = self._times[place], self._values[place]
@@ -50,9 +73,9 @@ class Trajectory:
 
 
 def _between(left: Value, right: Value, weight: float) -> Value:
-    """The value between two, of an array element by element.
+    """The value between two values; of an array, element by element.
 
-    With a weight below 1 this never leaves the range of the two values, which may be the limits of the FMU.
+    With a weight below 1, the result stays between the two values, which may be the limits of the variable.
     """
     if isinstance(left, list) and isinstance(right, list):
         return [_between(one, other, weight) for one, other in zip(left, right, strict=True)]

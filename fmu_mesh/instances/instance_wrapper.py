@@ -1,23 +1,35 @@
-"""An instance around another one: everything goes to the one within, until a subclass does more."""
+"""An instance around another one: all calls go to the inner instance, and a subclass changes some of them.
+
+Also owns the form in which a wrapper stores its own part of a state next to that of the inner instance.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Generic, TypeVar
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Generic, TypeVar, cast
 
+import msgspec
+
+from ..errors import FmuError, FmuMeshError
+from ..rings.ring import Ring
+from ..simtime import TimeGrid
 from ..variables.model_description import ModelDescription, Value
-from .contract import Instance
+from .contract import Instance, KeepsState
 
-__all__ = ["AroundInstance"]
+__all__ = ["AroundInstance", "of_kind", "packed", "unpacked"]
 
 Within = TypeVar("Within", bound=Instance)
+Own = TypeVar("Own")
+Result = TypeVar("Result")
 
 
 class AroundInstance(Generic[Within]):
-    """Hands through what does not concern stepping; a subclass adds `bind` and `do_step`.
+    """Forwards all calls of `Instance` and `KeepsState` to another instance.
+
+    A subclass overrides the calls that it changes, and `_forward` if it puts something around every call.
 
     Args:
-        instance: the one within; is closed with this.
+        instance: the inner instance; `close` closes it.
     """
 
     def __init__(self, instance: Within) -> None:
@@ -32,20 +44,87 @@ class AroundInstance(Generic[Within]):
         self, start_time: float, stop_time: float | None, start_values: Mapping[str, Value]
     ) -> None:
         """See `Instance`."""
-        self._instance.enter_initialization(start_time, stop_time, start_values)
+        self._forward(self._instance.enter_initialization, start_time, stop_time, start_values)
 
     def exit_initialization(self) -> None:
         """See `Instance`."""
-        self._instance.exit_initialization()
+        self._forward(self._instance.exit_initialization)
 
     def set_values(self, values: Mapping[str, Value]) -> None:
         """See `Instance`."""
-        self._instance.set_values(values)
+        self._forward(self._instance.set_values, values)
 
     def get_values(self, names: Sequence[str]) -> list[Value]:
         """See `Instance`."""
-        return self._instance.get_values(names)
+        return self._forward(self._instance.get_values, names)
+
+    def bind(self, inputs: Ring, outputs: Sequence[Ring], grid: TimeGrid, points: int, step: int = 0) -> None:
+        """See `Instance`."""
+        self._forward(self._instance.bind, inputs, outputs, grid, points, step)
 
     def close(self) -> None:
         """See `Instance`."""
-        self._instance.close()
+        self._forward(self._instance.close)
+
+    def get_state(self) -> object:
+        """See `KeepsState`."""
+        return self._forward(self._keeper().get_state)
+
+    def set_state(self, state: object) -> None:
+        """See `KeepsState`."""
+        self._forward(self._keeper().set_state, state)
+
+    def free_state(self, state: object) -> None:
+        """See `KeepsState`."""
+        self._forward(self._keeper().free_state, state)
+
+    def serialize_state(self, state: object) -> bytes:
+        """See `KeepsState`."""
+        return self._forward(self._keeper().serialize_state, state)
+
+    def deserialize_state(self, data: bytes) -> object:
+        """See `KeepsState`."""
+        return self._forward(self._keeper().deserialize_state, data)
+
+    def _forward(self, call: Callable[..., Result], *arguments: Any) -> Result:  # noqa: ANN401 those of any method
+        """Call a method of the inner instance."""
+        return call(*arguments)
+
+    def _keeper(self) -> KeepsState:
+        """The inner instance as one that has states.
+
+        Raises:
+            FmuError: this kind of instance has none.
+        """
+        if not hasattr(self._instance, "get_state"):
+            raise FmuError("its state cannot be kept", instance=getattr(self._instance, "name", None))
+        return cast("KeepsState", self._instance)
+
+
+def packed(own: msgspec.Struct, within: bytes) -> bytes:
+    """Our own part of a state and the serialized state of the inner instance as one."""
+    return msgspec.msgpack.encode((own, within))
+
+
+def unpacked(data: bytes, kind: type[Own], instance: str | None) -> tuple[Own, bytes]:
+    """The two arguments of `packed`.
+
+    Raises:
+        FmuMeshError: ``data`` is no such state.
+    """
+    try:
+        return msgspec.msgpack.decode(data, type=tuple[kind, bytes])  # type: ignore[valid-type]  # a variable here
+    except msgspec.DecodeError as error:
+        raise FmuMeshError(f"this is no state of an instance: {error}", instance=instance) from error
+
+
+def of_kind(kind: type[Own], state: object) -> Own:
+    """``state``, which has to be one of this kind.
+
+    Raises:
+        TypeError: it is another object.
+    """
+    if not isinstance(state, kind):
+        msg = f"{type(state).__name__} is no state of this instance"
+        raise TypeError(msg)
+    return state

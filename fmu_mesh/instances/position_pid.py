@@ -1,24 +1,30 @@
 """The position controller of a joint: a PID whose derivative acts on the measured velocity.
 
 ``effort = p (target - position) + i ∫ (target - position) dt - d velocity``. Because the target's own jumps are not
-differentiated, a new target gives no kick. The gains are tunable and the target is an input, so both can be set while a
-mesh runs.
+differentiated, a new target causes no jump of the effort. The gains are tunable and the target is an input, so both can
+be set while a mesh runs.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import cast
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Literal, cast
 
 import msgspec
+from msgspec import Meta
 
+from ..config.base import Base
+from ..config.instance_sections import KIND, Group, Host, InstanceSection, StartValues, StepSize
+from ..config.mesh import LimitsConfig
 from ..errors import StepFailed
 from ..rings.ring import Ring
 from ..simtime import TimeGrid
 from ..variables.model_description import Causality, ModelDescription, Value, Variable
+from .contract import Instance, Kind, Opening
 
-__all__ = ["PidInstance", "describe_pid"]
+__all__ = ["KIND_OF_CONTROLLERS", "PidConfig", "PidInstance", "describe_pid"]
 
 _PARAMETERS = {
     "p": (0.0, "proportional gain in effort per rad or m"),
@@ -32,6 +38,53 @@ _INPUTS = {
     "position": "measured position in rad or m",
     "velocity": "measured velocity in rad/s or m/s",
 }
+
+
+class PidConfig(Base, InstanceSection, frozen=True, kw_only=True, tag_field=KIND, tag="controller"):
+    """A controller that needs no FMU."""
+
+    controller: Annotated[
+        Literal["position_pid"],
+        Meta(description="position_pid: gains p, i, d; inputs target, position, velocity; output effort."),
+    ]
+    start_values: StartValues = {}
+    step_size: StepSize = None
+    group: Group = None
+    host: Host = None
+
+    @property
+    def path(self) -> str:
+        """Empty: there is no file."""
+        return ""
+
+
+class ControllerKind(Kind[PidConfig]):
+    """Controllers that are part of fmu_mesh: their content is that of our version."""
+
+    section = PidConfig
+    expected = "no file"
+
+    def describe(
+        self,
+        path: Path,  # noqa: ARG002  there is no file
+        section: PidConfig,  # noqa: ARG002  there is one controller
+        limits: LimitsConfig,  # noqa: ARG002  for FMUs
+        tell: Callable[[str], None],  # noqa: ARG002  takes no time
+    ) -> ModelDescription:
+        """The model description of the controller."""
+        return describe_pid()
+
+    def content(self, path: Path) -> str:  # noqa: ARG002  there is no file
+        """Empty: there is no file."""
+        return ""
+
+    def open(self, opening: Opening[PidConfig]) -> Instance:
+        """A new controller, with nothing integrated yet."""
+        return PidInstance(opening.name)
+
+
+KIND_OF_CONTROLLERS = ControllerKind()
+"""What the entry point `controller` names."""
 
 
 def describe_pid() -> ModelDescription:
@@ -72,7 +125,7 @@ def _variable(name: str, causality: Causality, text: str, start: float | None = 
 
 
 class PidInstance:
-    """The controller as an `fmu_mesh.instances.contract.Instance`; see there for the call sequence."""
+    """The controller; see `fmu_mesh.instances.contract.Instance` for the call sequence."""
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -95,7 +148,7 @@ class PidInstance:
         self.set_values(start_values)
 
     def exit_initialization(self) -> None:
-        """Nothing is left to do."""
+        """Leave Initialization Mode; there is nothing to do."""
 
     def set_values(self, values: Mapping[str, Value]) -> None:
         """Set gains, limits and inputs by name."""
@@ -107,13 +160,17 @@ class PidInstance:
         return [self._effort() if name == "effort" else self._values[name] for name in names]
 
     def bind(self, inputs: Ring, outputs: Sequence[Ring], grid: TimeGrid, points: int, step: int = 0) -> None:
-        """Let `do_step` work on these rings; write the current effort as row ``step``."""
+        """Choose the rings of `do_step`, and write the current effort to row ``step``."""
         self._inputs, self._outputs = inputs, outputs
         self._step_size = points * grid.step_size
         self._write(step)
 
     def do_step(self, step: int) -> None:
-        """Take the inputs of row ``step``, write the effort they ask for to row ``step + 1``, and integrate."""
+        """Read the inputs of row ``step``, integrate the error over the step, and write the effort to row ``step + 1``.
+
+        Raises:
+            StepFailed: an input is infinite or no number.
+        """
         row = self._inputs.part("Float64")[step & self._inputs.mask].tolist()
         values = self._values
         values.update(zip(self._inputs.layout.names, row, strict=True))
@@ -126,11 +183,11 @@ class PidInstance:
         self._write(step + 1)
 
     def get_state(self) -> bytes:
-        """All that the next steps depend on."""
+        """The inputs, the gains and the integral."""
         return msgspec.json.encode(_State(self._values, self._integral))
 
     def set_state(self, state: object) -> None:
-        """Go back to what `get_state` of this or another controller returned."""
+        """Restore what `get_state` of this or another controller returned."""
         assert isinstance(state, bytes)
         decoded = msgspec.json.decode(state, type=_State)
         self._values, self._integral = dict(decoded.values), decoded.integral
@@ -139,12 +196,12 @@ class PidInstance:
         """Nothing to free: a state is bytes."""
 
     def serialize_state(self, state: object) -> bytes:
-        """The state as bytes, which it is."""
+        """The state, which is bytes already."""
         assert isinstance(state, bytes)
         return state
 
     def deserialize_state(self, data: bytes) -> object:
-        """The state of these bytes, which they are."""
+        """The state, which is these bytes."""
         return data
 
     def close(self) -> None:
@@ -162,7 +219,7 @@ class PidInstance:
 
 
 class _State(msgspec.Struct, frozen=True):
-    """What a controller remembers between steps."""
+    """The state of a controller between two steps."""
 
     values: dict[str, float]
     integral: float

@@ -1,188 +1,197 @@
-"""From an entry of the configuration to its model description, and from a plan to an instance.
+"""The installed kinds of instances, found by their keys through the entry points `fmu_mesh.instances`.
 
-The one place that knows all kinds of instances: a new kind is described and opened here, and nowhere else.
+Our own kinds are found in the same way as those of other packages. Nothing else in the package knows which kinds there
+are. A kind is imported when a configuration has its key, and what it needs when a model is described or opened.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 import msgspec
+from msgspec.structs import replace
 
-from .. import files
 from ..config.findings import Findings
-from ..config.mesh import AnyInstanceConfig, GazeboClassicConfig, MujocoConfig, PidConfig
+from ..config.instance_sections import KIND, InstanceSection, key_of
+from ..config.mesh import LimitsConfig
 from ..errors import ConfigurationError, LoadFailed
-from ..system.plan import InstancePlan
-from ..system.system import System
+from ..plugins import own_plugin_names, plugin, plugin_names
 from ..text import listed
 from ..variables.model_description import ModelDescription
-from .contract import Instance
-from .fmi import FmuInstance, LogMessage, Terms, compile_sources, content_of, read_description
-from .fmi import open_instance as open_fmu
-from .fmi import stepped as stepped_fmu
-from .gazebo import GazeboClassicInstance, check_gazebo_classic, describe_gazebo_world
-from .mujoco import Film, MujocoInstance, Picture, Window, describe_world, world_content
-from .position_pid import PidInstance, describe_pid
+from .contract import Instance, Kind, Opening, Showing
 
 __all__ = [
-    "Showing",
+    "GROUP",
+    "KINDS",
+    "can_be_shown",
     "check_engines",
     "check_showing",
     "content",
+    "decode_section",
     "describe",
     "expected_model",
     "open_instance",
-    "stepped",
 ]
 
+GROUP = "fmu_mesh.instances"
+"""The group of entry points."""
 
-class Showing(msgspec.Struct, frozen=True):
-    """Whether and how a physics engine shows its world.
+_USUAL = "fmu"
+"""The kind of an instance whose keys do not say it, for findings."""
 
-    Attributes:
-        view: in a window.
-        video: in a film.
+
+class InstalledKinds:
+    """The installed kinds as reading a configuration needs them; see `fmu_mesh.config.instance_sections.Kinds`."""
+
+    def own(self) -> dict[str, type[InstanceSection]]:
+        """The sections of our own kinds by key, that of FMUs first."""
+        names = sorted(own_plugin_names(GROUP), key=lambda name: (name != _USUAL, name))
+        return {name: self.section(name) for name in names}
+
+    def names(self) -> list[str]:
+        """The keys of all installed kinds, ours first."""
+        return _names()
+
+    def section(self, key: str) -> type[InstanceSection]:
+        """The section of the kind with the key ``key``.
+
+        Raises:
+            ConfigurationError: its package cannot be imported or offers something else, or two packages have this key.
+        """
+        section: type[InstanceSection] = _kind(key).section
+        return section
+
+
+KINDS = InstalledKinds()
+
+
+@cache
+def _names() -> list[str]:
+    return plugin_names(GROUP)  # reads all distributions
+
+
+def decode_section(type_: type, value: object) -> object:
+    """The `dec_hook` of msgspec for what holds an `InstanceSection`: its tag says which kind decodes it.
+
+    Example:
+        ``msgspec.json.decode(data, type=NodePlan, dec_hook=decode_section)``
+
+    Raises:
+        ConfigurationError: no installed kind has this tag.
     """
-
-    view: bool = False
-    video: Path | None = None
+    if type_ is not InstanceSection or not isinstance(value, dict):
+        raise NotImplementedError(type_)
+    return msgspec.convert(value, _kind(str(value.get(KIND))).section)
 
 
 def describe(
-    path: Path, config: AnyInstanceConfig, terms: Terms, tell: Callable[[str], None] = lambda _text: None
+    path: Path,
+    section: InstanceSection,
+    limits: LimitsConfig = LimitsConfig(),  # noqa: B008  a frozen Struct
+    tell: Callable[[str], None] = lambda _text: None,
 ) -> ModelDescription:
-    """The model description of an instance; an FMU without a binary for this platform is compiled.
-
-    Args:
-        path: the file of its model.
-        config: its section of the configuration.
-        terms: what an FMU has to keep to.
-        tell: called with what takes its time before it begins.
+    """The model description of an instance; see `Kind.describe`.
 
     Raises:
         LoadFailed: the model cannot be read.
     """
-    match config:
-        case MujocoConfig():
-            return describe_world(path, config)
-        case GazeboClassicConfig():
-            return describe_gazebo_world(path, config)
-        case PidConfig():
-            return describe_pid()
-        case _:
-            description = read_description(path, terms, config.kind)
-            compile_sources(path, description, terms, tell)
-            return description
+    return _kind_of(section).describe(path, section, limits, tell)
 
 
-def content(path: Path, config: AnyInstanceConfig) -> str:
-    """A SHA-256 of all files that the model of an instance is made of, wherever they lie.
+def content(path: Path, section: InstanceSection) -> str:
+    """A SHA-256 of all files that the model of an instance consists of; see `Kind.content`.
 
     Raises:
-        LoadFailed: one cannot be read.
+        LoadFailed: a file cannot be read.
     """
     try:
-        match config:
-            case MujocoConfig():
-                return world_content(path)
-            case GazeboClassicConfig():
-                return files.sha256_of(path)  # nothing else is read, see `fmu_mesh.instances.gazebo.gazebo_world`
-            case PidConfig():
-                return ""  # it is part of our version
-            case _:
-                return content_of(path)
+        return _kind_of(section).content(path)
     except OSError as error:
         raise LoadFailed(f"'{path}' cannot be read: {error.strerror or error}.") from error
 
 
-def expected_model(config: AnyInstanceConfig) -> str:
-    """In words what an instance's file should be."""
-    if isinstance(config, MujocoConfig):
-        return "a MuJoCo model (MJCF or URDF)"
-    if isinstance(config, GazeboClassicConfig):
-        return "an SDF world for Gazebo classic 11"
-    return "an FMI 1.0, 2.0 or 3.0 FMU for this platform"
+def expected_model(section: InstanceSection) -> str:
+    """In words, what the file of the model of an instance should be."""
+    return _kind_of(section).expected
 
 
-def open_instance(
-    item: InstancePlan,
-    folder: Path,
-    log: Callable[[LogMessage], None],
-    terms: Terms,
-    showing: Showing = Showing(),  # noqa: B008  a frozen Struct
-) -> Instance:
-    """Open an instance; the caller closes it.
-
-    Args:
-        item: what the plan says of it.
-        folder: an existing private folder for files.
-        log: called with every message of the FMU or engine.
-        terms: what an FMU has to keep to.
-        showing: for a physics engine.
+def open_instance(opening: Opening[Any]) -> Instance:
+    """Open an instance of whatever kind; the caller closes it.
 
     Raises:
         LoadFailed: it cannot be opened.
     """
-    match item.hosted:
-        case MujocoConfig() as config:
-
-            def log_engine(status: str, text: str, step: int) -> None:
-                log(LogMessage(item.name, status, "engine", text, step))
-
-            return MujocoInstance(Path(item.fmu), item.name, config, log_engine, _picture(item.name, showing))
-        case GazeboClassicConfig() as config:
-            return GazeboClassicInstance(Path(item.fmu), item.name, config)
-        case PidConfig():
-            return PidInstance(item.name)
-        case None:
-            path = Path(item.fmu)
-            kind = item.kind if item.kind in ("co_simulation", "model_exchange") else "auto"
-            description = read_description(path, terms, kind)
-            return open_fmu(path, item.name, description, folder, log, terms, item.options)
+    kind = _kind_of(opening.section)
+    if opening.showing and not kind.can_be_shown:
+        opening = replace(opening, showing=Showing())
+    return kind.open(opening)
 
 
-def stepped(instance: Instance, item: InstancePlan) -> Instance:
-    """What is stepped for an opened instance: it with its linear inputs, if it has some."""
-    return stepped_fmu(instance, item.options) if isinstance(instance, FmuInstance) else instance
+def can_be_shown(section: InstanceSection) -> bool:
+    """Whether `--view` and `--video` can show an instance."""
+    return _kind_of(section).can_be_shown
 
 
-def check_engines(system: System, file: str) -> None:
-    """See whether the engines of all instances that no `host` is named for are on this host.
+def check_engines(sections: Mapping[str, InstanceSection], file: str) -> None:
+    """Check that this host has the engines of all instances that no `host` is named for.
 
     Raises:
-        ConfigurationError: one is missing.
+        ConfigurationError: it does not; with a finding for each of these instances in the configuration ``file``.
     """
-    hosted = {name: own.hosted for name, own in system.instances.items()}
-    here = [name for name, own in hosted.items() if isinstance(own, GazeboClassicConfig) and own.host is None]
-    try:
-        if here:
-            check_gazebo_classic()
-    except LoadFailed as error:
-        expected = f"an engine that runs here, or the `host` of the instance. {error.hint}"
-        findings = Findings(file)
-        for name in here:
-            findings.add(f"instances.{name}.gazebo_classic", error.message, expected)
-        findings.raise_any()
+    findings = Findings(file)
+    reasons: dict[str, LoadFailed | None] = {}
+    for name, section in sections.items():
+        if section.host is not None:
+            continue
+        key = key_of(section)
+        if key not in reasons:
+            reasons[key] = None
+            try:
+                _kind_of(section).check_engine()
+            except LoadFailed as error:
+                reasons[key] = error
+        if (reason := reasons[key]) is not None:
+            expected = f"an engine that runs here, or the `host` of the instance. {reason.hint}"
+            findings.add(f"instances.{name}.{key}", reason.message, expected)
+    findings.raise_any()
 
 
-def check_showing(system: System, showing: Showing) -> None:
-    """See whether there is one world to show.
+def check_showing(sections: Mapping[str, InstanceSection], showing: Showing) -> None:
+    """Check that there is one world to show, and that this host can show it.
+
+    Call it before any model is described: an engine may have to know of a film when it is imported.
 
     Raises:
-        ConfigurationError: there is none, or there are several.
+        ConfigurationError: there is no world or there are several, or this host cannot show it.
     """
-    if not showing.view and showing.video is None:
+    if not showing:
         return
-    worlds = [name for name, instance in system.instances.items() if isinstance(instance.hosted, MujocoConfig)]
+    worlds = [name for name, section in sections.items() if can_be_shown(section)]
     if len(worlds) != 1:
         option = "--view" if showing.view else "--video"
         found = f"this one has {listed(worlds)}" if worlds else "this one has none"
         raise ConfigurationError(f"{option} shows the one physics engine of a mesh, and {found}.")
+    _kind_of(sections[worlds[0]]).check_showing(showing)
 
 
-def _picture(name: str, showing: Showing) -> Picture | None:
-    if showing.video is not None:
-        return Film(showing.video, name)
-    return Window() if showing.view else None
+def _kind_of(section: InstanceSection) -> Kind[Any]:
+    return _kind(key_of(section))
+
+
+def _kind(key: str) -> Kind[Any]:
+    """The kind with a key.
+
+    Raises:
+        ConfigurationError: nobody offers it, two packages do, or what is offered is no kind with this key.
+    """
+    kind = plugin(GROUP, key)
+    if kind is None:
+        text = f"no installed package offers the kind of instance '{key}'; there are {listed(plugin_names(GROUP))}."
+        raise ConfigurationError(text, hint="Install its package in the same Python on this host.")
+    if not isinstance(kind, Kind) or key_of(kind.section) != key:
+        text = f"what the entry point '{key}' ('{GROUP}') names is no kind whose section has the tag '{key}'."
+        raise ConfigurationError(text, hint="See docs/extending.md.")
+    return kind

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import operator
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import msgspec
 import zenoh
@@ -46,13 +46,31 @@ from ..wire.views import GOING_ON, Command, CommandAnswer, MeshInfo, MeshState, 
 from .followers import Followers
 from .grant_watch import CLOCK, PAUSE, GrantWatch
 from .members import Members, spoken
-from .mesh_server import STATUS_S, Events, Server, mesh_info
+from .mesh_server import STATUS_S, Events, MasterServer, mesh_info
 from .pacing import Clock, Pacer, Reach
 
-__all__ = ["Master"]
+__all__ = ["Master", "MasterSettings"]
 
 _HEARTBEAT_S = 0.5
 _LEAST_HEARTBEAT_S = 0.01
+
+
+class MasterSettings(msgspec.Struct, frozen=True):
+    """How a master runs its mesh, besides the plan.
+
+    Attributes:
+        endpoints: where tools can reach this process, for `mesh/info`.
+        config_file: name of the configuration file, for `mesh/info`.
+        launch: the launcher that started this process; None if it was started manually.
+        profile: whether the nodes measure themselves, and the master what holds the grant.
+        paused: whether the run begins paused at its first point.
+    """
+
+    endpoints: tuple[str, ...] = ()
+    config_file: str = ""
+    launch: str | None = None
+    profile: bool = False
+    paused: bool = False
 
 
 class Master:
@@ -61,35 +79,29 @@ class Master:
     Args:
         plan: the plan of the whole mesh.
         session: the session of this process; stays the caller's.
-        endpoints: where tools can reach this process, for `mesh/info`.
-        config_file: name of the configuration file, for `mesh/info`.
+        events: who is told what happens.
+        settings: how the mesh is run.
         router: the link to the router that connects the nodes, if there is one.
-        launch: the launcher that started this process; None where it was started by hand.
 
     Attributes:
-        watch: set it before `run` for a profile: then nodes measure themselves, and this sums up what holds the grant.
         ended_by: what ended the simulation before its last point although nothing failed: an FMU that asked for it, or
             `stop` where there is no stop time.
 
     Call `claim`, then `run` once, from the main thread, then `wait_for_followers` if it went well, then `close`.
     """
 
-    def __init__(  # noqa: PLR0913  one run and what it is reached by
+    def __init__(
         self,
         plan: Plan,
         session: zenoh.Session,
         events: Events,
-        *,
-        endpoints: Sequence[str],
-        config_file: str,
+        settings: MasterSettings,
         router: RouterLink | None = None,
-        launch: str | None = None,
     ) -> None:
         config = plan.system.config
         self._plan = plan
         self._session = session
-        self._endpoints = tuple(endpoints)
-        self._config_file = config_file
+        self._settings = settings
         self._timeouts = config.timeouts
         self._heartbeat_s = max(_LEAST_HEARTBEAT_S, min(_HEARTBEAT_S, config.timeouts.step / 4))
         self._keys = Keys(config.zenoh.key_prefix, config.mesh)
@@ -109,8 +121,7 @@ class Master:
         self._state: MeshState = "starting"
         self._grant = 0
         self._hold: int | None = None
-        self.watch: GrantWatch | None = None
-        self.starts_paused = False
+        self._watch = GrantWatch() if settings.profile else None
         self._pacer = Pacer(plan, config.simulation.real_time_factor)
         self._reach = Reach(plan.window)
         self._stepping = [number for number, node in enumerate(self._nodes) if node != RECORDER]
@@ -124,9 +135,9 @@ class Master:
         capacity = (plan.window + 64) * len(self._nodes) + 1024
         self._inbox.open(session, self._run_keys, MASTER, senders, capacity)
         self._followers = Followers(self._inbox, lambda: self._state in ("running", "paused"))
-        self._members = Members(plan, session, self._run_keys, self._inbox, self._lose, launch)
+        self._members = Members(plan, session, self._run_keys, self._inbox, self._lose, settings.launch)
         self._send = self._members.send
-        self._server = Server(session, self._keys, self._inbox, events, self.last_status, plan.system.instances)
+        self._server = MasterServer(session, self._keys, self._inbox, events, self.last_status, plan.system.instances)
         self._publish_status = self._server.publish_status
 
     def claim(self) -> None:
@@ -199,11 +210,11 @@ class Master:
         return self._clock.elapsed()
 
     def profile(self) -> MeshProfile | None:
-        """What the nodes that ended well have measured; None without a `watch`."""
-        if self.watch is None:
+        """What the nodes that ended well have measured; None if nothing was measured."""
+        if self._watch is None:
             return None
         reports = [self._reports[node] for node in self._nodes if node in self._reports]
-        return MeshProfile(tuple(r.profile for r in reports if r.profile is not None), self.watch.held_s)
+        return MeshProfile(tuple(r.profile for r in reports if r.profile is not None), self._watch.held_s)
 
     def interrupt(self, reason: str) -> None:
         """From any thread: end the run with `Interrupted`."""
@@ -222,14 +233,14 @@ class Master:
             if time.monotonic() > deadline:
                 raise self._members.absence()
             self._turn(0.25)
-        self._members.welcome(TIME_LINE_ENTRIES // len(self._nodes) if self.watch is not None else 0)
+        self._members.welcome(TIME_LINE_ENTRIES // len(self._nodes) if self._watch is not None else 0)
 
     def _grant_to_the_end(self) -> None:
-        if self.starts_paused:
+        if self._settings.paused:
             self._hold = 0
         else:
             self._clock.start()
-        self._enter("paused" if self.starts_paused else "running")
+        self._enter("paused" if self._settings.paused else "running")
         self._pacer.start(0)
         self._moved = time.monotonic()
         # Each of them has its own deadline for a step; the instances of a group take theirs one after the other.
@@ -258,8 +269,8 @@ class Master:
             grant = min(grant, self._hold)
         paced, pause = self._pacer.limit(grant, self._slowest)
         grant = min(grant, paced)
-        if self.watch is not None:
-            self.watch.look(self._holder(credit, grant))
+        if self._watch is not None:
+            self._watch.look(self._holder(credit, grant))
         if grant > self._grant:
             now = time.monotonic()
             if self._slowest >= self._grant:  # they had nothing to do until now: the wall clock held them
@@ -453,7 +464,9 @@ class Master:
     # --- views
 
     def _info(self) -> MeshInfo:
-        return mesh_info(self._plan, self._run_keys.run, self._config_file, self._endpoints, self._members.shared)
+        return mesh_info(
+            self._plan, self._run_keys.run, self._settings.config_file, self._settings.endpoints, self._members.shared
+        )
 
     def last_status(self) -> MeshStatus:
         """The state of the run right now."""

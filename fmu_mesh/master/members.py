@@ -16,7 +16,7 @@ from ..system.digest import difference
 from ..system.plan import RECORDER, Plan
 from ..wire.inbox import Inbox
 from ..wire.keys import MASTER, RunKeys, batched
-from ..wire.membership import Admission, Ready, Registration, Welcome
+from ..wire.membership import Admission, NodeReady, Registration, Welcome
 from ..wire.messages import GRANT, HEADER, decode_json, encode_abort
 from ..wire.refusals import payload_of
 from ..wire.session import tokens, undeclare_all
@@ -64,7 +64,7 @@ class Members:
         self._launch = launch
         self._admitted: dict[str, Registration] = {}
         self._refused: list[str] = []
-        self._ready: dict[str, tuple[Ready, zenoh.Query]] = {}
+        self._ready: dict[str, tuple[NodeReady, zenoh.Query]] = {}
         self._welcomed = False
         self._outlets: dict[str, SharedOutlet] = {}
         self.shared: tuple[str, ...] = ()
@@ -124,7 +124,7 @@ class Members:
         data = payload_of(query)
         if node not in self._admitted or node in self._ready:
             raise MessageRefused("it is from no node that has registered")
-        ready = decode_json(data, Ready)
+        ready = decode_json(data, NodeReady)
         outlet = SharedOutlet.open(ready.offer, MASTER, spoken(node), self._inbox.stash, self._timeouts.step)
         if outlet is not None and self._inbox.offer is not None:
             self._outlets[node] = outlet

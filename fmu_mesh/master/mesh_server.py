@@ -24,7 +24,7 @@ from ..wire.session import matches, undeclare_all
 from ..wire.values import json_encoding
 from ..wire.views import LogLine, MeshInfo, MeshStatus
 
-__all__ = ["STATUS_S", "Events", "Server", "mesh_info"]
+__all__ = ["STATUS_S", "Events", "MasterServer", "mesh_info"]
 
 STATUS_S = 0.1
 """How often the status is published."""
@@ -44,7 +44,7 @@ class Events(Protocol):
         ...
 
 
-class Server:
+class MasterServer:
     """Serves the queries of one run.
 
     Args:

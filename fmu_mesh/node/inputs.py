@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Literal
+from typing import Any, Literal, NamedTuple
+
+import msgspec
 
 from ..instances.contract import Instance
-from ..instances.input_trajectory import Trajectory
-from ..instances.instance_wrapper import AroundInstance
+from ..instances.input_trajectory import Samples, Trajectory
+from ..instances.instance_wrapper import AroundInstance, of_kind, packed, unpacked
 from ..rings.ring import Ring
 from ..simtime import ENDLESS, TimeGrid
 from ..variables.model_description import Value
@@ -87,7 +89,7 @@ class TimedInputs(AroundInstance[Instance]):
         if name not in self._trajectories:
             variable = self.description.variable(name)
             linear = self._linear and variable is not None and is_float(variable.type)
-            trajectory = Trajectory(linear=linear)
+            trajectory = Trajectory(Samples(linear))
             if when > now:
                 trajectory.add(now, self._instance.get_values([name])[0])
             self._trajectories[name] = trajectory
@@ -95,6 +97,33 @@ class TimedInputs(AroundInstance[Instance]):
             raise ValueRefused(f"{_WAITING} values of '{name}' wait for their time already")
         self._trajectories[name].add(when, value)
         return math.ceil(max(steps, self._step))
+
+    def get_state(self) -> object:
+        """See `KeepsState`; values whose time is to come are part of the state."""
+        inputs = {name: trajectory.samples for name, trajectory in self._trajectories.items()}
+        return _TimedState(super().get_state(), _Inputs(self._step, dict(self._used), inputs))
+
+    def set_state(self, state: object) -> None:
+        """See `KeepsState`."""
+        own = of_kind(_TimedState, state)
+        super().set_state(own.inner)
+        self._step = own.inputs.step
+        self._used = dict(own.inputs.used)
+        self._trajectories = {name: Trajectory(samples) for name, samples in own.inputs.trajectories.items()}
+
+    def free_state(self, state: object) -> None:
+        """See `KeepsState`."""
+        super().free_state(of_kind(_TimedState, state).inner)
+
+    def serialize_state(self, state: object) -> bytes:
+        """See `KeepsState`."""
+        own = of_kind(_TimedState, state)
+        return packed(own.inputs, super().serialize_state(own.inner))
+
+    def deserialize_state(self, data: bytes) -> object:
+        """See `KeepsState`."""
+        inputs, rest = unpacked(data, _Inputs, None)
+        return _TimedState(super().deserialize_state(rest), inputs)
 
     def _time(self, step: int) -> float:
         assert self._grid is not None
@@ -104,6 +133,21 @@ class TimedInputs(AroundInstance[Instance]):
         """How far apart two times may be and still mean the same: rounding of one multiplication and one addition."""
         assert self._grid is not None
         return 8 * math.ulp(max(abs(self._grid.start_time), abs(time)))
+
+
+class _Inputs(msgspec.Struct, frozen=True):
+    """The inputs over time in a state: own steps done, the values in use, and all values with their times."""
+
+    step: int
+    used: dict[str, Any]
+    trajectories: dict[str, Samples]
+
+
+class _TimedState(NamedTuple):
+    """A state of the inner instance, and the inputs."""
+
+    inner: object
+    inputs: _Inputs
 
 
 def set_input(runner: Runner, name: str, value: Value, time: float | None) -> int:
@@ -118,7 +162,7 @@ def set_input(runner: Runner, name: str, value: Value, time: float | None) -> in
     variable = runner.instance.description.variable(name)
     is_input = variable is not None and variable.causality == "input"
     if is_input and time is not None and not isinstance(runner.instance, TimedInputs):
-        runner.instance = timed = TimedInputs(runner.instance, "hold")
+        timed = runner.wrap(lambda instance: TimedInputs(instance, "hold"))
         timed.start(runner.grid, runner.plan.step_points, runner.step)
     if is_input and isinstance(runner.instance, TimedInputs):
         return runner.instance.add(name, value, time)

@@ -40,7 +40,7 @@ class OutLink:
             rows, size = min(_FRAME_POINTS, max(1, window // (4 * link.step_points))), _FRAME_BYTES
         self.capacity = max(1, min(rows, size // max(link.layout.row_size, 1)))
         self._outputs = outputs
-        self.put = put
+        self._put = put
         self._picks = _picks(outputs.layout, link.layout)
 
     def flush(self, end: int) -> None:
@@ -62,14 +62,14 @@ class OutLink:
                 for part, picked in self._picks
             )
             for message in encode_frames(FRAME, self.link.index, first, rows):
-                self.put(message)
+                self._put(message)
             first += cut
         self.sent = end
 
     def send_last(self, end: int) -> None:
         """The run ends early: send what is left up to own step ``end - 1``, and that there is no more."""
         self.flush(end)
-        self.put(HEADER.pack(LAST, self.link.index, 0, end))
+        self._put(HEADER.pack(LAST, self.link.index, 0, end))
 
     def send_initial(self, tag: int, values: Mapping[str, Value]) -> None:
         """Send the values of one level of Initialization Mode, which ``tag`` tells; other columns are zero."""
@@ -77,7 +77,7 @@ class OutLink:
         for name in row.layout.names:
             if name in values:
                 row.put(0, name, values[name])
-        self.put(encode_rows(INITIAL, self.link.index, tag, row.parts))
+        self._put(encode_rows(INITIAL, self.link.index, tag, row.parts))
 
 
 def _picks(have: Layout, want: Layout) -> list[tuple[int, list[int] | None]]:

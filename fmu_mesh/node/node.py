@@ -58,10 +58,10 @@ from .feeding import connect_feeds
 from .initialization import Initialization
 from .inputs import TimedInputs
 from .links import OutLink
-from .node_server import Server
+from .node_server import NodeServer
 from .stepping import LAZY_S, RemoteFeed, Runner, Unit
 from .streams import PRIORITY
-from .time_measurement import Profiler
+from .time_measurement import Calls, Profiler
 
 __all__ = ["Node"]
 
@@ -84,6 +84,7 @@ class Node:
         plan: what it has to do.
         session: the session of this process; stays the caller's.
         open_instance: opens an instance of the plan by name; instances stay the caller's, too.
+        on_hang: called on another thread if a step does not return in time.
         router: the link to the router that connects this node to the others, if there is one.
         launch: the launcher that started this process; None where it was started by hand.
 
@@ -93,12 +94,13 @@ class Node:
     Call `run` once, from the main thread.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913  one node and its surroundings
         self,
         plan: NodePlan,
         session: zenoh.Session,
         open_instance: Callable[[str], Instance],
         *,
+        on_hang: Callable[[FmuError], None] = lambda _error: None,
         router: RouterLink | None = None,
         launch: str | None = None,
     ) -> None:
@@ -121,12 +123,9 @@ class Node:
         self._inbox = Inbox(shared_inbox(plan, spins=True))
         self._membership = Membership(plan, session, self._inbox, launch, router)
         self._profiler: Profiler | None = None
-        # The calls that a profile measures; without one they are what they seem.
-        self._poll = self._inbox.poll
-        self._take = self._sort_in
-        self._put_progress: Callable[[bytes], None]
+        self._calls = Calls(self._inbox.poll, self._sort_in)
         self._activity = Activity(plan, self._inbox.refusals)
-        self.server = Server(plan, session, self._inbox, self._activity, self._membership.report)
+        self.server = NodeServer(plan, session, self._inbox, self._activity, self._membership.report, on_hang)
 
     def run(self) -> None:
         """Load, initialize and step to the last point, then report to the master.
@@ -176,8 +175,8 @@ class Node:
         self._activity.state = "loading"
         for item in plan.instances:
             instance = self._open_instance(item.name)
-            if item.interpolation is not None:
-                instance = TimedInputs(instance, item.interpolation)
+            if item.section.interpolation is not None:
+                instance = TimedInputs(instance, item.section.interpolation)
             self._runners[item.name] = Runner(item, instance, plan.grid, plan.ring_rows)
         self._remote = connect_feeds(plan, self._runners)
         self._units = [Unit([self._runners[name] for name in names]) for names in plan.units]
@@ -204,19 +203,16 @@ class Node:
         for link in plan.links_out:
             runner = self._runners[link.source]
             put = membership.sender(link.target_node, keys.frames(link.source, link.target_node))
-            out_links = self._initialization.out_links if link.initial_only else runner.out_links
-            out_links.append(OutLink(link, runner.outputs, put, plan.window))
-        self._poll = self._inbox.poll
-        self._put_progress = membership.sender(MASTER, keys.progress(plan.node))
+            if link.initial_only:
+                self._initialization.out_links.append(OutLink(link, runner.outputs, put, plan.window))
+            elif self._profiler is not None:
+                runner.out_links.append(self._profiler.link(link, runner.outputs, put))
+            else:
+                runner.out_links.append(OutLink(link, runner.outputs, put, plan.window))
+        self._calls = self._calls._replace(put_progress=membership.sender(MASTER, keys.progress(plan.node)))
         if self._profiler is not None:
-            self._measure(self._profiler)
-
-    def _measure(self, profiler: Profiler) -> None:
-        """From now on measured units, links and calls take the place of the plain ones."""
-        self._units = profiler.measure(self._units, self._runners.values())
-        self._poll = profiler.receiving(self._poll)
-        self._take = profiler.receiving(self._take)
-        self._put_progress = profiler.sending(self._put_progress)
+            self._units = self._profiler.measured_units(self._units)
+            self._calls = self._profiler.measured_calls(self._calls)
 
     def _initialize(self) -> None:
         """Initialization Mode: set and get level by level, exchange over the wire, then make the outputs point 0."""
@@ -235,14 +231,14 @@ class Node:
 
     def _wait_for_initial_value(self, left_s: float) -> None:
         if (message := self._inbox.wait(left_s)) is not None:
-            self._take(message)
+            self._calls.take(message)
 
     # --- from point to point
 
     def _step_to_the_end(self) -> None:
         """The loop of the module's docstring."""
         self._activity.state = "running"
-        poll = self._poll
+        poll, take = self._calls.poll, self._calls.take
         if self._profiler is not None:
             self._profiler.start()
         while not self._finished:
@@ -256,7 +252,7 @@ class Node:
             self._activity.advancing = None
             taken = False
             while (message := poll()) is not None:
-                self._take(message)
+                take(message)
                 taken = True
             if stepped:
                 self._tell_progress()
@@ -273,8 +269,7 @@ class Node:
         for runner in unit.runners:
             runner.last_step = runner.step
             runner.flush()
-        asked.point, asked.time = point, self._plan.grid.time(point)
-        self._tell_end(asked, self._plan.timeouts.stop)
+        self._tell_end(asked.at(point, self._plan.grid.time(point)), self._plan.timeouts.stop)
 
     def _flush_before_waiting(self) -> None:
         """Send what a consumer could be waiting for; what is only recorded at least every 50 ms, and at the end."""
@@ -297,7 +292,7 @@ class Node:
         if self._profiler is not None:
             self._profiler.waited(time.monotonic() - started, running=self._grant > 0)
         if message is not None:
-            self._take(message)
+            self._calls.take(message)
         now = time.monotonic()
         self._activity.waited_s += now - started
         if now - self._heard > self._plan.timeouts.step:
@@ -360,7 +355,7 @@ class Node:
         if due or covered >= self._grant:
             self._progress_sent = covered
             self._progress_told_at = now
-            self._put_progress(HEADER.pack(PROGRESS, 0, 0, covered))
+            self._calls.put_progress(HEADER.pack(PROGRESS, 0, 0, covered))
 
     # --- the end
 
@@ -381,7 +376,7 @@ class Node:
         deadline = time.monotonic() + _LAST_WORD_S
         while not self._finished and (left := deadline - time.monotonic()) > 0:
             if (message := self._inbox.wait(left)) is not None:
-                self._take(message)
+                self._calls.take(message)
         if not self._finished:
             raise error
 
@@ -391,8 +386,7 @@ class Node:
             return error.cause
         runner = self._runners.get(error.instance or "")
         if runner is not None and isinstance(error, StepFailed) and error.point is None:
-            error.point = runner.point
-            error.time = self._plan.grid.time(runner.point)
+            return error.at(runner.point, self._plan.grid.time(runner.point))
         return error
 
     def _send_last_rows(self) -> None:

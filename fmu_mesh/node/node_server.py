@@ -30,7 +30,7 @@ from .answering import Answers, Job
 from .stepping import Runner
 from .streams import MAX_WAITING_ROWS, Batch, InstanceStreams
 
-__all__ = ["Server"]
+__all__ = ["NodeServer"]
 
 log = logging.getLogger(__name__)
 
@@ -42,7 +42,7 @@ _EARLY_LINES = 1000
 """How many log messages are kept until this node belongs to a mesh."""
 
 
-class Server:
+class NodeServer:
     """Serves the instances of one node.
 
     Args:
@@ -51,17 +51,19 @@ class Server:
         inbox: the inbox of the node.
         activity: what the node is doing.
         report: tells the master how the node has ended, within so many seconds.
+        on_hang: called on the server's thread if a step does not return in time.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913, PLR0917  one node and whom it tells
         self,
         plan: NodePlan,
         session: zenoh.Session,
         inbox: Inbox,
         activity: Activity,
         report: Callable[[NodeReport, float], None],
+        on_hang: Callable[[FmuError], None],
     ) -> None:
-        self.on_hang: Callable[[FmuError], None] = lambda _error: None
+        self._on_hang = on_hang
         self._plan = plan
         self._session = session
         self._report = report
@@ -158,14 +160,13 @@ class Server:
             if matches(publisher):
                 publisher.put(msgspec.json.encode(self._activity.status(name)))
         if (hang := self._activity.look_at_steps(now)) is not None:
-            self.on_hang(hang)
+            self._on_hang(hang)
 
     def report_hang(self, error: FmuError, deadline_s: float) -> bool:
         """From a watching thread: tell the master that an FMU does not return; whether it knows now."""
         runner = self._activity.runners.get(error.instance or "")
         if runner is not None and self._activity.state != "initializing":
-            error.point = point = runner.point
-            error.time = self._plan.grid.time(point)
+            error = error.at(runner.point, self._plan.grid.time(runner.point))
         report = NodeReport(self._plan.node, error.point or 0, error.report())
         try:
             self._report(report, deadline_s)

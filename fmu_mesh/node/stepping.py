@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from threading import Lock
 from time import perf_counter
+from typing import TypeVar
 
 from ..instances.call_guard import DEFAULT_MODE, floating_point_changed, restore_floating_point
 from ..instances.contract import Instance
@@ -28,6 +29,9 @@ _BURST_S = 0.001
 
 LAZY_S = 0.05
 """How long rows that nobody steps on may wait for more of them: each frame wakes a process that needs a core for it."""
+
+
+Wrapped = TypeVar("Wrapped", bound=Instance)
 
 
 class RemoteFeed:
@@ -83,6 +87,11 @@ class Runner:
         variables = {variable.name: variable for variable in self.instance.description.variables}
         self.watched = Ring(Layout.of(variables[name] for name in names), self.outputs.rows) if names else None
         self.bind()
+
+    def wrap(self, wrapper: Callable[[Instance], Wrapped]) -> Wrapped:
+        """From the next step on, step what ``wrapper`` makes around the instance; returns it."""
+        self.instance = wrapped = wrapper(self.instance)
+        return wrapped
 
     @property
     def point(self) -> int:

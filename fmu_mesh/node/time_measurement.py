@@ -10,17 +10,33 @@ import os
 import socket
 from collections.abc import Callable, Iterable, Sequence
 from time import perf_counter
-from typing import ParamSpec, TypeVar
+from typing import NamedTuple, ParamSpec, TypeVar
 
 from ..rings.ring import Ring
+from ..system.plan import Link
+from ..wire.inbox import Message
 from ..wire.time_profile import GRANT, Burst, NodeProfile, UnitProfile, Wait
 from .links import OutLink
 from .stepping import Runner, Unit
 
-__all__ = ["Profiler"]
+__all__ = ["Calls", "Profiler"]
 
 P = ParamSpec("P")
 T = TypeVar("T")
+
+
+class Calls(NamedTuple):
+    """The calls of a node that a profile measures.
+
+    Attributes:
+        poll: returns the next message if there is one.
+        take: takes a message.
+        put_progress: sends the progress to the master.
+    """
+
+    poll: Callable[[], Message | None]
+    take: Callable[[Message], None]
+    put_progress: Callable[[bytes], None] = lambda _data: None
 
 
 class Profiler:
@@ -31,7 +47,8 @@ class Profiler:
         entries: how many bursts and waits are noted; sums go on.
         window: window of the node's plan, from which the capacity of links follows.
 
-    Call `measure` before Initialization Mode and `start` after it, then step; at the end call `profile`.
+    Call `link`, `measured_units` and `measured_calls` before Initialization Mode and `start` after it, then step; at
+    the end call `profile`.
     """
 
     def __init__(self, node: str, entries: int, window: int) -> None:
@@ -48,10 +65,16 @@ class Profiler:
         self._transport_s = 0.0
         self.sent_s = 0.0
 
-    def measure(self, units: Iterable[Unit], runners: Iterable[Runner]) -> list[Unit]:
-        """The measured forms of ``units``; the links of ``runners`` are replaced by measured ones."""
-        for runner in runners:
-            runner.out_links = [_MeasuredLink(self, link, runner.outputs, self._window) for link in runner.out_links]
+    def link(self, link: Link, outputs: Ring, put: Callable[[bytes], None]) -> OutLink:
+        """A link whose sending is measured."""
+        return _MeasuredLink(self, link, outputs, put, self._window)
+
+    def measured_calls(self, calls: Calls) -> Calls:
+        """The same calls, which are measured."""
+        return Calls(self._receiving(calls.poll), self._receiving(calls.take), self._sending(calls.put_progress))
+
+    def measured_units(self, units: Iterable[Unit]) -> list[Unit]:
+        """The measured forms of ``units``."""
         self._units = [_MeasuredUnit(unit.runners, number, self) for number, unit in enumerate(units)]
         return [*self._units]
 
@@ -60,7 +83,7 @@ class Profiler:
         self._started = self._ended = perf_counter()
         self.sent_s = self._received_s = self._transport_s = 0.0
 
-    def sending(self, call: Callable[P, T]) -> Callable[P, T]:
+    def _sending(self, call: Callable[P, T]) -> Callable[P, T]:
         """The same call, whose time is spent on sending."""
 
         def measured(*args: P.args, **kwargs: P.kwargs) -> T:
@@ -72,7 +95,7 @@ class Profiler:
 
         return measured
 
-    def receiving(self, call: Callable[P, T]) -> Callable[P, T]:
+    def _receiving(self, call: Callable[P, T]) -> Callable[P, T]:
         """The same call, whose time is spent on receiving."""
 
         def measured(*args: P.args, **kwargs: P.kwargs) -> T:
@@ -167,10 +190,12 @@ class _MeasuredUnit(Unit):
 
 
 class _MeasuredLink(OutLink):
-    """A link that takes the place of another one before its first frame, and tells the time that sending takes."""
+    """A link that tells the time that sending takes."""
 
-    def __init__(self, profiler: Profiler, link: OutLink, outputs: Ring, window: int) -> None:
-        super().__init__(link.link, outputs, link.put, window)
+    def __init__(
+        self, profiler: Profiler, link: Link, outputs: Ring, put: Callable[[bytes], None], window: int
+    ) -> None:
+        super().__init__(link, outputs, put, window)
         self._profiler = profiler
 
     def flush(self, end: int) -> None:

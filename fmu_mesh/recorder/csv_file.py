@@ -21,11 +21,13 @@ import numpy as np
 import orjson
 from numpy.typing import NDArray
 
+from ..config.findings import Findings
 from ..files import Kept, open_alone
+from ..system.recording import Recording
 from ..variables.value_types import Value, VariableType, is_text
 from .lines import in_lines, prepare
 
-__all__ = ["CsvFile", "cut_after_last_row"]
+__all__ = ["CsvFile"]
 
 _CHUNK_NUMBERS = 4096
 """What is formatted at once: more would not stay in the cache, and its memory would come from the system each time."""
@@ -73,6 +75,39 @@ class CsvFile:
     ) -> None:
         self.close()
 
+    @classmethod
+    def check(cls, recording: Recording, findings: Findings) -> None:
+        """A CSV can hold everything."""
+
+    @classmethod
+    def open(cls, path: Path, recording: Recording) -> Self:
+        """Open a result file for what a run records."""
+        return cls(path, recording.columns)
+
+    @staticmethod
+    def keep_whole_rows(path: Path, kept: Kept) -> int:
+        """Cut a result file off after its last complete row; returns how many rows it has.
+
+        Args:
+            path: the file; nobody writes it any more.
+            kept: rows that are known to be complete; only what follows them is read.
+        """
+        lines, end, quoted = 0, kept.size, False
+        with path.open("r+b") as file:
+            offset = file.seek(kept.size)
+            while piece := file.read(_READ_BYTES):
+                for number, part in enumerate(piece.split(b'"')):  # text may have line ends in it
+                    if number:
+                        quoted = not quoted
+                        offset += 1
+                    if not quoted and (last := part.rfind(b"\n")) >= 0:
+                        lines += part.count(b"\n")
+                        end = offset + last + 1
+                    offset += len(part)
+            rows = kept.rows + lines - (0 if kept.size else 1)  # the first line is the heading
+            file.truncate(end if rows > 0 else 0)
+        return max(rows, 0)
+
     def write(self, times: NDArray[np.float64], columns: Sequence[NDArray[Any]]) -> None:
         """Append one row per time; ``columns`` are arrays of the same length, of their types' dtypes."""
         for first in range(0, len(times), self._chunk_rows):
@@ -110,7 +145,7 @@ class CsvFile:
         """Rows that are there after a write failed, the last of them complete."""
         with suppress(OSError):
             if self.path.is_file():
-                return cut_after_last_row(self.path, self.kept)
+                return self.keep_whole_rows(self.path, self.kept)
         return self.kept.rows
 
     def _format(self, columns: Sequence[NDArray[Any]]) -> bytes | memoryview:
@@ -123,32 +158,6 @@ class CsvFile:
         if self._has_text or not all(np.isfinite(column).all() for column in columns):
             return "".join(",".join(map(_text, row)) + "\n" for row in rows).encode()
         return in_lines(orjson.dumps(list(chain.from_iterable(rows))), len(columns))
-
-
-def cut_after_last_row(path: Path, kept: Kept) -> int:
-    """Cut a result file off after its last complete row; returns how many rows it has.
-
-    Args:
-        path: the file; nobody writes it any more.
-        kept: rows that are known to be complete; only what follows them is read.
-    """
-    lines, end, quoted = 0, kept.size, False
-    with path.open("r+b") as file:
-        if file.seek(0, io.SEEK_END) < kept.size:
-            return 0  # it is another file by now
-        offset = file.seek(kept.size)
-        while piece := file.read(_READ_BYTES):
-            for number, part in enumerate(piece.split(b'"')):  # text may have line ends in it
-                if number:
-                    quoted = not quoted
-                    offset += 1
-                if not quoted and (last := part.rfind(b"\n")) >= 0:
-                    lines += part.count(b"\n")
-                    end = offset + last + 1
-                offset += len(part)
-        rows = kept.rows + lines - (0 if kept.size else 1)  # the first line is the heading
-        file.truncate(end if rows > 0 else 0)
-    return max(rows, 0)
 
 
 def _text(value: Value) -> str:

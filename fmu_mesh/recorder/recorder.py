@@ -7,11 +7,12 @@ written yet holds the grant back, so that nothing has to be dropped and memory s
 from __future__ import annotations
 
 import logging
+import os
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
-from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
@@ -19,9 +20,10 @@ import numpy as np
 import zenoh
 from numpy.typing import NDArray
 
-from ..errors import ConfigurationError, DeadlineExceeded, FmuMeshError, MeshLost, MessageRefused, from_report
+from ..errors import DeadlineExceeded, FmuMeshError, MeshLost, MessageRefused, from_report
+from ..files import unwritable
 from ..system.plan import RECORDER, Link, NodePlan
-from ..variables.model_description import VariableType
+from ..system.recording import ResultFile
 from ..wire.frames import FrameReceiver
 from ..wire.inbox import Inbox, Message
 from ..wire.keys import MASTER
@@ -38,11 +40,8 @@ from ..wire.messages import (
     NodeReport,
     decode_abort,
 )
-from .csv_file import CsvFile
-from .result_file import OpenResult
-from .turns import Turns
 
-__all__ = ["Recorder", "unwritable"]
+__all__ = ["Recorder"]
 
 log = logging.getLogger(__name__)
 
@@ -59,6 +58,7 @@ _LAST_S = 0.5
 
 _TELL_S = 0.1
 _FLUSH_S = 0.2
+_CAN_CHOOSE = hasattr(os, "sched_setaffinity")  # Linux
 
 
 class Recorder:
@@ -67,7 +67,7 @@ class Recorder:
     Args:
         plan: the recorder's part of the plan.
         session: the session of this process; stays the caller's.
-        open_file: opens the result file.
+        file: the result file; closed by the recorder.
         has_begun: whether all instances have reached point 0; nothing is written before.
 
     Use it as a context manager: the thread runs inside, and the file is complete up to the last complete row outside.
@@ -77,7 +77,7 @@ class Recorder:
         self,
         plan: NodePlan,
         session: zenoh.Session,
-        open_file: OpenResult = CsvFile,
+        file: ResultFile,
         has_begun: Callable[[], bool] = lambda: True,
         *,
         launch: str | None = None,
@@ -90,10 +90,7 @@ class Recorder:
         }
         by_name = {source.name: source for source in self._sources.values()}
         self._columns = [by_name[instance].column(variable) for instance, variable in plan.recorded]
-        self._file = open_file(
-            Path(plan.result_file or ""),
-            [(f"{i}.{v}", by_name[i].type_of(v)) for i, v in plan.recorded],
-        )
+        self._file = file
         self._has_begun = has_begun
         self._written = 0
         self._rested = 0
@@ -109,7 +106,7 @@ class Recorder:
         self._inbox = Inbox(shared_inbox(plan, spins=False))  # nobody waits for it, but others need the processor
         self._membership = Membership(plan, session, self._inbox, launch)
         self._put_progress: Callable[[bytes], None]
-        self._turns: Turns
+        self._turns: _Turns
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
 
     @property
@@ -175,7 +172,7 @@ class Recorder:
 
     def _meet(self) -> None:
         welcome = self._membership.join()
-        self._turns = Turns(len({link.source_node for link in self._plan.links_in}.intersection(welcome.shared)))
+        self._turns = _Turns(len({link.source_node for link in self._plan.links_in}.intersection(welcome.shared)))
         progress = self._membership.keys(self._plan.timeouts.start).progress(RECORDER)
         self._put_progress = self._membership.sender(MASTER, progress)
 
@@ -227,7 +224,7 @@ class Recorder:
         if kind == FRAME:
             source.receiver.take(point, count, data)
         elif kind == LAST:
-            source.ended = True
+            source.end()
         elif kind != INITIAL:
             raise MessageRefused(f"a message of kind {kind} is nothing that a node sends")
 
@@ -276,7 +273,8 @@ class Recorder:
         if isinstance(cause, MeshLost):
             lost = (cause.instance or "").split(", ")
             for source in self._sources.values():
-                source.ended = source.ended or source.name in lost
+                if source.name in lost:
+                    source.end()
         deadline = time.monotonic() + _LAST_S
         while True:
             message = self._inbox.poll()
@@ -321,14 +319,6 @@ class Recorder:
             log.info("failure_not_reported", extra={"error": str(unreachable)})
 
 
-def unwritable(path: Path, error: OSError) -> ConfigurationError:
-    """What to tell when a result file could be opened, but not be written to its end."""
-    return ConfigurationError(
-        f"the result file '{path}' cannot be written: {error.strerror}",
-        hint="The run has ended there. Make room, or choose another file with --output.",
-    )
-
-
 class _Ended(FmuMeshError):
     """The run ended before its last point; what was written stays."""
 
@@ -343,6 +333,10 @@ class _Source:
         self.receiver = receiver
         self.name = receiver.link.source
         self.ended = False
+
+    def end(self) -> None:
+        """No more rows come."""
+        self.ended = True
 
     def covered(self, last_point: int) -> int:
         """The last point for which the value is known; it holds until the next own point."""
@@ -367,6 +361,27 @@ class _Source:
 
         return each if step_points == 1 else held
 
-    def type_of(self, variable: str) -> VariableType:
-        """The type of a variable."""
-        return self.receiver.link.layout.column(variable).type
+
+class _Turns:
+    """Lets a thread that works now and then take its time from all processors in turn.
+
+    The scheduler wakes a thread where it slept last. A recorder left alone takes its time from the same node again and
+    again, which then holds up the others, and often two nodes are left on one processor while another one is idle.
+
+    Args:
+        busy: how many nodes of this host step all the time. Where there are more processors than that, the scheduler
+            finds the idle one by itself, and nothing is done.
+    """
+
+    def __init__(self, busy: int) -> None:
+        self._busy = busy
+        self._turn = 0
+
+    def next(self) -> None:
+        """Move the calling thread to the next processor; it is not bound to it, and may go where one is idle."""
+        processors = sorted(os.sched_getaffinity(0)) if _CAN_CHOOSE else []
+        if 1 < len(processors) <= self._busy:
+            self._turn = (self._turn + 1) % len(processors)
+            with suppress(OSError):  # just taken from this process
+                os.sched_setaffinity(0, {processors[self._turn]})
+                os.sched_setaffinity(0, processors)

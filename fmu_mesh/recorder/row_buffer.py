@@ -8,10 +8,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ..files import unwritable
 from ..simtime import TimeGrid
+from ..system.recording import ResultFile
 from ..variables.value_types import DTYPES, Value, VariableType
-from .recorder import unwritable
-from .result_file import ResultFile
 
 __all__ = ["RowBuffer"]
 

@@ -1,6 +1,7 @@
 """Inputs that are arrays of which only some elements are connected.
 
-An FMU takes and gives arrays as a whole (FMI 3.0, 2.2.6.2), so what is not connected keeps what the FMU has there.
+An FMU reads and writes arrays as a whole (FMI 3.0, 2.2.6.2), so an element that is not connected is set to the value
+that the FMU already has.
 """
 
 from __future__ import annotations
@@ -17,12 +18,12 @@ Get = Callable[[Sequence[str]], list[Value]]
 
 
 def merged(values: Mapping[str, Value], layout: Layout, get: Get) -> dict[str, Value]:
-    """Values of variables, out of values of variables and of elements.
+    """Values of whole variables, from values of variables and of elements of arrays.
 
     Args:
         values: by name; `u[2]` is an element of `u`.
-        layout: the columns that the names are of.
-        get: the current values of variables, to which the elements go.
+        layout: the columns that the names belong to.
+        get: reads the current values of variables; the other elements of an array keep them.
     """
     row = Ring(layout, 1)
     columns = {name: layout.column(name).name for name in values}
@@ -43,7 +44,7 @@ def element_of(value: Value, column: Column, name: str) -> Value:
 
 
 def fill_unconnected(ring: Ring, connected: Iterable[str], get: Get) -> None:
-    """Let the elements of input arrays that are not ``connected`` keep what the FMU has there, in every row."""
+    """Write the current values of the FMU to the elements of input arrays that are not ``connected``, in every row."""
     names = {*connected}
     for column in ring.layout.columns:
         if not column.shape or column.name in names:
@@ -57,7 +58,10 @@ def fill_unconnected(ring: Ring, connected: Iterable[str], get: Get) -> None:
 
 
 def scaled(value: Value, factor: float, offset: float) -> Value:
-    """``value * factor + offset``, one rounding each; of an array, each element; as it is if that is nothing to do."""
+    """``value * factor + offset`` with one rounding each, for each element of an array.
+
+    With factor 1 and offset 0, and for text, the result is ``value`` itself.
+    """
     if (factor, offset) == (1.0, 0.0) or isinstance(value, str | bytes):
         return value
     if isinstance(value, list):

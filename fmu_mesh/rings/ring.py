@@ -1,6 +1,6 @@
-"""Rings: the preallocated rows in which values wait between an instance, a frame and another instance.
+"""Rings: preallocated rows that hold values between an instance, a frame and another instance.
 
-Row ``n`` lives in slot ``n & mask``. Owns the memory and nothing else: no FMI, no Zenoh.
+Row ``n`` is in slot ``n & mask``. This module owns the memory; it knows neither FMI nor Zenoh.
 """
 
 from __future__ import annotations
@@ -23,6 +23,12 @@ Rows = tuple[NDArray[Any], ...]
 
 class Ring:
     """A ring of rows, with one preallocated array for each part of its layout.
+
+    Example:
+        >>> ring = Ring(Layout.of([("y", "Float64")]), rows=4)
+        >>> ring.put(5, "y", 0.5)
+        >>> ring.value(5, "y"), ring.value(1, "y")  # rows 5 and 1 share a slot
+        (0.5, 0.5)
 
     Args:
         layout: the columns.
@@ -47,13 +53,13 @@ class Ring:
         )
 
     def part(self, type_: VariableType) -> NDArray[Any]:
-        """The array of one type, of shape (rows, elements); without elements if no column has it."""
+        """The array of one type, of shape (rows, elements); it has no elements if no column has this type."""
         if type_ in self._types:
             return self.parts[self._types.index(type_)]
         return np.zeros((self.rows, 0), dtype=DTYPES[type_])
 
     def value(self, row: int, name: str) -> Value:
-        """The value of a column of ``row``, or of an element of it, as Python has it."""
+        """The value of a column of ``row``, or of one element of it, as a Python object."""
         part, first, size, shape = self._place(name)
         if not shape:
             element: Value = self.parts[part].item(row & self.mask, first)
@@ -61,9 +67,9 @@ class Ring:
         return nested(self.parts[part][row & self.mask, first : first + size].tolist(), shape)
 
     def put(self, row: int, name: str, value: Value) -> None:
-        """Give a column of ``row``, or an element of it, a value that its type can hold.
+        """Write a value that the type can hold to a column of ``row``, or to one element of it.
 
-        What is beyond the range of a Float32 becomes an infinity, as in C.
+        A value beyond the range of a Float32 becomes infinite, as in C.
         """
         part, first, _, shape = self._place(name)
         array, slot = self.parts[part], row & self.mask
@@ -77,16 +83,18 @@ class Ring:
                 array[slot, place] = element
 
     def reader(self, name: str) -> Callable[[int], Value]:
-        """`value` of one column as a function of the row, for whoever asks for it at every point."""
+        """`value` of one column as a function of the row: the fast way for a caller that reads it at every point."""
         part, first, _, shape = self._place(name)
         mask, (_, width) = self.mask, self.parts[part].shape
         if self._types[part] != "Float64" or shape:
             return lambda row: self.value(row, name)
-        memory: Any = self.parts[part].reshape(-1).data  # a view; its index takes half the time of one of numpy
+        memory: Any = (
+            self.parts[part].reshape(-1).data
+        )  # a memory view: indexing it takes half the time of indexing numpy
         return lambda row: memory[(row & mask) * width + first]
 
     def writer(self, name: str) -> Callable[[int, Value], None]:
-        """`put` of one column as a function of the row and the value, for whoever sets it at every point."""
+        """`put` of one column as a function of row and value: the fast way for a caller that writes at every point."""
         part, first, _, shape = self._place(name)
         mask, (_, width) = self.mask, self.parts[part].shape
         if self._types[part] != "Float64" or shape:

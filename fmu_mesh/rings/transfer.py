@@ -1,7 +1,7 @@
-"""Moving values from rows of a source to rows of a target: which step needs which, and the arithmetic of a connection.
+"""Moving values from rows of a source to rows of a target, with the factor and the offset of a connection.
 
-Owns the mapping of invariant 1: values are matched by instance and point, never by arrival order. Used on frames that
-arrive and on rings of the same process alike.
+Which row a step reads is `fmu_mesh.system.coupling_rule`. Frames from another node and rings of the same process go
+the same way.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..system.coupling_rule import CouplingRule
 from ..system.layout import Layout
 from ..system.plan import Feed
 from .ring import Ring, Rows
@@ -24,9 +25,12 @@ Index = slice | NDArray[np.intp]
 class Transfer:
     """Copies the columns of one feed into the input ring of its target.
 
-    Own step ``j`` of the target, which takes ``target_points`` base points, uses the source's value at base point
-    ``j * target_points`` with a delay of 1, and ``(j + 1) * target_points`` with a delay of 0 (design, section 3). A
-    source that takes ``source_points`` base points per step holds its value between them.
+    Args:
+        feed: the source, the delay and the columns.
+        source_layout: columns of the source's rows, in a ring or in a frame.
+        inputs: the input ring of the target.
+        source_points: base points per step of the source.
+        target_points: base points per step of the target.
     """
 
     def __init__(
@@ -34,46 +38,39 @@ class Transfer:
     ) -> None:
         self.feed = feed
         self._inputs = inputs
-        self._source_points = source_points
-        self._target_points = target_points
-        self._lead = 0 if feed.delay else target_points
+        self._rule = CouplingRule(feed.delay, source_points, target_points)
         self._same_rate = source_points == target_points
         self._copies = _copies(feed, source_layout, inputs)
 
-    def ready(self, source_steps: int) -> int:
-        """How many own steps of the target are fed once the source's rows ``0 .. source_steps - 1`` are there."""
-        return max(0, -(-(source_steps * self._source_points - self._lead) // self._target_points))
-
-    def source_step(self, step: int) -> int:
-        """The source's own step whose row feeds own step ``step`` of the target."""
-        return (step * self._target_points + self._lead) // self._source_points
+    def ready(self, rows: int) -> int:
+        """See `CouplingRule.steps_ready`."""
+        return self._rule.steps_ready(rows)
 
     def from_rows(self, first: int, rows: Rows) -> None:
-        """Take what the source's rows from own step ``first`` on feed."""
+        """Feed all steps of the target that ``rows`` of the source feed; the first of them is row ``first``."""
         low, high = self.ready(first), self.ready(first + len(rows[0]))
         if low >= high:
             return
         if self._same_rate:
-            skip = self.source_step(low) - first
+            skip = self._rule.row_for(low) - first
             picked: Index = slice(skip, skip + high - low)
         else:
-            steps = np.arange(low, high)
-            picked = (steps * self._target_points + self._lead) // self._source_points - first
+            picked = self._rule.row_for(np.arange(low, high)) - first
         self._write(low, high, tuple(part[picked] for part in rows))
 
     def from_ring(self, source: Ring, low: int, high: int) -> None:
         """Feed own steps ``low .. high - 1`` of the target from the rows of ``source``."""
-        steps = np.arange(low, high)
-        slots = ((steps * self._target_points + self._lead) // self._source_points) & source.mask
+        slots = self._rule.row_for(np.arange(low, high)) & source.mask
         self._write(low, high, tuple(part[slots] for part in source.parts))
 
     def stepper(self, source: Ring) -> Callable[[int], None]:
-        """What feeds one own step of the target from ``source``: the cheap way for one row.
+        """A function that feeds one own step of the target from ``source``; faster than `from_ring` for a single row.
 
-        Single numbers of one type go through memory views, which hand over the same bits several times faster.
+        Single numbers of one type go through memory views: the bits are the same, and a copy takes a fraction of the
+        time.
         """
         if self._same_rate and all(copy.is_one_number(source) for copy in self._copies):
-            lead = self._lead // self._source_points
+            lead = self._rule.row_for(0)
             steppers = [copy.stepper(source, lead, self._inputs.mask) for copy in self._copies]
             if len(steppers) == 1:
                 return steppers[0]
@@ -83,9 +80,10 @@ class Transfer:
                     feed(step)
 
             return step_each
+        row_for = self._rule.row_for
 
         def step_rows(step: int) -> None:
-            slot = self.source_step(step) & source.mask
+            slot = row_for(step) & source.mask
             target = step & self._inputs.mask
             for copy in self._copies:
                 values = source.parts[copy.source_part][slot]
@@ -118,7 +116,7 @@ class _Copy:
         self.scale = scale
 
     def is_one_number(self, source: Ring) -> bool:
-        """Whether this is one number that Python hands over as it is; a Float32 would go through a Float64."""
+        """Whether this copies one number that Python does not change; a Float32 would become a Float64 on the way."""
         if not (isinstance(self.source_columns, slice) and isinstance(self.columns, slice)):
             return False
         single = self.columns.stop - self.columns.start == 1
@@ -126,7 +124,7 @@ class _Copy:
         return single and dtype == self.part.dtype and dtype not in (np.float32, np.object_)
 
     def stepper(self, source: Ring, lead: int, mask: int) -> Callable[[int], None]:
-        """As `Transfer.stepper`, for `is_one_number`; ``lead`` is how many rows the source is ahead."""
+        """As `Transfer.stepper`, if `is_one_number`; step n reads row ``n + lead``."""
         have, want = source.parts[self.source_part], self.part
         values, inputs = have.reshape(-1).data, want.reshape(-1).data
         assert isinstance(self.source_columns, slice)
@@ -149,9 +147,9 @@ class _Copy:
         return step_scaled
 
     def convert(self, values: NDArray[Any]) -> NDArray[Any]:
-        """Apply factor and offset in Float64, one rounding each, as any program would; a Float32 is rounded once more.
+        """``values * factor + offset`` in Float64, with one rounding each; for a Float32 the result is rounded again.
 
-        Types that differ are converted by the assignment that follows; `check` has seen to it that nothing is lost.
+        The assignment that follows converts between types; `check` refuses connections that would lose something.
         """
         if self.scale is None:
             return values
@@ -164,7 +162,10 @@ class _Copy:
 
 
 def _copies(feed: Feed, source: Layout, inputs: Ring) -> list[_Copy]:
-    """Group the columns by part of source and target, and by whether they are scaled: others stay as they are."""
+    """Group the columns by part of source and target, and by whether they are scaled.
+
+    An unscaled column is not multiplied by 1.0, so it keeps every bit, also of a NaN.
+    """
     groups: dict[tuple[int, int, bool], list[tuple[int, int, float, float]]] = {}
     for source_name, target_name, factor, offset in feed.columns:
         have, want = source.place(source_name), inputs.layout.place(target_name)
@@ -180,7 +181,7 @@ def _copies(feed: Feed, source: Layout, inputs: Ring) -> list[_Copy]:
 
 
 def _index(columns: Sequence[int]) -> Index:
-    """A slice if the columns are consecutive, which numpy handles faster, otherwise an index array."""
+    """A slice if the columns are consecutive, because numpy copies it faster; otherwise an index array."""
     if list(columns) == list(range(columns[0], columns[0] + len(columns))):
         return slice(columns[0], columns[0] + len(columns))
     return np.array(columns, dtype=np.intp)

@@ -1,4 +1,4 @@
-"""The mesh as ROS 2 sees it: names, message types and CDR, the gateway, and what a ROS node needs.
+"""The mesh as ROS 2 sees it: messages, the gateway, the ROS node, and bags.
 
-Meets the rest of the mesh on the wire only. Nothing here needs an installed ROS but `fmu_mesh.ros.node`.
+This package meets the rest of the mesh on the wire only. Only `fmu_mesh.ros.node` needs an installed ROS.
 """

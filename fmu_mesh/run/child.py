@@ -1,6 +1,6 @@
-"""One child process of the launcher, the threads that read what it writes, and how long it has been stopped.
+"""One child process of the launcher: its start and end, the threads that read its output, and how long it was stopped.
 
-Knows nothing of meshes; what happens is posted to the launcher's thread.
+Does not know what a mesh is. What happens is posted to the launcher's thread.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ _LINE_BYTES = 1000
 def own_command(*arguments: str) -> list[str]:
     """The command ``fmu-mesh`` with these arguments as a process of this Python.
 
-    -P: Python does not look for modules in the current folder, where a user's `random.py` or `token.py` would be
-    executed instead of the one that is meant.
+    With -P, Python does not look for modules in the current folder. Otherwise a `random.py` of the user would be
+    imported instead of that of the standard library.
     """
     return [sys.executable, "-Pm", "fmu_mesh", *arguments]
 
@@ -37,9 +37,9 @@ class Child:
     """One child process.
 
     Args:
-        name: what it is called where its lines and its end are handed on.
+        name: the name that the callbacks of `start` get.
         command: the program and its arguments.
-        post: takes what is to be called on the launcher's thread.
+        post: calls a function on the launcher's thread.
     """
 
     def __init__(self, name: str, command: list[str], post: Callable[[Callable[[], None]], None]) -> None:
@@ -60,7 +60,7 @@ class Child:
     ) -> None:
         """Start it in a session of its own, so that Ctrl-C reaches only the launcher.
 
-        Where it is ``limited``, it may hold an FMU that writes without end: all is read, and the beginning handed on.
+        If ``limited``, only the beginning of its output is passed on, because an FMU may write without end.
         """
         self._popen = popen = subprocess.Popen(
             self._command,
@@ -90,7 +90,7 @@ class Child:
 
     @property
     def stopped(self) -> bool:
-        """Whether somebody has stopped it (SIGSTOP); a debugger that holds it for a moment has not."""
+        """Whether it is stopped by SIGSTOP; being held by a debugger does not count."""
         return self._popen is not None and self.running and process_state(self._popen.pid) == "T"
 
     def signal(self, number: signal.Signals) -> None:
@@ -99,7 +99,7 @@ class Child:
             self._popen.send_signal(number)
 
     def close(self) -> None:
-        """End what it has left behind, wait for the readers and close the pipes; call when it has ended."""
+        """Kill the processes it has left behind, wait for the readers and close the pipes; call it after the end."""
         if self._left_others:
             self._signal_others(signal.SIGKILL)
         for thread in self._threads:
@@ -108,13 +108,13 @@ class Child:
             self._popen.stdin.close()
 
     def _signal_others(self, number: int) -> None:
-        """Send a signal to what it has started and left behind, as an FMU may do: its session has a group."""
+        """Send a signal to the processes that it has started and left behind; an FMU may start some."""
         assert self._popen is not None
         with suppress(ProcessLookupError, PermissionError):
             os.killpg(self._popen.pid, number)
             self._left_others = True
 
-    # Each reader closes its pipe: a process that was left behind may hold the other end open, and nobody waits for it.
+    # Each reader closes its pipe, because a process that was left behind may keep the other end open.
 
     def _read(self, pipe: IO[bytes], on_line: Callable[[bytes], None]) -> None:
         with pipe:
@@ -122,7 +122,7 @@ class Child:
                 self._post(partial(on_line, line))
 
     def _read_beginning(self, pipe: IO[bytes], on_line: Callable[[bytes], None]) -> None:
-        """Read all of it, so that the process never waits, but hand on `_SHOWN_LINES` lines only."""
+        """Read everything, so that the process never blocks, but pass on only `_SHOWN_LINES` lines."""
         count = 0
         with pipe:
             while line := pipe.readline(_LINE_BYTES):
@@ -142,13 +142,13 @@ class Child:
 
 
 class StopWatch:
-    """How long children have been stopped, as far as the launcher was there to see it.
+    """Measures how long children have been stopped.
 
-    The launcher itself may have been stopped (Ctrl-Z): of the time between two looks no more counts than a turn takes.
+    The launcher itself may have been stopped (Ctrl-Z), so of the time between two looks at most two turns count.
 
     Args:
-        patience_s: how long a child may be stopped.
-        turn_s: about how often the launcher looks.
+        patience_s: how long a child may be stopped, in s.
+        turn_s: about how often the launcher looks, in s.
     """
 
     def __init__(self, patience_s: float, turn_s: float) -> None:
@@ -162,7 +162,7 @@ class StopWatch:
         return self._looked is None or now - self._looked >= self._turn_s
 
     def look(self, now: float, stopped: Iterable[str]) -> list[str]:
-        """Note which children are stopped now; returns those that have been for too long."""
+        """Note which children are stopped now; returns those that have been stopped for too long."""
         passed_s = min(now - self._looked, 2 * self._turn_s) if self._looked is not None else 0.0
         self._looked = now
         self._stopped_s = {name: self._stopped_s.get(name, 0.0) + passed_s for name in stopped}
@@ -170,7 +170,7 @@ class StopWatch:
 
 
 def how_it_ended(code: int) -> str:
-    """What a message says of an exit code, or of a signal if it is negative."""
+    """Describe an exit code in a message; a negative one is the number of a signal."""
     if code == Interrupted.exit_code:
         return "was asked to end by a signal"
     if code >= 0:

@@ -1,4 +1,4 @@
-"""What a master's process tells its launcher: one JSON line per event on standard output."""
+"""The events that the process of the master sends to its launcher: one JSON line each on standard output."""
 
 from __future__ import annotations
 
@@ -9,24 +9,23 @@ from collections import deque
 
 import msgspec
 
-from ..errors import ErrorReport
-from ..wire.time_profile import MeshProfile
 from ..wire.views import LogLine, MeshStatus
+from .outcome import Outcome
 
-__all__ = ["End", "Event", "EventWriter", "Log", "Ready", "Status", "decode_event"]
+__all__ = ["Event", "EventWriter", "Log", "Reachable", "Status", "decode_event"]
 
 
 _MOST_WAITING = 10_000
 
 
-class Ready(msgspec.Struct, frozen=True, tag="ready"):
-    """The master can be reached at these endpoints."""
+class Reachable(msgspec.Struct, frozen=True, tag="reachable"):
+    """The master, or the gateway, can be reached at these Zenoh endpoints."""
 
     endpoints: tuple[str, ...]
 
 
 class Status(msgspec.Struct, frozen=True, tag="status"):
-    """The state of the run, about ten times a second."""
+    """The state of the run; sent about ten times per second."""
 
     status: MeshStatus
 
@@ -37,50 +36,29 @@ class Log(msgspec.Struct, frozen=True, tag="log"):
     line: LogLine
 
 
-class End(msgspec.Struct, frozen=True, tag="end"):
-    """The run is over.
-
-    Attributes:
-        seconds: wall-clock time from the first grant to the last point in s.
-        rows: rows in the result file.
-        profile: where the time went, if that was asked for.
-        ended_by: what ended the simulation before its last point although nothing failed, if something did.
-        signal: by which signal the process of the master was asked to end, if it was.
-    """
-
-    status: MeshStatus
-    seconds: float
-    rows: int
-    result_file: str | None
-    error: ErrorReport | None = None
-    profile: MeshProfile | None = None
-    ended_by: ErrorReport | None = None
-    signal: str | None = None
-
-
-Event = Ready | Status | Log | End
+Event = Reachable | Status | Log | Outcome
 
 _decoder: msgspec.json.Decoder[Event] = msgspec.json.Decoder(Event)
 
 
 def decode_event(line: bytes) -> Event:
-    """The event of one line.
+    """Decode the event of one line.
 
     Raises:
-        msgspec.DecodeError: it is none.
+        msgspec.DecodeError: the line is not an event.
     """
     return _decoder.decode(line)
 
 
 class EventWriter:
-    """Writes events for the launcher; from any thread.
+    """Writes events for the launcher; may be called from any thread.
 
-    The launcher may be stopped (Ctrl-Z) and read nothing for as long as its user likes. Nobody waits for it: a thread
-    of its own writes, and of statuses that are not written yet the newest is kept. Only the last event waits until it
-    is written, or the launcher is gone.
+    The launcher may be stopped (Ctrl-Z) and then reads nothing. The run does not wait for it: a thread of its own
+    writes, and only the newest of several unwritten statuses is kept. Only a call with the outcome returns after the
+    event is written, or after the launcher has ended.
 
     Args:
-        descriptor: where to write; by default standard output.
+        descriptor: the file descriptor to write to; by default that of standard output.
     """
 
     def __init__(self, descriptor: int | None = None) -> None:
@@ -97,11 +75,11 @@ class EventWriter:
             waiting = self._waiting
             if waiting and isinstance(event, Status) and isinstance(waiting[-1], Status):
                 waiting.pop()
-            if len(waiting) < _MOST_WAITING or isinstance(event, End):
+            if len(waiting) < _MOST_WAITING or isinstance(event, Outcome):
                 waiting.append(event)
             self._changed.notify_all()
-            if isinstance(event, End):
-                # The end of standard input ends this process when the launcher is gone (`fmu_mesh.run.process`).
+            if isinstance(event, Outcome):
+                # If the launcher has ended, the end of standard input ends this process (`fmu_mesh.run.process`).
                 self._changed.wait_for(lambda: self._gone or not (waiting or self._writing))
 
     def _run(self) -> None:
@@ -111,7 +89,7 @@ class EventWriter:
                 event, self._writing = self._waiting.popleft(), True
             line = msgspec.json.encode(event) + b"\n"
             try:
-                while line:  # not through a buffered file, whose lock would keep the process from ending
+                while line:  # not through a buffered file: its lock would keep the process from ending
                     line = line[os.write(self._descriptor, line) :]
             except OSError:  # nobody reads any more
                 self._gone = True

@@ -1,107 +1,83 @@
-"""What the process of the gateway to ROS does from its start to its end."""
+"""The role of a process that is the gateway to ROS."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import ExitStack
-from pathlib import Path
 
-from ..config.loading import LoadedConfig, load
 from ..errors import ConfigurationError, Interrupted
-from ..ros.gateway.gateway import Gateway
+from ..ros.gateway.gateway import Gateway, open_profiles
 from ..ros.gateway.link import RosLink
-from ..ros.gateway.mapping import message_types, resolve
-from ..ros.gateway.serving import open_profiles, parameter_services
-from ..ros.gateway.topics import RosPlan
-from ..ros.messages.definitions import MessageTypes
-from ..system.plan import Plan
+from ..ros.gateway.mapping import resolve
+from ..ros.messages.topics import RosPlan
 from ..wire.keys import MASTER, Keys
-from ..wire.runtime import leave_run_folder, run_folder, socket_endpoint
+from ..wire.runtime import socket_endpoint
 from ..wire.session import Wiring, close_session, open_session
-from .events import Event, Ready
-from .preparing import Options, prepare
-from .process import die_with_parent, ended_by_signals
+from .events import Event, Reachable
+from .process import RunProcess
+from .run_plan import RunPlan
 
 __all__ = ["run_gateway"]
 
-_BY_HAND = "hand"
 
-
-def run_gateway(config_file: Path, options: Options, emit: Callable[[Event], None], *, run: str = _BY_HAND) -> None:
+def run_gateway(run: RunPlan, emit: Callable[[Event], None]) -> None:
     """Be the gateway of a mesh, from before its first point until it ends.
 
     Args:
-        config_file: the configuration file.
-        options: what the command line changes.
-        emit: called once, when everything is declared and no sample is missed any more.
-        run: name of the run; the launcher's process id when it started this process.
+        run: the plan of the run.
+        emit: called once, when everything is declared and no sample can be missed any more.
 
     Raises:
         FmuMeshError: the gateway could not start, or was interrupted.
     """
-    child = run != _BY_HAND
-    if child:
-        die_with_parent()
-    plan = prepare(config_file, options)
-    loaded = load(config_file)
-    section = loaded.config.ros
+    config, file = run.loaded.config, run.loaded.file
+    section, patience_s = config.ros, config.timeouts.start
     if section is None:
-        raise ConfigurationError(f"{config_file}: there is no section `ros`", hint="It says which topics there are.")
+        raise ConfigurationError(f"{file}: there is no section `ros`", hint="It says which topics there are.")
     if section.profile == "rclpy":
         raise ConfigurationError(
-            f"{config_file}: with the profile rclpy a ROS node is the gateway",
-            hint=f"Start it: python -m fmu_mesh.ros.node --ros-args -p config:={config_file}",
+            f"{file}: with the profile rclpy a ROS node is the gateway",
+            hint=f"Start it: python -m fmu_mesh.ros.node --ros-args -p config:={file}",
         )
-    types, ros_plan = _ros_plan(loaded, plan)
-    folder = run_folder(loaded.config.mesh, run)
-    interrupted: list[str] = []
-    gateway: Gateway | None = None
-
-    def interrupt(reason: str) -> None:
-        interrupted.append(reason)
-        if gateway is not None:
-            gateway.end()
-
-    with ended_by_signals(interrupt, lambda: leave_run_folder(folder), watch_stdin=child), ExitStack() as stack:
-        stack.callback(leave_run_folder, folder)
-        if child or not (connect := options.connect or _client_endpoints(loaded)):
-            connect = (socket_endpoint(folder, MASTER),)
-        mesh = open_session(Wiring(mode="client", connect=connect, patience_s=loaded.config.timeouts.start))
+    ros_plan = _ros_plan(run)
+    with RunProcess(config.mesh, run.run) as process:
+        stack = process.stack
+        mesh = open_session(Wiring(mode="client", connect=_master_at(run, process), patience_s=patience_s))
         stack.callback(close_session, mesh)
-        # A peer that gossips, as the nodes of ROS are: a router passes nothing on between peers, it makes them meet.
-        # They have ports, to which this process connects; one of its own would be open to every user of the host.
+        # A peer that gossips, as the nodes of ROS are: a router does not forward between peers, it introduces them.
+        # They have ports, and this process connects to them; a port of its own would be open to every user of the host.
         wiring = Wiring(mode="peer", listen=tuple(section.listen), connect=tuple(section.connect), gossip=True)
         ros = open_session(wiring)
         stack.callback(close_session, ros)
-        keys = Keys(loaded.config.zenoh.key_prefix, loaded.config.mesh)
-        profiles = stack.enter_context(open_profiles(section, ros, types, ros_plan))
-        stack.enter_context(parameter_services(ros_plan, types, mesh, keys, profiles))
+        keys = Keys(config.zenoh.key_prefix, config.mesh)
+        profiles = stack.enter_context(open_profiles(section, ros, ros_plan, mesh, keys))
         link = RosLink(section, ros, mesh, keys, clock=ros_plan.clock_points is not None)
         stack.callback(link.close)
         link.open()
-        patience_s = loaded.config.timeouts.start
-        gateway = Gateway(ros_plan, types, mesh, keys, plan.grid, profiles, patience_s)
+        gateway = Gateway(ros_plan, mesh, keys, run.plan.grid, profiles)
         stack.callback(gateway.close)
-        gateway.open()
-        emit(Ready((*section.connect, *section.listen)))
-        if not interrupted:
+        process.interruption.goes_to(lambda _reason: gateway.end())
+        gateway.open(patience_s)
+        emit(Reachable((*section.connect, *section.listen)))
+        if process.interruption.reason is None:
             gateway.run()
-        if interrupted:
-            raise Interrupted(interrupted[0])
+        if process.interruption.reason is not None:
+            raise Interrupted(process.interruption.reason)
 
 
-def _ros_plan(loaded: LoadedConfig, plan: Plan) -> tuple[MessageTypes, RosPlan]:
+def _ros_plan(run: RunPlan) -> RosPlan:
     """The topics of a configuration that was checked before."""
-    findings = loaded.findings()
-    types = message_types(loaded, findings)
-    ros_plan = resolve(loaded, {name: own.description for name, own in plan.system.instances.items()}, findings)
+    findings = run.loaded.findings()
+    descriptions = {name: own.description for name, own in run.plan.system.instances.items()}
+    ros_plan = resolve(run.loaded, descriptions, findings)
     findings.raise_any()
-    assert types is not None
     assert ros_plan is not None
-    return types, ros_plan
+    return ros_plan
 
 
-def _client_endpoints(loaded: LoadedConfig) -> tuple[str, ...]:
-    """The router, where all processes of the mesh are clients of one."""
-    section = loaded.config.zenoh
-    return tuple(section.connect) if section.mode == "client" else ()
+def _master_at(run: RunPlan, process: RunProcess) -> tuple[str, ...]:
+    """Where the master can be reached: `--connect`, or the router that all processes use, or its socket."""
+    section = run.loaded.config.zenoh
+    connect = run.options.connect or (tuple(section.connect) if section.mode == "client" else ())
+    if process.is_child or not connect:
+        return (socket_endpoint(process.folder, MASTER),)
+    return connect

@@ -1,8 +1,8 @@
-"""The launcher: one process per node and one for the master, watched until the last of them has ended.
+"""The launcher: starts one process per node and one for the master, and watches them until all have ended.
 
-Desired is that every process runs until the master has said how the run ended. What happens otherwise: a process that
-dies ends the run with `MeshLost` and its name; a request to end goes to the master, which tells the nodes. At the end
-no process and no file of the run is left, whatever became of them.
+Every process should run until the master has reported the outcome. If a process ends before, the run ends with
+`MeshLost` and the name of the process. A request to end goes to the master, which tells the nodes. Whatever happens, no
+process and no file of the run is left at the end.
 """
 
 from __future__ import annotations
@@ -13,22 +13,25 @@ import signal
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
-from pathlib import Path
 
 import msgspec
+from msgspec.structs import replace
 
-from ..config.mesh import MujocoConfig
 from ..errors import DeadlineExceeded, FmuError, FmuMeshError, Interrupted, MeshLost, from_report
-from ..system.plan import RECORDER, Plan
+from ..system.plan import RECORDER
 from ..wire.runtime import MeshNote, remove_run_folder, remove_stale_folders, run_folder, runtime_folder, write_note
 from ..wire.session import LEASE_MS
 from ..wire.views import GOING_ON
 from .child import Child, StopWatch, how_it_ended, own_command
-from .events import End, Event, Ready, Status, decode_event
-from .preparing import Options
+from .events import Event, Reachable, Status, decode_event
+from .outcome import Outcome
 from .results import rows_left, what_is_kept
+from .run_plan import RunPlan
 
-__all__ = ["Launcher", "Output"]
+__all__ = ["PLANNED", "Launcher", "Output"]
+
+PLANNED = "--planned"
+"""Option of the commands `node`, `master` and `gateway`: their file is a run plan, and a launcher watches them."""
 
 _MASTER = "the master"
 _GATEWAY = "the gateway to ROS"
@@ -37,43 +40,30 @@ _TOLD_S = 8.0
 _INTERRUPT_S = 0.9
 _KILL_S = 0.7
 _GATEWAY_S = 2.0
-"""A gateway ends with its mesh; one that has ended so long before it has lost its link."""
+"""A gateway ends with its mesh. If it has ended so long before the mesh, it has lost its link."""
 
 _SILENCE_S = 10.0
-"""The master says something ten times a second; after this time without a word it is taken for lost."""
+"""The master sends an event ten times per second. After this time without one, it counts as lost."""
 
 _TURN_S = 0.25
 
 Output = Callable[[str, str], None]
-"""Called with the name of a process and a line that it wrote to its standard output or error."""
+"""Called with the name of a process and a line that it has written to its standard output or error."""
 
 
 class Launcher:
     """Runs a plan as processes of this host.
 
     Args:
-        config_file: the configuration file.
-        options: what the command line changed; handed on.
+        run: the plan of the run.
         on_event: called with every event of the master, on the thread that calls `run`.
         on_output: called with every line that a process writes, likewise.
-        restarts: how often the run was started before.
     """
 
-    def __init__(  # noqa: PLR0913 a run and whom it tells
-        self,
-        plan: Plan,
-        config_file: Path,
-        options: Options,
-        on_event: Callable[[Event], None],
-        on_output: Output,
-        *,
-        restarts: int = 0,
-    ) -> None:
-        self._plan = plan
-        self._restarts = restarts
-        self._config_file = config_file
-        self._options = options
-        self._timeouts = plan.system.config.timeouts
+    def __init__(self, run: RunPlan, on_event: Callable[[Event], None], on_output: Output) -> None:
+        self._run = replace(run, run=str(os.getpid()))
+        self._plan = run.plan
+        self._timeouts = run.loaded.config.timeouts
         self._on_event = on_event
         self._on_output = on_output
         self._happened: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
@@ -82,7 +72,7 @@ class Launcher:
         self._gateway_ready = False
         self._gateway_ended: float | None = None
         self._how: dict[str, str] = {}
-        self._end: End | None = None
+        self._outcome: Outcome | None = None
         self._rows: int | None = None
         self._point: int | None = None
         self._starting = True
@@ -92,87 +82,56 @@ class Launcher:
         self._ending = False
         self._signalled = False
         self._interrupted_at: float | None = None
-        self._spawn_nodes: Callable[[], None] = lambda: None
 
-    def run(self) -> End:
-        """Start everything, wait for the end, clean up.
+    def run(self) -> Outcome:
+        """Start all processes, wait for the end, and remove what the run has left.
 
         Raises:
             FmuMeshError: the run ended early, and why.
         """
         remove_stale_folders()
         _remove_folders_without_note()
-        run = str(os.getpid())
-        folder = run_folder(self._plan.system.config.mesh, run)
+        self._folder = run_folder(self._run.mesh, self._run.run)
         try:
-            self._spawn_all(folder, run)
+            self._file = str(self._run.write(self._folder))
+            self._spawn_all()
             while not self._over():
                 self._turn()
         finally:
             self._end_all()
             if self._rows is None and (result_file := self._plan.system.result_file) is not None:
-                self._rows = rows_left(result_file, folder)
-            remove_run_folder(folder)
-        return self._outcome()
+                self._rows = rows_left(result_file, self._folder)  # the master could not say it any more
+            remove_run_folder(self._folder)
+        return self._result()
 
     def interrupt(self) -> None:
-        """From any thread or signal handler: end the run; a second call does not wait for anybody."""
+        """From any thread or signal handler: end the run; a second call ends it without waiting."""
         self._happened.put(self._interrupt)
 
     # --- start
 
-    def _spawn_all(self, folder: Path, run: str) -> None:
-        config_file = str(self._config_file)
-        common = ["--run", run]
-        for endpoint in self._options.connect:
-            common += ["--connect", endpoint]
-        for endpoint in self._options.listen:
-            common += ["--listen", endpoint]
-        changes = [f"--set={change}" for change in self._options.start_values]
-        if self._options.window is not None:
-            changes.append(f"--window={self._options.window}")
-        if self._options.real_time_factor is not None:
-            changes.append(f"--real-time-factor={self._options.real_time_factor!r}")
-        if self._options.output is not None:
-            changes.append(f"--output={self._options.output}")
-        granting = ["--profile"] if self._options.profile else []
-        if self._options.paused:
-            granting.append("--paused")
-        self._spawn(_MASTER, ["master", config_file, *common, *changes, *granting, "--events"], folder)
-        self._spawn_nodes = partial(self._spawn_each_node, folder, common)
-        section = self._plan.system.config.ros
+    def _spawn_all(self) -> None:
+        self._spawn(_MASTER, ["master", self._file], self._take_event)
+        section = self._run.loaded.config.ros
         if section is not None and section.profile != "rclpy":
-            # The nodes follow when it is ready: then it misses nothing.
-            self._spawn(_GATEWAY, ["gateway", config_file, *common, *changes, "--events"], folder)
+            # The nodes are started when it is ready, so that it misses no sample.
+            self._spawn(_GATEWAY, ["gateway", self._file], self._take_gateway_line)
         else:
             self._spawn_nodes()
 
-    def _spawn_each_node(self, folder: Path, common: Sequence[str]) -> None:
-        for number, (node, plan) in enumerate(self._plan.nodes.items()):
-            if node == RECORDER:
-                continue
-            plan_file = folder / f"{number}.json"
-            plan_file.write_bytes(msgspec.json.encode(msgspec.structs.replace(plan, restarts=self._restarts)))
-            shown = self._showing() if any(isinstance(i.hosted, MujocoConfig) for i in plan.instances) else []
-            self._spawn(node, ["node", str(self._config_file), node, *common, *shown, "--plan", str(plan_file)], folder)
+    def _spawn_nodes(self) -> None:
+        for node in self._plan.nodes:
+            if node != RECORDER:
+                self._spawn(node, ["node", self._file, node], partial(self._take_output, node), limited=True)
 
-    def _showing(self) -> list[str]:
-        """The options of the node with the physics engine."""
-        showing = self._options.showing
-        video = [f"--video={showing.video}"] if showing.video is not None else []
-        return [*(["--view"] if showing.view else []), *video]
-
-    def _spawn(self, name: str, arguments: Sequence[str], folder: Path) -> None:
-        process = Child(name, own_command(*arguments), self._happened.put)
+    def _spawn(
+        self, name: str, arguments: Sequence[str], on_line: Callable[[bytes], None], *, limited: bool = False
+    ) -> None:
+        process = Child(name, own_command(*arguments, PLANNED), self._happened.put)
         self._processes[name] = process
-        if name == _MASTER:
-            process.start(lambda line: self._take_event(line, folder), self._take_output, self._take_exit)
-        elif name == _GATEWAY:
-            process.start(self._take_gateway_line, self._take_output, self._take_exit)
-        else:
-            process.start(lambda line: self._take_output(name, line), self._take_output, self._take_exit, limited=True)
+        process.start(on_line, self._take_output, self._take_exit, limited=limited)
 
-    # --- what happens; all on the thread that called `run`
+    # --- what happens; all of it on the thread that called `run`
 
     def _turn(self) -> None:
         try:
@@ -184,43 +143,41 @@ class Launcher:
             self._look_for_stopped(now)
 
     def _look_for_stopped(self, now: float) -> None:
-        """A process that is stopped before it has met the others is missed by nobody else until the deadline."""
+        """Find processes that are stopped before the run begins: the others would only notice at the deadline."""
         met = {_MASTER: self._point is not None, _GATEWAY: self._gateway_ready}
         stopped = [name for name, process in self._processes.items() if not met.get(name) and process.stopped]
         for name in self._stop_watch.look(now, stopped):
             self._how[name] = "is stopped"
             self._lost.append((name, -signal.SIGSTOP, now))
 
-    def _take_event(self, line: bytes, folder: Path) -> None:
+    def _take_event(self, line: bytes) -> None:
         try:
             event = decode_event(line)
         except msgspec.DecodeError:
             self._take_output(_MASTER, line)
             return
         self._heard = time.monotonic()
-        if isinstance(event, Ready):
-            config = self._plan.system.config
-            note = MeshNote(
-                config.mesh, config.zenoh.key_prefix, event.endpoints, os.getpid(), str(self._config_file.absolute())
-            )
-            write_note(folder, note)
-        elif isinstance(event, Status):
-            self._point = event.status.point
-            self._starting = event.status.state == "starting"
-            ended = self._gateway_ended
-            if event.status.state in GOING_ON and ended is not None and self._heard - ended > _GATEWAY_S:
-                self._gateway_ended = None
-                self._lost.append((_GATEWAY, 0, ended))
-        elif isinstance(event, End):
-            self._rows = event.rows
-            asked = event.error is not None and event.error.kind == Interrupted.__name__
-            if not (self._signalled and asked):  # it was this process that asked, and not why the run ends
-                self._end = event
+        match event:
+            case Reachable(endpoints):
+                prefix, file = self._run.loaded.config.zenoh.key_prefix, str(self._run.config_file)
+                write_note(self._folder, MeshNote(self._run.mesh, prefix, endpoints, os.getpid(), file))
+            case Status(status):
+                self._point = status.point
+                self._starting = status.state == "starting"
+                ended = self._gateway_ended
+                if status.state in GOING_ON and ended is not None and self._heard - ended > _GATEWAY_S:
+                    self._gateway_ended = None
+                    self._lost.append((_GATEWAY, 0, ended))
+            case Outcome(rows=rows, error=error):
+                self._rows = rows
+                asked = error is not None and error.kind == Interrupted.__name__
+                if not (self._signalled and asked):  # this process has asked, and that is not why the run ends
+                    self._outcome = event
         self._on_event(event)
 
     def _take_gateway_line(self, line: bytes) -> None:
         try:
-            decode_event(line)  # the only one that it has: it is ready
+            decode_event(line)  # it has one event: it is ready
         except msgspec.DecodeError:
             self._take_output(_GATEWAY, line)
             return
@@ -231,11 +188,11 @@ class Launcher:
         self._on_output(name, line.decode(errors="replace").rstrip())
 
     def _take_exit(self, name: str, code: int) -> None:
-        if not self._signalled:  # afterwards it says no more what was wrong
+        if not self._signalled:  # afterwards the signal is the reason
             self._how[name] = how_it_ended(code)
         if self._ending:
             return
-        if self._end is None and (code != 0 or name == _MASTER):
+        if self._outcome is None and (code != 0 or name == _MASTER):
             self._lost.append((name, code, time.monotonic()))
         elif name == _GATEWAY:
             self._gateway_ended = time.monotonic()
@@ -252,12 +209,12 @@ class Launcher:
         """Whether there is nothing left to wait for."""
         now = time.monotonic()
         silent_s = now - self._heard if self._quiet else 0.0
-        if self._end is not None:
+        if self._outcome is not None:
             return not self._processes[_MASTER].running or silent_s > self._timeouts.stop
         if any(name == _MASTER or code == -signal.SIGSTOP for name, code, _ in self._lost):
             return True
-        # A node is gone: the master sees it within milliseconds and says so; if it does not, we do.
-        # One that ended because of its FMU has told the master, which may have to wait for its recorder before it ends.
+        # If a node has ended, the master notices it within milliseconds and reports it; otherwise this process does.
+        # A node that ended because of its FMU has told the master, which may wait for the recorder before it ends.
         told = bool(self._lost) and self._lost[0][1] == FmuError.exit_code
         if self._lost and now - self._lost[0][2] > (_TOLD_S if told else _REPORT_S):
             return True
@@ -268,10 +225,10 @@ class Launcher:
     # --- the end
 
     def _end_all(self) -> None:
-        """Wait for those that end by themselves, then ask, then kill."""
+        """Wait for the processes that end by themselves, then send SIGTERM, then SIGKILL."""
         self._ending = True
-        patience = _KILL_S if self._end is not None else 0.1
-        if self._end is not None and self._end.error is None:  # the gateway has samples to carry to ROS
+        patience = _KILL_S if self._outcome is not None else 0.1
+        if self._outcome is not None and self._outcome.error is None:  # the gateway may still have samples for ROS
             patience = self._timeouts.stop
         grace_s = _KILL_S if self._interrupted_at is None else 0.3
         for step in (None, signal.SIGTERM, signal.SIGKILL):
@@ -293,62 +250,62 @@ class Launcher:
         while not self._happened.empty():
             self._happened.get()()
 
-    def _outcome(self) -> End:
-        """How the run ended, as the master says; as this process saw it where the master could not say it any more."""
-        result_file, rows = self._plan.system.result_file, self._rows or 0
-        gateway_lost = any(name == _GATEWAY for name, _, _ in self._lost)  # of which the master knows nothing
-        if self._end is not None and not gateway_lost:
-            if self._end.error is None:
-                return self._end
-            error = self._with_cause(from_report(self._end.error))
+    def _result(self) -> Outcome:
+        """The outcome of a run that went well.
+
+        Raises:
+            FmuMeshError: it did not; as the master says, or as this process saw it if the master could not say it.
+        """
+        outcome, file, rows = self._outcome, self._plan.system.result_file, self._rows or 0
+        gateway_lost = any(name == _GATEWAY for name, _, _ in self._lost)  # the master knows nothing of it
+        if outcome is None or gateway_lost:
+            error = self._own_account()
+        elif outcome.error is None:
+            return outcome
+        else:
+            error = self._with_cause(from_report(outcome.error), outcome)
             if isinstance(error, DeadlineExceeded) and _GATEWAY in self._processes and not self._gateway_ready:
                 error = DeadlineExceeded(f"{_GATEWAY} was not ready within {self._timeouts.start:g} s")
-        else:
-            error = self._own_account()
         if type(error) in (Interrupted, MeshLost) and rows > (error.point or 0):
-            # What is recorded is newer than what the last progress said.
-            error.point, error.time = rows - 1, self._plan.grid.time(rows - 1)
-        if kept := what_is_kept(result_file, rows):
-            error.hint = f"{error.hint} {kept}" if error.hint else kept
-        raise error
+            error.at(rows - 1, self._plan.grid.time(rows - 1))  # the last progress is older than the last row
+        raise error.with_hint(what_is_kept(file, rows))
 
     def _own_account(self) -> FmuMeshError:
-        """Why the run ended without a last word of the master."""
-        point = self._point or 0
+        """Why the run ended, if the master has not said it."""
+        error = self._loss()
+        return error.at(self._point or 0, self._plan.grid.time(self._point or 0))
+
+    def _loss(self) -> FmuMeshError:
         if self._interrupted_at is not None:
-            return Interrupted("interrupted", point=point, time=self._plan.grid.time(point))
-        # A node that ends with this code only says that it misses another process.
+            return Interrupted("interrupted")
+        # A node that ends with this code only says that another process is missing.
         named = [loss for loss in self._lost if loss[0] == _MASTER or loss[1] != MeshLost.exit_code]
         if not named:
-            text = "the master was lost: its process does not answer any more"
-            return MeshLost(text, point=point, time=self._plan.grid.time(point))
-        name = named[0][0]
+            return MeshLost("the master was lost: its process does not answer any more")
+        name, code, _ = named[0]
         if name in (_MASTER, _GATEWAY):
-            text = f"{name} was lost: its process {self._how[name]}"
-            hint = "Was it stopped for some seconds? Then the mesh lets go of it." if not named[0][1] else None
-            return MeshLost(text, point=point, time=self._plan.grid.time(point), hint=hint)
+            hint = "Was it stopped for some seconds? Then the mesh lets go of it." if not code else None
+            return MeshLost(f"{name} was lost: its process {self._how[name]}", hint=hint)
         instances = ", ".join(item.name for item in self._plan.nodes[name].instances)
-        text = f"node '{name}' was lost: its process {self._how[name]}"
-        return MeshLost(text, instance=instances, point=point, time=self._plan.grid.time(point))
+        return MeshLost(f"node '{name}' was lost: its process {self._how[name]}", instance=instances)
 
-    def _with_cause(self, error: FmuMeshError) -> FmuMeshError:
-        """Say how the process of a lost node ended, or who interrupted the run; only the parent of all knows."""
-        end = self._end
+    def _with_cause(self, error: FmuMeshError, outcome: Outcome) -> FmuMeshError:
+        """Add how the process of a lost node ended, or who interrupted the run; only this process knows it."""
         if isinstance(error, MeshLost) and error.instance is not None:
             for name, how in self._how.items():
                 lost = error.message.startswith(f"node '{name}' was lost")
-                if lost and error.message.endswith("does not answer any more"):  # or it has said why by itself
-                    error.message = f"node '{name}' was lost: its process {how}"
-        elif isinstance(error, Interrupted) and end is not None and self._interrupted_at is not None:
-            error.message, error.point, error.time = "interrupted", end.status.point, end.status.time
-        elif isinstance(error, Interrupted) and end is not None and end.signal is not None:
-            text = f"{_MASTER} was lost: its process received {end.signal}"  # and not from this process
-            return MeshLost(text, point=end.status.point, time=end.status.time)
+                if lost and error.message.endswith("does not answer any more"):  # otherwise the node has said why
+                    error.saying(f"node '{name}' was lost: its process {how}")
+        elif isinstance(error, Interrupted) and self._interrupted_at is not None:
+            error.saying("interrupted").at(outcome.point, outcome.time)
+        elif isinstance(error, Interrupted) and outcome.signal is not None:
+            text = f"{_MASTER} was lost: its process received {outcome.signal}"  # and this process has not sent it
+            return MeshLost(text, point=outcome.point, time=outcome.time)
         return error
 
 
 def _remove_folders_without_note() -> None:
-    """Remove the folders of launchers that were killed before they knew where their master can be reached."""
+    """Remove the folders of launchers that were killed before they wrote the note of their mesh."""
     for folder in runtime_folder().glob("*.*"):
         pid = folder.suffix.removeprefix(".")
         if pid.isdigit() and not (folder / "mesh.json").exists():

@@ -1,7 +1,7 @@
 """A whole mesh in one process: the reference of invariant 1, and `launch --local`.
 
-A plain loop over points and instances, as the textbook writes it, on the same plan but none of the code of a node: what
-a distributed run must equal in every float.
+A plain loop over points and instances. It uses the same plan as the nodes but none of their code. A distributed run
+must give bit-for-bit the same result.
 """
 
 from __future__ import annotations
@@ -18,24 +18,24 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import NamedTuple
 
+from ..config.loading import LoadedConfig
 from ..errors import ConfigurationError, FmuError, FmuMeshError, Interrupted, StepFailed, TerminationRequested
 from ..instances.call_guard import CallWatch, Guarded, floating_point_changed, restore_floating_point
-from ..instances.contract import Instance
-from ..instances.fmi import LogMessage, Terms
-from ..instances.registry import Showing, open_instance, stepped
+from ..instances.contract import Instance, LogMessage, Opening, Showing
+from ..instances.registry import open_instance
 from ..master.pacing import Pacer
-from ..recorder.csv_file import CsvFile
-from ..recorder.result_file import OpenResult
 from ..recorder.row_buffer import RowBuffer
 from ..rings.array_elements import scaled
 from ..rings.ring import Ring
 from ..simtime import TimeGrid
 from ..system.algebraic_loop import FixedPoint
+from ..system.coupling_rule import CouplingRule
 from ..system.initialization_plan import Loop, Tear
 from ..system.layout import Layout
 from ..system.plan import Plan
 from ..variables.value_types import Value
-from .results import what_is_kept
+from .outcome import Outcome
+from .results import open_result, what_is_kept
 
 __all__ = ["LocalMesh"]
 
@@ -48,22 +48,24 @@ _FLUSH_S = 0.2
 class LocalMesh:
     """Runs a plan in this process, as fast as its real-time factor allows.
 
+    ```python
+    outcome = LocalMesh(prepare(Path("configs/pendulum_delay.yaml"))).run()
+    print(outcome.point, outcome.file)
+    ```
+
     Args:
-        plan: the plan; its processes and window play no part.
+        plan: the plan; its nodes and its window are not used.
         log: called with every log message of an FMU.
         progress: called with the point now and then.
-        open_instance: opens an instance by name, where it is not the FMU of the plan; this closes it.
-        on_hang: called on another thread when an FMU does not return in time, with what was recorded up to then in the
-            result file; the thread in the FMU cannot be got back, so only the end of the process is left to do.
-        parent: an existing folder to extract FMUs into; by default that for temporary files.
+        open_instance: opens an instance by name, instead of the model of the plan; it is closed here.
+        on_hang: called on another thread if an FMU does not return in time. All rows so far are in the result file.
+            The thread that is inside the FMU cannot be stopped, so the caller has to end the process.
+        parent: an existing folder to extract FMUs into; by default the folder for temporary files.
         showing: whether and how a physics engine shows its world.
-        open_result: opens the result file.
+        loaded: the configuration; None: that of the plan, with paths relative to the working directory.
 
     Attributes:
         point: the last point reached.
-        rows: rows in the result file.
-        seconds: wall-clock time of the loop.
-        ended_by: which FMU asked to end the simulation before its last point, if one did.
     """
 
     def __init__(  # noqa: PLR0913, PLR0917  what a caller may want to hear of
@@ -75,12 +77,13 @@ class LocalMesh:
         on_hang: Callable[[FmuError], None] = lambda error: log.error("%s", error),
         parent: Path | None = None,
         showing: Showing = Showing(),  # noqa: B008  a frozen Struct
-        open_result: OpenResult = CsvFile,
+        loaded: LoadedConfig | None = None,
     ) -> None:
         self.point = 0
-        self.rows = 0
-        self.seconds = 0.0
-        self.ended_by: TerminationRequested | None = None
+        self._seconds = 0.0
+        self._ended_by: TerminationRequested | None = None
+        self._buffer: RowBuffer | None = None
+        self._rows = 0
         self._plan = plan
         self._log = log
         self._progress = progress
@@ -88,9 +91,8 @@ class LocalMesh:
         self._on_hang = on_hang
         self._parent = parent
         self._stepping = ""
-        self._save: Callable[[], None] = lambda: None
         self._showing = showing
-        self._open_result = open_result
+        self._loaded = loaded if loaded is not None else LoadedConfig(plan.system.config, Path())
         self._stop: str | None = None
         self._stopped = threading.Event()
         self._folder: Path | None = None
@@ -101,28 +103,40 @@ class LocalMesh:
         self._stopped.set()
 
     def clean_up(self) -> None:
-        """From another thread, when the main thread does not come back from an FMU: keep rows, remove other files."""
+        """From another thread, if the main thread does not return from an FMU: keep the rows, remove other files."""
         self._save_from_outside()
         if self._folder is not None:
             shutil.rmtree(self._folder, ignore_errors=True)
 
-    def run(self) -> None:
+    def run(self) -> Outcome:
         """Run from the first to the last point.
 
         Raises:
-            FmuMeshError: an FMU failed, or the run was interrupted; rows up to then are kept.
-            Or this system cannot run in one process.
+            FmuMeshError: an FMU failed, the run was interrupted, or this system cannot run in one process. The rows
+                that were recorded before are kept.
         """
         self._check_one_process()
         try:
             self._run()
         except FmuMeshError as error:
-            if kept := what_is_kept(self._plan.system.result_file, self.rows):
-                error.hint = f"{error.hint} {kept}" if error.hint else kept
+            error.with_hint(self._kept())
             raise
+        ended_by = self._ended_by.report() if self._ended_by is not None else None
+        return Outcome(
+            state="done",
+            point=self.point,
+            time=self._plan.grid.time(self.point),
+            seconds=self._seconds,
+            rows=self._rows,
+            file=self._plan.system.result_file,
+            ended_by=ended_by,
+        )
+
+    def _kept(self) -> str | None:
+        return what_is_kept(self._plan.system.result_file, self._rows)
 
     def _check_one_process(self) -> None:
-        """Two instances of an FMU that allows one per process cannot run here, whatever their groups.
+        """Refuse two instances of an FMU that allows one per process; groups do not matter here.
 
         Raises:
             ConfigurationError: there are two.
@@ -139,16 +153,14 @@ class LocalMesh:
 
     def _run(self) -> None:
         plan = self._plan
-        recorded = plan.system.recorded
         layouts = {name: Layout.of(i.description.variables) for name, i in plan.system.instances.items()}
-        columns = [(f"{instance}.{name}", layouts[instance].column(name).type) for instance, name in recorded]
+        types = [layouts[instance].column(name).type for instance, name in plan.system.recorded]
         members: dict[str, _Member] = {}
         watch = CallWatch(self._take_hang)
         with tempfile.TemporaryDirectory(prefix="fmu_mesh-", dir=self._parent) as folder, closing(watch):
             self._folder = Path(folder)
-            file = self._open_result(Path(plan.system.result_file), columns) if plan.system.result_file else None
-            rows = RowBuffer(file, plan.grid, [type_ for _, type_ in columns])
-            self._save = lambda: self._close(rows)
+            file = open_result(self._loaded, plan.system) if plan.system.result_file else None
+            self._buffer = rows = RowBuffer(file, plan.grid, types)
             try:
                 for name in plan.order:
                     members[name] = _Member(plan, name, self._guarded(name, Path(folder), watch))
@@ -158,7 +170,7 @@ class LocalMesh:
                     with watch.stepping(self._position, plan.system.config.timeouts.step):
                         self._loop(members, rows)
                 finally:
-                    self.seconds = time.perf_counter() - started
+                    self._seconds = time.perf_counter() - started
             finally:
                 self._save()
                 for member in members.values():
@@ -168,27 +180,35 @@ class LocalMesh:
         if self._open_instance is not None:
             return self._open_instance(name)
         item = self._plan.nodes[self._plan.node_of(name)].instance(name)
-        terms = Terms(self._plan.system.config.limits, item.sha256)
-        return stepped(open_instance(item, folder, self._log, terms, self._showing), item)
+        opening = Opening(
+            name=name,
+            path=Path(item.fmu),
+            section=item.section,
+            description=self._plan.system.instances[name].description,
+            folder=folder,
+            limits=self._plan.system.config.limits,
+            linear_inputs=item.linear_inputs,
+            log=self._log,
+            showing=self._showing,
+        )
+        return open_instance(opening)
 
     def _guarded(self, name: str, folder: Path, watch: CallWatch) -> Guarded:
         return Guarded(name, lambda: self._open(name, folder), watch, self._plan.system.config.timeouts)
 
     def _take_hang(self, error: FmuError) -> None:
-        """From the watching thread: the main thread is in an FMU, and nothing of this object changes any more."""
+        """From the watching thread: the main thread is inside an FMU, so nothing of this object changes any more."""
         if self._stepping:
-            error.point, error.time = self.point, self._plan.grid.time(self.point)
+            error.at(self.point, self._plan.grid.time(self.point))
         self._save_from_outside()
-        if kept := what_is_kept(self._plan.system.result_file, self.rows):
-            error.hint = f"{error.hint} {kept}"
-        self._on_hang(error)
+        self._on_hang(error.with_hint(self._kept()))
 
     def _save_from_outside(self) -> None:
-        with suppress(FmuMeshError):  # the process ends now, and its reason is another one
+        with suppress(FmuMeshError):  # the process ends now for another reason
             self._save()
 
     def _position(self) -> tuple[str, int]:
-        """Who steps at which point; nobody is late while all wait for the wall clock."""
+        """Which instance steps at which point; while all wait for the wall clock, the answer changes all the time."""
         return (self._stepping, self.point) if self._stepping else ("", time.monotonic_ns())
 
     def _initialize(self, members: dict[str, _Member]) -> None:
@@ -214,7 +234,7 @@ class LocalMesh:
             member.bind(grid, members)
 
     def _iterate(self, loop: Loop, members: dict[str, _Member], known: dict[tuple[str, str], Value]) -> None:
-        """Bring an algebraic loop to consistent values, which are known then."""
+        """Iterate an algebraic loop until its values are consistent."""
         point = FixedPoint(loop, self._plan.system.config.initialization)
         before = dict(known)
         consistent = False
@@ -255,16 +275,15 @@ class LocalMesh:
                 for self._stepping, member in members.items():
                     member.step_from(point)
         except TerminationRequested as asked:
-            asked.point, asked.time = self.point, grid.time(self.point)
-            self.ended_by = asked
+            self._ended_by = asked.at(self.point, grid.time(self.point))
         except StepFailed as error:
-            error.point, error.time = self.point, grid.time(self.point)
+            error.at(self.point, grid.time(self.point))
             raise
         rows.write()
         self._progress(self.point)
 
     def _wait_for_the_clock(self, pacer: Pacer, rows: RowBuffer) -> None:
-        """Wait until the wall clock allows the next step, or the run is to end; meanwhile what there is can be seen."""
+        """Wait until the wall clock allows the next step, or the run has to end; meanwhile write what was recorded."""
         while not self._stopped.is_set():
             granted, pause_s = pacer.limit(self.point + 1, self.point)
             if granted > self.point:
@@ -275,20 +294,22 @@ class LocalMesh:
                 self._progress(self.point)
             self._stopped.wait(pause_s)
 
-    def _close(self, rows: RowBuffer) -> None:
-        """Bring to the file what is not there yet, and close it; from the watching thread if the main thread cannot."""
-        self._save = lambda: None
+    def _save(self) -> None:
+        """Write all rows to the file and close it, once; the watching thread calls this if the main thread cannot."""
+        rows, self._buffer = self._buffer, None
+        if rows is None:
+            return
         try:
             rows.close()
         finally:
-            self.rows = rows.count
+            self._rows = rows.count
 
 
 class _Member:
     """One instance of a `LocalMesh`.
 
     Attributes:
-        settled: inputs that keep what was found for them in the iteration of a loop at the start.
+        settled: inputs that keep the values of the iteration of a loop at the start.
     """
 
     def __init__(self, plan: Plan, name: str, instance: Instance) -> None:
@@ -297,7 +318,7 @@ class _Member:
         self.connections = [c for c in plan.connections if c.target_instance == name]
         self.instance = instance
         self._inputs = Ring(self.plan.inputs, 1)
-        # A slower instance asks for a value as old as its own step.
+        # A slower instance reads values that are as old as its own step.
         oldest = max(instance.step_points for instance in plan.system.instances.values())
         self._outputs = Ring(self.plan.outputs, 1 << (2 * oldest).bit_length())
         self._points = self.plan.step_points
@@ -333,52 +354,51 @@ class _Member:
             self.instance.set_values(values)
 
     def bind(self, grid: TimeGrid, members: Mapping[str, _Member]) -> None:
-        """Get ready for `step_from`: what it needs at every point is looked up here, once."""
+        """Prepare `step_from`: what it needs at every point is looked up here, once."""
         arrays = [column.name for column in self.plan.inputs.columns if column.shape]
         for name, value in zip(arrays, self.instance.get_values(arrays) if arrays else [], strict=True):
-            self._inputs.put(0, name, value)  # what is not connected keeps it
+            self._inputs.put(0, name, value)  # elements that are not connected keep it
         self.instance.bind(self._inputs, (self._outputs,), grid, self.plan.step_points)
-        self._do_step = self.instance.do_step
         for c in self.connections:
             read, points = members[c.source_instance].reader(c.source_name)
-            late = self.plan.step_points if c.delay else 0
+            lead = CouplingRule(c.delay or 0, points, self._points).lead
             same = (c.factor, c.offset) == (1.0, 0.0)
             change = None if same else partial(scaled, factor=c.factor, offset=c.offset)
-            self._feeds.append(_Feed(read, points, late, change, self._inputs.writer(c.target_name)))
+            self._feeds.append(_Feed(read, points, lead, change, self._inputs.writer(c.target_name)))
 
     def reader(self, variable: str) -> tuple[Callable[[int], Value], int]:
-        """An output as a function of the own step, and how many points that has.
+        """A function that returns an output after an own step, and the number of points of an own step.
 
-        At a point it is that of the last own step that ended there or before: ``read(point // points)``.
+        The value at a point is that of the last own step that ended there or before: ``read(point // points)``.
         """
         return self._outputs.reader(variable), self.plan.step_points
 
     def step_from(self, point: int) -> None:
         """Take the own step that ends at ``point + 1``, if there is one, with the inputs that the delays prescribe."""
-        end = point + 1
-        if end % self._points:
+        if (point + 1) % self._points:
             return
-        for read, points, late, change, write in self._feeds:
-            value = read((end - late) // points)
+        start = self.step * self._points
+        for read, points, lead, change, write in self._feeds:
+            value = read((start + lead) // points)  # `CouplingRule.row_for`, without a call
             write(0, value if change is None else change(value))
-        self._do_step(self.step)
+        self.instance.do_step(self.step)
         if floating_point_changed():
             restore_floating_point()
         self.step += 1
 
 
 class _Feed(NamedTuple):
-    """How an input gets its value: ``read`` a source whose steps have ``points``, ``late`` points before the end."""
+    """How an input gets its value: ``read`` a row of the source; see `CouplingRule` for ``points`` and ``lead``."""
 
     read: Callable[[int], Value]
     points: int
-    late: int
+    lead: int
     change: Callable[[Value], Value] | None
     write: Callable[[int, Value], None]
 
 
 def _at(value: Value, index: tuple[int, ...]) -> Value:
-    """An element of an array; without an index the value itself."""
+    """An element of an array; the value itself if there is no index."""
     for number in index:
         assert isinstance(value, list)
         value = value[number]

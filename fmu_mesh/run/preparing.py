@@ -1,55 +1,30 @@
-"""From a configuration file to a plan: everything is checked here, before anything is spawned."""
+"""From a configuration file to the plan of a run. Everything is checked here, before any process is started."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
+from collections.abc import Set as AbstractSet
 from pathlib import Path
-from typing import Literal
 
 import msgspec
-from msgspec.structs import replace
 
 from .. import files
 from ..config.findings import Findings
-from ..config.loading import LoadedConfig, examine
-from ..config.mesh import AnyInstanceConfig, GazeboClassicConfig, InstanceConfig, MujocoConfig, PidConfig, ZenohConfig
+from ..config.instance_sections import InstanceSection, key_of, placed
+from ..config.loading import LoadedConfig
 from ..errors import Finding, LoadFailed
-from ..instances.fmi import Terms
-from ..instances.registry import Showing, check_showing, content, describe, expected_model
+from ..instances.configuration import examine
+from ..instances.registry import check_showing, content, describe, expected_model
 from ..ros.gateway.mapping import resolve as resolve_ros
 from ..system.plan import Plan, make_plan
 from ..system.system import build
 from ..text import nearest_file
 from ..variables.model_description import ModelDescription
+from .options import Options, with_options
 from .results import check_results
+from .run_plan import RunPlan
 
-__all__ = ["Options", "planned", "prepare", "zenoh_section"]
-
-
-class Options(msgspec.Struct, frozen=True):
-    """What the command line changes of a configuration.
-
-    Attributes:
-        start_values: `instance.variable=value` each.
-        window: in points, or `auto`, instead of the configured one.
-        real_time_factor: simulated over wall-clock time instead of the configured one; 0 for as fast as possible.
-        output: the result file instead of the configured one.
-        connect: Zenoh endpoints instead of the configured ones.
-        listen: likewise, where the master can be reached besides its socket.
-        profile: whether the nodes measure where their time goes.
-        showing: whether and how a physics engine shows its world.
-        paused: whether the run starts at rest at its first point.
-    """
-
-    start_values: tuple[str, ...] = ()
-    window: int | Literal["auto"] | None = None
-    real_time_factor: float | None = None
-    output: Path | None = None
-    connect: tuple[str, ...] = ()
-    listen: tuple[str, ...] = ()
-    profile: bool = False
-    showing: Showing = Showing()
-    paused: bool = False
+__all__ = ["plan_run", "planned", "prepare"]
 
 
 def prepare(
@@ -57,15 +32,24 @@ def prepare(
     options: Options = Options(),  # noqa: B008 a frozen Struct
     tell: Callable[[str], None] = lambda _text: None,
 ) -> Plan:
+    """As `plan_run`, for callers that need only the plan of the mesh."""
+    return plan_run(path, options, tell).plan
+
+
+def plan_run(
+    path: Path,
+    options: Options = Options(),  # noqa: B008 a frozen Struct
+    tell: Callable[[str], None] = lambda _text: None,
+) -> RunPlan:
     """Read, check and plan the configuration at ``path``.
 
     Args:
         path: the YAML file.
         options: what the command line changes.
-        tell: called with what takes its time, such as compiling an FMU, before it begins.
+        tell: called before something that takes long, such as compiling an FMU.
 
     Raises:
-        ConfigurationError: with everything that is wrong with it or its FMUs.
+        ConfigurationError: the configuration or an FMU is wrong; carries all findings.
     """
     loaded, findings = examine(path, options.start_values)
     return planned(loaded, findings, options, tell)
@@ -73,103 +57,66 @@ def prepare(
 
 def planned(
     loaded: LoadedConfig, findings: Findings, options: Options, tell: Callable[[str], None] = lambda _text: None
-) -> Plan:
+) -> RunPlan:
     """Check and plan a configuration whose structure was examined; ``findings`` are those of its structure.
 
     Raises:
-        ConfigurationError: with everything that is wrong with it or its FMUs.
+        ConfigurationError: the configuration or an FMU is wrong; carries all findings.
     """
-    loaded = _with_options(loaded, options)
-    descriptions, unreadable = _descriptions(loaded, tell)
+    loaded = with_options(loaded, options, findings)
+    if not len(findings):  # otherwise the world may be what is wrong
+        check_showing(loaded.config.instances, options.showing)
+    descriptions, unreadable = _descriptions(loaded, findings.places, tell)
     findings.merge(unreadable)
     resolve_ros(loaded, descriptions, findings)
     system = build(loaded, descriptions, tuple(findings))
     check_results(loaded, system)
-    check_showing(system, options.showing)
     sections = loaded.config.instances
     contents = {name: content(Path(own.fmu), sections[name]) for name, own in system.instances.items()}
-    return make_plan(system, file=str(loaded.file), contents=contents)
-
-
-def zenoh_section(loaded: LoadedConfig, options: Options) -> ZenohConfig:
-    """The `zenoh` section, with the endpoints of the command line if there are any."""
-    section = loaded.config.zenoh
-    return replace(
-        section, connect=list(options.connect) or section.connect, listen=list(options.listen) or section.listen
-    )
-
-
-def _with_options(loaded: LoadedConfig, options: Options) -> LoadedConfig:
-    config = replace(loaded.config, zenoh=zenoh_section(loaded, options))
-    if options.window is not None:
-        config = replace(config, simulation=replace(config.simulation, window=options.window))
-    if (factor := options.real_time_factor) is not None:
-        config = replace(config, simulation=replace(config.simulation, real_time_factor=factor))
-        overrides = {"simulation.real_time_factor": f"--real-time-factor {factor:g}"}
-        loaded = replace(loaded, overrides={**loaded.overrides, **overrides})
-    if options.output is not None:
-        config = replace(config, record=replace(config.record, file=str(options.output.absolute())))
-        loaded = replace(loaded, overrides={**loaded.overrides, "record.file": f"--output {options.output}"})
-    return replace(loaded, config=config)
+    plan = make_plan(system, file=str(loaded.file), contents=contents)
+    return RunPlan(loaded, options, plan, contents)
 
 
 def _descriptions(
-    loaded: LoadedConfig, tell: Callable[[str], None]
+    loaded: LoadedConfig, known_places: AbstractSet[str], tell: Callable[[str], None]
 ) -> tuple[dict[str, ModelDescription], Sequence[Finding]]:
-    """The description of every instance whose model can be read, and a finding for every other."""
-    cache: dict[tuple[Path, Terms, str], ModelDescription | LoadFailed] = {}
+    """The description of every instance whose model can be read, and a finding for every other.
+
+    ``known_places`` are the places of earlier findings: an empty path stands for a section with one of them.
+    """
+    cache: dict[tuple[Path, bytes], ModelDescription | LoadFailed] = {}
     descriptions: dict[str, ModelDescription] = {}
     findings = []
-    for name, instance in loaded.config.instances.items():
-        if not instance.path and not isinstance(instance, PidConfig):
-            continue  # what stands there instead is a finding already
-        path, key = loaded.resolve(instance.path), None
-        if isinstance(instance, InstanceConfig):
-            terms = Terms(loaded.config.limits, instance.sha256)
-            key = (path, terms, instance.kind)
-        else:
-            terms = Terms()
-        found = cache.get(key) if key is not None else None
-        if found is None:
+    for name, section in loaded.config.instances.items():
+        key = key_of(section)
+        place = f"instances.{name}.{key}"
+        if getattr(section, key) == "":
+            if not any(f"{known}.".startswith(f"instances.{name}.") for known in known_places):
+                findings.append(loaded.finding(place, "an empty path", expected_model(section)))
+            continue
+        path, own = loaded.resolve(section.path) if section.path else Path(), placed(section)
+        known = (path, msgspec.json.encode(own))
+        if known not in cache:
             try:
-                found = describe(path, instance, terms, tell)
+                cache[known] = describe(path, own, loaded.config.limits, tell)
             except LoadFailed as error:
-                found = error
-        if key is not None:
-            cache[key] = found
+                cache[known] = error
+        found = cache[known]
         if isinstance(found, LoadFailed):
             text = found.message.rstrip(".") + (f" ({found.hint.rstrip('.')})" if found.hint else "")
-            place = f"instances.{name}.{_key_of_path(instance)}"
-            expected = expected_model(instance)
-            if not files.exists(path) and files.exists(Path(instance.path)):
-                expected += "; paths are relative to the configuration file"
-            findings.append(loaded.finding(place, text, expected, _similar(path)))
-        else:
-            descriptions[name] = found
-            findings += _strict_findings(loaded, name, instance, found)
+            findings.append(loaded.finding(place, text, _expected(section, path), _similar(path)))
+            continue
+        descriptions[name] = found
+        if loaded.config.is_strict(section):
+            expected = "an FMU without problems, or `strict: false`"
+            findings += [loaded.finding(place, " ".join(text.split()), expected) for text in found.problems]
     return descriptions, findings
 
 
-def _strict_findings(
-    loaded: LoadedConfig, name: str, instance: AnyInstanceConfig, description: ModelDescription
-) -> Iterable[Finding]:
-    """The problems of an FMU, where the configuration says that they are errors."""
-    if not isinstance(instance, InstanceConfig):
-        return
-    for problem in description.problems if loaded.config.is_strict(instance) else ():
-        text = " ".join(problem.split())
-        yield loaded.finding(f"instances.{name}.fmu", text, "an FMU without problems, or `strict: false`")
-
-
-def _key_of_path(instance: AnyInstanceConfig) -> str:
-    """Where the file of an instance stands in its section."""
-    match instance:
-        case MujocoConfig():
-            return "mujoco"
-        case GazeboClassicConfig():
-            return "gazebo_classic"
-        case _:
-            return "fmu"
+def _expected(section: InstanceSection, path: Path) -> str:
+    """In words, what the file of a model should be, where the one at ``path`` is not."""
+    elsewhere = not files.exists(path) and files.exists(Path(section.path))
+    return expected_model(section) + ("; paths are relative to the configuration file" if elsewhere else "")
 
 
 def _similar(path: Path) -> str | None:

@@ -1,7 +1,7 @@
-"""What every process of a mesh does about signals, its parent and its end (design, invariant 5).
+"""What all processes of a run have in common: the folder of the run, signals, the parent process, and the end.
 
-A process that was started by `launch` ends with it: the kernel tells it when its parent dies, and so does the end of
-its standard input. An end that was asked for is carried out by a thread, because the main thread may be inside an FMU.
+A process that was started by `launch` ends with it (design, invariant 5): the kernel signals the death of its parent,
+and its standard input ends. A thread carries out a request to end, because the main thread may be inside an FMU.
 """
 
 from __future__ import annotations
@@ -9,27 +9,140 @@ from __future__ import annotations
 import ctypes
 import os
 import signal
+import socket
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from types import FrameType
+from contextlib import ExitStack, contextmanager
+from types import FrameType, TracebackType
+from typing import Self
 
-__all__ = ["GRACE_S", "SIGNAL_RECEIVED", "die_with_parent", "ended_by_signals"]
+from ..errors import ConfigurationError
+from ..wire.runtime import (
+    enter_run_folder,
+    leave_run_folder,
+    run_folder,
+    socket_endpoint,
+    tidy_run_folder,
+)
+from .run_plan import MANUAL
+
+__all__ = ["GRACE_S", "Interruption", "RunProcess", "ended_by_signals"]
 
 GRACE_S = 1.0
-"""How long the main thread has to end by itself before the process is ended for it."""
+"""How long the main thread may take to end the process before another thread does."""
 
-SIGNAL_RECEIVED = " was received"
-"""What follows the name of a signal in the reason of an end."""
-
+_SIGNAL_RECEIVED = " was received"
 _PR_SET_PDEATHSIG = 1
 
 
-def die_with_parent() -> None:
-    """Ask the kernel to terminate this process when its parent dies (Linux), and end now if it has died already."""
-    if sys.platform.startswith("linux"):
-        ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+class Interruption:
+    """A request to end the process. It may come before there is anything that can be ended.
+
+    Attributes:
+        reason: the reason of the first request; None if there was none.
+    """
+
+    def __init__(self) -> None:
+        self.reason: str | None = None
+        self._end: Callable[[str], None] = lambda _reason: None
+
+    @property
+    def signal(self) -> str | None:
+        """Name of the signal that was the request, such as `SIGTERM`."""
+        return self.reason.removesuffix(_SIGNAL_RECEIVED) if self.reason is not None else None
+
+    def request(self, reason: str) -> None:
+        """From any thread: ask for the end."""
+        if self.reason is None:
+            self.reason = reason
+        self._end(reason)
+
+    def goes_to(self, end: Callable[[str], None]) -> None:
+        """Call ``end`` with the reason of each request from now on, and at once if there was one."""
+        self._end = end
+        if self.reason is not None:
+            end(self.reason)
+
+
+class RunProcess:
+    """One process of a run, from its start to its end; use it as a context manager on the main thread.
+
+    ```python
+    with RunProcess(mesh, run) as process:
+        process.take_place(name, f"node '{name}' of mesh '{mesh}'")
+        session = open_session(wiring)
+        process.stack.callback(close_session, session)
+        node = Node(plan, session, open_instance)
+        process.interruption.goes_to(node.interrupt)
+        node.run()
+    ```
+
+    Args:
+        mesh: name of the mesh.
+        run: name of the run; `MANUAL` if a person has started this process.
+
+    Attributes:
+        is_child: whether a launcher has started this process and watches it.
+        launch: identifies the launch among those that meet at a router; None if there is no launcher.
+        folder: the folder of the run.
+        stack: what to close at the end.
+        interruption: requests to end, from signals or the parent.
+    """
+
+    def __init__(self, mesh: str, run: str) -> None:
+        self.is_child = run != MANUAL
+        self.launch = f"{socket.gethostname()}.{run}" if self.is_child else None
+        self.folder = run_folder(mesh, run)
+        self.stack = ExitStack()
+        self.interruption = Interruption()
+        self._clean_ups: list[Callable[[], None]] = [lambda: leave_run_folder(self.folder)]
+
+    def __enter__(self) -> Self:
+        if self.is_child:
+            _die_with_parent()
+        self.stack.enter_context(ended_by_signals(self.interruption.request, self.clean_up, watch_stdin=self.is_child))
+        self.stack.callback(leave_run_folder, self.folder)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.stack.__exit__(kind, error, trace)
+
+    def take_place(self, name: str, who: str) -> None:
+        """Note in the folder of the run that this process is ``name``, and what to remove if it is killed.
+
+        Args:
+            name: name of the node, or `MASTER`.
+            who: the process in words, for the error.
+
+        Raises:
+            ConfigurationError: such a process runs already.
+        """
+        tidy_run_folder(self.folder)
+        with socket.socket(socket.AF_UNIX) as probe:
+            try:
+                probe.connect(socket_endpoint(self.folder, name).partition("/")[2])
+            except OSError:
+                enter_run_folder(self.folder, name)
+                return
+        raise ConfigurationError(f"{who} runs already", hint="Stop it first, or give this mesh another name.")
+
+    def cleans_up(self, action: Callable[[], None]) -> None:
+        """Call ``action`` first if the process has to end although its main thread does not return from an FMU."""
+        self._clean_ups.insert(0, action)
+
+    def clean_up(self) -> None:
+        """From another thread, before the end of a process whose main thread does not return from an FMU."""
+        for action in self._clean_ups:
+            action()
+
+    def end_now(self, code: int) -> None:
+        """From another thread: end the process with this exit code although its main thread does not return."""
+        self.clean_up()
+        sys.stderr.flush()
+        os._exit(code)
 
 
 @contextmanager
@@ -38,8 +151,8 @@ def ended_by_signals(
 ) -> Iterator[None]:
     """While inside: SIGTERM, SIGINT, or the end of standard input call ``interrupt`` with the reason.
 
-    If the main thread has not left within `GRACE_S`, ``clean_up`` is called and the process exits with 130. Use it on
-    the main thread.
+    If the main thread has not left the block `GRACE_S` later, ``clean_up`` is called and the process exits with 130.
+    Use it on the main thread.
     """
     left = threading.Event()
     reading, writing = os.pipe()
@@ -49,12 +162,12 @@ def ended_by_signals(
         interrupt(reason)
         if not left.wait(GRACE_S):
             clean_up()
-            _exit(reason, told=watch_stdin)
+            _exit(reason, reported=watch_stdin)
 
     def wait_for_signal() -> None:
         number = os.read(reading, 1)
         if number:
-            end(f"{signal.Signals(number[0]).name}{SIGNAL_RECEIVED}")
+            end(f"{signal.Signals(number[0]).name}{_SIGNAL_RECEIVED}")
 
     def wait_for_stdin() -> None:
         while os.read(0, 4096):
@@ -62,7 +175,7 @@ def ended_by_signals(
         if not left.is_set():
             end("the process that started this one is gone")
 
-    # The C level handler writes the number at once, whichever thread the signal reaches and whatever it is doing.
+    # The C handler writes the number at once, whichever thread gets the signal and whatever that thread is doing.
     wakeup = signal.set_wakeup_fd(writing, warn_on_full_buffer=False)
     handlers = {number: signal.signal(number, _ignore) for number in (signal.SIGTERM, signal.SIGINT)}
     watcher = threading.Thread(target=wait_for_signal, name="signals", daemon=True)
@@ -81,12 +194,18 @@ def ended_by_signals(
         os.close(reading)
 
 
-def _exit(reason: str, *, told: bool) -> None:
-    """End the process although its main thread does not come back; say why, unless the launcher does."""
-    if not told:
+def _exit(reason: str, *, reported: bool) -> None:
+    """End the process although its main thread does not return; say why, unless the launcher does."""
+    if not reported:
         os.write(2, f"fmu-mesh: {reason}\n".encode())
     os._exit(130)
 
 
+def _die_with_parent() -> None:
+    """Ask the kernel to terminate this process when its parent dies; standard input tells if it died before."""
+    if sys.platform.startswith("linux"):
+        ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+
+
 def _ignore(_number: int, _frame: FrameType | None) -> None:
-    """The wakeup descriptor does the work."""
+    """The thread that reads the wakeup descriptor does the work."""

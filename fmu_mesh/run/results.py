@@ -1,73 +1,151 @@
-"""Which kind of file the results of a run go into, by its name, and what is there after its process was killed."""
+"""The result file of a run: checked before the run, opened in its format, counted after its writer was killed.
+
+Knows no format: `fmu_mesh.system.recording` finds the format by the name of the file.
+
+A run in processes keeps a note in its folder: how many rows the operating system has. The note is made before the first
+row is written. So without a note, the result file is not that of this run.
+"""
 
 from __future__ import annotations
 
+import os
+import struct
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
-from ..config.findings import Findings
-from ..config.loading import LoadedConfig, load
+import numpy as np
+from numpy.typing import NDArray
+
+from ..config.loading import LoadedConfig
 from ..errors import ConfigurationError
-from ..files import open_alone
-from ..recorder.csv_file import CsvFile, cut_after_last_row
-from ..recorder.noted import NotedFile, noted
-from ..recorder.result_file import OpenResult, ResultFile
-from ..ros.bags.recording import BagTopics, McapFile, bag_topics, is_bag
+from ..files import Kept, open_alone
+from ..system.recording import Recording, ResultFile, ResultFormat, result_format
 from ..system.system import System
-from ..variables.model_description import VariableType
 
-__all__ = ["check_results", "result_opener", "rows_left", "what_is_kept"]
+__all__ = ["check_results", "open_result", "rows_left", "what_is_kept"]
+
+_NAME = "recorded"
+_NOTE = struct.Struct("<qq")
 
 
 def check_results(loaded: LoadedConfig, system: System) -> None:
-    """Look whether what is recorded can be written into the result file.
+    """Check that the result file can hold what is recorded.
 
     Raises:
-        ConfigurationError: with everything that is wrong.
+        ConfigurationError: it cannot; carries all findings.
     """
-    if is_bag(system.result_file):
-        _topics(loaded, system)
+    if system.result_file is not None:
+        findings = loaded.findings()
+        _format(system.result_file).check(_recording(loaded, system), findings)
+        findings.raise_any()
 
 
-def result_opener(config_file: Path, system: System, folder: Path | None = None) -> OpenResult:
-    """What opens the result file of a run: an MCAP if it is called so, else a CSV.
+def open_result(loaded: LoadedConfig, system: System, folder: Path | None = None) -> ResultFile:
+    """Open the result file of a run.
 
     Args:
-        config_file: the configuration file.
-        system: what it means.
-        folder: of the run, where somebody asks `rows_left` if this process is killed.
+        loaded: the configuration.
+        system: the system of this configuration; it has a result file.
+        folder: the folder of the run, if somebody calls `rows_left` when this process was killed.
+
+    Raises:
+        ConfigurationError: the file cannot be written, or another run is writing it.
     """
-
-    def open_result(path: Path, columns: Sequence[tuple[str, VariableType]]) -> ResultFile:
-        file = McapFile(path, columns, _topics(load(config_file), system)) if is_bag(path) else CsvFile(path, columns)
-        return NotedFile(file, folder) if folder is not None else file
-
-    return open_result
+    assert system.result_file is not None
+    path = Path(system.result_file)
+    file = _format(path).open(path, _recording(loaded, system))
+    return _NotedFile(file, folder) if folder is not None else file
 
 
 def rows_left(result_file: str, folder: Path) -> int:
-    """Rows in the result file of the run in ``folder``, whose master was killed; cuts off what follows the last row."""
-    path, kept = Path(result_file), noted(folder)
+    """The number of rows that a killed process has left in its result file. What follows the last row is cut off.
+
+    Args:
+        result_file: path of the file.
+        folder: the folder of the run.
+    """
+    path = Path(result_file)
     if path.exists() and not path.is_file():
         return 0  # a device keeps nothing
-    with suppress(ConfigurationError, OSError), open_alone(path):  # nobody else may write it now; removes what it left
-        if kept is not None and path.is_file():
-            return kept.rows if is_bag(path) else cut_after_last_row(path, kept)
+    try:
+        kept = Kept(*_NOTE.unpack((folder / _NAME).read_bytes()))
+    except (FileNotFoundError, struct.error):
+        kept = None
+    # Opening the file makes sure that no other run is writing it, and removes a draft that the process has left.
+    with suppress(ConfigurationError, OSError), open_alone(path):
+        if kept is not None and path.is_file() and path.stat().st_size >= kept.size:  # or it is another file by now
+            return _format(path).keep_whole_rows(path, kept)
     return 0
 
 
 def what_is_kept(result_file: str | None, rows: int) -> str | None:
-    """What is told of a run that ended early and left rows; a device keeps none."""
+    """The sentence for a run that ended early and left rows; None if there are no rows, as on a device."""
     if not rows or result_file is None or not Path(result_file).is_file():
         return None
     return f"What was recorded up to then ({rows} rows) is in '{result_file}'."
 
 
-def _topics(loaded: LoadedConfig, system: System) -> BagTopics:
-    findings = Findings(str(loaded.file), loaded.lines)
+def _format(path: str | Path) -> ResultFormat:
+    found = result_format(path)
+    if found is None:  # it was there when the configuration was checked
+        raise ConfigurationError(f"no installed package writes the format of '{path}'")
+    return found
+
+
+def _recording(loaded: LoadedConfig, system: System) -> Recording:
     descriptions = {name: instance.description for name, instance in system.instances.items()}
-    topics = bag_topics(loaded, descriptions, system.recorded, findings)
-    findings.raise_any()
-    assert topics is not None  # or there is a finding
-    return topics
+    return Recording(loaded, descriptions, system.recorded)
+
+
+class _NotedFile:
+    """A result file that notes in the folder of the run how many of its rows the operating system has.
+
+    Args:
+        file: the result file; it is closed with this.
+        folder: the folder of the run.
+    """
+
+    def __init__(self, file: ResultFile, folder: Path) -> None:
+        self._file = file
+        self._note = folder / _NAME
+        self._descriptor: int | None = None
+        self._noted = Kept()
+
+    @property
+    def path(self) -> Path:
+        return self._file.path
+
+    @property
+    def rows(self) -> int:
+        return self._file.rows
+
+    @property
+    def kept(self) -> Kept:
+        return self._file.kept
+
+    def write(self, times: NDArray[np.float64], columns: Sequence[NDArray[Any]]) -> None:
+        if self._descriptor is None:
+            self._descriptor = os.open(self._note, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o600)
+            os.pwrite(self._descriptor, _NOTE.pack(*self._noted), 0)
+        self._file.write(times, columns)
+        self._note_kept()
+
+    def flush(self) -> None:
+        self._file.flush()
+        self._note_kept()
+
+    def close(self) -> None:
+        try:
+            self._file.close()
+        finally:
+            self._note_kept()
+            if self._descriptor is not None:
+                os.close(self._descriptor)
+                self._descriptor = None
+
+    def _note_kept(self) -> None:
+        if self._descriptor is not None and (kept := self._file.kept) != self._noted:
+            self._noted = kept
+            os.pwrite(self._descriptor, _NOTE.pack(*kept), 0)

@@ -1,135 +1,103 @@
-"""What a process of the mesh does from its start to its end: as a node, or as the master with the recorder.
+"""The roles that a process of a run can have: a node, the master with the recorder, or all of it in one process.
 
-The same functions serve `launch`, which starts these processes, and a person who starts them by hand.
+The same functions serve the processes that `launch` starts and those that a person starts manually.
 """
 
 from __future__ import annotations
 
 import logging
 import os
-import socket
-import sys
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, closing, contextmanager
+from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 
-import msgspec
-
-from ..config.loading import load
-from ..errors import ConfigurationError, FmuError, FmuMeshError, StepFailed
+from ..errors import FmuError, FmuMeshError, StepFailed
 from ..instances.call_guard import CallWatch, Guarded
-from ..instances.contract import Instance
-from ..instances.fmi import FmuInstance, LogMessage, Terms
-from ..instances.registry import open_instance, stepped
-from ..master.grant_watch import GrantWatch
-from ..master.master import Master
+from ..instances.contract import Instance, KeepsFiles, LogMessage, Opening
+from ..instances.registry import open_instance
+from ..master.master import Master, MasterSettings
 from ..node.node import Node
 from ..recorder.recorder import Recorder
-from ..system.plan import RECORDER, NodePlan, Plan
-from ..text import listed, nearest
+from ..system.plan import RECORDER
 from ..wire.keys import MASTER
-from ..wire.runtime import (
-    MeshNote,
-    enter_run_folder,
-    fmu_folder,
-    leave_run_folder,
-    run_folder,
-    socket_endpoint,
-    tidy_run_folder,
-    write_note,
-)
+from ..wire.runtime import MeshNote, enter_run_folder, fmu_folder, remove_stale_folders, write_note
 from ..wire.session import RouterLink, close_session, open_session, own_endpoints
 from ..wire.views import LogLine, MeshStatus
-from .events import End, Event, Log, Ready, Status
-from .preparing import Options, prepare, zenoh_section
-from .process import SIGNAL_RECEIVED, die_with_parent, ended_by_signals
-from .results import result_opener
+from .events import Event, Log, Reachable, Status
+from .local import LocalMesh
+from .outcome import Outcome
+from .process import RunProcess
+from .results import open_result
+from .run_plan import NodeRun, RunPlan
 from .wiring import is_socket, wiring
 
-__all__ = ["BY_HAND", "run_master", "run_node"]
+__all__ = ["run_local", "run_master", "run_node"]
 
 log = logging.getLogger(__name__)
 
-BY_HAND = "hand"
-"""Name of the run whose processes were started by hand."""
 
-
-def run_node(
-    config_file: Path, name: str, options: Options, *, plan_file: Path | None = None, run: str = BY_HAND
-) -> None:
-    """Be one node of a mesh.
-
-    Args:
-        config_file: the configuration file.
-        name: name of the node: that of an instance without a group, or of a group.
-        options: what the command line changes.
-        plan_file: the node's plan if the launcher has made it already; removed once it is read.
-        run: name of the run; the launcher's process id when it started this process.
+def run_node(run: NodeRun) -> None:
+    """Be one node of a mesh, until the run ends.
 
     Raises:
         FmuMeshError: the node could not start, or its run ended early.
     """
-    child = run != BY_HAND
-    if child:
-        die_with_parent()
-    if plan_file is not None:
-        plan = msgspec.json.decode(plan_file.read_bytes(), type=NodePlan)
-        plan_file.unlink()
-    else:
-        plan = _node_plan(prepare(config_file, options), name)
-    _NodeProcess(config_file, plan, options, run_folder(plan.mesh, run), _launch(run)).run(child=child)
+    with RunProcess(run.plan.mesh, run.run) as process:
+        _NodeProcess(run, process).run()
 
 
 class _NodeProcess:
-    """A node with all that it takes from its host: a session, a folder, FMUs, and an answer to signals."""
+    """A node, its instances, and what happens if one of them does not return from a call."""
 
-    def __init__(self, config_file: Path, plan: NodePlan, options: Options, folder: Path, launch: str | None) -> None:
-        self._config_file = config_file
-        self._plan = plan
-        self._zenoh = zenoh_section(load(config_file), options)
-        self._folder = folder
-        self._launch = launch
-        self._options = options
+    def __init__(self, run: NodeRun, process: RunProcess) -> None:
+        self._run = run
+        self._plan = run.plan
+        self._process = process
         self._instances: list[Instance] = []
         self._guarded: list[Guarded] = []
-        self._child = False
         self._node: Node | None = None
-        self._interrupted: str | None = None
 
-    def run(self, *, child: bool) -> None:
-        """Run the node; ``child`` tells whether a launcher watches this process."""
-        self._child = child
-        with ended_by_signals(self._interrupt, self._clean_up, watch_stdin=child), ExitStack() as stack:
-            stack.callback(leave_run_folder, self._folder)
-            tidy_run_folder(self._folder)
-            _refuse_second(self._folder, self._plan.node, f"node '{self._plan.node}' of mesh '{self._plan.mesh}'")
-            enter_run_folder(self._folder, self._plan.node)
-            session = open_session(
-                wiring(self._zenoh, self._config_file, self._folder, self._plan.node, self._plan.peers())
-            )
-            stack.callback(close_session, session)
-            self._watch = stack.enter_context(closing(CallWatch(self._take_hang)))
-            stack.callback(self._close_instances)
-            router = RouterLink(session, self._zenoh.connect)
-            self._node = node = Node(self._plan, session, self._open, router=router, launch=self._launch)
-            node.server.on_hang = self._take_hang
-            if self._interrupted is not None:
-                node.interrupt(self._interrupted)
-            try:
-                node.run()
-            except FmuMeshError as error:
-                # Under a launcher one process tells what happened, and the others only end.
-                error.told = child and node.failure_is_known
-                raise
+    def run(self) -> None:
+        """Run the node."""
+        plan, run, process = self._plan, self._run, self._process
+        process.cleans_up(self._remove_files)
+        process.take_place(plan.node, f"node '{plan.node}' of mesh '{plan.mesh}'")
+        session = open_session(wiring(run.zenoh, run.config_file, process.folder, plan.node, plan.peers()))
+        process.stack.callback(close_session, session)
+        self._watch = process.stack.enter_context(closing(CallWatch(self._take_hang)))
+        process.stack.callback(self._close_instances)
+        router = RouterLink(session, run.zenoh.connect)
+        self._node = node = Node(
+            plan, session, self._open, on_hang=self._take_hang, router=router, launch=process.launch
+        )
+        process.interruption.goes_to(node.interrupt)
+        try:
+            node.run()
+        except FmuMeshError as error:
+            # If there is a launcher, one process shows what happened, and the others only end.
+            if process.is_child and node.failure_is_known:
+                error.already_reported()
+            raise
 
     def _open(self, name: str) -> Guarded:
-        item = self._plan.instance(name)
-        terms = Terms(self._plan.limits, item.sha256)
+        item, model = self._plan.instance(name), self._run.models[name]
+        opening = Opening(
+            name=name,
+            path=Path(item.fmu),
+            section=item.section,
+            description=model.description,
+            folder=fmu_folder(self._process.folder),
+            content=model.content,
+            limits=self._plan.limits,
+            linear_inputs=item.linear_inputs,
+            log=self._log,
+            showing=self._run.showing,
+        )
 
         def instantiate() -> Instance:
-            instance = open_instance(item, fmu_folder(self._folder), self._log, terms, self._options.showing)
+            instance = open_instance(opening)
             self._instances.append(instance)
-            return stepped(instance, item)
+            return instance
 
         self._guarded.append(Guarded(name, instantiate, self._watch, self._plan.timeouts))
         return self._guarded[-1]
@@ -144,144 +112,95 @@ class _NodeProcess:
         for instance in self._guarded:
             instance.close()
 
-    def _interrupt(self, reason: str) -> None:
-        self._interrupted = reason
-        if self._node is not None:
-            self._node.interrupt(reason)
-
-    def _clean_up(self) -> None:
-        """From another thread, when the main thread does not come back from an FMU."""
+    def _remove_files(self) -> None:
         for instance in self._instances:
-            if isinstance(instance, FmuInstance):
+            if isinstance(instance, KeepsFiles):
                 instance.remove_files()
-        leave_run_folder(self._folder)
 
     def _take_hang(self, error: FmuError) -> None:
-        """From a watching thread: an FMU has not returned in time, and only the end of the process gets it back."""
+        """From a watching thread: an FMU has not returned in time, so the process has to end."""
         known = self._node is not None and self._node.report_hang(error)
-        if not (self._child and known):
+        if not (self._process.is_child and known):
             log.error("%s", error)
-        self._clean_up()
-        sys.stderr.flush()
-        os._exit(StepFailed.exit_code)
+        self._process.end_now(StepFailed.exit_code)
 
 
-def run_master(
-    config_file: Path,
-    options: Options,
-    emit: Callable[[Event], None],
-    *,
-    plan: Plan | None = None,
-    run: str = BY_HAND,
-) -> None:
-    """Be the master, with the recorder in the same process; the end of the run is emitted as an event.
+def run_master(run: RunPlan, emit: Callable[[Event], None]) -> Outcome:
+    """Be the master and the recorder of a mesh, until the run ends; the outcome is also the last event.
 
     Raises:
-        FmuMeshError: the run ended early; the event before says the same.
+        FmuMeshError: the run ended early; the outcome that was emitted before says the same.
     """
-    child = run != BY_HAND
-    if child:
-        die_with_parent()
-    if plan is None:
-        plan = prepare(config_file, options)
-    config = plan.system.config
-    folder = run_folder(config.mesh, run)
-    master: Master | None = None
-    reasons: list[str] = []
-
-    def interrupt(reason: str) -> None:
-        reasons.append(reason)
-        if master is not None:
-            master.interrupt(reason)
-
-    with ended_by_signals(interrupt, lambda: leave_run_folder(folder), watch_stdin=child), ExitStack() as stack:
-        stack.callback(leave_run_folder, folder)
-        tidy_run_folder(folder)
-        _refuse_second(folder, MASTER, f"the master of mesh '{config.mesh}'")
-        enter_run_folder(folder, MASTER)
-        recorder = error = None
-        with _told(plan, emit):
-            session = open_session(wiring(config.zenoh, config_file, folder, MASTER, ()))
-            stack.callback(close_session, session)
-            endpoints = own_endpoints(session) if config.zenoh.mode == "peer" else tuple(config.zenoh.connect)
-            endpoints = tuple(sorted(endpoints, key=is_socket, reverse=True))
-            master = Master(
-                plan,
-                session,
-                _Emitter(emit),
-                endpoints=endpoints,
-                config_file=str(config_file),
-                router=RouterLink(session, config.zenoh.connect),
-                launch=_launch(run),
-            )
-            stack.callback(master.close)
+    plan, config = run.plan, run.loaded.config
+    with RunProcess(config.mesh, run.run) as process:
+        process.take_place(MASTER, f"the master of mesh '{config.mesh}'")
+        try:
+            session = open_session(wiring(config.zenoh, run.config_file, process.folder, MASTER, ()))
+            process.stack.callback(close_session, session)
+            settings = _settings(run, process, own_endpoints(session) if config.zenoh.mode == "peer" else ())
+            master = Master(plan, session, _Emitter(emit), settings, RouterLink(session, config.zenoh.connect))
+            process.stack.callback(master.close)
             master.claim()
-        if not child:
-            write_note(folder, MeshNote(config.mesh, config.zenoh.key_prefix, endpoints, os.getpid(), str(config_file)))
-        emit(Ready(endpoints))
-        master.watch = GrantWatch() if options.profile else None
-        master.starts_paused = options.paused
-        for reason in reasons:
-            master.interrupt(reason)
+        except FmuMeshError as error:  # before the first point, such as at a port that is in use
+            emit(Outcome("failed", 0, plan.grid.time(0), 0.0, 0, plan.system.result_file, error.report()))
+            raise
+        endpoints, file = settings.endpoints, settings.config_file
+        if not process.is_child:
+            write_note(process.folder, MeshNote(config.mesh, config.zenoh.key_prefix, endpoints, os.getpid(), file))
+        emit(Reachable(endpoints))
+        process.interruption.goes_to(master.interrupt)
+        recorder = failure = None
         try:
             if RECORDER in plan.nodes:
-                open_file = result_opener(config_file, plan.system, folder if child else None)
+                result = open_result(run.loaded, plan.system, process.folder if process.is_child else None)
                 with Recorder(
-                    plan.nodes[RECORDER], session, open_file, lambda: master.has_begun, launch=_launch(run)
+                    plan.nodes[RECORDER], session, result, lambda: master.has_begun, launch=process.launch
                 ) as recorder:
                     master.run()
             else:
                 master.run()
-        except FmuMeshError as ended:
-            error = ended
-        rows = recorder.rows if recorder is not None else 0
-        signal = reasons[0].removesuffix(SIGNAL_RECEIVED) if reasons else None
-        emit(_end_of(master, rows, plan.system.result_file, error, signal))
-        if error is not None:
-            raise error
+        except FmuMeshError as error:
+            failure = error
+        outcome = _outcome_of(run, master, recorder, failure, process.interruption.signal)
+        emit(outcome)
+        if failure is not None:
+            raise failure
         master.wait_for_followers()
+        return outcome
 
 
-def _launch(run: str) -> str | None:
-    """Which launch a process belongs to, for those that meet it on a router; None if it was started by hand."""
-    return f"{socket.gethostname()}.{run}" if run != BY_HAND else None
+def _settings(run: RunPlan, process: RunProcess, own: tuple[str, ...]) -> MasterSettings:
+    """The settings of a master whose session listens at ``own``; a client is reached through its router."""
+    endpoints = own or tuple(run.loaded.config.zenoh.connect)
+    return MasterSettings(
+        endpoints=tuple(sorted(endpoints, key=is_socket, reverse=True)),
+        config_file=str(run.loaded.file),
+        launch=process.launch,
+        profile=run.options.profile is not None,
+        paused=run.options.paused,
+    )
 
 
-def _end_of(master: Master, rows: int, result_file: str | None, error: FmuMeshError | None, signal: str | None) -> End:
-    """What is told of a run that is over."""
-    report = error.report() if error is not None else None
-    ended_by = master.ended_by.report() if master.ended_by is not None and error is None else None
-    return End(master.last_status(), master.seconds, rows, result_file, report, master.profile(), ended_by, signal)
-
-
-@contextmanager
-def _told(plan: Plan, emit: Callable[[Event], None]) -> Iterator[None]:
-    """Emit the end of a run that fails before its first point, such as at a port that is in use."""
-    try:
-        yield
-    except FmuMeshError as error:
-        mesh, grid, report = plan.system.config.mesh, plan.grid, error.report()
-        status = MeshStatus(mesh, "failed", 0, grid.last_point, grid.time(0), 0.0, 0.0, progress={}, error=report)
-        emit(End(status, 0.0, 0, plan.system.result_file, report))
-        raise
-
-
-def _refuse_second(folder: Path, process: str, who: str) -> None:
-    """Look whether somebody listens already where this process is going to.
-
-    Raises:
-        ConfigurationError: the process runs already.
-    """
-    with socket.socket(socket.AF_UNIX) as probe:
-        try:
-            probe.connect(socket_endpoint(folder, process).partition("/")[2])
-        except OSError:
-            return
-    raise ConfigurationError(f"{who} runs already", hint="Stop it first, or give this mesh another name.")
+def _outcome_of(
+    run: RunPlan, master: Master, recorder: Recorder | None, error: FmuMeshError | None, signal: str | None
+) -> Outcome:
+    status = master.last_status()
+    return Outcome(
+        state="done" if error is None else "failed",
+        point=status.point,
+        time=status.time,
+        seconds=master.seconds,
+        rows=recorder.rows if recorder is not None else 0,
+        file=run.plan.system.result_file,
+        error=error.report() if error is not None else None,
+        ended_by=master.ended_by.report() if master.ended_by is not None and error is None else None,
+        profile=master.profile(),
+        signal=signal,
+    )
 
 
 class _Emitter:
-    """The master's events as lines for the launcher, or for the display of this process."""
+    """Converts what the master reports to events."""
 
     def __init__(self, emit: Callable[[Event], None]) -> None:
         self._emit = emit
@@ -293,18 +212,45 @@ class _Emitter:
         self._emit(Log(line))
 
 
-def _node_plan(plan: Plan, name: str) -> NodePlan:
-    """The plan of a node, or of the node that an instance runs in if it is alone there.
+def run_local(
+    run: RunPlan,
+    log: Callable[[LogLine], None],
+    progress: Callable[[int], None],
+    on_hang: Callable[[FmuError], None],
+) -> Outcome:
+    """Run a whole mesh in this process.
+
+    Args:
+        run: the plan of the run.
+        log: called with every log message of an FMU.
+        progress: called with the point now and then.
+        on_hang: called on another thread if an FMU does not return in time, before the process ends.
 
     Raises:
-        ConfigurationError: there is no such node.
+        FmuMeshError: the run ended early, and why.
     """
-    if name in plan.nodes and name != RECORDER:
-        return plan.nodes[name]
-    names = [node for node in plan.nodes if node != RECORDER]
-    suggestion = nearest(name, names)
-    if name in plan.system.instances:
-        group = plan.node_of(name)
-        raise ConfigurationError(f"instance '{name}' runs in the group '{group}'", hint=f"Start node '{group}'.")
-    hint = f"Did you mean '{suggestion}'?" if suggestion else None
-    raise ConfigurationError(f"there is no node '{name}'; there are: {listed(names)}.", hint=hint)
+    remove_stale_folders()
+    with RunProcess(run.mesh, run.run) as process:
+        enter_run_folder(process.folder, f"local {os.getpid()}")
+        fmus = fmu_folder(process.folder)
+        fmus.mkdir(parents=True, exist_ok=True)
+
+        def show(message: LogMessage) -> None:
+            log(LogLine(message.instance, message.status, message.category, message.message, mesh.point))
+
+        def end(error: FmuError) -> None:
+            on_hang(error)
+            process.end_now(error.exit_code)
+
+        mesh = LocalMesh(
+            run.plan,
+            show,
+            progress,
+            on_hang=end,
+            parent=fmus,
+            showing=run.options.showing,
+            loaded=run.loaded,
+        )
+        process.cleans_up(mesh.clean_up)
+        process.interruption.goes_to(mesh.interrupt)
+        return mesh.run()

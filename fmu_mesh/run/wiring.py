@@ -1,8 +1,8 @@
-"""Which process of a mesh listens and connects where.
+"""The endpoints at which each process of a mesh listens and to which it connects.
 
-Processes of one host meet on Unix sockets in the folder of the run, which only their user can enter: one per node, so
-that data goes peer to peer. That of the master is also the way in for the tools of this user. Other hosts and users
-reach the master only where the configuration has it listen.
+Processes of one host meet at Unix sockets in the folder of the run, which only their user can enter. Each node has one,
+so that data goes peer to peer. The tools of this user connect to the socket of the master. Other hosts and users can
+reach the master only at the endpoints of `zenoh.listen`.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ __all__ = ["is_socket", "leaves_host", "wiring"]
 
 
 def wiring(config: ZenohConfig, config_file: Path, folder: Path, process: str, peers: Iterable[str]) -> Wiring:
-    """The wiring of one process.
+    """The endpoints of one process.
 
     Args:
         config: the `zenoh` section.
         config_file: the configuration file, for relative paths.
-        folder: folder of the run.
-        process: node name, or `MASTER`.
-        peers: nodes that this one exchanges frames with; of each two, the later name connects.
+        folder: the folder of the run.
+        process: name of the node, or `MASTER`.
+        peers: the nodes that this one exchanges frames with; of two nodes, the one with the later name connects.
     """
     base = config_file.absolute().parent / config.config if config.config is not None else None
     if config.mode == "client":
@@ -43,19 +43,19 @@ def wiring(config: ZenohConfig, config_file: Path, folder: Path, process: str, p
         mode="peer",
         listen=tuple(listen),
         connect=(*sockets, *config.connect),
-        # Beyond this host, peers learn of each other from those they know.
+        # Peers on other hosts learn about each other by gossip.
         gossip=bool(config.connect or config.listen),
         config=base,
     )
 
 
 def is_socket(endpoint: str) -> bool:
-    """Whether an endpoint is a Unix socket, which the permissions of its folder protect."""
+    """Whether an endpoint is a Unix socket, which is protected by the permissions of its folder."""
     return endpoint.startswith("unixsock-stream/")
 
 
 def leaves_host(endpoint: str) -> bool:
-    """Whether others than the users of this host may come in by an endpoint that somebody listens at."""
+    """Whether other hosts can connect to a process that listens at this endpoint."""
     address = endpoint.partition("/")[2].partition("?")[0].partition("#")[0]
     host = address.rpartition(":")[0].strip("[]")
     try:

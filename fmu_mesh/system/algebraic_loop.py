@@ -1,7 +1,7 @@
-"""The fixed-point iteration of an algebraic loop at the start: arithmetic and the criterion, and nothing of who calls.
+"""The fixed-point iteration of an algebraic loop at the start: its arithmetic and its criterion for convergence.
 
-Every process that takes part in a loop sees the same values and runs this on them, so all of them come to the same end
-at the same sweep without asking each other, and so does a run in one process.
+Every process that takes part in a loop gets the same values and runs the same iteration. So all of them, and a run in
+one process, end after the same sweep without a message about it.
 """
 
 from __future__ import annotations
@@ -23,23 +23,23 @@ _SHOWN = 8
 class FixedPoint:
     """The assumed values of the torn inputs of one loop.
 
-    One sweep, by the caller: set the torn inputs to `assumed`, get all outputs of the loop level by level, and hand
-    what the torn connections bring then to `update`. With what a connection brings as ``new``::
+    One sweep of the caller: set the torn inputs to `assumed`, get all outputs of the loop level by level, and call
+    `update` with the new values of the torn connections. For each of these values ``new``::
 
         residual = |new - assumed|, which must be at most tolerance * max(1, |new|)
         assumed  = assumed + relaxation * (new - assumed)          (new itself where the relaxation is 1)
 
-    Of an array, each element. Other types than Float64 and Float32 have to be equal, and take the new value as it is.
-    When all agree, the torn inputs keep what was assumed: then every other connection is exact, and only these are off,
-    by their residual at most.
+    For an array, this holds for each element. Values of types other than Float64 and Float32 must be equal, and are
+    replaced without relaxation. After convergence the torn inputs keep the assumed values: then all other connections
+    are exact, and the torn ones are off by their residual.
 
     Args:
         loop: the loop.
-        settings: tolerance, relaxation, and the limit.
+        settings: tolerance, relaxation and the maximum number of iterations.
 
     Attributes:
         assumed: by (instance, input).
-        sweeps: sweeps done.
+        sweeps: number of sweeps so far.
     """
 
     def __init__(self, loop: Loop, settings: InitializationConfig) -> None:
@@ -49,7 +49,13 @@ class FixedPoint:
         self._settings = settings
 
     def update(self, brought: Sequence[Value]) -> bool:
-        """Take what the torn connections bring, in the order of the loop's tears; whether the loop is consistent.
+        """Finish one sweep.
+
+        Args:
+            brought: the new values of the torn connections, in the order of the tears.
+
+        Returns:
+            Whether the loop has converged.
 
         Raises:
             LoopNotConverged: the limit is reached, or a value is not finite.

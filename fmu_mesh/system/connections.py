@@ -1,8 +1,7 @@
-"""Connections of the configuration to connections between variables.
+"""From the connections of a configuration to connections between variables.
 
-Owns the names of connection ends (the first dot ends the instance name), causality, and which types may be
-connected.
-Delays and cycles are `fmu_mesh.system.plan`.
+Owns the names of the ends (the first dot ends the instance name), causality, types and units. Delays and cycles are
+`fmu_mesh.system.plan`.
 """
 
 from __future__ import annotations
@@ -23,19 +22,19 @@ from fmu_mesh.variables.value_types import FMI2_TYPES, TYPES, VariableType, elem
 __all__ = ["Connection", "Variables", "resolve_connections", "resolve_variable", "unit_warnings"]
 
 Variables = Mapping[str, Mapping[str, Variable] | None]
-"""The variables of every instance by name; None where the model description could not be read."""
+"""The variables of every instance by name; None without a model description."""
 
 
 class Connection(msgspec.Struct, frozen=True):
     """One connection: `target = factor * source + offset`.
 
     Attributes:
-        factor: that of the file after that of the unit conversion; so is the offset.
+        factor: of the unit conversion and the file together; ``offset`` likewise.
         source_index: the element of the source array that is connected, counted from 0; empty for all of it.
         target_index: as ``source_index``, for the target.
         delay: 0, 1, or None where the algorithm decides.
         path: its place in the configuration file, such as `connections[2]`.
-        units: in words what was done about units; empty if nothing was to do.
+        units: the unit conversion in words; empty if there is none.
         extrapolation: whether the target's input changes linearly within a step.
     """
 
@@ -69,7 +68,7 @@ class Connection(msgspec.Struct, frozen=True):
 def resolve_connections(
     configs: Sequence[ConnectionConfig], variables: Variables, findings: Findings
 ) -> tuple[Connection, ...]:
-    """All connections whose ends exist and fit; what is wrong with the others goes to ``findings``."""
+    """All connections whose ends exist and fit; the others are findings."""
     connections: list[Connection] = []
     sources: dict[str, tuple[str, ConnectionConfig]] = {}
     for index, config in enumerate(configs):
@@ -105,7 +104,7 @@ def resolve_connections(
 def resolve_variable(
     reference: str, path: str, variables: Variables, causality: str, findings: Findings
 ) -> tuple[Variable, tuple[int, ...]] | None:
-    """The variable that `instance.variable` names, or None where that cannot be told.
+    """The variable that `instance.variable` names; None after a finding, or without a model description.
 
     `instance.array[1,2]` names an element of an array, counted from 1, unless a variable has that very name.
 
@@ -144,10 +143,10 @@ def resolve_variable(
 def unit_warnings(
     connections: Sequence[Connection], descriptions: Mapping[str, ModelDescription], findings: Findings
 ) -> None:
-    """Note the connections between different units that nothing converts, because one of them is not defined.
+    """Add a warning for each connection between different units of which one has no definition.
 
-    Such units are compared as they are written; a model may write one unit in several ways, so this is a warning.
-    FMI 1.0 has display units only, which no value ever is in (FMI 1.0, 3.3), so its units are never defined.
+    Such units are compared by their names. This is a warning only, because a unit may have several names. FMI 1.0
+    defines no units: it has display units only, and no value is in a display unit (FMI 1.0, 3.3).
     """
     for connection in connections:
         source, target = connection.source.unit, connection.target.unit
@@ -167,7 +166,7 @@ def unit_warnings(
 def _with_units(connection: Connection, config: ConnectionConfig, findings: Findings) -> Connection:
     """The connection with the conversion between the units of its ends.
 
-    The conversion comes first and the factor and offset of the file after it, so they are in the unit of the target
+    The conversion is applied before the factor and the offset of the file. These are in the unit of the target
     (SSP 1.0, LinearTransformation of a connection; `ignore_units` is suppressUnitConversion).
     """
     source, target = connection.source, connection.target
@@ -201,7 +200,7 @@ def _ends(connection: Connection) -> tuple[tuple[str, Variable], tuple[str, Vari
 
 
 def _taken(reference: str, target: tuple[Variable, tuple[int, ...]] | None) -> tuple[str, str]:
-    """The name of the target and that of the variable it belongs to, each with the instance; as written if unknown."""
+    """The names of the target and of its variable, both with the instance; as written if there is no such variable."""
     if target is None:
         return reference, reference
     variable, index = target
@@ -216,9 +215,9 @@ def _check_single_source(
     sources: dict[str, tuple[str, ConnectionConfig]],
     findings: Findings,
 ) -> None:
-    """An input has one source, and so has each element of an array.
+    """Check that an input, and each element of an array, has one source.
 
-    ``sources`` holds the first source by target, and by `*` after the name of an array that of its first element.
+    ``sources`` has the first source of each target. The key `array*` has the first source of any of its elements.
     """
     name, whole = taken
     first_source = sources.get(name) or sources.get(whole if name != whole else f"{whole}*")
@@ -258,7 +257,7 @@ def _causality_is_right(connection: Connection, variables: Variables, findings: 
 
 
 def _names_of(instance: str, causality: str, variables: Variables) -> str:
-    """Which variables of an instance would be right, to follow `an output` or `an input`."""
+    """The variables of an instance with a causality, as the end of the sentence `an output ...`."""
     own = variables[instance] or {}
     names = [variable.name for variable in own.values() if variable.causality == causality]
     return f" of '{instance}': {listed(names)}"
@@ -283,27 +282,27 @@ def _check_types(connection: Connection, findings: Findings) -> None:
 
 
 def _sources_for(target: VariableType, source: Variable) -> list[VariableType]:
-    """All types that an input of this type takes, its own first; as far as the source's version of FMI has them."""
+    """The types that an input of this type accepts, its own first, of those in the FMI version of the source."""
     known = TYPES if source.declared_type is None else FMI2_TYPES.values()
     return [target, *(type_ for type_ in known if type_ != target and takes(target, type_))]
 
 
 def _name_of(type_: VariableType, like: Variable) -> str:
-    """A type in the words of the FMI version of a variable."""
+    """The name of a type in the FMI version of a variable."""
     if like.declared_type is None:
         return type_
     return next((name for name, own in FMI2_TYPES.items() if own == type_), type_)
 
 
 def _end(variable: Variable, index: tuple[int, ...]) -> str:
-    """The type at one end: that of the variable, or of one element of it."""
+    """The type of one end: of the variable, or of one of its elements."""
     return variable.type_name.partition("[")[0] if index else variable.type_name
 
 
 def _element(
     variable: Variable, index: tuple[int, ...], path: str, reference: str, findings: Findings
 ) -> tuple[Variable, tuple[int, ...]] | None:
-    """The element of an array, if it has one with this index."""
+    """An element of an array; None after a finding, if it has no such index."""
     if len(index) == len(variable.shape) and all(0 <= i < size for i, size in zip(index, variable.shape, strict=True)):
         return variable, index
     if not variable.shape:

@@ -1,8 +1,8 @@
-"""What `controllers`, `actuators` and `fluid_dynamics` of a physics engine mean as connections.
+"""Connections for the `controllers`, `actuators` and `fluid_dynamics` of a physics engine.
 
-Owns the variable names of the two `gazebo-fmi` plugins and of controllers. The order is theirs, too: what comes from
-the engine has a delay of one point, so that within a step the controller is first, then the actuator, then the engine
-with the fresh effort.
+Owns the variable names of the two `gazebo-fmi` plugins and of controllers. Their order is that of `gazebo-fmi`: values
+from the engine have a delay of one point. So in each step the controller comes first, then the actuator, then the
+engine with the new effort.
 """
 
 from __future__ import annotations
@@ -14,20 +14,22 @@ import msgspec
 from msgspec.structs import replace
 
 from ..config.findings import Findings
-from ..config.mesh import ActuatorConfig, Config, ControllerConfig, EngineConfig, FluidDynamicsConfig
+from ..config.instance_sections import ActuatorConfig, ControllerConfig, FluidDynamicsConfig, PhysicsSection
+from ..config.mesh import Config
 from ..text import listed, nearest
-from ..variables.model_description import Variable
-from .connections import Connection, Variables
+from ..variables.model_description import ModelDescription, Variable
+from .connections import Connection, Variables, resolve_connections
 
-__all__ = ["coupled_connections"]
+__all__ = ["coupled_connections", "driven_inputs"]
 
 AnyCoupling = ControllerConfig | ActuatorConfig | FluidDynamicsConfig
 
 _AXES = ("x", "y", "z")
+_FREE = "an input without a connection"
 
 
 class _Coupling(msgspec.Struct, frozen=True):
-    """One entry of a section, and what its variables are connected to in the engine.
+    """One entry of a section, and the variables of the engine that it is connected to.
 
     Attributes:
         part: the joint or body.
@@ -47,17 +49,17 @@ class _Coupling(msgspec.Struct, frozen=True):
 def coupled_connections(
     config: Config, variables: Variables, explicit: Sequence[Connection], findings: Findings
 ) -> tuple[Connection, ...]:
-    """The connections that the sections of all physics engines stand for.
+    """The connections that follow from the sections of all physics engines.
 
     Args:
         config: the configuration.
-        variables: the variables of every instance by name; what needs a missing one is left out.
+        variables: the variables of every instance by name. An instance without a description gets no connections.
         explicit: the connections that the file has.
-        findings: where everything goes that does not fit.
+        findings: where mistakes go.
     """
     found: list[Connection] = []
     couplings = [*_couplings(config)]
-    # Controllers first: what they ask for is what actuators take.
+    # Controllers first: actuators take their efforts.
     for coupling in sorted(couplings, key=lambda coupling: isinstance(coupling.config, ActuatorConfig)):
         found += _connect(coupling, variables, [*explicit, *found], findings)
         if isinstance(coupling.config, ActuatorConfig):
@@ -65,8 +67,40 @@ def coupled_connections(
     return tuple(found)
 
 
+def driven_inputs(config: Config, descriptions: Mapping[str, ModelDescription]) -> dict[str, str]:
+    """The inputs that have a source in the mesh, as `instance.variable`, and for each what can be set instead.
+
+    An array has a source if one of its elements has. The effort command of a joint with an actuator counts, too,
+    because the engine does not use it.
+
+    Args:
+        config: the configuration.
+        descriptions: the model descriptions by instance name, arrays in their sizes; some may be missing.
+    """
+    ignored = Findings("")  # `fmu_mesh.system.system` reports them
+    variables: Variables = {
+        name: {variable.name: variable for variable in descriptions[name].variables} if name in descriptions else None
+        for name in config.instances
+    }
+    explicit = resolve_connections(config.connections, variables, ignored)
+    connections = (*explicit, *coupled_connections(config, variables, explicit, ignored))
+    driven = {f"{c.target_instance}.{c.target.name}": _FREE for c in connections}
+    # Also the target of a connection whose source does not exist.
+    driven |= {connection.target: _FREE for connection in config.connections}
+    for name, engine in config.instances.items():
+        for actuator in engine.actuators if isinstance(engine, PhysicsSection) else ():
+            if actuator.enabled:
+                driven.setdefault(f"{name}.{actuator.joint}.effort_command", _instead(actuator))
+    return driven
+
+
+def _instead(actuator: ActuatorConfig) -> str:
+    own = actuator.variable_names.get("actuatorInput", "actuatorInput")
+    return f"'{actuator.instance}.{own}': the joint '{actuator.joint}' has the actuator '{actuator.name}'"
+
+
 def _check_command(config: Config, coupling: _Coupling, findings: Findings) -> None:
-    """With an actuator the engine has no use for a command; a start value for it would do nothing."""
+    """Refuse a start value of an effort command that the engine does not use because there is an actuator."""
     command = coupling.reads["actuatorInput"]
     if command in config.instances[coupling.engine].start_values:
         own = coupling.config.variable_names.get("actuatorInput", "actuatorInput")
@@ -77,7 +111,7 @@ def _check_command(config: Config, coupling: _Coupling, findings: Findings) -> N
 
 def _couplings(config: Config) -> Iterator[_Coupling]:
     for name, engine in config.instances.items():
-        if not isinstance(engine, EngineConfig):
+        if not isinstance(engine, PhysicsSection):
             continue
         sections: tuple[tuple[str, Sequence[AnyCoupling]], ...] = (
             ("controllers", engine.controllers),
@@ -113,7 +147,7 @@ def _coupling(engine: str, path: str, config: AnyCoupling) -> _Coupling:
 def _connect(
     coupling: _Coupling, variables: Variables, others: Sequence[Connection], findings: Findings
 ) -> list[Connection]:
-    """The connections of one coupling; none if anything of it does not fit."""
+    """The connections of one coupling; none after a finding."""
     own = _own_variables(coupling, variables, findings)
     engine = variables[coupling.engine]
     if engine is None or not _part_exists(coupling, engine, findings) or own is None:
@@ -143,14 +177,14 @@ def _connect(
 def _command(
     coupling: _Coupling, command: str, variable: Variable, others: Sequence[Connection]
 ) -> Iterator[Connection]:
-    """What a controller sends to the joint, to the actuator as well; nothing if nobody sends anything."""
+    """A connection from the controller of the joint to the actuator; none without a controller."""
     for other in others:
         if (other.target_instance, other.target.name) == (coupling.engine, command):
             yield replace(other, target_instance=coupling.config.instance, target=variable, path=coupling.path)
 
 
 def _part_exists(coupling: _Coupling, engine: Mapping[str, Variable], findings: Findings) -> bool:
-    """Whether the engine has the joint or body, with all that a coupling connects."""
+    """Whether the engine has the joint or body."""
     config, last = coupling.config, ".effort" if coupling.what == "joint" else ".force_x"
     if f"{coupling.part}{last}" in engine:
         return True
@@ -164,7 +198,7 @@ def _part_exists(coupling: _Coupling, engine: Mapping[str, Variable], findings: 
 
 
 def _own_variables(coupling: _Coupling, variables: Variables, findings: Findings) -> dict[str, Variable] | None:
-    """The instance's own variables by default name; None after a finding, or where they are not known."""
+    """The variables of the instance by default name; None after a finding, or without a description."""
     config, path = coupling.config, coupling.path
     defaults = [*coupling.reads, *coupling.drives]
     before = len(findings)

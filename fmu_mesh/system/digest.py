@@ -1,8 +1,8 @@
-"""The digest by which processes of a mesh prove that they agree: on our version, the configuration, and every model.
+"""The digest of a mesh: processes that compare it know that they have the same version, configuration and models.
 
-Processes that somebody started by hand, or on several hosts, read the configuration and the models each for itself. The
-digest has one part for each of these, so that whoever refuses another one can say what differs. What counts as the
-configuration is known in `fmu_mesh.system.plan`.
+Manually started processes, and those on several hosts, read the configuration and the models separately. The digest has
+one part for each, so that an error can say what differs. `fmu_mesh.system.plan` decides what of the configuration
+counts.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ def digest_of(configuration: object, models: Mapping[str, tuple[str, str]]) -> s
     """The digest of a mesh: our version, a hash of the configuration, and one of the model of each instance.
 
     Args:
-        configuration: all that must be the same, as a value that JSON can hold.
+        configuration: what must be equal, as a value that JSON can hold.
         models: the GUID and the SHA-256 of the content by instance name.
     """
     hashes = [_hash(models[name])[:_MODEL_DIGITS] for name in sorted(models)]
@@ -32,11 +32,11 @@ def digest_of(configuration: object, models: Mapping[str, tuple[str, str]]) -> s
 
 
 def difference(own: str, other: str, instances: Iterable[str]) -> str:
-    """In words, what a process with the digest ``other`` has instead: `another model of 'gain'`.
+    """In words, what is different in a process with the digest ``other``: `another model of 'gain'`.
 
     Args:
         own: the digest of this process.
-        other: one that differs.
+        other: the different digest.
         instances: the names of all instances here.
     """
     (version, configuration, *models), there = own.split(), other.split()

@@ -1,4 +1,4 @@
-"""Directed graphs, as far as the plan needs them; everything is deterministic in the order of its arguments."""
+"""Algorithms on directed graphs. Each result depends only on the arguments and their order."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def strongly_connected(vertices: Iterable[V], edges: Iterable[tuple[V, V]]) -> l
                     parent = work[-1][0]
                     low[parent] = min(low[parent], low[vertex])
                 if low[vertex] == index[vertex]:
-                    cut = bisect_left(stack, index[vertex], key=index.__getitem__)  # the stack is in their order
+                    cut = bisect_left(stack, index[vertex], key=index.__getitem__)  # the stack is sorted by index
                     component = stack[cut:]
                     del stack[cut:]
                     on_stack.difference_update(component)
@@ -55,7 +55,7 @@ def strongly_connected(vertices: Iterable[V], edges: Iterable[tuple[V, V]]) -> l
 
 
 def topological_order(vertices: Iterable[V], edges: Iterable[tuple[V, V]]) -> list[V]:
-    """An order in which every source stands before its targets; otherwise the order of ``vertices`` is kept.
+    """An order with every source before its targets; where the edges allow, in the order of ``vertices``.
 
     Raises:
         ValueError: the graph has a cycle.
@@ -79,35 +79,36 @@ def topological_order(vertices: Iterable[V], edges: Iterable[tuple[V, V]]) -> li
 
 
 def feedback_edges(vertices: Iterable[V], edges: Sequence[tuple[V, V, bool]]) -> list[int]:
-    """Indices of edges whose removal leaves no cycle, taken only from those whose flag says that they may be.
+    """Indices of edges to remove so that no cycle is left.
 
-    The edges that must stay are laid first, then the others in their order; one that would lead back to its own source
-    is taken. So it is the connection written last that closes a cycle. Cycles made only of edges that must stay remain.
+    Only edges whose flag is true may be removed; a cycle of the others stays. The others are added to an empty graph
+    first, then those with the flag in their order. An edge that would close a cycle is not added but returned. So it is
+    the connection written last that closes a cycle.
     """
-    successors: dict[V, dict[V, None]] = {vertex: {} for vertex in vertices}  # many edges may go the same way
+    successors: dict[V, dict[V, None]] = {vertex: {} for vertex in vertices}  # there may be many equal edges
     for source, target, free in edges:
         if not free:
             successors[source][target] = None
-    taken = []
+    removed = []
     for index, (source, target, free) in enumerate(edges):
         if free and reaches(successors, target, source):
-            taken.append(index)
+            removed.append(index)
         elif free:
             successors[source][target] = None
-    return taken
+    return removed
 
 
 def reaches(successors: Mapping[V, Iterable[V]], start: V, goal: V) -> bool:
-    """Whether a way leads from ``start`` to ``goal``; from every vertex one leads to itself."""
-    seen = {start}
+    """Whether there is a path from ``start`` to ``goal``. Every vertex reaches itself."""
+    visited = {start}
     stack = [start]
     while stack:
         vertex = stack.pop()
         if vertex == goal:
             return True
         for target in successors[vertex]:
-            if target not in seen:
-                seen.add(target)
+            if target not in visited:
+                visited.add(target)
                 stack.append(target)
     return False
 

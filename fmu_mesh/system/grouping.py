@@ -1,8 +1,8 @@
-"""`group: auto`: which instances should share a node because they form a cycle, and what keeps them apart.
+"""`group: auto`: the instances of each cycle share one node.
 
-Within a cycle every point needs what another member did at the same point or the one before: over several nodes that
-is a message there and one back, within one node it is a copy in memory. Between cycles data flows one way, and nodes
-that work side by side are faster. So each cycle gets one node, and everything else a node of its own.
+In a cycle, each point needs values of another member from the same point or the point before. Between two nodes this
+costs a message in each direction; within one node it is a copy in memory. Outside of cycles data flows one way, and
+parallel nodes are faster. So each cycle gets one node, and every other instance its own.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _SUFFIX = "-cycle"
 def automatic_nodes(
     config: Config, edges: Iterable[tuple[str, str]], descriptions: Mapping[str, ModelDescription]
 ) -> dict[str, str]:
-    """The node of each instance that shares one with other members of its cycle; the others are not in it.
+    """The names of the nodes that several instances of a cycle share, by instance. Other instances are not in it.
 
     An instance with a ``group`` of its own stays there. Instances with different hosts never share a node, nor do
     two of an FMU that allows one instance per process.

@@ -1,9 +1,9 @@
-"""In which order connected values become known in Initialization Mode, and which of them have to be iterated.
+"""The order in which connected outputs are computed in Initialization Mode, and which of them are iterated.
 
-Each connected output gets a level: 0 if it depends on no connected input there, otherwise one more than the highest
-level among the outputs that feed the inputs it depends on (FMI 2.0, 2.2.8, InitialUnknowns). Outputs that depend on
-each other form a loop (docs/adr/0013): it is torn at some of its connections, its outputs have levels of their own in
-the torn graph, and these levels are gone through until the torn connections bring what was assumed.
+Each connected output has a level. It is 0 if the output depends on no connected input; otherwise it is one more than
+the highest level of the outputs that these inputs are connected to (FMI 2.0, 2.2.8, InitialUnknowns). Outputs that
+depend on each other form a loop (docs/adr/0013). A loop is torn at some of its connections, and its outputs get their
+levels in the torn graph. These levels are repeated until the torn connections have the assumed values.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ Key = tuple[str, str]
 
 
 class Tear(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A connection at which a loop is torn: the input has an assumed value, which the source has to confirm.
+    """A connection at which a loop is torn. Its input has an assumed value, which the iteration corrects.
 
     Attributes:
         output: as `y`, or an element of it as `y[2]`; ``input`` likewise.
         type: the type of the input, or of the element.
         shape: the sizes of its dimensions.
-        start: what is assumed at first: the start value of the input.
+        start: the first assumed value: the start value of the input.
     """
 
     source: str
@@ -52,11 +52,11 @@ class Loop(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """An algebraic loop in Initialization Mode.
 
     Attributes:
-        first: its first level; no other output has a level of the loop.
+        first: its first level. Outputs outside of the loop have none of its levels.
         last: its last level.
-        tears: where it is torn; without them it has no cycle.
+        tears: the torn connections; without them there is no cycle.
         outputs: (instance, output) of all its outputs, in the order of their levels.
-        nodes: the nodes that have these outputs.
+        nodes: the nodes with these outputs.
     """
 
     first: int
@@ -77,9 +77,9 @@ def plan_initialization(system: System, connections: Sequence[Connection]) -> In
     """Levels of all connected outputs, and the loops.
 
     Args:
-        system: where the start values of inputs are.
-        connections: all connections, with their delays. A delay means nothing in Initialization Mode, but a connection
-            that has one is torn rather than one that has none: values go the way that steps go.
+        system: the system, for the start values of inputs.
+        connections: all connections, with their delays. In Initialization Mode a delay has no effect, but a connection
+            with a delay is torn before one without: so the values flow in the order of the steps.
     """
     outputs = tuple(dict.fromkeys((c.source_instance, c.source.name) for c in connections))
     reached = _reached(connections)
@@ -114,9 +114,9 @@ def plan_initialization(system: System, connections: Sequence[Connection]) -> In
 def _torn(
     members: Sequence[Key], connections: Sequence[Connection], reached: Mapping[int, Sequence[Key]]
 ) -> tuple[list[Connection], list[tuple[Key, Key]]]:
-    """The ones of the connections out of a loop at which it is torn, and the edges that are left.
+    """The connections of a loop at which it is torn, and the remaining edges.
 
-    As with the delays of Gauss-Seidel, it is the connection written last that closes a cycle.
+    Like the delays of Gauss-Seidel, it is the connection written last that closes a cycle.
     """
     own = set(members)
     torn: set[int] = set()
@@ -155,7 +155,7 @@ def _tear(system: System, connection: Connection) -> Tear:
 
 
 def _reached(connections: Sequence[Connection]) -> dict[int, list[Key]]:
-    """By the id of each connection: the connected outputs that depend on its target."""
+    """The connected outputs that depend on the target of a connection, by the id of the connection."""
     outputs: dict[str, dict[str, Variable]] = {}
     for c in connections:
         outputs.setdefault(c.source_instance, {})[c.source.name] = c.source
@@ -186,7 +186,7 @@ class _Dependents:
 
 
 def _by_depth(vertices: Sequence[Key], edges: Sequence[tuple[Key, Key]]) -> list[list[list[Key]]]:
-    """The strongly connected components, by how many others lie before them on the longest way to them."""
+    """The strongly connected components by depth: the number of components on the longest path to them."""
     parts = strongly_connected(vertices, edges)
     part_of = {key: number for number, part in enumerate(parts) for key in part}
     before: list[set[int]] = [set() for _ in parts]
@@ -194,7 +194,7 @@ def _by_depth(vertices: Sequence[Key], edges: Sequence[tuple[Key, Key]]) -> list
         if part_of[source] != part_of[target]:
             before[part_of[target]].add(part_of[source])
     depths: list[int] = []
-    for others in before:  # sources stand before their targets
+    for others in before:  # sources come before their targets
         depths.append(1 + max((depths[other] for other in others), default=-1))
     by_depth: list[list[list[Key]]] = [[] for _ in range(max(depths, default=-1) + 1)]
     for part, depth in zip(parts, depths, strict=True):

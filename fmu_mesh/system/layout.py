@@ -1,6 +1,6 @@
-"""The layout of a row: which values of an instance lie where, and how many rows a ring has.
+"""The layout of a row: which variables it has and at which places.
 
-A row holds the values of one instance at one of its own steps. Pure data; the memory is `fmu_mesh.rings.ring`.
+A row has the values of one instance at one of its own steps. The memory itself is `fmu_mesh.rings.ring`.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from ..variables.value_types import DTYPES, TYPES, VariableType, element_names, 
 __all__ = ["Column", "Layout", "Part", "Place", "rows_for"]
 
 _TEXT_BYTES = 64
-"""What a String or Binary is taken for where memory and frames are planned, if it does not say how long it can be."""
+"""Assumed size of a String or Binary without a maximum size, to plan memory and frames."""
 
 
 class Column(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One variable in a row; an array takes as many neighbouring elements as it has, row by row."""
+    """One variable in a row. The elements of an array are neighbours, in row-major order."""
 
     name: str
     type: VariableType
@@ -31,20 +31,20 @@ class Column(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def size(self) -> int:
-        """How many elements it has."""
+        """Number of elements; 1 for a scalar."""
         return math.prod(self.shape)
 
     @property
     def elements(self) -> tuple[str, ...]:
-        """The names of its elements, as `y[1,2]`; of a scalar, its own name."""
+        """The names of its elements, as `y[1,2]`; for a scalar, its own name."""
         return element_names(self.name, self.shape)
 
 
 class Part(NamedTuple):
-    """The columns of one type, which lie in one array.
+    """The columns of one type; their values are in one array.
 
     Attributes:
-        width: how many elements they have together.
+        width: number of elements of all columns together.
     """
 
     type: VariableType
@@ -53,7 +53,7 @@ class Part(NamedTuple):
 
 
 class Place(NamedTuple):
-    """Where a variable, or one element of an array, lies in a row: elements ``first .. first + size - 1`` of a part."""
+    """The place of a variable or of one array element in a row: elements ``first .. first + size - 1`` of a part."""
 
     part: int
     first: int
@@ -62,9 +62,9 @@ class Place(NamedTuple):
 
 
 class Layout(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The columns of a row, those of each type together: first Float64, then the others in the order of `TYPES`.
+    """The columns of a row, grouped by type in the order of `TYPES`, Float64 first.
 
-    Make it by `of`, which puts the columns in that order.
+    Make it with `of`, which sorts the columns.
     """
 
     columns: tuple[Column, ...] = ()
@@ -73,7 +73,7 @@ class Layout(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def of(
         cls, columns: Iterable[tuple[str, VariableType] | tuple[str, VariableType, tuple[int, ...]] | Variable]
     ) -> Layout:
-        """The layout that holds these variables, or (name, type) or (name, type, shape), in their order per type."""
+        """The layout for these variables, or for (name, type) or (name, type, shape); keeps the order within a type."""
         made = [Column(c.name, c.type, c.shape, c.max_size) if isinstance(c, Variable) else Column(*c) for c in columns]
         return cls(tuple(sorted(made, key=lambda column: TYPES.index(column.type))))
 
@@ -92,7 +92,7 @@ class Layout(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def parts(self) -> tuple[Part, ...]:
-        """The parts that have columns, in the order in which they lie in memory and in a frame."""
+        """The parts that have columns, in their order in memory and in a frame."""
         by_type: dict[VariableType, list[Column]] = {}
         for column in self.columns:
             by_type.setdefault(column.type, []).append(column)
@@ -110,7 +110,7 @@ class Layout(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return by_name[name]
 
     def place(self, name: str) -> Place:
-        """Where a variable lies, or an element of an array such as `y[2]`; a variable of that very name comes first.
+        """The place of a variable, or of an array element such as `y[2]`, unless a variable has exactly that name.
 
         Raises:
             KeyError: there is no such column.
@@ -129,7 +129,7 @@ class Layout(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def rows_for(window: int) -> int:
-    """Rows that a ring needs so that no row is overwritten while a node runs ``window`` points ahead."""
+    """Number of rows of a ring in which a node can be ``window`` points ahead without overwriting a row in use."""
     return 1 << (window + 3).bit_length()
 
 

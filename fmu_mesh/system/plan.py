@@ -1,47 +1,38 @@
-"""What follows from the graph: delays, order, cycles, initialization levels, and what every node has to do.
+"""The plan of a mesh: delays, order, cycles, initialization levels, and the tasks of every node.
 
-Owns the synchronization model (design, section 3) as data. The plan is a pure function of a `System`; every process of
-a mesh computes or receives the same one, and its digest proves it.
+Owns the synchronization model (docs/architecture.md) as data. The plan is a pure function of a `System`. Every process
+of a mesh computes or receives the same plan; they compare its digest.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Literal
 
 import msgspec
 from msgspec.structs import replace
 
-from ..config.mesh import (
-    GazeboClassicConfig,
-    HostConfig,
-    InitializationConfig,
-    InstanceConfig,
-    LimitsConfig,
-    MujocoConfig,
-    TimeoutsConfig,
-)
+from ..config.instance_sections import InstanceSection, placed
+from ..config.mesh import InitializationConfig, LimitsConfig, TimeoutsConfig
 from ..errors import ConfigurationError, Finding
 from ..simtime import TimeGrid
-from ..variables.model_description import HostKind, Kind
 from ..variables.value_conversion import to_plain
 from ..variables.value_types import PlainValue
 from .digest import digest_of
 from .graph import cycle_through, feedback_edges, strongly_connected, topological_order
 from .initialization_plan import InitializationPlan, Loop, plan_initialization
 from .layout import Layout, rows_for
-from .step_options import StepOptions, linear_inputs
+from .linear_inputs import LinearInput, linear_inputs
 from .system import Connection, System, SystemInstance
 from .window import LAZY_ROWS, recorder_window, window_of
 
 __all__ = ["RECORDER", "Feed", "InstancePlan", "Link", "NodePlan", "Plan", "make_plan"]
 
 RECORDER = "@record"
-"""Name of the recorder where node names stand; no instance can have it."""
+"""Name of the recorder in place of the name of a node. No instance can have it."""
 
 
 class Feed(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How one source instance feeds one instance, all connections with the same delay together.
+    """All connections from one instance to another that have the same delay.
 
     Attributes:
         columns: (source, target, factor, offset) of each connection; an end is a variable, or an element as `y[2]`.
@@ -53,17 +44,16 @@ class Feed(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class InstancePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a node has to do for one of its instances.
+    """The part of one instance in the plan of a node.
 
     Attributes:
         step_points: base points per own step.
         outputs: the columns read after every step: connected or recorded outputs.
         inputs: the connected inputs, set before every step.
-        initialization: the levels at which connected outputs become known in Initialization Mode, by name.
-        interpolation: what the time of a value that is sent to an unconnected input means; None: nothing.
-        kind: which kind of the FMU is used.
-        options: how it is stepped.
-        hosted: the section of the configuration of an instance that is no FMU.
+        initialization: the levels of its connected outputs in Initialization Mode, by name.
+        section: its section of the configuration, without the common keys: their meaning is in the other fields. It is
+            decoded with the hook `fmu_mesh.instances.registry.decode_section`, because only that knows the kinds.
+        linear_inputs: the inputs whose connections are extrapolated.
     """
 
     name: str
@@ -74,21 +64,18 @@ class InstancePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     inputs: Layout
     feeds: tuple[Feed, ...]
     initialization: dict[str, int]
-    interpolation: Literal["hold", "linear"] | None = None
-    sha256: str | None = None
-    kind: Kind | HostKind = "co_simulation"
-    options: StepOptions = StepOptions()
-    hosted: HostConfig | None = None
+    section: InstanceSection
+    linear_inputs: tuple[LinearInput, ...] = ()
 
 
 class Link(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The frames of one instance for one node: every link has its own columns and is flushed on its own.
+    """The frames of one instance for one node. Each link has its own columns and is flushed separately.
 
     Attributes:
-        index: number of the link in the mesh; stands in every frame.
-        levels: initialization level of each column, in the order of `layout.names`; -1 for one that is not needed then.
-        initial_only: whether it carries nothing after Initialization Mode: a node that takes part in the iteration of a
-            loop has to see what the torn connections of others bring.
+        index: number of the link in the mesh; every frame has it.
+        levels: initialization level of each column, in the order of `layout.names`; -1: not needed in initialization.
+        initial_only: whether it has no frames after Initialization Mode. A node that takes part in the iteration of a
+            loop needs the values of all torn connections of the loop, also of those between other nodes.
     """
 
     index: int
@@ -102,21 +89,20 @@ class Link(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class NodePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Everything that one node must know.
+    """The plan of one node.
 
     Attributes:
-        units: the instances in execution order; those of one inner tuple form a cycle within the node and step point by
-            point, the others run as far ahead as their inputs and the grant allow.
-        window: how many points this node may be behind the grant.
-        progress_stride: points after which the master is told; a quarter of the window, or every point where a single
-            step is as long as that.
-        ring_rows: rows of every ring; a power of two.
-        loops: the algebraic loops at the start that instances of this node are part of.
-        initialization: how they are iterated.
+        units: the instances in execution order. Those of one inner tuple form a cycle within the node and step point by
+            point; the others run ahead as far as their inputs and the grant allow.
+        window: number of points that this node may be behind the grant.
+        progress_stride: number of points between two progress messages to the master: a quarter of the window, or 1 if
+            a single step is that long.
+        ring_rows: number of rows of every ring; a power of two.
+        loops: the algebraic loops at the start that have instances of this node.
+        initialization: how these loops are iterated.
         links_in: links that end here.
         links_out: links that start here.
-        result_file: absolute path of the result CSV (for the recorder).
-        restarts: how often the run was started again.
+        restarts: how many times the run was restarted.
         shared_memory: whether processes of one host exchange messages through shared memory.
     """
 
@@ -135,7 +121,6 @@ class NodePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     links_out: tuple[Link, ...]
     loops: tuple[Loop, ...] = ()
     initialization: InitializationConfig = InitializationConfig()
-    result_file: str | None = None
     recorded: tuple[tuple[str, str], ...] = ()
     limits: LimitsConfig = LimitsConfig()
     shared_memory: bool = True
@@ -146,7 +131,7 @@ class NodePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return next(instance for instance in self.instances if instance.name == name)
 
     def peers(self) -> set[str]:
-        """Names of the nodes that this one exchanges frames with; the recorder is with the master."""
+        """Names of the nodes that exchange frames with this one, without the recorder, which is part of the master."""
         nodes = {link.source_node for link in self.links_in} | {link.target_node for link in self.links_out}
         return nodes - {RECORDER}
 
@@ -158,8 +143,8 @@ class Plan(msgspec.Struct, frozen=True):
         connections: the connections of the system, each with its delay.
         order: instance names in execution order within one point.
         cycles: instance names of every cycle.
-        closing: the connections that close a cycle and got a delay of 1 for it.
-        nodes: by node name, recorder included if there is one.
+        closing: the connections that have a delay of 1 because they close a cycle.
+        nodes: by node name, with the recorder if there is one.
     """
 
     system: System
@@ -178,7 +163,7 @@ class Plan(msgspec.Struct, frozen=True):
         return self.system.grid
 
     def node_of(self, instance: str) -> str:
-        """The node that an instance runs in."""
+        """The name of the node of an instance."""
         return self.system.instances[instance].node
 
 
@@ -195,7 +180,7 @@ def make_plan(
         system: the system.
         window: overrides the window of the configuration, in points.
         file: name of the configuration file, for errors.
-        contents: the SHA-256 of what the model of each instance is, by instance name.
+        contents: the SHA-256 of the content of each model, by instance name.
 
     Raises:
         ConfigurationError: a cycle has no delay; names the cycle.
@@ -229,27 +214,19 @@ def make_plan(
 
 
 def _digest(system: System, nodes: dict[str, NodePlan], contents: Mapping[str, str]) -> str:
-    """What all processes of a mesh must agree on: also what is in files, but not where they lie on each host."""
+    """The digest that all processes must have: it covers the content of files, but not where they are on each host."""
     agreed = [
         replace(
             node,
-            result_file=None,
             limits=LimitsConfig(),
             instances=tuple(
-                replace(instance, fmu="", sha256=None, hosted=_without_path(instance.hosted))
-                for instance in node.instances
+                replace(instance, fmu="", section=instance.section.agreed()) for instance in node.instances
             ),
         )
         for node in nodes.values()
     ]
     models = {name: (own.description.guid, contents.get(name, "")) for name, own in system.instances.items()}
     return digest_of(agreed, models)
-
-
-def _without_path(section: HostConfig | None) -> HostConfig | None:
-    if isinstance(section, MujocoConfig):
-        return replace(section, mujoco="")
-    return replace(section, gazebo_classic="") if isinstance(section, GazeboClassicConfig) else section
 
 
 def _with_delays(system: System) -> tuple[tuple[Connection, ...], tuple[Connection, ...]]:
@@ -310,9 +287,10 @@ def _nodes(plan: Plan) -> dict[str, NodePlan]:
 
 
 def _units(plan: Plan, node: str, members: list[str]) -> dict[str, tuple[str, ...]]:
-    """The unit of each member of a node: its cycle, if the whole cycle is in this node, otherwise itself alone.
+    """The unit of each member of a node: its cycle if all of it is in this node, otherwise the member alone.
 
-    A cycle that leaves the node must be stepped member by member: one member may wait for what another one caused.
+    A cycle over several nodes is stepped member by member, because a member may wait for another node that waits for a
+    member of this node.
     """
     units: dict[str, tuple[str, ...]] = {name: (name,) for name in members}
     for cycle in plan.cycles:
@@ -343,8 +321,8 @@ def _node(
         grid=plan.grid,
         window=window,
         progress_stride=window // 4 if window >= 4 * longest_step else 1,
-        # A source may be two own steps beyond the grant (the one it takes, and the one it holds its value for), and a
-        # target one own step before what it told.
+        # A source may be two own steps beyond the grant (the step it takes, and the step for which it holds its value).
+        # A target may be one own step behind the progress it has reported.
         ring_rows=rows_for(max(window, LAZY_ROWS) + 3 * longest_step),
         timeouts=config.timeouts,
         instances=instances,
@@ -353,7 +331,6 @@ def _node(
         links_out=tuple(link for link in links if link.source_node == node),
         loops=tuple(loop for loop in plan.initialization.loops if node in loop.nodes),
         initialization=config.initialization,
-        result_file=plan.system.result_file if node == RECORDER else None,
         recorded=plan.system.recorded if node == RECORDER else (),
         limits=config.limits,
         shared_memory=config.zenoh.shared_memory,
@@ -370,7 +347,6 @@ def _output_layout(plan: Plan, name: str) -> Layout:
 
 def _instance_plan(plan: Plan, instance: SystemInstance, outputs: Layout) -> InstancePlan:
     incoming = [c for c in plan.connections if c.target_instance == instance.name]
-    section = plan.system.config.instances[instance.name]
     feeds: dict[tuple[str, int], list[tuple[str, str, float, float]]] = {}
     for c in incoming:
         feeds.setdefault((c.source_instance, c.delay or 0), []).append(
@@ -387,16 +363,13 @@ def _instance_plan(plan: Plan, instance: SystemInstance, outputs: Layout) -> Ins
         inputs=Layout.of(v for v in instance.description.variables if v.name in connected),
         feeds=tuple(Feed(source=s, delay=d, columns=tuple(columns)) for (s, d), columns in sorted(feeds.items())),
         initialization={variable: level for (owner, variable), level in levels.items() if owner == instance.name},
-        interpolation=section.interpolation if isinstance(section, InstanceConfig) else None,
-        sha256=section.sha256 if isinstance(section, InstanceConfig) else None,
-        kind=instance.description.kind,
-        options=replace(instance.options, linear_inputs=linear_inputs(plan.connections, instance.name)),
-        hosted=instance.hosted,
+        section=placed(plan.system.config.instances[instance.name]),
+        linear_inputs=linear_inputs(plan.connections, instance.name),
     )
 
 
 def _links(plan: Plan) -> tuple[Link, ...]:
-    """One link per source instance and other node that needs some of its outputs, recorder last, initial ones after."""
+    """One link per instance and other node that needs its outputs: to the recorder last, then the initial ones."""
     needed: dict[tuple[str, str], set[str]] = {}
     for c in plan.connections:
         target_node = plan.node_of(c.target_instance)
@@ -430,7 +403,7 @@ def _links(plan: Plan) -> tuple[Link, ...]:
 
 
 def _needed_initially(plan: Plan, needed: dict[tuple[str, str], set[str]]) -> dict[tuple[str, str], set[str]]:
-    """Outputs by (instance, node) that decide whether a loop is consistent, and come over no other link."""
+    """Outputs by (instance, node) that a node needs to iterate a loop and that no other link has."""
     initial: dict[tuple[str, str], set[str]] = {}
     for loop in plan.initialization.loops:
         for node in loop.nodes:
@@ -442,6 +415,6 @@ def _needed_initially(plan: Plan, needed: dict[tuple[str, str], set[str]]) -> di
 
 
 def _base(plan: Plan, instance: str, name: str) -> str:
-    """The name of the variable that a column or an end of a connection is, or is an element of."""
+    """The name of the variable of a column or of an end of a connection, which may be an array element."""
     variable = plan.system.instances[instance].description.variable_of(name)
     return variable.name if variable is not None else name

@@ -1,7 +1,7 @@
-"""Start values of the configuration to values of the variables' types.
+"""From the start values of a configuration to values of the types of the variables.
 
-Owns what may be set before the start (FMI 2.0, 2.2.7), and what an FMU is handed although the standard forbids it.
-Which plain value stands for which value is `fmu_mesh.variables.value_conversion`.
+Owns which variables can be set before the start (FMI 2.0, 2.2.7), and which start values an FMU gets although FMI
+forbids them. The conversion of a single value is `fmu_mesh.variables.value_conversion`.
 """
 
 from __future__ import annotations
@@ -10,7 +10,8 @@ from collections.abc import Mapping
 from typing import Final
 
 from fmu_mesh.config.findings import Findings
-from fmu_mesh.config.mesh import AnyInstanceConfig, Config, InstanceConfig
+from fmu_mesh.config.instance_sections import InstanceSection
+from fmu_mesh.config.mesh import Config
 from fmu_mesh.text import listed, nearest, shown
 from fmu_mesh.variables.model_description import ModelDescription, Value, Variable
 from fmu_mesh.variables.value_conversion import ValueRefused, to_value
@@ -19,24 +20,24 @@ from fmu_mesh.variables.value_types import MAX_ELEMENTS
 __all__ = ["forbidden", "forbidden_start_values", "resolve_start_values", "sized"]
 
 _SOURCES: Final = {"1": "FMI 1.0 (ME 3.3)", "2": "FMI 2.0 (2.2.7)", "3": "FMI 3.0 (2.4.7)"}
-"""What says which variables may have a start value, by the version of FMI."""
+"""The clause that says which variables may have a start value, by version of FMI."""
 
 
-def sized(name: str, description: ModelDescription, config: AnyInstanceConfig, findings: Findings) -> ModelDescription:
-    """A model description with the shapes that its arrays get by the structural parameters of the configuration.
+def sized(name: str, description: ModelDescription, config: InstanceSection, findings: Findings) -> ModelDescription:
+    """A model description with its arrays in the sizes that the structural parameters of the configuration give.
 
     Args:
         name: instance name.
         description: the model description.
         config: the instance's section of the configuration.
-        findings: where arrays go that would be too large; they keep their shapes.
+        findings: where arrays go that would be too large; these keep their sizes.
     """
     sizes: dict[str, Value] = {}
     for variable in description.with_causality("structuralParameter"):
         try:
             sizes[variable.name] = to_value(config.start_values[variable.name], variable)
         except (KeyError, ValueRefused):
-            continue  # it keeps its own, or `resolve_start_values` finds it
+            continue  # there is none, or `resolve_start_values` refuses it
     made = description.sized(sizes)
     for variable in made.variables:
         if variable.size > MAX_ELEMENTS:
@@ -47,7 +48,7 @@ def sized(name: str, description: ModelDescription, config: AnyInstanceConfig, f
 
 
 def resolve_start_values(
-    name: str, config: AnyInstanceConfig, variables: Mapping[str, Variable], findings: Findings
+    name: str, config: InstanceSection, variables: Mapping[str, Variable], findings: Findings
 ) -> dict[str, Value]:
     """The start values of the instance ``name``, converted to the types of its variables.
 
@@ -55,9 +56,8 @@ def resolve_start_values(
         name: instance name.
         config: its section of the configuration.
         variables: its variables by name.
-        findings: where unknown names and impossible values go; they are left out of the result.
+        findings: where unknown names and wrong values go; the result does not have them.
     """
-    is_fmu = isinstance(config, InstanceConfig)
     settable = [variable.name for variable in variables.values() if variable.settable_before_start]
     values: dict[str, Value] = {}
     for variable_name, value in config.start_values.items():
@@ -66,7 +66,7 @@ def resolve_start_values(
         if variable is None:
             found = f"the unknown variable '{variable_name}' of instance '{name}'"
             findings.add(path, found, f"one of {listed(settable)}", nearest(variable_name, settable))
-        elif not (variable.may_take_start_value if is_fmu else variable.settable_before_start):
+        elif not (variable.may_take_start_value if config.follows_fmi else variable.settable_before_start):
             found = f"'{variable_name}', {variable.role} that cannot be set before the start"
             findings.add(path, found, f"one of {listed(settable)}")
         else:
@@ -83,30 +83,30 @@ def resolve_start_values(
 def forbidden_start_values(
     config: Config, descriptions: Mapping[str, ModelDescription], findings: Findings, *, strict: bool
 ) -> None:
-    """Note the start values that FMI forbids, and that the FMUs are handed all the same: some take them.
+    """Add a finding for each start value that FMI forbids. FMUs get these values anyway, because some use them.
 
     Args:
         config: the configuration.
         descriptions: the model descriptions by instance name.
         findings: where they go.
-        strict: whether to look at the instances where they are errors, or at those where they are warnings.
+        strict: true: for the instances where they are errors; false: for those where they are warnings.
     """
     for name, instance in config.instances.items():
-        if not isinstance(instance, InstanceConfig) or name not in descriptions or config.is_strict(instance) != strict:
+        if not instance.follows_fmi or name not in descriptions or config.is_strict(instance) != strict:
             continue
         variables = {variable.name: variable for variable in descriptions[name].variables}
         settable = [variable.name for variable in variables.values() if variable.settable_before_start]
         for variable_name, value in instance.start_values.items():
             variable = variables.get(variable_name)
             if variable is None or variable.settable_before_start or not variable.may_take_start_value:
-                continue  # it is right, or `resolve_start_values` refuses it
+                continue  # it is allowed, or `resolve_start_values` refuses it
             found = f"{shown(value)} for {forbidden(variable, descriptions[name])}"
             expected = f"one of {listed(settable)}; `strict: false` leaves it to the FMU" if strict else ""
             findings.add(f"instances.{name}.start_values.{variable_name}", found, expected)
 
 
 def forbidden(variable: Variable, description: ModelDescription) -> str:
-    """In words why a start value of a variable may have no effect, to follow what it is set to."""
+    """Why a start value of a variable may have no effect, as the end of the sentence `1.0 for ...`."""
     source = _SOURCES[description.fmi_version[0]]
     what = f"'{variable.name}', {variable.role}"
     return f"{what}: {source} does not allow setting it; whether it takes effect is up to the FMU"

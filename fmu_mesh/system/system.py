@@ -1,7 +1,7 @@
-"""The validated system: every name of the configuration resolved against the model descriptions.
+"""The validated system: every name of the configuration is resolved with the model descriptions.
 
-Owns the meaning of a configuration (names, causality, types, step sizes). What follows from the graph
-(delays, order, cycles) is `fmu_mesh.system.plan`. Descriptions are handed in: it knows neither FMPy nor Zenoh.
+Owns the meaning of names, causality, types and step sizes. Delays, order and cycles are `fmu_mesh.system.plan`. The
+model descriptions are arguments: this module knows neither FMPy nor Zenoh.
 """
 
 from __future__ import annotations
@@ -14,8 +14,9 @@ from msgspec.structs import replace
 
 from fmu_mesh import files
 from fmu_mesh.config.findings import Findings
+from fmu_mesh.config.instance_sections import InstanceSection, key_of
 from fmu_mesh.config.loading import LoadedConfig
-from fmu_mesh.config.mesh import AnyInstanceConfig, Config, HostConfig, InstanceConfig
+from fmu_mesh.config.mesh import Config
 from fmu_mesh.errors import Finding
 from fmu_mesh.simtime import ENDLESS, TimeGrid, steps_between
 from fmu_mesh.system.connections import (
@@ -27,8 +28,9 @@ from fmu_mesh.system.connections import (
 )
 from fmu_mesh.system.couplings import coupled_connections
 from fmu_mesh.system.grouping import automatic_nodes
+from fmu_mesh.system.linear_inputs import check_extrapolation
+from fmu_mesh.system.recording import result_endings, result_format
 from fmu_mesh.system.start_values import forbidden_start_values, resolve_start_values, sized
-from fmu_mesh.system.step_options import StepOptions, capability_warnings, check_extrapolation, resolve_step_options
 from fmu_mesh.text import nearest_file, shown
 from fmu_mesh.variables.model_description import ModelDescription, Value
 from fmu_mesh.variables.value_types import element_name, is_text
@@ -37,24 +39,17 @@ __all__ = ["Connection", "System", "SystemInstance", "build"]
 
 _RESERVED_NAME = "mesh"
 
-_OTHER_FORMATS = frozenset(
-    (".arrow", ".bag", ".db3", ".feather", ".h5", ".hdf5", ".json", ".mat", ".npz", ".ods", ".parquet", ".xls", ".xlsx")
-)
-"""Endings of other formats: a CSV under such a name would not open in what the name asks for."""
-
 
 class SystemInstance(msgspec.Struct, frozen=True):
     """One instance of the system.
 
     Attributes:
         name: instance name.
-        fmu: absolute path of the FMU, or of the model of a physics engine; empty where there is no file.
+        fmu: absolute path of the model; empty for a kind without files.
         description: its model description.
         start_values: start values by variable name, converted to the variable's type.
         step_points: its step size as a multiple of the base step size; 1 or more.
-        node: name of the node (process) it runs in: its group, that of its cycle (`group: auto`), or its own name.
-        options: how it is stepped; its linear inputs are not known before the delays.
-        hosted: its section of the configuration if it is no FMU.
+        node: name of its node (process): its group, that of its cycle (`group: auto`), or its own name.
     """
 
     name: str
@@ -63,19 +58,17 @@ class SystemInstance(msgspec.Struct, frozen=True):
     start_values: dict[str, Value]
     step_points: int
     node: str
-    options: StepOptions = StepOptions()
-    hosted: HostConfig | None = None
 
 
 class System(msgspec.Struct, frozen=True):
-    """A configuration whose every name has a meaning.
+    """A configuration whose names are all resolved.
 
     Attributes:
         instances: in the order of the file.
-        recorded: the recorded outputs as (instance, variable), in the order of the result columns; of an array every
-            element is a column of its own, as `y[1,2]`.
-        result_file: absolute path of the result CSV, or None if nothing is recorded.
-        warnings: what is odd but can run, such as connections between different units.
+        recorded: the recorded outputs as (instance, variable), in the order of the result columns. Each element of an
+            array is a column, as `y[1,2]`.
+        result_file: absolute path of the result file, or None if nothing is recorded.
+        warnings: findings that do not prevent a run, such as connections between different units.
     """
 
     config: Config
@@ -90,16 +83,16 @@ class System(msgspec.Struct, frozen=True):
 def build(
     loaded: LoadedConfig, descriptions: Mapping[str, ModelDescription], findings: Iterable[Finding] = ()
 ) -> System:
-    """Give every name of a configuration its meaning.
+    """Resolve every name of a configuration.
 
     Args:
         loaded: the configuration and its places in the file.
-        descriptions: the model descriptions by instance name. Where one is missing, because its FMU could not
-            be read, what needs it is not checked; then ``findings`` has to say why it is missing.
-        findings: earlier findings, which one error shows together with those of this function.
+        descriptions: the model descriptions by instance name. One may be missing because its model could not be read;
+            then ``findings`` must say why, and checks that need it are left out.
+        findings: earlier findings; the error has them, too.
 
     Raises:
-        ConfigurationError: something is wrong; carries all findings.
+        ConfigurationError: there are findings; it has all of them.
     """
     config = loaded.config
     collected = loaded.findings()
@@ -121,7 +114,7 @@ def build(
     check_extrapolation(connections, config.instances, descriptions, collected)
     connections += coupled_connections(config, variables, connections, collected)
     recorded, result_file = _recorded(config, variables, collected), _result_file(loaded, collected)
-    if not recorded or result_file is None:  # one without the other records nothing
+    if not recorded or result_file is None:  # both are needed to record anything
         recorded, result_file = (), None
     _check_zenoh(loaded, collected)
     if grid is None or len(instances) < len(config.instances):
@@ -136,7 +129,7 @@ def build(
     warnings = loaded.findings()
     forbidden_start_values(config, descriptions, warnings, strict=False)
     unit_warnings(connections, descriptions, warnings)
-    capability_warnings(config.instances, descriptions, warnings)
+    _needed_tools(config, descriptions, warnings)
     return System(config, grid, instances, connections, recorded, result_file, tuple(warnings))
 
 
@@ -147,7 +140,7 @@ def _grid(config: Config, findings: Findings) -> TimeGrid | None:
         found = f"{simulation.real_time_factor:g}"
         findings.add("simulation.real_time_factor", found, "0 (as fast as possible) or a positive factor")
     if any(time is not None and math.isnan(time) for time in (start, stop, step)):
-        return None  # no time of a file is NaN: the structure is wrong there, which is found already
+        return None  # a placeholder, for which there is a finding already
     if not (math.isfinite(step) and step > 0.0):
         findings.add("simulation.step_size", f"{step:g}", "a step size > 0 in s")
         return None
@@ -179,7 +172,7 @@ def _instances(
     variables: Variables,
     findings: Findings,
 ) -> dict[str, SystemInstance]:
-    """The instances whose model description is there."""
+    """All instances with a model description."""
     base = loaded.config.simulation.step_size
     instances: dict[str, SystemInstance] = {}
     for name, config in loaded.config.instances.items():
@@ -189,20 +182,20 @@ def _instances(
         own = variables[name]
         if own is None:
             continue
+        start_values = resolve_start_values(name, config, own, findings)
+        config.check(f"instances.{name}", descriptions[name], findings)
         instances[name] = SystemInstance(
             name=name,
             fmu=str(loaded.resolve(config.path)) if config.path else "",
             description=descriptions[name],
-            start_values=resolve_start_values(name, config, own, findings),
+            start_values=start_values,
             step_points=step_points,
             node=config.group or name,
-            options=resolve_step_options(name, config, descriptions[name], findings),
-            hosted=None if isinstance(config, InstanceConfig) else config,
         )
     return instances
 
 
-def _step_points(name: str, config: AnyInstanceConfig, base: float, findings: Findings) -> int:
+def _step_points(name: str, config: InstanceSection, base: float, findings: Findings) -> int:
     """The step size of an instance in points; 1 after a finding."""
     path, step = f"instances.{name}.step_size", config.step_size
     if step is None:
@@ -223,7 +216,7 @@ def _step_points(name: str, config: AnyInstanceConfig, base: float, findings: Fi
 
 
 def _check_nodes(config: Config, descriptions: Mapping[str, ModelDescription], findings: Findings) -> None:
-    """Whether the instances of every group can share one node."""
+    """Check that the instances of each group can share one node."""
     first_of: dict[str, str] = {}
     only_once: dict[tuple[str, str], str] = {}
     for name, instance in config.instances.items():
@@ -249,8 +242,18 @@ def _check_nodes(config: Config, descriptions: Mapping[str, ModelDescription], f
                 findings.add(path, found, "different groups: this FMU allows one instance per process")
 
 
+def _needed_tools(config: Config, descriptions: Mapping[str, ModelDescription], findings: Findings) -> None:
+    """Note which models need a tool that fmu_mesh does not start."""
+    for name, section in config.instances.items():
+        if descriptions[name].needs_execution_tool:
+            tool = descriptions[name].generation_tool
+            found = f"the FMU of '{name}' needs an execution tool ({tool or 'it does not say which'})"
+            place = f"instances.{name}.{key_of(section)}"
+            findings.add(place, found, f"{tool or 'that tool'} on the host that runs it")
+
+
 def _recorded(config: Config, variables: Variables, findings: Findings) -> tuple[tuple[str, str], ...]:
-    """The recorded outputs; by default all that are no String and no Binary."""
+    """The recorded outputs; by default all but String and Binary."""
     if config.record.variables is None:
         return tuple(
             (name, element)
@@ -285,15 +288,14 @@ def _result_file(loaded: LoadedConfig, findings: Findings) -> str | None:
     path = loaded.resolve(text.replace("{mesh}", loaded.config.mesh))
     try:
         is_folder = path.is_dir()
-    except OSError as error:  # its name is too long, or it is in a folder of somebody else
+    except OSError as error:  # the name is too long, or the folder belongs to another user
         findings.add("record.file", f"{shown(text)} ({error.strerror})", "a file that can be written")
         return None
     if is_folder:
         findings.add("record.file", f"the folder '{text}'", "a file, or null to record nothing")
-    elif path.suffix.lower() in _OTHER_FORMATS:
-        findings.add(
-            "record.file", f"'{text}', a format that is not written", "a name ending in .csv, or .mcap for a bag"
-        )
+    elif result_format(path) is None:
+        endings = " or ".join(result_endings())
+        findings.add("record.file", f"'{text}', a format that is not written", f"a name ending in {endings}")
     return str(path)
 
 

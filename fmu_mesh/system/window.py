@@ -1,4 +1,4 @@
-"""How far ahead of others who may be: the sizes of windows, in points, and what they are bounded by."""
+"""The sizes of windows in points: how far nodes may be ahead, and how far the recorder may be behind."""
 
 from __future__ import annotations
 
@@ -18,49 +18,53 @@ __all__ = [
 ]
 
 RECORDER_WINDOW = 32768
-"""How many points the recorder may be behind, where its memory for their rows allows: it rests while they gather."""
+"""Largest number of points that the recorder may be behind. It sleeps while rows accumulate."""
 
 _LEAST_RECORDER_WINDOW = 8192
 _RECORDER_BYTES = 16 * 2**20
 
 FRAME_OVERHEAD = 32
-"""What a message takes besides its rows, in bytes; it may hold a single one."""
+"""Bytes of a message besides its rows. A message may have a single row."""
 
 LAZY_ROWS = 2048
-"""Rows that a ring holds at least, so that half of them may wait for the recorder where the window is small."""
+"""Smallest number of rows of a ring, so that half of them can wait for the recorder even with a small window."""
 
 _LAZY_FRAME_ROWS = 4096
 
 AUTO_WINDOW_POINTS = 16384
 AUTO_WINDOW_BYTES = 16 * 2**20
 AUTO_WINDOW_ROWS = 65536
-"""Of all instances together; where a step goes call by call, each row is kept with a pointer to it, too."""
+"""Limit for all instances together. Without a compiled call, each row also needs a pointer."""
 
 STEADY_POINTS = 1024
-"""So far the grant may be ahead at any speed; how far beyond that depends on it."""
+"""Points that the grant may be ahead at any speed; more only for fast instances."""
 
 
 def recorder_window(window: int, row_sizes: Sequence[int]) -> int:
-    """How many points the recorder may be behind: rows that nobody steps on hold nodes back only when there are many.
+    """Number of points that the recorder may be behind: no node needs its rows, so it delays nodes as late as possible.
 
     Args:
-        window: that of the mesh.
-        row_sizes: of all instances that are recorded, in bytes.
+        window: window of the mesh in points.
+        row_sizes: row sizes of all recorded instances in bytes.
     """
     row_bytes = sum(row_sizes) + FRAME_OVERHEAD * len(row_sizes)
     return max(window, _LEAST_RECORDER_WINDOW, min(RECORDER_WINDOW, _RECORDER_BYTES // max(row_bytes, 1)))
 
 
 def lazy_frame_rows(window: int) -> int:
-    """How many rows may wait in a node until a frame for the recorder is worth sending, for a window of the mesh."""
+    """Number of rows that a node collects before it sends a frame to the recorder.
+
+    Args:
+        window: window of the mesh in points.
+    """
     return min(_LAZY_FRAME_ROWS, max(LAZY_ROWS // 2, window // 4))
 
 
 def window_of(system: System) -> int:
-    """The window of the configuration; `auto` is as large as the memory for the rows allows.
+    """The window of the configuration in points; `auto` is as large as the memory for the rows allows.
 
-    A large window only costs memory: values do not depend on it, what a node sends is flushed when a consumer could
-    be waiting for it, and slow instances are granted a part of it only, so that a pause holds soon.
+    A large window costs memory only. Values do not depend on it; a node flushes a frame when a consumer could be
+    waiting; and slow instances are granted only a part of the window, so that a pause takes effect soon.
     """
     configured = system.config.simulation.window
     if configured != "auto":

@@ -1,1 +1,1 @@
-"""What an instance offers: its model description, variables, their types, values and units. Imports only `errors`."""
+"""The variables of an instance: model description, types, values and units. Imports only `errors`."""

@@ -1,4 +1,4 @@
-"""What an instance offers: its variables, capabilities and default experiment.
+"""The model description of an instance: its variables, capabilities and default experiment.
 
 Owns the description Structs that every layer above speaks of; independent of FMPy and of the FMI version. The readers
 in `fmu_mesh.instances.fmi` (and later the hosts) fill them.
@@ -21,7 +21,6 @@ __all__ = [
     "Causality",
     "Clock",
     "DefaultExperiment",
-    "HostKind",
     "Kind",
     "ModelDescription",
     "PlainValue",
@@ -37,8 +36,6 @@ Causality = Literal[
 Variability = Literal["constant", "fixed", "tunable", "discrete", "continuous"]
 Initial = Literal["exact", "approx", "calculated"]
 Kind = Literal["co_simulation", "model_exchange"]
-HostKind = Literal["physics_engine", "controller"]
-"""What an instance is that is no FMU."""
 
 
 class Variable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -82,18 +79,18 @@ class Variable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def type_name(self) -> str:
-        """The type as a reader knows it from the FMU, with the sizes of its dimensions: `Real`, `Float64[2,3]`."""
+        """The type in the words of its FMU, with the sizes of its dimensions: `Real`, `Float64[2,3]`."""
         name = self.declared_type or self.type
         return f"{name}[{','.join(map(str, self.shape))}]" if self.shape else name
 
     @property
     def size(self) -> int:
-        """How many elements it has; 1 for a scalar."""
+        """Number of elements; 1 for a scalar."""
         return math.prod(self.shape)
 
     @property
     def elements(self) -> tuple[str, ...]:
-        """The names of its elements, as `y[1,2]`; of a scalar, its own name."""
+        """The names of its elements, such as `y[1,2]`; for a scalar its own name."""
         return element_names(self.name, self.shape)
 
     @property
@@ -105,12 +102,12 @@ class Variable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def may_take_start_value(self) -> bool:
-        """Whether an FMU can be asked to take a start value; some take one where the standard forbids it."""
+        """Whether an FMU may be given a start value; some accept one where the standard forbids it."""
         return self.variability != "constant" and self.causality != "independent"
 
     @property
     def role(self) -> str:
-        """What it is for somebody who wants to set it, in the words of FMI: `an output with initial 'calculated'`."""
+        """Causality and initial for a message about setting it: `an output with initial 'calculated'`."""
         if self.variability == "constant":
             return "a constant"
         article = "an" if self.causality[0] in "aeiou" else "a"
@@ -144,22 +141,23 @@ class Clock(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     shift: float = 0.0
 
     def __str__(self) -> str:
-        """Such as `tick (input, constant, every 0.4 s from 0.2 s on)`."""
+        """The clock for a person: `tick (input, constant, every 0.4 s from 0.2 s on)`."""
         every = f", every {self.interval:g} s from {self.shift:g} s on" if self.interval is not None else ""
         return f"{self.name} ({self.causality}, {self.interval_variability}{every})"
 
 
 class ModelDescription(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict=True):
-    """A model description (FMI 2.0, 2.2) as far as the mesh needs it.
+    """The part of a model description (FMI 2.0, 2.2) that the mesh needs.
 
     Attributes:
+        kind: a `Kind` of FMU, or in one word what the model is: physics_engine, controller, ...
         library: the file of the FMU that is loaded on this platform; None if it is compiled, or nothing is loaded.
     """
 
     model_name: str
     model_identifier: str
     fmi_version: str
-    kind: Kind | HostKind
+    kind: str
     guid: str
     variables: tuple[Variable, ...]
     description: str | None = None
@@ -191,7 +189,7 @@ class ModelDescription(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
         return {variable.name: variable for variable in self.variables}
 
     def variable_of(self, name: str) -> Variable | None:
-        """The variable that ``name`` means, where ``name`` may also be that of an element of an array, as `y[1,2]`."""
+        """The variable with this name, or whose element has this name, such as `y[1,2]`; None if there is none."""
         found = self.variable(name)
         if found is None and (parts := split_element(name)) is not None:
             found = self.variable(parts[0])
@@ -202,7 +200,7 @@ class ModelDescription(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
         return tuple(variable for variable in self.variables if variable.causality in causalities)
 
     def sized(self, start_values: Mapping[str, Value]) -> ModelDescription:
-        """With the shapes that its arrays have if structural parameters get these values (FMI 3.0, 2.2.8)."""
+        """A copy with the shapes of arrays for these values of structural parameters (FMI 3.0, 2.2.8)."""
         if not any(isinstance(size, str) for variable in self.variables for size in variable.dimensions):
             return self
         sizes = {v.name: v.start for v in self.variables if v.causality in ("structuralParameter", "parameter")}
@@ -216,7 +214,7 @@ class ModelDescription(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
 
 
 def _reshaped(variable: Variable, shape: tuple[int, ...]) -> Variable:
-    """A variable with another shape; its start value goes along if it is one value for all elements."""
+    """A variable with another shape; a start value that is equal for all elements is kept."""
     if shape == variable.shape:
         return variable
     elements = [] if variable.start is None else flattened(variable.start, len(variable.shape))

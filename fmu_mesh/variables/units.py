@@ -1,4 +1,4 @@
-"""Units: what a value in one unit is in another one (FMI 2.0, 2.2.2; FMI 3.0, 2.4.3).
+"""Conversion of values between units (FMI 2.0, 2.2.2; FMI 3.0, 2.4.3).
 
 Owns the arithmetic between units and the order in which a connection applies it. Which ends have which units is
 `fmu_mesh.system.connections`.
@@ -31,12 +31,12 @@ class BaseUnit(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def dimension(self) -> tuple[int, ...]:
-        """The exponents of the base units; equal for units that convert into each other."""
+        """The exponents of the base units; equal for units that can be converted into each other."""
         return (self.kg, self.m, self.s, self.A, self.K, self.mol, self.cd, self.rad)
 
     @property
     def usable(self) -> bool:
-        """Whether something can be converted with it."""
+        """Whether values can be converted with it."""
         return math.isfinite(self.factor) and self.factor != 0.0 and math.isfinite(self.offset)
 
     def __str__(self) -> str:
@@ -46,18 +46,18 @@ class BaseUnit(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Linear(msgspec.Struct, frozen=True):
-    """`factor * value + offset`: one multiplication and one addition; nothing at all if it is the identity."""
+    """`factor * value + offset`: one multiplication and one addition, or no operation for the identity."""
 
     factor: float = 1.0
     offset: float = 0.0
 
     @property
     def identity(self) -> bool:
-        """Whether values stay as they are, bit for bit."""
+        """Whether it leaves values unchanged, bit for bit."""
         return (self.factor, self.offset) == (1.0, 0.0)
 
     def then(self, other: Linear) -> Linear:
-        """This one first, ``other`` after it, as one: it is rounded here, once, and not at every value.
+        """This conversion followed by ``other``, as one: coefficients are rounded once here, not for every value.
 
         An identity leaves the other one exactly as it is.
         """
@@ -69,7 +69,7 @@ class Linear(msgspec.Struct, frozen=True):
 
 
 def conversion(source: BaseUnit, target: BaseUnit, *, relative: bool = False) -> Linear | None:
-    """What makes a value in ``source`` one in ``target``; None where the dimensions differ.
+    """The conversion of values from ``source`` to ``target``; None if the dimensions differ.
 
     Args:
         source: the unit that values come in.

@@ -1,4 +1,4 @@
-"""Plain values, as files and the wire have them, to values of variables, and back.
+"""Conversion between plain values, as in files and on the wire, and values of variables.
 
 The one place that knows which plain value stands for which value of a type: the configuration, settings over the wire
 and programs that use the library all come through here, so all of them take and refuse the same.
@@ -20,14 +20,14 @@ from .value_types import INTEGERS, PlainValue, Value, nested
 __all__ = ["MAX_TEXT_SIZE", "ValueRefused", "range_of", "to_plain", "to_value"]
 
 MAX_TEXT_SIZE = 16 * 2**20
-"""Bytes that a String or Binary may have."""
+"""Largest size of a String or Binary in bytes."""
 
 _NOT_FINITE = {"NaN": math.nan, "INF": math.inf, "-INF": -math.inf}
 _FLOAT32_MAX = float(np.finfo(np.float32).max)
 
 
 class ValueRefused(ValueError):
-    """A value that a variable cannot take.
+    """A value that is not allowed for a variable.
 
     Args:
         message: why, where no ``expected`` says it.
@@ -46,7 +46,7 @@ class ValueRefused(ValueError):
 
 
 def to_value(plain: object, variable: Variable) -> Value:
-    """The value that a plain value, or a Python or numpy value, gives for a variable.
+    """Convert a plain value, or a Python or numpy value, to the value of a variable.
 
     A floating-point number may be given as a whole number, or as `NaN`, `INF` or `-INF` (FMI 3.0, 2.4.8); an
     Enumeration by the name or the number of an item; Binary as bytes or as base64; an array as nested lists by rows.
@@ -60,7 +60,7 @@ def to_value(plain: object, variable: Variable) -> Value:
 
 
 def to_plain(value: Value) -> PlainValue:
-    """A value as JSON and YAML have it; `to_value` takes it back."""
+    """A value as in JSON and YAML; the inverse of `to_value`."""
     match value:
         case float() if not math.isfinite(value):
             return "NaN" if math.isnan(value) else "INF" if value > 0 else "-INF"
@@ -73,14 +73,14 @@ def to_plain(value: Value) -> PlainValue:
 
 
 def range_of(variable: Variable) -> str:
-    """The range of a variable in words."""
+    """The allowed range of a variable, for a message."""
     if variable.minimum is None:
         return f"<= {variable.maximum:g}"
     return f">= {variable.minimum:g}" + (f" and <= {variable.maximum:g}" if variable.maximum is not None else "")
 
 
 def _elements(plain: object, variable: Variable, shape: tuple[int, ...]) -> list[Any]:
-    """The elements of an array, whose lists must be as long as its dimensions are large."""
+    """The elements of an array; its lists must have the lengths of its dimensions."""
     elements: list[Any] = [plain]
     for size in shape:
         for row in elements:
@@ -109,7 +109,7 @@ def _refused(variable: Variable, suggestion: str | None = None) -> ValueRefused:
 
 
 def _converted(plain: object, variable: Variable) -> Value | None:
-    """``plain`` as a value of the variable's type, or None if it is none."""
+    """``plain`` as a value of the type of the variable, or None if it is not one."""
     converted: Value | None = None
     match variable.type, plain:
         case "Boolean", bool():
@@ -135,7 +135,7 @@ def _converted(plain: object, variable: Variable) -> Value | None:
 
 
 def _float(plain: float | str, variable: Variable) -> float | None:
-    """A floating-point number; of a Float32 the nearest one that it can hold, which must not be an infinity."""
+    """A floating-point number; a Float32 is rounded, and must not become infinite by that."""
     if isinstance(plain, str):
         return _NOT_FINITE.get(plain)
     try:
@@ -155,7 +155,7 @@ def _binary(text: str) -> bytes | None:
 
 
 def _is_unicode(text: str) -> bool:
-    """Whether a text can be sent at all: JSON can hold half a character."""
+    """Whether a text is valid Unicode: JSON allows a single surrogate."""
     try:
         text.encode()
     except UnicodeEncodeError:

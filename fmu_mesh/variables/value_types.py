@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import re
-from typing import Any, Final, Literal
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 from numpy.typing import DTypeLike
@@ -51,9 +51,12 @@ VariableType = Literal[
 ]
 
 PlainValue = float | int | bool | str | list[Any]
-"""A value as YAML and JSON have it: an array as nested lists, row by row; Binary as base64; NaN, INF, -INF as text."""
+"""A value as in YAML and JSON: an array as nested lists, row by row; Binary as base64; NaN, INF, -INF as text."""
 
-Value = float | int | bool | str | bytes | list[Any]
+if TYPE_CHECKING:
+    Value = float | int | bool | str | bytes | list[Any]
+else:
+    Value = Any  # msgspec cannot decode a union of str and bytes, although MessagePack tells them apart
 """A value as Python has it: an array as nested lists, row by row; Binary as bytes."""
 
 DTYPES: Final[dict[VariableType, DTypeLike]] = {
@@ -72,7 +75,7 @@ DTYPES: Final[dict[VariableType, DTypeLike]] = {
     "String": np.object_,
     "Binary": np.object_,
 }
-"""The memory of each type, in the order of the parts of a row: the larger first, so that every part is aligned."""
+"""The array type of each type, in the order of the parts of a row: larger elements first, so all are aligned."""
 
 TYPES: Final[tuple[VariableType, ...]] = tuple(DTYPES)
 
@@ -96,27 +99,27 @@ INTEGERS: Final[dict[VariableType, range]] = {
     "Int8": range(-(2**7), 2**7),
     "UInt8": range(2**8),
 }
-"""What each type of whole numbers can hold."""
+"""The range of each integer type."""
 
 MAX_ELEMENTS: Final = 2**20
-"""How many elements an array may have."""
+"""Largest number of elements of an array."""
 
 _ELEMENT: Final = re.compile(r"(?s)(.+)\[(\s*\d+\s*(?:,\s*\d+\s*)*)\]")
 _MANTISSA_BITS: Final[dict[VariableType, int]] = {"Float64": 53, "Float32": 24}
 
 
 def is_float(type_: VariableType) -> bool:
-    """Whether values of this type are floating-point numbers, which alone may be scaled and be continuous."""
+    """Whether values of this type are floating-point numbers. Only these can be scaled or continuous."""
     return type_ in _MANTISSA_BITS
 
 
 def is_text(type_: VariableType) -> bool:
-    """Whether values of this type have no fixed size: String and Binary."""
+    """Whether values of this type have a variable size: String and Binary."""
     return type_ in ("String", "Binary")
 
 
 def zero(type_: VariableType) -> Value:
-    """The value of this type that nobody has set."""
+    """The value of a variable of this type before it is set."""
     match type_:
         case "Float64" | "Float32":
             return 0.0
@@ -131,7 +134,7 @@ def zero(type_: VariableType) -> Value:
 
 
 def takes(target: VariableType, source: VariableType, items: tuple[int, ...] = ()) -> bool:
-    """Whether every value of type ``source`` is one of type ``target``, so that a connection loses nothing.
+    """Whether every value of type ``source`` is also one of type ``target``: a connection then loses nothing.
 
     Args:
         target: the type of the input.
@@ -157,7 +160,7 @@ def takes(target: VariableType, source: VariableType, items: tuple[int, ...] = (
 
 
 def flattened(value: Value, rank: int) -> list[Any]:
-    """The elements of an array of ``rank`` dimensions, row by row (FMI 3.0, 2.2.6.1); of a scalar, itself."""
+    """The elements of an array of ``rank`` dimensions, row by row (FMI 3.0, 2.2.6.1); for a scalar the value itself."""
     values: list[Any] = [value]
     for _ in range(rank):
         values = [element for row in values for element in row]
@@ -165,7 +168,7 @@ def flattened(value: Value, rank: int) -> list[Any]:
 
 
 def nested(values: list[Any], shape: tuple[int, ...]) -> Value:
-    """The value with this shape that has these elements; the reverse of `flattened`."""
+    """The value with this shape and these elements; the inverse of `flattened`."""
     if not shape:
         element: Value = values[0]
         return element
@@ -175,17 +178,17 @@ def nested(values: list[Any], shape: tuple[int, ...]) -> Value:
 
 
 def element_name(name: str, index: tuple[int, ...]) -> str:
-    """The name of an element of an array: indices are counted from 1, the last one runs fastest (`y[1,2]`)."""
+    """The name of an element of an array: indices start at 1, the last one runs fastest (`y[1,2]`)."""
     return f"{name}[{','.join(str(number + 1) for number in index)}]"
 
 
 def element_names(name: str, shape: tuple[int, ...]) -> tuple[str, ...]:
-    """The names of all elements of an array, row by row; of a scalar, its own name."""
+    """The names of all elements of an array, row by row; for a scalar its own name."""
     return tuple(element_name(name, index) if index else name for index in itertools.product(*map(range, shape)))
 
 
 def split_element(name: str) -> tuple[str, tuple[int, ...]] | None:
-    """An array's name and an index counted from 0, out of the name of an element; None if it is no such name."""
+    """The name of the array and the index from 0, from the name of an element; None for any other name."""
     match = _ELEMENT.fullmatch(name)
     if match is None:
         return None

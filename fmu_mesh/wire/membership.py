@@ -28,10 +28,10 @@ from .inbox import Inbox
 from .keys import MASTER, RUN_ID_BYTES, Keys, RunKeys
 from .messages import NodeReport, decode_json
 from .refusals import payload_of
-from .session import RouterLink, ask, tokens
+from .session import Question, RouterLink, ask, tokens
 from .shared_memory import Offer, SharedInbox, SharedOutlet, available
 
-__all__ = ["Admission", "Membership", "Ready", "Registration", "Welcome", "shared_inbox"]
+__all__ = ["Admission", "Membership", "NodeReady", "Registration", "Welcome", "shared_inbox"]
 
 T = TypeVar("T")
 
@@ -72,7 +72,7 @@ class Hello(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     offer: Offer | None = None
 
 
-class Ready(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class NodeReady(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What a node says about itself when its links work.
 
     Attributes:
@@ -228,7 +228,8 @@ class Membership:
             MeshLost: the master has not taken it in time, or this is no node of its run.
         """
         key = self.keys(timeout_s).report(self._plan.node)
-        ask(self._session, key, msgspec.json.encode(report), timeout_s, "the master", over=over, priority=priority)
+        question = Question(key, "the master", timeout_s, msgspec.json.encode(report), priority=priority)
+        ask(self._session, question, over)
 
     def join(self) -> Welcome:
         """Wait until the links with all other nodes work in both directions, then tell the master.
@@ -247,20 +248,12 @@ class Membership:
         hello = msgspec.json.encode(Hello(plan.node, inbox.offer))
         shared = inbox.offer is not None
         for node in dict.fromkeys(link.source_node for link in plan.links_in):
-            answer = ask(
-                self._session, keys.hello(node), hello, deadline_s, f"node '{node}'", over=self._has_nothing_to_join
-            )
+            question = Question(keys.hello(node), f"node '{node}'", deadline_s, hello)
+            answer = ask(self._session, question, self._has_nothing_to_join)
             shared = shared and answer == _SHARED
-        ready = msgspec.json.encode(Ready(inbox.offer, shared))
-        answer = ask(
-            self._session,
-            keys.ready(plan.node),
-            ready,
-            deadline_s,
-            "the master",
-            2 * deadline_s,
-            over=self._has_nothing_to_join,
-        )
+        ready = msgspec.json.encode(NodeReady(inbox.offer, shared))
+        question = Question(keys.ready(plan.node), "the master", deadline_s, ready, answer_s=2 * deadline_s)
+        answer = ask(self._session, question, self._has_nothing_to_join)
         welcome = _understood(answer, Welcome)
         self._router.look()
         self._shared = frozenset(welcome.shared)
@@ -292,15 +285,8 @@ class Membership:
         registration = Registration(plan.node, plan.digest, os.getpid(), socket.gethostname(), self._launch)
         public = Keys(plan.key_prefix, plan.mesh)
         payload = msgspec.json.encode(registration)
-        answer = ask(
-            self._session,
-            public.register,
-            payload,
-            plan.timeouts.start,
-            "the master",
-            answer_s=plan.timeouts.start,
-            over=lambda: self.given_up,
-        )
+        question = Question(public.register, "the master", plan.timeouts.start, payload)
+        answer = ask(self._session, question, lambda: self.given_up)
         self._admission = _understood(answer, Admission)
         self._keys = keys = public.run(self._admission.run)
 

@@ -7,8 +7,8 @@ import queue
 import re
 import threading
 import time
-from collections.abc import Callable, Iterable
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -19,15 +19,20 @@ import zenoh
 from zenoh.handlers import Callback
 
 from ..errors import ConfigurationError, DeadlineExceeded, MeshLost
+from .values import json_encoding
 
 __all__ = [
+    "Question",
     "RouterLink",
     "Wiring",
+    "answer_of",
+    "answers",
     "ask",
     "close_session",
     "matches",
     "open_session",
     "own_endpoints",
+    "run_router",
     "tokens",
     "undeclare_all",
 ]
@@ -53,6 +58,8 @@ _CANNOT_LISTEN = (
 
 _CLOSE_S = 1.0
 _LOOK_S = 0.05
+_TIMEOUT = "Timeout"
+"""What Zenoh answers in the name of somebody who did not."""
 _TOKENS_S = 2.0
 _TOKENS_TRIES = 3
 _LINK_S = 1.0
@@ -158,7 +165,7 @@ def own_endpoints(session: zenoh.Session, deadline_s: float = 5.0) -> tuple[str,
     Raises:
         DeadlineExceeded: the session does not tell within ``deadline_s`` seconds.
     """
-    answer = ask(session, f"@/{session.zid()}/*", b"", deadline_s, "the session's own endpoints")
+    answer = ask(session, Question(f"@/{session.zid()}/*", "the session's own endpoints", deadline_s))
     return tuple(str(locator) for locator in json.loads(answer).get("locators", ()))
 
 
@@ -236,38 +243,54 @@ def undeclare_all(*entities: Iterable[_Declared]) -> None:
         entity.undeclare()
 
 
-def ask(  # noqa: PLR0913, PLR0917  the parts of one question
-    session: zenoh.Session,
-    key: str,
-    payload: bytes | None,
-    deadline_s: float,
-    what: str,
-    answer_s: float | None = None,
-    over: Callable[[], bool] = lambda: False,
-    priority: zenoh.Priority = zenoh.Priority.DEFAULT,
-) -> bytes:
-    """Query ``key`` until somebody is there to answer, and return the answer's payload.
+class Question(msgspec.Struct, frozen=True):
+    """A query that waits for its answer.
+
+    Attributes:
+        key: key expression of the queryable.
+        whom: who is asked, for the error.
+        deadline_s: how long to wait for an answer, in s.
+        payload: JSON that goes with the query, if anything.
+        answer_s: how long somebody who is there may take to answer, in s, if that is longer.
+        priority: the query goes ahead of what has a lower one, and behind what was sent before with its own.
+    """
+
+    key: str
+    whom: str
+    deadline_s: float
+    payload: bytes | None = None
+    answer_s: float | None = None
+    priority: zenoh.Priority = zenoh.Priority.DEFAULT
+
+
+def ask(session: zenoh.Session, question: Question, over: Callable[[], bool] = lambda: False) -> bytes:
+    """The payload of the first answer to a question; otherwise as `answers`."""
+    return answers(session, question, over, every=False)[0].payload.to_bytes()
+
+
+def answers(
+    session: zenoh.Session, question: Question, over: Callable[[], bool] = lambda: False, *, every: bool = True
+) -> list[zenoh.Sample]:
+    """Query until somebody is there to answer; at least one answer.
 
     A query sent before the queryable is known gets no reply at all, so this waits until a queryable matches, and asks
     again when the matching changes.
 
     Args:
         session: the session to ask with.
-        key: key expression of the queryable.
-        payload: what goes with the query, if anything.
-        deadline_s: how long to wait for an answer, in s.
-        what: what is being waited for, for the error.
-        answer_s: how long somebody who is there may take to answer, in s, if that is longer.
+        question: what is asked.
         over: whether the answer is not wanted any more.
-        priority: the query goes ahead of what has a lower one, and behind what was sent before with its own.
+        every: whether to wait for the end of the query; False: the first answer is enough.
 
     Raises:
-        DeadlineExceeded: nobody answered within ``deadline_s`` seconds.
+        DeadlineExceeded: nobody answered in time.
         MeshLost: the answer was an error; its text is the message. Or it is not wanted any more.
     """
-    end = time.monotonic() + deadline_s
+    end = time.monotonic() + question.deadline_s
     changed = threading.Event()
-    with session.declare_querier(key, timeout=answer_s or deadline_s, priority=priority) as querier:
+    timeout_s = question.answer_s or question.deadline_s
+    encoding = json_encoding if question.payload is not None else None
+    with session.declare_querier(question.key, timeout=timeout_s, priority=question.priority) as querier:
         listener = querier.declare_matching_listener(lambda _status: changed.set())
         try:
             while (left := end - time.monotonic()) > 0:
@@ -275,19 +298,58 @@ def ask(  # noqa: PLR0913, PLR0917  the parts of one question
                 if matches(querier):
                     # Zenoh does not tell when whoever took the query is gone: it would wait for the timeout.
                     replies: queue.SimpleQueue[zenoh.Reply | None] = queue.SimpleQueue()
-                    querier.get(Callback(replies.put, partial(replies.put, None)), payload=payload)
-                    while not over():
-                        with suppress(queue.Empty):
-                            if (reply := replies.get(timeout=_LOOK_S)) is None:
-                                break
-                            if reply.ok is not None:
-                                return reply.ok.payload.to_bytes()
-                            text = reply.err.payload.to_bytes().decode(errors="replace") if reply.err else ""
-                            if text != "Timeout":
-                                raise MeshLost(text)
+                    handler = Callback(replies.put, partial(replies.put, None))
+                    querier.get(handler, payload=question.payload, encoding=encoding)
+                    if samples := _collected(replies, over, every=every):
+                        return samples
                 if over():
-                    raise MeshLost(f"{what} has not answered yet, and the asker gave up")
+                    raise MeshLost(f"{question.whom} has not answered yet, and the asker gave up")
                 changed.wait(min(left, _LOOK_S))
         finally:
             listener.undeclare()
-    raise DeadlineExceeded(f"nobody answered for {what} within {deadline_s:g} s")
+    raise DeadlineExceeded(f"nobody answered for {question.whom} within {question.deadline_s:g} s")
+
+
+def answer_of(reply: zenoh.Reply) -> zenoh.Sample | None:
+    """What was answered; None where Zenoh itself says that somebody did not answer in time.
+
+    Raises:
+        MeshLost: the answer is an error; its text is the message.
+    """
+    if reply.ok is not None:
+        return reply.ok
+    text = reply.err.payload.to_bytes().decode(errors="replace") if reply.err else ""
+    if text != _TIMEOUT:
+        raise MeshLost(text)
+    return None
+
+
+def _collected(
+    replies: queue.SimpleQueue[zenoh.Reply | None], over: Callable[[], bool], *, every: bool
+) -> list[zenoh.Sample]:
+    """The answers of one query, to its end, marked by None, or to the first one."""
+    samples: list[zenoh.Sample] = []
+    while not over():
+        with suppress(queue.Empty):
+            if (reply := replies.get(timeout=_LOOK_S)) is None:
+                break
+            if (sample := answer_of(reply)) is not None:
+                samples.append(sample)
+                if not every:
+                    break
+    return samples
+
+
+@contextmanager
+def run_router(listen: Sequence[str]) -> Iterator[tuple[str, ...]]:
+    """A Zenoh router in this process, while inside, for a host without `zenohd`; gives the endpoints it listens on.
+
+    Raises:
+        ConfigurationError: an endpoint cannot be used.
+    """
+    # Peers behind it, such as ROS nodes, learn of each other here and meet directly: it passes nothing on for them.
+    session = open_session(Wiring(mode="router", listen=tuple(listen), gossip=True))
+    try:
+        yield own_endpoints(session)
+    finally:
+        session.close()

@@ -14,7 +14,8 @@ import pytest
 import yaml
 
 from fmu_mesh.run.local import LocalMesh
-from fmu_mesh.run.preparing import Options, prepare
+from fmu_mesh.run.options import Options
+from fmu_mesh.run.preparing import prepare
 from tests.fmus.event_fmus import Version
 from tests.helpers import Place
 

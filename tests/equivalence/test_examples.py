@@ -17,7 +17,8 @@ from fmpy.fmi2 import FMU2Slave
 from examples import integrated_node
 from fmu_mesh import FMIAdapter
 from fmu_mesh.run.local import LocalMesh
-from fmu_mesh.run.preparing import Options, prepare
+from fmu_mesh.run.options import Options
+from fmu_mesh.run.preparing import prepare
 
 ROOT = Path(__file__).resolve().parents[2]
 CONFIG = ROOT / "configs" / "chapter_library_example.yaml"

@@ -10,7 +10,7 @@ import pytest
 from msgspec.structs import replace
 
 from fmu_mesh.cli.checking import plan_page
-from fmu_mesh.config.loading import load
+from fmu_mesh.instances.configuration import load
 from fmu_mesh.run.preparing import prepare
 from fmu_mesh.system.grouping import automatic_nodes
 from fmu_mesh.system.plan import RECORDER, Plan

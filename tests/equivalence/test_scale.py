@@ -7,7 +7,8 @@ import itertools
 import pytest
 
 from fmu_mesh.run.local import LocalMesh
-from fmu_mesh.run.preparing import Options, prepare
+from fmu_mesh.run.options import Options
+from fmu_mesh.run.preparing import prepare
 from tests.helpers import Place, write_config
 
 

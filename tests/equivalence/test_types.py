@@ -16,7 +16,8 @@ import yaml
 
 from fmu_mesh.cli.main import main
 from fmu_mesh.run.local import LocalMesh
-from fmu_mesh.run.preparing import Options, prepare
+from fmu_mesh.run.options import Options
+from fmu_mesh.run.preparing import prepare
 from tests.fmus.helpers import NO_COMPILER, build_test_fmu
 from tests.helpers import Place
 

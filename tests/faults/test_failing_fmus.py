@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from fmu_mesh.instances.fmi.co_simulation.step_status import RETRY
+from fmu_mesh.instances.fmi.co_simulation.discarded_steps import RETRY
 from tests.fmus.helpers import find_fmu
 from tests.helpers import Place, row_count, rows_of, wait_until, write_config
 

@@ -19,7 +19,8 @@ from hypothesis import strategies as st
 
 from fmu_mesh.errors import ErrorReport
 from fmu_mesh.run.local import LocalMesh
-from fmu_mesh.run.preparing import Options, prepare
+from fmu_mesh.run.options import Options
+from fmu_mesh.run.preparing import prepare
 from fmu_mesh.wire.keys import Keys, RunKeys
 from fmu_mesh.wire.messages import ABORT, FINISH, FRAME, GRANT, HEADER, LAST, PROGRESS, NodeReport
 from tests.helpers import DEADLINE_S, Launched, Place, rows_of, wait_until, write_config

@@ -120,7 +120,8 @@ class PageRun:
         if block.note != "file":
             file.write_text(yaml.safe_dump(content), encoding="utf-8")
         for words in ("check", "launch --local --no-progress --real-time-factor 0"):
-            done = self._place.run(*words.split(), file)
+            command = f"{self._exports}fmu-mesh {words} {file}"
+            done = self._place.start_command(["bash", "-euo", "pipefail", "-c", command])
             assert done.wait() == 0, f"{block.place}\n{done.story()}"
 
     def _run_command(self, command: Command, *, in_background: bool) -> None:

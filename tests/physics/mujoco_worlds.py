@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from fmu_mesh.config.mesh import MujocoConfig
-from fmu_mesh.instances.mujoco import MujocoInstance, Picture
+from fmu_mesh.instances.mujoco.mujoco_instance import MujocoInstance
+from fmu_mesh.instances.mujoco.mujoco_kind import MujocoConfig
+from fmu_mesh.instances.mujoco.rendering import Picture
 from fmu_mesh.rings.ring import Ring
 from fmu_mesh.simtime import TimeGrid
 from fmu_mesh.system.layout import Layout

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from fmu_mesh.instances.gazebo.gazebo_process import PROGRAM_VARIABLE, GazeboGone, find_program
 from fmu_mesh.run.local import LocalMesh
-from fmu_mesh.run.preparing import Options, prepare
+from fmu_mesh.run.options import Options
+from fmu_mesh.run.preparing import prepare
 from tests.helpers import Place, rows_of
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"

@@ -14,13 +14,16 @@ from pathlib import Path
 import pytest
 
 from fmu_mesh.cli.main import main
-from fmu_mesh.config.mesh import ActuatorConfig, GazeboClassicConfig
+from fmu_mesh.config.instance_sections import ActuatorConfig
 from fmu_mesh.errors import FmuError, InitializationFailed, LoadFailed, StepFailed
-from fmu_mesh.instances.gazebo import GazeboClassicInstance, describe_gazebo_world, gazebo_process
-from fmu_mesh.instances.gazebo.gazebo_world import load_gazebo_world
+from fmu_mesh.instances.gazebo import gazebo_process
+from fmu_mesh.instances.gazebo.gazebo_classic import GazeboClassicInstance
+from fmu_mesh.instances.gazebo.gazebo_kind import GazeboClassicConfig
+from fmu_mesh.instances.gazebo.gazebo_world import describe_gazebo_world, load_gazebo_world
 from fmu_mesh.rings.ring import Ring
 from fmu_mesh.run.local import LocalMesh
-from fmu_mesh.run.preparing import Options, prepare
+from fmu_mesh.run.options import Options
+from fmu_mesh.run.preparing import prepare
 from fmu_mesh.simtime import TimeGrid
 from fmu_mesh.system.layout import Layout
 from tests.helpers import FMUS

@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 
 from fmu_mesh.cli.main import main
 from fmu_mesh.errors import ConfigurationError
-from fmu_mesh.instances.mujoco import check_film, check_window
-from fmu_mesh.instances.mujoco.rendering import HEIGHT, WIDTH
+from fmu_mesh.instances.mujoco.rendering import HEIGHT, WIDTH, check_film, check_window
 from tests.helpers import Place
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -28,7 +27,7 @@ CONFIGS = ROOT / "configs"
 RENDER = """\
 import sys
 from pathlib import Path
-from fmu_mesh.instances import check_film
+from fmu_mesh.instances.mujoco.rendering import check_film
 check_film(Path("x.mp4"))
 import mujoco
 mujoco.Renderer(mujoco.MjModel.from_xml_string("<mujoco/>"), 16, 16).close()
@@ -37,7 +36,7 @@ mujoco.Renderer(mujoco.MjModel.from_xml_string("<mujoco/>"), 16, 16).close()
 FILM = """\
 import sys
 from pathlib import Path
-from fmu_mesh.instances import Film
+from fmu_mesh.instances.mujoco.rendering import Film
 path = Path(sys.argv[1])
 older = path.read_bytes() if path.exists() else None
 def look():

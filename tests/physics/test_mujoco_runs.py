@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
 from fmu_mesh.run.local import LocalMesh
-from fmu_mesh.run.preparing import Options, prepare
+from fmu_mesh.run.options import Options
+from fmu_mesh.run.preparing import prepare
 from tests.helpers import Place
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -15,7 +15,8 @@ import pytest
 from numpy.typing import NDArray
 
 from fmu_mesh.run.local import LocalMesh
-from fmu_mesh.run.preparing import Options, prepare
+from fmu_mesh.run.options import Options
+from fmu_mesh.run.preparing import prepare
 
 CONFIG = Path(__file__).resolve().parents[2] / "configs" / "path_filter.yaml"
 

@@ -17,7 +17,8 @@ import pytest
 from numpy.typing import NDArray
 
 from fmu_mesh.run.local import LocalMesh
-from fmu_mesh.run.preparing import Options, prepare
+from fmu_mesh.run.options import Options
+from fmu_mesh.run.preparing import prepare
 from fmu_mesh.system.plan import make_plan
 from tests.fmus.reference import Pendulum, angle_after
 

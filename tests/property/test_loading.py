@@ -12,10 +12,13 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from fmu_mesh.config.findings import locate
-from fmu_mesh.config.loading import LoadedConfig, _examine, parse
-from fmu_mesh.config.mesh import MAX_WINDOW, Config, ConnectionConfig, InstanceConfig, SimulationConfig
+from fmu_mesh.config.loading import LoadedConfig, _examine
+from fmu_mesh.config.mesh import MAX_WINDOW, Config, ConnectionConfig, SimulationConfig
 from fmu_mesh.config.yaml_text import resolve
 from fmu_mesh.errors import ConfigurationError, Finding
+from fmu_mesh.instances.configuration import installed_config, parse
+from fmu_mesh.instances.fmi.fmu_kind import FmuConfig
+from fmu_mesh.instances.registry import KINDS
 from fmu_mesh.system.system import build
 from fmu_mesh.text import nearest
 from fmu_mesh.variables.model_description import ModelDescription, Variable
@@ -77,7 +80,7 @@ SIMULATIONS = st.builds(
 INSTANCES = st.dictionaries(
     NAMES,
     st.builds(
-        InstanceConfig,
+        FmuConfig,
         fmu=TEXTS,
         start_values=st.dictionaries(st.sampled_from(["u", "y", "k"]) | TEXTS, VALUES, max_size=3),
         step_size=st.none() | FINITE,
@@ -98,7 +101,9 @@ CONNECTIONS = st.lists(
     ),
     max_size=3,
 )
-CONFIGS = st.builds(Config, mesh=NAMES, simulation=SIMULATIONS, instances=INSTANCES, connections=CONNECTIONS)
+CONFIGS = st.builds(
+    installed_config(), mesh=NAMES, simulation=SIMULATIONS, instances=INSTANCES, connections=CONNECTIONS
+)
 
 GAIN = ModelDescription(
     model_name="Gain",
@@ -161,7 +166,7 @@ def test_what_is_wrong_in_the_structure_is_never_lost_on_the_way_to_a_system(sec
     found = findings_of(text)
     assume(found)
     with contextlib.suppress(ConfigurationError):
-        loaded, findings = _examine(text, FILE, ())
+        loaded, findings = _examine(text, FILE, (), KINDS)
         with pytest.raises(ConfigurationError) as caught:
             build(loaded, dict.fromkeys(loaded.config.instances, GAIN), findings)
         assert set(found) <= set(caught.value.findings)

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fmu_mesh.instances.registry import decode_section
 from fmu_mesh.system.graph import cycle_through, feedback_edges, strongly_connected, topological_order
 from fmu_mesh.system.plan import RECORDER, NodePlan
 from tests.property.test_random_systems import Drawn, planned, systems
@@ -156,7 +157,7 @@ def test_a_plan_is_a_function_of_the_system_and_survives_the_way_to_another_proc
     assert (plan.order, plan.closing) == (again.order, again.closing)
     for node in plan.nodes.values():
         assert node.digest == plan.digest
-        assert msgspec.json.decode(msgspec.json.encode(node), type=NodePlan) == node
+        assert msgspec.json.decode(msgspec.json.encode(node), type=NodePlan, dec_hook=decode_section) == node
 
 
 @given(systems(), st.integers(0, 100))

@@ -18,8 +18,10 @@ from hypothesis import HealthCheck, event, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from fmu_mesh.config.mesh import KIND, Config
+from fmu_mesh.config.instance_sections import KIND
+from fmu_mesh.config.mesh import Config
 from fmu_mesh.errors import LoopNotConverged
+from fmu_mesh.instances.registry import decode_section
 from fmu_mesh.rings.ring import Ring
 from fmu_mesh.run.local import LocalMesh
 from fmu_mesh.simtime import TimeGrid
@@ -257,6 +259,7 @@ def planned(drawn: Drawn) -> Plan:
             "initialization": {"iterations": ITERATIONS},
         },
         Config,
+        dec_hook=decode_section,
     )
     system = System(
         config=config,
@@ -365,7 +368,7 @@ def expected_of(drawn: Drawn, plan: Plan) -> list[list[Row]]:
     return reference(drawn, [connection.delay or 0 for connection in plan.connections], started(drawn, loops))
 
 
-def run(drawn: Drawn, plan: Plan, mesh: Callable[[Callable[[str], Mixer]], None]) -> list[list[Row]]:
+def run(drawn: Drawn, plan: Plan, mesh: Callable[[Callable[[str], Mixer]], object]) -> list[list[Row]]:
     mixers = [Mixer(drawn, plan, number) for number in range(len(drawn.steps))]
     by_name = {name_of(number): mixer for number, mixer in enumerate(mixers)}
     mesh(by_name.__getitem__)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -191,6 +192,16 @@ def test_what_an_mcap_cannot_hold_is_told_by_check(
     assert main(["check", str(config)]) == 2
 
     assert complaint in capsys.readouterr().err
+
+
+def test_a_missing_package_is_told_by_check(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "mcap.writer", None)
+
+    assert main(["check", str(write_config(tmp_path, record={"file": "pair.mcap"}))]) == 2
+
+    assert "a recording into .mcap needs the package mcap" in capsys.readouterr().err
 
 
 def test_a_plot_of_an_mcap_is_refused_with_the_way_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -29,13 +29,13 @@ def gain() -> Iterator[FmuDriver]:
 
 
 def y(driver: FmuDriver, time: int, *, restart: bool = True) -> float:
-    value = driver.turn(time, ["y"], restart=restart).values["y"]
+    value = driver.update(time, ["y"], restart=restart).values["y"]
     assert isinstance(value, float)
     return value
 
 
 def test_the_first_turn_is_the_time_zero_of_the_fmu_and_takes_no_step(gain: FmuDriver) -> None:
-    turn = gain.turn(UNIX_NS, ["y"], restart=True)
+    turn = gain.update(UNIX_NS, ["y"], restart=True)
 
     assert (turn.time, turn.steps, turn.values) == (UNIX_NS, 0, {"y": 0.0})
     assert gain.started
@@ -50,8 +50,8 @@ def test_a_run_by_turns_gives_the_floats_of_a_loop_of_steps() -> None:
             angles.append(pendulum.get_output_value("a"))
     driver = FmuDriver(DriveSettings(fmu_path=FMUS / "DampedPendulum.fmu"))
     try:
-        driver.turn(UNIX_NS, [], restart=True)
-        turns = [driver.turn(UNIX_NS + k * 2 * MS, ["a"], restart=True) for k in range(1, 201)]
+        driver.update(UNIX_NS, [], restart=True)
+        turns = [driver.update(UNIX_NS + k * 2 * MS, ["a"], restart=True) for k in range(1, 201)]
     finally:
         driver.close()
 
@@ -71,8 +71,8 @@ def test_an_input_holds_from_its_stamp_on_and_the_last_of_two_with_one_stamp_cou
 def test_catching_up_is_bounded_and_told_and_skips_no_step() -> None:
     driver = FmuDriver(DriveSettings(fmu_path=FMUS / "Gain.fmu", step_size=0.1, max_steps=4))
     try:
-        driver.turn(1, [], restart=True)
-        turns = [driver.turn(1 + 1000 * MS, [], restart=True) for _ in range(4)]
+        driver.update(1, [], restart=True)
+        turns = [driver.update(1 + 1000 * MS, [], restart=True) for _ in range(4)]
     finally:
         driver.close()
 
@@ -86,7 +86,7 @@ def test_simulated_time_that_jumps_back_starts_the_fmu_again_with_the_values_it_
     gain.set_input("u", 5_000 * MS, 2.0)
     before = y(gain, 6_000 * MS)
 
-    turn = gain.turn(1_000 * MS, ["y"], restart=True)
+    turn = gain.update(1_000 * MS, ["y"], restart=True)
     gain.set_input("u", 1_000 * MS, 4.0)
 
     assert before == 6.0
@@ -99,17 +99,17 @@ def test_a_wall_clock_that_is_set_back_does_not_disturb_the_fmu(gain: FmuDriver)
     gain.set_input("u", UNIX_NS, 2.0)
     y(gain, UNIX_NS + 1_000 * MS)
 
-    turn = gain.turn(UNIX_NS, ["y"], restart=False)
+    turn = gain.update(UNIX_NS, ["y"], restart=False)
 
     assert (turn.time, turn.jumped_back, turn.values["y"]) == (UNIX_NS, 1.0, 2.0)
-    assert gain.turn(UNIX_NS + 300 * MS, ["y"], restart=False).steps == 3
+    assert gain.update(UNIX_NS + 300 * MS, ["y"], restart=False).steps == 3
 
 
 def test_time_that_is_less_than_half_a_step_early_is_no_jump(gain: FmuDriver) -> None:
     y(gain, UNIX_NS)
     y(gain, UNIX_NS + 60 * MS)
 
-    turn = gain.turn(UNIX_NS + 55 * MS, [], restart=True)
+    turn = gain.update(UNIX_NS + 55 * MS, [], restart=True)
 
     assert (turn.jumped_back, turn.steps, turn.time) == (0.0, 0, UNIX_NS + 100 * MS)
 
@@ -119,7 +119,7 @@ def test_a_pause_is_no_time_for_the_fmu(gain: FmuDriver) -> None:
     y(gain, UNIX_NS + 200 * MS)
 
     gain.resume(UNIX_NS + 5_000 * MS)
-    turn = gain.turn(UNIX_NS + 5_100 * MS, [], restart=True)
+    turn = gain.update(UNIX_NS + 5_100 * MS, [], restart=True)
 
     assert (turn.steps, turn.time, turn.jumped_back) == (1, UNIX_NS + 5_100 * MS, 0.0)
 
@@ -128,9 +128,9 @@ def test_a_pause_is_no_time_for_the_fmu(gain: FmuDriver) -> None:
 def test_the_last_step_ends_at_the_stop_time_at_the_latest(stop_time: float, steps: int) -> None:
     driver = FmuDriver(DriveSettings(fmu_path=FMUS / "Gain.fmu", step_size=0.1, stop_time=stop_time))
     try:
-        driver.turn(UNIX_NS, [], restart=True)
-        turn = driver.turn(UNIX_NS + 10_000 * MS, [], restart=True)
-        again = driver.turn(UNIX_NS + 11_000 * MS, [], restart=True)
+        driver.update(UNIX_NS, [], restart=True)
+        turn = driver.update(UNIX_NS + 10_000 * MS, [], restart=True)
+        again = driver.update(UNIX_NS + 11_000 * MS, [], restart=True)
     finally:
         driver.close()
 
@@ -141,10 +141,10 @@ def test_the_last_step_ends_at_the_stop_time_at_the_latest(stop_time: float, ste
 def test_after_the_stop_time_a_new_start_is_from_the_beginning() -> None:
     driver = FmuDriver(DriveSettings(fmu_path=FMUS / "DampedPendulum.fmu", stop_time=0.1))
     try:
-        first = driver.turn(UNIX_NS, ["a"], restart=True)
-        driver.turn(UNIX_NS + 200 * MS, [], restart=True)
+        first = driver.update(UNIX_NS, ["a"], restart=True)
+        driver.update(UNIX_NS + 200 * MS, [], restart=True)
         driver.resume(UNIX_NS + 300 * MS)
-        second = driver.turn(UNIX_NS + 300 * MS, ["a"], restart=True)
+        second = driver.update(UNIX_NS + 300 * MS, ["a"], restart=True)
     finally:
         driver.close()
 
@@ -155,7 +155,7 @@ def test_a_parameter_that_is_not_tunable_changes_before_the_start_only() -> None
     driver = FmuDriver(DriveSettings(fmu_path=FMUS / "DampedPendulum.fmu"))
     try:
         driver.set_value("l", 2)
-        driver.turn(UNIX_NS, [], restart=True)
+        driver.update(UNIX_NS, [], restart=True)
         with pytest.raises(CallRefused, match="this fixed parameter is not a tunable parameter"):
             driver.check_value("l", 3.0)
     finally:
@@ -165,9 +165,9 @@ def test_a_parameter_that_is_not_tunable_changes_before_the_start_only() -> None
 def test_nothing_is_left_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     driver = FmuDriver(DriveSettings(fmu_path=FMUS / "Gain.fmu", step_size=0.1))
-    driver.turn(5_000 * MS, [], restart=True)
-    driver.turn(6_000 * MS, [], restart=True)
-    driver.turn(1_000 * MS, [], restart=True)
+    driver.update(5_000 * MS, [], restart=True)
+    driver.update(6_000 * MS, [], restart=True)
+    driver.update(1_000 * MS, [], restart=True)
     assert len(list(tmp_path.iterdir())) == 1
 
     driver.close()

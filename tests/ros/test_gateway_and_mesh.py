@@ -10,7 +10,7 @@ import pytest
 import zenoh
 
 from fmu_mesh.ros.gateway.gateway import Gateway
-from fmu_mesh.ros.gateway.topics import RosPlan
+from fmu_mesh.ros.messages.topics import RosPlan
 from fmu_mesh.simtime import TimeGrid
 from fmu_mesh.wire.keys import Keys
 from tests.helpers import DEADLINE_S, wait_until
@@ -21,8 +21,8 @@ GONE, THERE = zenoh.SampleKind.DELETE, zenoh.SampleKind.PUT
 def run_while_samples_come(*tokens: zenoh.SampleKind) -> bool:
     """Whether a gateway that is told this, all before it looks, ends though the samples of the mesh go on and on."""
     nothing: Any = None
-    plan = RosPlan((), (), "lab", "/", None, None)
-    gateway = Gateway(plan, nothing, nothing, Keys("fmu_mesh", "lab"), TimeGrid(0.0, 0.1, 1000), {})
+    plan = RosPlan(nothing)
+    gateway = Gateway(plan, nothing, Keys("fmu_mesh", "lab"), TimeGrid(0.0, 0.1, 1000), {})
     port = SimpleNamespace(instance="a", kind="out", variable=SimpleNamespace(name="y"), step_points=1)
     gateway._watch(cast("Any", port))
     for kind in tokens:

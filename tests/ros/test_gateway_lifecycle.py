@@ -15,7 +15,7 @@ from typing import IO
 
 import pytest
 
-from fmu_mesh.ros.gateway.topics import Topic
+from fmu_mesh.ros.messages.topics import Topic
 from fmu_mesh.ros.node.gateway_node import RclpyProfile
 from tests.helpers import DEADLINE_S, FMUS, Place, write_config
 from tests.ros.ros_peer import Ros, ros_or_skip
@@ -193,9 +193,7 @@ def test_a_sample_that_comes_after_ros_was_shut_down_is_dropped_without_a_word()
     context = rclpy.Context()
     rclpy.init(context=context)
     node = rclpy.create_node("own", context=context)
-    topic = Topic(
-        "/y", "std_msgs/msg/Float64", "out", (), "ros2dds", stamped=False, frame_id="", reliability="reliable"
-    )
+    topic = Topic("/y", "std_msgs/msg/Float64", "out", ())
     put = RclpyProfile(node).publish(topic)
     put(serialize_message(Float64(data=1.0)), 0.0)
     rclpy.shutdown(context=context)

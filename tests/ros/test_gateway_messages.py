@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fmu_mesh.ros.gateway.topics import Port, Topic
 from fmu_mesh.ros.messages.assembling import Assembler, Disassembler
 from fmu_mesh.ros.messages.cdr import CdrError, Codec
 from fmu_mesh.ros.messages.definitions import MessageTypes, Nested
+from fmu_mesh.ros.messages.topics import Port, Topic
 from fmu_mesh.variables.model_description import Variable, VariableType
 
 TYPES = MessageTypes("kilted")
@@ -31,17 +31,7 @@ def port(path: str, *, kind: VariableType = "Float64", steps: int = 1, shape: tu
 def topic(
     message: str, *ports: Port, direction: Literal["out", "in"] = "out", constants: tuple[tuple[str, str], ...] = ()
 ) -> Topic:
-    return Topic(
-        "/t",
-        message,
-        direction,
-        ports,
-        "ros2dds",
-        stamped=TYPES.has_header(message),
-        frame_id="base",
-        reliability="reliable",
-        constants=constants,
-    )
+    return Topic("/t", message, direction, ports, frame_id="base", constants=constants)
 
 
 def decoded(message: str, data: bytes) -> dict[str, Any]:

@@ -7,10 +7,10 @@ from typing import Any
 
 import pytest
 
-from fmu_mesh.config.loading import load
 from fmu_mesh.errors import ConfigurationError
+from fmu_mesh.instances.configuration import load
 from fmu_mesh.ros.gateway.mapping import resolve
-from fmu_mesh.ros.gateway.topics import RosPlan
+from fmu_mesh.ros.messages.topics import RosPlan
 from fmu_mesh.run.preparing import prepare
 from fmu_mesh.variables.model_description import ModelDescription, Variable
 from tests.fmus.helpers import find_fmu
@@ -148,7 +148,7 @@ def test_topics_are_set_by_hand_for_a_variable_an_instance_or_several_variables(
         ],
     )
 
-    assert [(topic.name, topic.profile, topic.stamped) for topic in plan.topics] == [
+    assert [(topic.name, topic.profile, plan.types.has_header(topic.message)) for topic in plan.topics] == [
         ("/delay/y", "rmw_zenoh", False),
         ("/g/u", "rmw_zenoh", False),
         ("/g/y", "rmw_zenoh", False),
@@ -317,7 +317,7 @@ def test_names_that_collide_or_start_with_a_digit_are_told_with_all_else_that_is
 
     texts = [str(finding) for finding in findings]
     assert len(texts) == 3
-    assert "in 'pendulum' the variables 'b.x', 'b_x' all become 'b_x'; expected a name by hand" in texts[0]
+    assert "in 'pendulum' the variables 'b.x', 'b_x' all become 'b_x'; expected a name of your choice" in texts[0]
     assert "{topic: /a_name, variable: 'pendulum.b.x'}" in texts[0]
     assert "the variable '1st' becomes '1st', which starts with a digit" in texts[1]
     assert "the unknown variable 'nothing'" in texts[2]

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import importlib
 import math
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+import fmu_mesh.ros.node
 from fmu_mesh.ros.messages.ros_names import absolute, dds_type, name_problems, ros_name, topic_problem
 from fmu_mesh.ros.messages.stamp import from_stamp, nanoseconds, to_stamp
 
@@ -60,3 +62,18 @@ def test_a_stamp_becomes_the_nearest_float_and_comes_back_while_floats_are_that_
     assert abs(nanoseconds(time) - (sec * 10**9 + nanosec)) <= math.ceil(math.ulp(time) / 2 * 1e9)
     if abs(sec) < 2**22:
         assert to_stamp(time) == {"sec": sec, "nanosec": nanosec}
+
+
+@pytest.mark.parametrize(
+    ("old", "name"),
+    [
+        ("fmu_mesh.ros.node_parameters", "initialize_from_parameters"),
+        ("fmu_mesh.ros.node_parameters", "declare_parameters"),
+        ("fmu_mesh.ros.names", "ros_name"),
+    ],
+)
+def test_an_old_import_path_works_and_shows_the_new_spelling(old: str, name: str) -> None:
+    with pytest.warns(DeprecationWarning, match=f"{old} is deprecated: write `from fmu_mesh.ros.node import {name}`"):
+        found = getattr(importlib.import_module(old), name)
+
+    assert found is getattr(fmu_mesh.ros.node, name)

@@ -9,7 +9,9 @@ from pathlib import Path
 import pytest
 
 from fmu_mesh.errors import ConfigurationError
-from fmu_mesh.ros.messages.definitions import Basic, MessageTypes, UnknownField, UnknownType, carries, default_type
+from fmu_mesh.ros.messages.definitions import Basic, MessageTypes, UnknownField, UnknownType
+from fmu_mesh.ros.messages.fitting import carries, default_type
+from fmu_mesh.variables.value_types import TYPES as FMI_TYPES
 
 SHARE = Path(sys.prefix) / "share"
 """Where the packages of ROS from PyPI put what the generators of ROS have computed."""
@@ -118,34 +120,34 @@ def test_a_wrong_custom_definition_is_refused(name: str, text: str, reason: str)
 
 
 def test_every_fmi_type_has_a_message_that_carries_it() -> None:
-    for kind in ("Real", "Integer", "Boolean", "Enumeration", "String", "Float32", "UInt64", "Int8"):
+    for kind in set(FMI_TYPES) - {"Binary"}:
         message = default_type(kind)
         assert message is not None
         leaf = TYPES.field(message, "data")
         assert isinstance(leaf, Basic)
         assert carries(leaf.kind, kind)
         assert carries(kind, leaf.kind)
-    assert default_type("Real", array=True) == "std_msgs/msg/Float64MultiArray"
+    assert default_type("Float64", array=True) == "std_msgs/msg/Float64MultiArray"
     assert default_type("Binary") is None
 
 
 @pytest.mark.parametrize(
     ("target", "source", "fits"),
     [
-        ("float64", "Integer", True),
-        ("float32", "Integer", False),
-        ("float32", "Real", True),
+        ("float64", "Int32", True),
+        ("float32", "Int32", False),
+        ("float32", "Float64", True),
         ("float64", "int64", False),
-        ("int32", "Real", False),
-        ("int16", "Integer", False),
+        ("int32", "Float64", False),
+        ("int16", "Int32", False),
         ("int64", "uint32", True),
         ("int32", "uint32", False),
         ("uint8", "int8", False),
         ("int8", "Boolean", True),
-        ("bool", "Integer", False),
-        ("string", "Real", False),
-        ("Integer", "int64", False),
-        ("Real", "int32", True),
+        ("bool", "Int32", False),
+        ("string", "Float64", False),
+        ("Int32", "int64", False),
+        ("Float64", "int32", True),
     ],
 )
 def test_only_what_loses_no_whole_number_is_carried(target: str, source: str, *, fits: bool) -> None:

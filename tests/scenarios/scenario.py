@@ -12,7 +12,9 @@ from dataclasses import dataclass, field
 
 import msgspec
 
-from fmu_mesh.config.mesh import KIND, Config
+from fmu_mesh.config.instance_sections import KIND
+from fmu_mesh.config.mesh import Config
+from fmu_mesh.instances.registry import decode_section
 from fmu_mesh.rings.ring import Ring
 from fmu_mesh.run.local import LocalMesh
 from fmu_mesh.simtime import TimeGrid
@@ -68,6 +70,7 @@ class Scenario:
                 "instances": {name: {KIND: "fmu", "fmu": "none.fmu"} for name in names},
             },
             Config,
+            dec_hook=decode_section,
         )
         descriptions = {name: self._description(name, [s for s, t, _ in ends if t == name]) for name in names}
         system = System(

@@ -75,7 +75,7 @@ def test_an_entry_that_would_leave_the_folder_is_refused_before_anything_is_writ
         with pytest.raises(LoadFailed, match=r"hostile\.fmu") as caught:
             refused()
         assert says in str(caught.value)
-    assert list(parent.iterdir()) == []
+    assert list(parent.glob("*")) == []
     assert not (tmp_path / "evil").exists()
     assert not Path("/tmp/fmu_mesh_evil").exists()  # noqa: S108 that it is not written is the point
 
@@ -128,7 +128,7 @@ def test_an_archive_that_cannot_be_unpacked_is_told_with_the_reason(
     with pytest.raises(LoadFailed, match=says):
         extract(tmp_path / "broken.fmu", tmp_path / "parent")
 
-    assert list((tmp_path / "parent").iterdir()) == []
+    assert list((tmp_path / "parent").glob("*")) == []
 
 
 def test_a_file_in_the_place_of_a_folder_is_told_and_nothing_is_left(tmp_path: Path) -> None:
@@ -137,7 +137,7 @@ def test_a_file_in_the_place_of_a_folder_is_told_and_nothing_is_left(tmp_path: P
     with pytest.raises(LoadFailed, match=r"odd\.fmu"):
         extract(path, tmp_path / "parent")
 
-    assert list((tmp_path / "parent").iterdir()) == []
+    assert list((tmp_path / "parent").glob("*")) == []
 
 
 @pytest.mark.parametrize(
@@ -162,7 +162,7 @@ def test_an_archive_bomb_is_refused_by_its_ratio_without_being_unpacked(tmp_path
     with pytest.raises(LoadFailed, match=r"is \d+ times as large when it is unpacked; the limit is 200"):
         extract(path, tmp_path / "parent")
 
-    assert list((tmp_path / "parent").iterdir()) == []
+    assert list((tmp_path / "parent").glob("*")) == []
     read_description(path, Terms(LimitsConfig(ratio=2000)))  # a person may trust it
 
 
@@ -177,7 +177,7 @@ def test_an_entry_that_holds_more_than_it_announces_is_refused(tmp_path: Path) -
     with pytest.raises(LoadFailed, match="damaged"):
         extract(path, tmp_path / "parent")
 
-    assert list((tmp_path / "parent").iterdir()) == []
+    assert list((tmp_path / "parent").glob("*")) == []
 
 
 def test_an_fmu_is_unpacked_into_a_private_folder_and_keeps_what_is_executable(tmp_path: Path) -> None:
@@ -202,7 +202,7 @@ def test_a_checksum_is_verified_when_an_fmu_is_read_and_when_it_is_unpacked(tmp_
     for refused in (lambda: read_description(GAIN, wrong), lambda: extract(GAIN, tmp_path / "parent", wrong)):
         with pytest.raises(LoadFailed, match=f"has the SHA-256 {right}, not 0000"):
             refused()
-    assert list((tmp_path / "parent").iterdir()) == []
+    assert list((tmp_path / "parent").glob("*")) == []
 
 
 def test_an_unpacked_folder_is_used_without_writing_into_it(tmp_path: Path) -> None:

@@ -12,8 +12,9 @@ from msgspec.structs import replace
 
 from fmu_mesh.cli.checking import plan_page
 from fmu_mesh.cli.main import main
-from fmu_mesh.config.schema import json_schema
+from fmu_mesh.config.structure import json_schema
 from fmu_mesh.errors import Finding
+from fmu_mesh.instances.configuration import installed_config
 from fmu_mesh.run.preparing import prepare
 
 FMUS = Path(__file__).parents[2] / "fmus"
@@ -222,4 +223,16 @@ def test_every_kept_configuration_can_run(
 
 def test_schema_prints_the_json_schema(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["schema"]) == 0
-    assert json.loads(capsys.readouterr().out) == json_schema()
+    assert json.loads(capsys.readouterr().out) == json_schema(installed_config())
+
+
+@pytest.mark.parametrize("key", ["fmu", "mujoco", "gazebo_classic"])
+def test_an_empty_path_of_a_model_is_a_finding(key: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    config = tmp_path / "mesh.yaml"
+    config.write_text(
+        f"mesh: m\nsimulation: {{stop_time: 1, step_size: 0.1}}\ninstances: {{a: {{{key}: ''}}}}\n", encoding="utf-8"
+    )
+
+    assert main(["check", str(config)]) == 2
+
+    assert f"mesh.yaml:3: instances.a.{key}: an empty path; expected a" in capsys.readouterr().err

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from fmu_mesh.config.loading import examine, parse
 from fmu_mesh.errors import ConfigurationError
+from fmu_mesh.instances.configuration import examine, parse
 from fmu_mesh.instances.position_pid import describe_pid
 from fmu_mesh.system.plan import Plan, make_plan
 from fmu_mesh.system.system import build

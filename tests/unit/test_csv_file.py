@@ -12,7 +12,7 @@ import pytest
 
 from fmu_mesh.errors import ConfigurationError
 from fmu_mesh.files import Kept
-from fmu_mesh.recorder.csv_file import CsvFile, cut_after_last_row
+from fmu_mesh.recorder.csv_file import CsvFile
 from fmu_mesh.variables.model_description import VariableType
 
 COLUMNS: list[tuple[str, VariableType]] = [
@@ -201,13 +201,12 @@ def test_what_a_full_disk_leaves_ends_with_a_whole_row_and_nothing_follows_when_
         ("", Kept(), 0, ""),
         ("time,a\n0.0,1\n0.1,2\n0.", Kept(1, 13), 2, "time,a\n0.0,1\n0.1,2\n"),
         ("time,a\n0.0,1\n", Kept(1, 13), 1, "time,a\n0.0,1\n"),
-        ("another", Kept(1, 13), 0, "another"),
     ],
 )
 def test_a_file_is_cut_after_its_last_whole_row(tmp_path: Path, text: str, kept: Kept, rows: int, left: str) -> None:
     path = tmp_path / "a.csv"
     path.write_text(text)
 
-    assert cut_after_last_row(path, kept) == rows
+    assert CsvFile.keep_whole_rows(path, kept) == rows
 
     assert path.read_text() == left

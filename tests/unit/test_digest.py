@@ -12,7 +12,8 @@ from typing import Any
 import pytest
 import yaml
 
-from fmu_mesh.run.preparing import Options, prepare
+from fmu_mesh.run.options import Options
+from fmu_mesh.run.preparing import prepare
 from fmu_mesh.system import digest
 from fmu_mesh.system.digest import difference
 from fmu_mesh.system.plan import Plan

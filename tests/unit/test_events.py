@@ -6,7 +6,8 @@ import contextlib
 import os
 import threading
 
-from fmu_mesh.run.events import End, Event, EventWriter, Status, decode_event
+from fmu_mesh.run.events import Event, EventWriter, Status, decode_event
+from fmu_mesh.run.outcome import Outcome
 from fmu_mesh.wire.views import MeshStatus
 from tests.helpers import DEADLINE_S, wait_until
 
@@ -46,7 +47,7 @@ def test_a_master_whose_launcher_reads_nothing_goes_on_and_keeps_the_newest_stat
         for point in range(count):
             emit(Status(status(point)))
             told.append(point)
-        emit(End(status(count), 1.0, 0, None))
+        emit(Outcome("done", count, 0.0, 1.0, 0, None))
 
     master = threading.Thread(target=run, daemon=True)
     master.start()
@@ -57,7 +58,7 @@ def test_a_master_whose_launcher_reads_nothing_goes_on_and_keeps_the_newest_stat
     with open(reading, "rb") as pipe:  # noqa: PTH123 a descriptor
         for line in pipe:
             events.append(decode_event(line))
-            if isinstance(events[-1], End):
+            if isinstance(events[-1], Outcome):
                 break
     master.join(DEADLINE_S)
     os.close(writing)
@@ -74,6 +75,6 @@ def test_a_launcher_that_is_gone_keeps_nobody_waiting() -> None:
     emit = EventWriter(writing)
 
     emit(Status(status(0)))
-    emit(End(status(1), 1.0, 0, None))
+    emit(Outcome("done", 1, 0.0, 1.0, 0, None))
 
     os.close(writing)

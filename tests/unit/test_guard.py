@@ -7,14 +7,23 @@ import locale
 import os
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import closing
 from pathlib import Path
 
 import pytest
 
 from fmu_mesh.errors import FmuError, InitializationFailed, StepFailed
-from fmu_mesh.instances.call_guard import CallWatch, floating_point_changed, kept_state, restore_floating_point
-from tests.helpers import DEADLINE_S
+from fmu_mesh.instances.call_guard import (
+    CallWatch,
+    current_function,
+    floating_point_changed,
+    kept_state,
+    restore_floating_point,
+)
+from fmu_mesh.instances.fmi import Fmi2Instance, read_description
+from fmu_mesh.instances.fmi.calls import FmpyCalls
+from tests.helpers import DEADLINE_S, FMUS
 
 UPWARD, DOWNWARD, TOWARD_ZERO = 0x800, 0x400, 0xC00  # of x86; other processors have other numbers
 
@@ -46,14 +55,22 @@ def watch(overruns: Overruns) -> Iterator[CallWatch]:
     watch.close()
 
 
-def test_a_call_that_meets_its_deadline_is_told_with_the_function_on_the_stack(
-    watch: CallWatch, overruns: Overruns
-) -> None:
-    def _call(fname: str) -> None:  # as FMPy names it
-        assert overruns.there.wait(DEADLINE_S), fname
+class Hanging:
+    """Stands for FMPy's object of an FMU, whose call returns when the watch has found that it is late."""
+
+    def __init__(self, overruns: Overruns) -> None:
+        self.component = 0
+        self._overruns = overruns
+
+    def enterInitializationMode(self) -> None:  # noqa: N802 as FMPy names it
+        assert self._overruns.there.wait(DEADLINE_S)
+
+
+def test_a_call_that_meets_its_deadline_is_told_with_the_function_of_fmi(watch: CallWatch, overruns: Overruns) -> None:
+    fmu = FmpyCalls(Hanging(overruns), "fmi2", {})
 
     with watch.calling("plant", InitializationFailed, "call", 0.05):
-        _call("fmi2EnterInitializationMode")
+        fmu.enterInitializationMode()
 
     (error,) = overruns.found
     assert type(error) is InitializationFailed
@@ -61,6 +78,31 @@ def test_a_call_that_meets_its_deadline_is_told_with_the_function_on_the_stack(
     assert error.message.endswith("s from fmi2EnterInitializationMode; its process is ended")
     assert error.hint is not None
     assert "`timeouts.call`" in error.hint
+    assert current_function(threading.get_ident()) is None
+
+
+def test_a_function_is_named_by_its_prefix_unless_it_has_another_name() -> None:
+    class Slave:
+        component = 0
+
+        def __init__(self) -> None:
+            self.named: list[str | None] = []
+
+        def instantiate(self) -> None:
+            self.named.append(current_function(threading.get_ident()))
+
+        setupExperiment = fmi2GetFMUstate = instantiate  # noqa: N815 as FMPy names them
+
+    slave = Slave()
+    fmu = FmpyCalls(slave, "fmi2", {"instantiate": "fmi2Instantiated"})
+
+    fmu.instantiate()
+    fmu.setupExperiment()
+    fmu.fmi2GetFMUstate()
+    slave.component = 7
+
+    assert slave.named == ["fmi2Instantiated", "fmi2SetupExperiment", "fmi2GetFMUstate"]
+    assert fmu.component == 7
 
 
 def test_calls_in_time_are_not_told_however_many_they_are(watch: CallWatch, overruns: Overruns) -> None:
@@ -112,3 +154,20 @@ def test_folder_locale_rounding_and_signal_handlers_are_kept(tmp_path: Path) -> 
         assert interrupts == [signal.SIGTERM]
     finally:
         signal.signal(signal.SIGTERM, before)
+
+
+def test_a_call_that_sets_or_gets_values_has_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    named: list[str | None] = []
+    call: Callable[..., int] = Fmi2Instance._call
+
+    def noted(*arguments: object) -> int:
+        named.append(current_function(threading.get_ident()))
+        return call(*arguments)
+
+    monkeypatch.setattr(Fmi2Instance, "_call", noted)
+    path = FMUS / "Gain.fmu"
+    with closing(Fmi2Instance(path, "gain", read_description(path), tmp_path)) as gain:
+        gain.enter_initialization(0.0, None, {"u": 2.0})
+        gain.get_values(["y"])
+
+    assert named == ["fmi2SetReal", "fmi2GetReal"]

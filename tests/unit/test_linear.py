@@ -13,8 +13,8 @@ import pytest
 
 from fmu_mesh.cli.checking import plan_page
 from fmu_mesh.config.findings import Findings
-from fmu_mesh.config.loading import parse
 from fmu_mesh.config.mesh import ConnectionConfig
+from fmu_mesh.instances.configuration import parse
 from fmu_mesh.system.connections import resolve_connections
 from fmu_mesh.system.plan import make_plan
 from fmu_mesh.system.system import build

@@ -6,10 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from fmu_mesh.config.loading import MAXIMUM_BYTES, LoadedConfig, load, parse
+from fmu_mesh.config.loading import MAXIMUM_BYTES, LoadedConfig
 from fmu_mesh.config.mesh import ConnectionConfig
 from fmu_mesh.config.yaml_text import MAXIMUM_DEPTH
 from fmu_mesh.errors import ConfigurationError, Finding
+from fmu_mesh.instances.configuration import load, parse
 
 CONFIGS = sorted((Path(__file__).parents[2] / "configs").glob("*.yaml"))
 
@@ -189,6 +190,12 @@ STRUCTURE = [
         "mesh.yaml:5: instances.delay: 'delay.fmu'; expected a mapping with fmu, kind, solver, tolerance, "
         "retry_discarded_steps, start_values, step_size, group and 4 more",
         id="text for a mapping",
+    ),
+    pytest.param(
+        changed("a: 1,", "a: [1, {b: 2}],"),
+        "mesh.yaml:4: instances.pendulum.start_values.a[1]: a mapping; "
+        "expected a number, text, true or false, or a list",
+        id="a mapping in an array of start values",
     ),
     pytest.param(
         changed('"der(a,2)": 0.5', "der(a,2): 0.5").replace("2)", "'2)'"),

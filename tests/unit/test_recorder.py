@@ -14,6 +14,7 @@ import zenoh
 
 from fmu_mesh.errors import MeshLost
 from fmu_mesh.recorder import recorder as module
+from fmu_mesh.recorder.csv_file import CsvFile
 from fmu_mesh.recorder.recorder import Recorder
 from fmu_mesh.rings.ring import Ring
 from fmu_mesh.system.plan import RECORDER, NodePlan
@@ -36,11 +37,11 @@ class Mesh:
         plan = Scenario(("a -> b",), points=POINTS).plan(groups={"a": "n", "b": "n"}, record=True, window=ROWS)
         self.plan: NodePlan = msgspec.structs.replace(
             plan.nodes[RECORDER],
-            result_file=str(folder / "result.csv"),
             shared_memory=False,
             timeouts=msgspec.structs.replace(plan.system.config.timeouts, stop=DEADLINE_S),
         )
         self.session = session
+        self._folder = folder
         self.reported = threading.Event()
         self._welcomed = threading.Event()
         public = Keys(self.plan.key_prefix, self.plan.mesh)
@@ -52,6 +53,10 @@ class Mesh:
             session.declare_queryable(self._keys.ready(RECORDER), self._take_ready),
             session.declare_queryable(self._keys.report(RECORDER), self._take_report),
         ]
+
+    def file(self) -> CsvFile:
+        """The result file."""
+        return CsvFile(self._folder / "result.csv", [(f"{i}.{v}", "Float64") for i, v in self.plan.recorded])
 
     def put(self, message: bytes) -> None:
         """What the master sends."""
@@ -110,10 +115,10 @@ def test_a_recorder_at_rest_ends_with_a_run_that_fails_and_writes_what_has_come(
         def next(self) -> None:
             rests.set()
 
-    monkeypatch.setattr(module, "Turns", Turns)
+    monkeypatch.setattr(module, "_Turns", Turns)
     monkeypatch.setattr(module, "_REST_S", DEADLINE_S)
 
-    with suppress(MeshLost), Recorder(mesh.plan, mesh.session) as recorder:
+    with suppress(MeshLost), Recorder(mesh.plan, mesh.session, mesh.file()) as recorder:
         mesh.put_rows()
         assert rests.wait(DEADLINE_S)
         error = MeshLost("node 'n' was lost", instance="a, b")
@@ -125,7 +130,7 @@ def test_a_recorder_at_rest_ends_with_a_run_that_fails_and_writes_what_has_come(
 
 
 def test_a_recorder_that_reports_ends_with_a_master_that_takes_no_reports_any_more(mesh: Mesh) -> None:
-    with suppress(MeshLost), Recorder(mesh.plan, mesh.session) as recorder:
+    with suppress(MeshLost), Recorder(mesh.plan, mesh.session, mesh.file()) as recorder:
         mesh.put_rows()
         mesh.put(HEADER.pack(FINISH, 0, 0, 0))
         assert mesh.reported.wait(DEADLINE_S)

@@ -9,7 +9,8 @@ import pytest
 import yaml
 from jsonschema import Draft202012Validator
 
-from fmu_mesh.config.schema import json_schema, schema_text
+from fmu_mesh.config.structure import json_schema, schema_text
+from fmu_mesh.instances.configuration import installed_config
 
 FOLDER = Path(__file__).parents[2] / "configs"
 CONFIGS = sorted(FOLDER.glob("*.yaml"))
@@ -23,19 +24,22 @@ connections: ['a.der(x,2) -> b.u', {from: a.x, to: b.v, delay: 1}]
 
 
 def errors_of(text: str) -> list[str]:
-    return [error.message for error in Draft202012Validator(json_schema()).iter_errors(yaml.safe_load(text))]
+    return [
+        error.message
+        for error in Draft202012Validator(json_schema(installed_config())).iter_errors(yaml.safe_load(text))
+    ]
 
 
 def test_the_schema_is_one_of_draft_2020_12() -> None:
-    Draft202012Validator.check_schema(json_schema())
+    Draft202012Validator.check_schema(json_schema(installed_config()))
 
 
 def test_the_kept_copy_is_what_the_code_makes() -> None:
-    assert (FOLDER / "schema.json").read_text(encoding="utf-8") == schema_text()
+    assert (FOLDER / "schema.json").read_text(encoding="utf-8") == schema_text(installed_config())
 
 
 def test_every_key_is_described_for_editors() -> None:
-    definitions = json.loads(schema_text())["$defs"]
+    definitions = json.loads(schema_text(installed_config()))["$defs"]
     keys = [(name, schema) for section in definitions.values() for name, schema in section["properties"].items()]
     assert len(keys) > 30
     assert [name for name, schema in keys if "description" not in schema and "$ref" not in schema] == []

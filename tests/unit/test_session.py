@@ -11,7 +11,7 @@ import zenoh
 
 from fmu_mesh.errors import ConfigurationError, MeshLost
 from fmu_mesh.wire.client.mesh_client import key_expression
-from fmu_mesh.wire.session import Wiring, ask, close_session, open_session
+from fmu_mesh.wire.session import Question, Wiring, ask, close_session, open_session
 from tests.helpers import DEADLINE_S
 
 
@@ -52,7 +52,7 @@ def test_a_question_that_nobody_wants_answered_any_more_ends() -> None:
     session = open_session(Wiring())
 
     with pytest.raises(MeshLost, match="the asker gave up"):
-        ask(session, "nobody/there", b"", 10 * DEADLINE_S, "nobody", over=lambda: True)
+        ask(session, Question("nobody/there", "nobody", 10 * DEADLINE_S), lambda: True)
 
     close_session(session)
 

@@ -18,7 +18,7 @@ import yaml
 from fmu_mesh.cli.main import main
 from fmu_mesh.errors import LoadFailed
 from fmu_mesh.instances.fmi import open_instance, read_description
-from fmu_mesh.instances.fmi.archive.sources import extract
+from fmu_mesh.instances.fmi.archive.sources import cache_folder, extract
 from fmu_mesh.variables.model_description import Kind
 from tests.fmus import event_fmus
 from tests.fmus.event_fmus import Version, event_source_fmu
@@ -178,7 +178,7 @@ def test_sources_that_do_not_compile_are_told_with_the_reason_and_leave_nothing(
     with pytest.raises(LoadFailed, match=says):
         extract(path, tmp_path / "parent")
 
-    assert list((tmp_path / "parent").iterdir()) == []
+    assert list((tmp_path / "parent").glob("*")) == []
     assert libraries(cache) == []
 
 
@@ -340,3 +340,22 @@ def test_an_fmu_for_another_platform_without_sources_is_refused(tmp_path: Path) 
 
     with pytest.raises(LoadFailed, match=r"no binary for this platform \(linux64\); it has: aarch64-darwin, win64"):
         read_description(path)
+
+
+@pytest.mark.parametrize(
+    ("environment", "expected"),
+    [
+        ({"FMU_MESH_CACHE_DIR": "/one", "XDG_CACHE_HOME": "/two"}, "/one"),
+        ({"XDG_CACHE_HOME": "/two"}, "/two/fmu_mesh"),
+        ({"XDG_CACHE_HOME": "", "HOME": "/three"}, "/three/.cache/fmu_mesh"),
+        ({"HOME": "/three"}, "/three/.cache/fmu_mesh"),
+    ],
+)
+def test_the_cache_is_where_the_environment_says(
+    environment: dict[str, str], expected: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("FMU_MESH_CACHE_DIR", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in environment.items():
+        monkeypatch.setenv(name, value)
+    assert cache_folder() == Path(expected)

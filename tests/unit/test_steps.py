@@ -14,13 +14,14 @@ import pytest
 
 from fmu_mesh.errors import StepFailed, TerminationRequested
 from fmu_mesh.instances.fmi import FmuInstance, open_instance, read_description, stepped
+from fmu_mesh.instances.fmi.co_simulation.discarded_steps import DISCARD, SMALLEST, take_sub_steps
 from fmu_mesh.instances.fmi.co_simulation.extrapolation import LinearInputs
 from fmu_mesh.instances.fmi.co_simulation.fmi3_steps import Fmi3Steps
-from fmu_mesh.instances.fmi.co_simulation.substeps import DISCARD, SMALLEST, take_sub_steps
+from fmu_mesh.instances.fmi.step_options import SolverSettings, StepOptions
 from fmu_mesh.rings.ring import Ring
 from fmu_mesh.simtime import TimeGrid
 from fmu_mesh.system.layout import Layout
-from fmu_mesh.system.step_options import LinearInput, SolverSettings, StepOptions
+from fmu_mesh.system.linear_inputs import LinearInput
 from fmu_mesh.variables.model_description import Kind, ModelDescription
 from fmu_mesh.variables.value_types import Value
 from tests.fmus.event_fmus import Version
@@ -376,7 +377,7 @@ def test_an_event_that_follows_from_a_value_after_a_state_was_set_has_its_own_ti
         stairs.do_step(1)
 
         after = stairs.get_state()
-        assert (state.standing.last_event, after.standing.last_event) == (0.0, 0.25)
+        assert (state.kept.last_event, after.kept.last_event) == (0.0, 0.25)
         stairs.free_state(state)
         stairs.free_state(after)
 

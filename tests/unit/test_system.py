@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from fmu_mesh.config.loading import examine, parse
 from fmu_mesh.errors import ConfigurationError, Finding
+from fmu_mesh.instances.configuration import examine, parse
 from fmu_mesh.simtime import TimeGrid
 from fmu_mesh.system.system import System, build
 from fmu_mesh.variables.model_description import Causality, ModelDescription, Value, Variable, VariableType
@@ -499,10 +499,10 @@ def test_a_folder_is_no_result_file(tmp_path: Path) -> None:
     assert found == f"7: record.file: the folder '{tmp_path}'; expected a file, or null to record nothing"
 
 
-@pytest.mark.parametrize("name", ["result.xlsx", "result.H5", "result.json"])
+@pytest.mark.parametrize("name", ["result.xlsx", "result.H5", "result.json", "result.v2"])
 def test_a_format_that_is_not_written_is_refused(name: str) -> None:
     assert findings_of(text(rest=f"record: {{file: {name}}}")) == [
-        f"7: record.file: '{name}', a format that is not written; expected a name ending in .csv, or .mcap for a bag"
+        f"7: record.file: '{name}', a format that is not written; expected a name ending in .csv or .mcap"
     ]
 
 

@@ -10,6 +10,7 @@ import pytest
 
 from fmu_mesh.instances.contract import Instance
 from fmu_mesh.instances.fmi import Fmi2Instance, read_description
+from fmu_mesh.instances.fmi.fmu_kind import FmuConfig
 from fmu_mesh.node.inputs import TimedInputs, set_input
 from fmu_mesh.node.stepping import Runner
 from fmu_mesh.rings.ring import Ring
@@ -115,7 +116,7 @@ def test_values_that_come_before_the_first_point_wait_for_it(tmp_path: Path) -> 
 def runner_of(instance: Instance) -> Runner:
     """A runner in the middle of a run, whose steps are a tenth of a second."""
     outputs = Layout.of([("y", "Float64")])
-    plan = InstancePlan("gain", "Gain.fmu", {}, 1, outputs, Layout(), (), {})
+    plan = InstancePlan("gain", "Gain.fmu", {}, 1, outputs, Layout(), (), {}, FmuConfig(fmu="Gain.fmu"))
     runner = Runner(plan, instance, TimeGrid(1.0, STEP_SIZE, 60), 64)
     runner.bind()
     return runner

@@ -1,4 +1,4 @@
-"""Which step of a target needs which row of its source, and what happens to the values on the way."""
+"""What happens to values on their way from the rows of a source to the steps of a target."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import pytest
 
 from fmu_mesh.rings.ring import Ring
 from fmu_mesh.rings.transfer import Transfer
+from fmu_mesh.system.coupling_rule import CouplingRule
 from fmu_mesh.system.layout import Layout
 from fmu_mesh.system.plan import Feed
 from fmu_mesh.variables.value_types import Value
@@ -36,27 +37,6 @@ def filled(rows: int) -> Ring:
 
 
 @pytest.mark.parametrize(("source_points", "target_points", "delay"), RATES)
-def test_a_step_uses_the_last_row_of_the_source_at_or_before_the_point(
-    source_points: int, target_points: int, delay: int
-) -> None:
-    moved = transfer(Ring(INPUTS, 8), source_points, target_points, delay)
-
-    for step in range(30):
-        point = step * target_points if delay else (step + 1) * target_points
-        row = max(row for row in range(200) if row * source_points <= point)
-        assert moved.source_step(step) == row
-
-
-@pytest.mark.parametrize(("source_points", "target_points", "delay"), RATES)
-def test_as_many_steps_are_ready_as_have_their_row(source_points: int, target_points: int, delay: int) -> None:
-    moved = transfer(Ring(INPUTS, 8), source_points, target_points, delay)
-
-    for rows in range(30):
-        ready = sum(1 for step in range(200) if moved.source_step(step) < rows)
-        assert moved.ready(rows) == ready
-
-
-@pytest.mark.parametrize(("source_points", "target_points", "delay"), RATES)
 @pytest.mark.parametrize("frame", [1, 3, 7])
 def test_frames_of_any_length_feed_every_step_once(
     source_points: int, target_points: int, delay: int, frame: int
@@ -68,7 +48,7 @@ def test_frames_of_any_length_feed_every_step_once(
         moved.from_rows(first, tuple(part[first : first + frame] for part in source.parts))
 
     for step in range(moved.ready(42)):
-        row = moved.source_step(step)
+        row = CouplingRule(delay, source_points, target_points).row_for(step)
         assert inputs.part("Float64")[step].tolist() == [
             source.part("Float64")[row, 2],
             0.0,

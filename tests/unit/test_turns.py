@@ -6,7 +6,7 @@ import os
 
 import pytest
 
-from fmu_mesh.recorder.turns import Turns
+from fmu_mesh.recorder.recorder import _Turns as Turns
 
 
 class Scheduler:
@@ -18,7 +18,7 @@ class Scheduler:
         self.moves: list[set[int]] = []
         monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(self.allowed), raising=False)
         monkeypatch.setattr(os, "sched_setaffinity", self._set, raising=False)
-        monkeypatch.setattr("fmu_mesh.recorder.turns._CAN_CHOOSE", True)
+        monkeypatch.setattr("fmu_mesh.recorder.recorder._CAN_CHOOSE", True)
 
     def _set(self, thread: int, processors: set[int]) -> None:
         assert thread == 0  # the calling one

@@ -13,10 +13,11 @@ from fmu_mesh.cli.main import main
 from fmu_mesh.errors import StepFailed
 from fmu_mesh.instances.fmi import open_instance, read_description, stepped
 from fmu_mesh.instances.fmi.co_simulation.extrapolation import TakesDerivatives
+from fmu_mesh.instances.fmi.step_options import StepOptions
 from fmu_mesh.rings.ring import Ring
 from fmu_mesh.simtime import TimeGrid
 from fmu_mesh.system.layout import Layout
-from fmu_mesh.system.step_options import LinearInput, StepOptions
+from fmu_mesh.system.linear_inputs import LinearInput
 from tests.fmus.helpers import find_fmu
 from tests.fmus.packing import repacked
 from tests.helpers import write_config

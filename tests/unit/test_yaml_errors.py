@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from fmu_mesh.config.loading import parse
 from fmu_mesh.errors import ConfigurationError
+from fmu_mesh.instances.configuration import parse
 
 GOOD = """\
 mesh: pair

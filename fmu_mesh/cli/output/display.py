@@ -1,4 +1,4 @@
-"""What a person sees during a run: log messages, one progress line below them, and a summary at the end."""
+"""The output of a run for a person: log messages, one progress line below them, and a summary at the end."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import sys
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from pathlib import Path
 from types import TracebackType
 from typing import Final, Self
 
@@ -16,9 +15,11 @@ from rich.console import Console
 from rich.markup import escape
 
 from ...errors import ErrorReport, FmuMeshError, from_report
-from ...run.events import End, Event, Log, Ready, Status
+from ...run.events import Event, Log, Reachable, Status
+from ...run.outcome import Outcome
 from ...run.wiring import is_socket, leaves_host
 from ...system.plan import Plan
+from ...text import short_path
 from ...wire.views import LogLine, MeshStatus
 from .progress import ProgressLine
 
@@ -26,22 +27,22 @@ __all__ = ["Display", "say", "stdout_as_stderr", "summary", "warn"]
 
 _SHOWN_TIMES: Final = 5
 _WARNINGS: Final = 5
-"""How many warnings are told before a run."""
+"""Number of warnings that are shown before a run."""
 _COUNTED: Final = 1000
-"""How many different messages are counted."""
+"""Number of different messages that are counted."""
 _HELD: Final = 100
-"""How many messages of FMUs that may be about to fail are held back."""
+"""Number of messages that are held back because their FMU may fail next."""
 _STYLES = {"ok": "dim", "warning": "yellow", "discard": "yellow", "error": "red", "fatal": "red"}
 
 
 class Display:
-    """Shows events of a run on standard error.
+    """Shows the events of a run on standard error.
 
     Args:
-        plan: what runs.
-        show_progress: whether to draw the bar; never drawn where standard error is no terminal.
-        waits_for_nodes: whether the address is shown when all nodes are there, so that whoever uses it gets answers;
-            where they are started by hand, they need it before.
+        plan: the plan of the run.
+        show_progress: whether to draw the progress line, if standard error is a terminal.
+        waits_for_nodes: whether the address is shown only when all instances answer. Nodes that are started manually
+            need it earlier.
     """
 
     def __init__(self, plan: Plan, *, show_progress: bool, waits_for_nodes: bool = True) -> None:
@@ -70,7 +71,7 @@ class Display:
     def event(self, event: Event) -> None:
         """Show one event of the master."""
         match event:
-            case Ready(endpoints):
+            case Reachable(endpoints):
                 self._endpoints = endpoints
                 self._warn()
                 if not self._waits_for_nodes:
@@ -79,26 +80,26 @@ class Display:
                 self._status(status)
             case Log(line):
                 self.log(line)
-            case End(ended_by=ErrorReport() as report):
+            case Outcome(ended_by=ErrorReport() as report):
                 self.ended(from_report(report))
-            case End():
+            case Outcome():
                 pass
 
     def _show_address(self) -> None:
-        """Show where the mesh can be reached: where it was asked to listen, or else its socket."""
+        """Show the endpoints that the user asked for, or else the socket."""
         if shown := ", ".join([one for one in self._endpoints if not is_socket(one)] or self._endpoints):
             self._console.print(escape(f"mesh '{self._plan.system.config.mesh}' at {shown}"), soft_wrap=True)
         self._endpoints = ()
 
     def _warn(self) -> None:
-        """Show who else can reach it."""
+        """Warn if other hosts can reach it."""
         config = self._plan.system.config
         if config.zenoh.mode == "peer" and (wide := ", ".join(filter(leaves_host, config.zenoh.listen))):
             text = f"warning: whoever can reach this host at {wide} can read, set and end this mesh"
             self._console.print(f"[yellow]{escape(text)}[/]", soft_wrap=True)
 
     def ended(self, early: FmuMeshError) -> None:
-        """Show why a run ended before its last point although nothing failed."""
+        """Show why a run ended before its last point without a failure."""
         self._console.print(escape(str(early)))
 
     def progress(self, point: int) -> None:
@@ -107,9 +108,9 @@ class Display:
         self._release(lambda line: point > line.point)
 
     def log(self, line: LogLine) -> None:
-        """Show one log message of an FMU; the same text is shown a few times, and then only counted.
+        """Show one log message of an FMU. After five times, the same text is only counted.
 
-        One that may tell why the FMU fails is held back until it has gone on: the error would tell the same once more.
+        A warning or error is held back until the FMU has taken the next step. If that fails, the error has the text.
         """
         if line.status == "ok":
             self._show(line)
@@ -119,13 +120,13 @@ class Display:
             self._show(self._held.popleft())
 
     def flush(self, error: str = "") -> None:
-        """Show what is held back, but for what an error tells."""
+        """Show the messages that are held back, except those in the text of ``error``."""
         told = error.partition("the FMU says: ")[2]
         self._held = deque(line for line in self._held if line.message not in told)
         self._release(lambda _line: True)
 
     def _release(self, may_go: Callable[[LogLine], bool]) -> None:
-        """Show the messages that were held back without a need."""
+        """Show the messages for which ``may_go`` is true."""
         held, self._held = self._held, deque()
         for line in held:
             if may_go(line):
@@ -144,7 +145,7 @@ class Display:
         self._console.print(f"[{style}]{escape(where)}: {escape(line.message)}[/]")
 
     def output(self, name: str, text: str) -> None:
-        """Show a line that a process wrote by itself."""
+        """Show a line of the output of a process."""
         if text:
             shown = "".join(c if c.isprintable() or c == "\t" else "\N{REPLACEMENT CHARACTER}" for c in text)
             self._console.print(f"[dim]{escape(name)} |[/] {escape(shown)}")
@@ -160,12 +161,12 @@ class Display:
 
 
 def say(text: str) -> None:
-    """Tell what takes its time before a run, on standard error."""
+    """Print one line on standard error before a run."""
     print(f"fmu-mesh: {text}", file=sys.stderr, flush=True)
 
 
 def warn(plan: Plan) -> None:
-    """Tell on standard error what is odd in a system that is about to run; of many warnings the first ones."""
+    """Print the first five warnings about a system on standard error before it runs."""
     for warning in plan.system.warnings[:_WARNINGS]:
         say(f"warning: {warning}")
     if (rest := len(plan.system.warnings) - _WARNINGS) > 0:
@@ -174,31 +175,25 @@ def warn(plan: Plan) -> None:
 
 @contextmanager
 def stdout_as_stderr() -> Iterator[None]:
-    """While inside, what an FMU in this process prints goes to standard error: standard output is for results."""
+    """In the block, output of an FMU in this process goes to standard error: standard output is for results."""
     sys.stdout.flush()
     stdout = os.dup(1)
     os.dup2(2, 1)
     try:
         yield
     finally:
-        ctypes.CDLL(None).fflush(None)  # what the FMU printed may still be in the buffer of the C library
+        ctypes.CDLL(None).fflush(None)  # output of the FMU may still be in the buffer of the C library
         os.dup2(stdout, 1)
         os.close(stdout)
 
 
-def summary(plan: Plan, *, point: int, seconds: float, rows: int, result_file: str | None) -> list[str]:
+def summary(plan: Plan, outcome: Outcome) -> list[str]:
     """The closing lines of a run; the last one is `20000 points in 1.234 s: 16207 points/s, real-time factor 32.4`."""
     lines = []
-    if result_file is not None:
-        lines.append(f"result: {_short(Path(result_file))} ({rows} rows)")
+    if outcome.file is not None:
+        lines.append(f"result: {short_path(outcome.file)} ({outcome.rows} rows)")
+    point, seconds = outcome.point, outcome.seconds
     rate = point / seconds if seconds > 0 else 0.0
     factor = rate * plan.grid.step_size
     lines.append(f"{point} points in {seconds:.3f} s: {rate:.0f} points/s, real-time factor {factor:.3g}")
     return lines
-
-
-def _short(path: Path) -> str:
-    try:
-        return str(path.relative_to(Path.cwd()))
-    except ValueError:
-        return str(path)

@@ -1,7 +1,7 @@
-"""Results as a picture: axes by unit, lines that can be told apart, and a legend that leaves them room.
+"""Results as a picture: axes by unit, distinguishable lines, and a legend beside them.
 
-Owns how a picture looks. Where its values and units come from is `fmu_mesh.cli.plotting`. matplotlib is an extra, so it
-is imported when something is drawn.
+Owns how a picture looks. Its values and units come from `fmu_mesh.cli.plotting`. matplotlib is optional, so it is
+imported when something is drawn.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ if TYPE_CHECKING:
 __all__ = ["FLAGS", "VALUE", "Curve", "Results", "draw", "figure_of", "reduced"]
 
 FLAGS = "true (1) or false (0)"
-"""What stands at the axis of Booleans."""
+"""Label of the axis of Booleans."""
 VALUE = "value"
-"""What stands at the axis of numbers without a unit, and of those whose unit is not known."""
+"""Label of the axis of numbers whose unit is unknown or that have none."""
 
 _MAX_POINTS = 4000
-"""Points drawn per line: more than twice the pixels of the picture's width would show nothing new."""
+"""Points per line: more than twice the width of the picture in pixels would not be visible."""
 _COLOURS = 10
 _DASHES: tuple[Any, ...] = (
     "solid",
@@ -46,17 +46,17 @@ _DASHES: tuple[Any, ...] = (
     (0, (10, 3)),
     (0, (3, 1.2, 1, 1.2)),
 )
-"""With each of ten colours: 80 lines that can be told apart."""
+"""With ten colours each: 80 distinguishable lines."""
 _OVER = (4.0, 2.0, 1.0)
-"""How long the dashes are, each 8 apart, of lines that lie on another one, so that all of them show."""
+"""Lengths of the dashes, with a period of 8, of lines that cover another one, so that all are visible."""
 _SAME = 1 / 400
-"""Two lines are one on the picture if they are nowhere further apart than this part of the height of their axes."""
+"""Two lines look like one if their distance is nowhere larger than this fraction of the height of the axes."""
 _GREATEST = 1e300
-"""Greater values are drawn as this one: matplotlib adds and subtracts the ends of its axes."""
+"""Largest value that is drawn: matplotlib adds and subtracts the limits of its axes."""
 _ROWS = 40
-"""Lines of a legend before it gets another column."""
+"""Lines of one column of a legend."""
 _NAMES = 100
-"""Names in one legend: nobody tells more lines apart, and a picture has an end."""
+"""Largest number of names in a legend."""
 _CHARACTERS = 60
 _AXES_INCHES = (8.4, 2.8)
 """Width, and least height, of axes with their labels in inches."""
@@ -70,8 +70,8 @@ class Results(msgspec.Struct, frozen=True):
     Attributes:
         times: the times in s.
         columns: the values by variable; true is 1 and false is 0.
-        flags: the variables that hold nothing but true and false.
-        whole: the variables that are Integer or Enumeration: a Real is never written without a point or an exponent.
+        flags: the variables with only true and false.
+        whole: the variables of type Integer or Enumeration: a Real always has a point or an exponent.
     """
 
     times: NDArray[np.float64]
@@ -84,8 +84,8 @@ class Curve(msgspec.Struct, frozen=True):
     """How one variable is drawn.
 
     Attributes:
-        axis: what stands at its axis; variables with the same share one.
-        note: what the legend adds to its name.
+        axis: label of its axis; variables with the same label share one.
+        note: added to its name in the legend.
     """
 
     axis: str
@@ -93,22 +93,22 @@ class Curve(msgspec.Struct, frozen=True):
 
 
 def draw(results: Results, output: Path, *, title: str, curves: Mapping[str, Curve]) -> None:
-    """Draw results into a file whose suffix says its format.
+    """Draw results into a file; its suffix gives the format.
 
     Args:
-        results: what to draw.
-        output: the file; its folder is made.
-        title: the line above all axes.
-        curves: how to draw variables of which more is known than their values, by name.
+        results: the columns.
+        output: the file; its folder is created.
+        title: the title of the picture.
+        curves: by name of a variable, how to draw it if more than its values is known.
 
     Raises:
         ConfigurationError: the file cannot be written.
     """
     try:
         output.parent.mkdir(parents=True, exist_ok=True)
-        picture = BytesIO()  # a backend that cannot write fails in ways of its own
+        picture = BytesIO()  # a failed write to a file raises errors that depend on the backend
         with warnings.catch_warnings():
-            # Such as a character that the font does not have: it is drawn as a box.
+            # For example a character that is not in the font: it is drawn as a box.
             warnings.simplefilter("ignore")
             figure_of(results, title, curves).savefig(picture, format=output.suffix.removeprefix(".") or None)
         with replaced(output) as draft:
@@ -119,7 +119,7 @@ def draw(results: Results, output: Path, *, title: str, curves: Mapping[str, Cur
 
 
 def figure_of(results: Results, title: str, curves: Mapping[str, Curve]) -> Figure:
-    """The picture as matplotlib has it: one axes below the other, each as high as its legend needs."""
+    """The matplotlib figure: one axes below the other, each as high as its legend."""
     # The object interface: no window, no global state of pyplot.
     from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415  matplotlib is an extra, and slow to import
     from matplotlib.figure import Figure  # noqa: PLC0415  matplotlib is an extra, and slow to import
@@ -149,7 +149,7 @@ def figure_of(results: Results, title: str, curves: Mapping[str, Curve]) -> Figu
 
 
 def _draw_axes(axes: Axes, results: Results, names: Sequence[str], label: str) -> None:
-    lone = "o" if len(results.times) == 1 else None  # a line of one point would show nothing
+    lone = "o" if len(results.times) == 1 else None  # a line of one point is invisible
     for number, (name, below) in enumerate(zip(names, _lines_below(results, names), strict=True)):
         times, values = reduced(results.times, results.columns[name], _MAX_POINTS)
         values = np.clip(values, -_GREATEST, _GREATEST)
@@ -177,9 +177,9 @@ def _draw_axes(axes: Axes, results: Results, names: Sequence[str], label: str) -
 
 
 def _lines_below(results: Results, names: Sequence[str]) -> list[int]:
-    """Of each variable, how many of those before it are the same line on the picture.
+    """For each variable, how many earlier ones look like the same line.
 
-    Only where no dashes tell them apart anyway.
+    All 0 if the lines differ in their dashes anyway.
     """
     if not 1 < len(names) <= _COLOURS or len(results.times) < 2:
         return [0] * len(names)
@@ -193,7 +193,7 @@ def _lines_below(results: Results, names: Sequence[str]) -> list[int]:
 
 
 def _legend_columns(count: int) -> int:
-    """How many columns the legend of so many names has."""
+    """Number of columns of a legend with this number of names."""
     return math.ceil(min(count, _NAMES + 1) / _ROWS) or 1
 
 
@@ -202,7 +202,7 @@ def _legend_rows(count: int) -> int:
 
 
 def _add_legend(axes: Axes, labels: Sequence[str]) -> Legend:
-    """A legend beside the axes, where it hides no line."""
+    """Add a legend beside the axes, where it covers no line."""
     from matplotlib.lines import Line2D  # noqa: PLC0415  matplotlib is an extra, and slow to import
 
     lines = list(axes.lines)[: len(labels)]
@@ -214,7 +214,7 @@ def _add_legend(axes: Axes, labels: Sequence[str]) -> Legend:
         )
     legend = axes.legend(
         lines,
-        # matplotlib leaves out a name that begins with an underscore; a joiner without width before it does not show.
+        # matplotlib omits a name that begins with an underscore; an invisible word joiner before it prevents that.
         [f"\N{WORD JOINER}{text}" if text.startswith("_") else text for text in shown],
         loc="upper left",
         bbox_to_anchor=(1.005, 1.0),
@@ -226,12 +226,12 @@ def _add_legend(axes: Axes, labels: Sequence[str]) -> Legend:
         handlelength=2.6,
     )
     for text in legend.get_texts():
-        text.set_parse_math(False)  # a dollar in a name is one
+        text.set_parse_math(False)  # a dollar sign in a name does not start a formula
     return legend
 
 
 def _short(text: str) -> str:
-    """A name with its middle left out where it gets long: both ends of a structured name say something."""
+    """A long name without its middle: both ends of a structured name matter."""
     half = _CHARACTERS // 2
     return text if len(text) <= _CHARACTERS else f"{text[: half - 1]}…{text[-half:]}"
 
@@ -239,7 +239,7 @@ def _short(text: str) -> str:
 def reduced(
     times: NDArray[np.float64], values: NDArray[np.float64], most: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """About ``most`` points that look like all of them: the least and the greatest of every stretch."""
+    """About ``most`` points that look like all of them: the minimum and maximum of every section."""
     values = np.where(np.isinf(values), np.nan, values)
     if len(times) <= most:
         return times, values
@@ -248,7 +248,7 @@ def reduced(
     for first, end in pairwise(edges):
         stretch = values[first:end]
         if np.isnan(stretch).all():
-            kept.add(int(first))  # so that the gap shows
+            kept.add(int(first))  # keeps the gap visible
         else:
             kept.update((int(first + np.nanargmin(stretch)), int(first + np.nanargmax(stretch))))
     picked = np.array(sorted(kept))

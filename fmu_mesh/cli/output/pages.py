@@ -1,4 +1,4 @@
-"""What the mesh answers, as lines of text for a person."""
+"""The answers of a mesh as lines of text for a person."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 import msgspec
 
 from ...simtime import ENDLESS
+from ...text import short_number
 from ...wire.client.readings import Reading
 from ...wire.views import InstanceInfo, InstanceStatus, MeshInfo, MeshStatus, RosView, VariableView
 from .tables import pairs, table
@@ -43,7 +44,7 @@ def instances(statuses: Iterable[InstanceStatus]) -> list[str]:
 
 
 def mesh_status(status: MeshStatus, ros: Sequence[RosView] = ()) -> list[str]:
-    """How far a mesh is, and what its gateways to ROS reach."""
+    """The status of a mesh, and of its gateways to ROS."""
     return pairs(
         [
             ("mesh", status.mesh),
@@ -60,7 +61,7 @@ def mesh_status(status: MeshStatus, ros: Sequence[RosView] = ()) -> list[str]:
 
 
 def instance_status(status: InstanceStatus) -> list[str]:
-    """How far an instance is."""
+    """The status of an instance."""
     return pairs(
         [
             ("instance", status.instance),
@@ -80,7 +81,7 @@ _PARTS = {"@record": "the recorder", "@mesh": "the master"}
 
 
 def mesh_info(info: MeshInfo) -> list[str]:
-    """What a mesh is."""
+    """The information about a mesh."""
     return pairs(
         [
             ("mesh", info.mesh),
@@ -103,7 +104,7 @@ def mesh_info(info: MeshInfo) -> list[str]:
 
 
 def instance_info(info: InstanceInfo) -> list[str]:
-    """What an instance is, with its variables."""
+    """The information about an instance, and its variables."""
     fmi = f"FMI {info.fmi_version}, " if info.fmi_version else ""
     facts = pairs(
         [
@@ -129,7 +130,7 @@ def instance_info(info: InstanceInfo) -> list[str]:
 
 
 def cells(reading: Reading) -> list[str]:
-    """A value as key, value, unit, and point with time."""
+    """The cells of a value: key, value, unit, and point with time."""
     where = f"(point {reading.point}, t = {seconds(reading.time)})"
     return [reading.key, _text(reading.value), reading.unit or "", where]
 
@@ -141,7 +142,7 @@ def progress(status: MeshStatus) -> str:
 
 def seconds(time: float) -> str:
     """A time in s."""
-    return f"{time:.12g} s"
+    return f"{short_number(time)} s"
 
 
 def _end(stop_time: float | None) -> str:

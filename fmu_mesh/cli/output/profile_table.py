@@ -1,12 +1,11 @@
-"""`--profile`: where the time of a run went, as a table, and as a trace file that Chrome and Perfetto show.
+"""`--profile`: where the time of a run went, as a table and as a trace file for Chrome and Perfetto.
 
-Owns what a person sees of a `MeshProfile`. A trace file is JSON in the Trace Event Format: one process per node, with
+Owns how a `MeshProfile` is shown. A trace file is JSON in the Trace Event Format: one process per node, with
 its bursts of steps, the sending at the end of each, and its waits; the summary is in it as `otherData.fmu_mesh`.
 """
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -19,40 +18,21 @@ from ...system.plan import RECORDER, Plan
 from ...wire.time_profile import GRANT, MeshProfile, NodeProfile
 from .tables import table
 
-__all__ = ["add_profile", "critical_path", "profile_page", "show_profile", "summary_of", "trace"]
+__all__ = ["critical_path", "profile_page", "show_profile", "summary_of", "trace"]
 
-_TABLE_ONLY = Path()
 _HOLDERS = {RECORDER: "the recorder", "@clock": "the wall clock", "@pause": "a pause"}
 _LITTLE = 0.1
-"""A share of the time that is not worth following."""
-
-
-def add_profile(parser: argparse.ArgumentParser) -> None:
-    """Add the option; its value is None, `_TABLE_ONLY`, or the trace file to write."""
-    parser.add_argument(
-        "--profile",
-        nargs="?",
-        const=_TABLE_ONLY,
-        type=_trace_file,
-        metavar="FILE.json",
-        help="show where the time went, and write it as a trace file for Perfetto",
-    )
-
-
-def _trace_file(text: str) -> Path:
-    if not text.endswith(".json"):
-        raise argparse.ArgumentTypeError(f"'{text}' is no .json file; write --profile after the other arguments")
-    return Path(text)
+"""Shares of the time below this one are ignored."""
 
 
 def show_profile(plan: Plan, profile: MeshProfile, seconds: float, file: Path) -> None:
-    """Print the table of a run that took ``seconds``, and write the trace file if one is wanted.
+    """Print the table of a run that took ``seconds``, and write the trace file unless it is `Path()`.
 
     Raises:
         ConfigurationError: the file cannot be written.
     """
     print("\n".join(profile_page(plan, profile)))
-    if file == _TABLE_ONLY:
+    if file == Path():
         return
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -100,7 +80,7 @@ def _other_s(node: NodeProfile) -> float:
 
 
 def critical_path(plan: Plan, profile: MeshProfile) -> list[str]:
-    """Who waits for whom, from the node that waits most to the one that sets the pace, in words."""
+    """Which node waits for which, from the one that waits most to the one that sets the pace, in words."""
     nodes = {node.node: node for node in profile.nodes if node.seconds > 0.0}
     if not nodes:
         return []
@@ -149,7 +129,7 @@ def _waiting(node: NodeProfile) -> float:
 
 
 def _holder(profile: MeshProfile) -> str | None:
-    """What held the grant longest."""
+    """The instance, or other cause, that held the grant back for the longest time."""
     return max(profile.held_s, key=lambda holder: profile.held_s[holder], default=None)
 
 
@@ -220,7 +200,7 @@ def trace(plan: Plan, profile: MeshProfile, seconds: float) -> dict[str, Any]:
 
 
 def _named(number: int, node: NodeProfile) -> list[dict[str, Any]]:
-    """What the viewer calls a node; process ids of several hosts could be equal, so nodes are numbered."""
+    """The names of a node in the viewer. Process ids of two hosts can be equal, so nodes are numbered."""
     text = f"{node.node} (process {node.pid} on {node.host})"
     return [
         {"ph": "M", "name": "process_name", "pid": number, "tid": 1, "args": {"name": text}},

@@ -1,6 +1,6 @@
-"""The progress line of a run: how far it is, how fast, and how long it still takes, in the width of the terminal.
+"""The progress line of a run: its point, its speed and the time left, in the width of the terminal.
 
-Owns what is left out where there is no room for it. Never wider than one line: a line that breaks cannot be taken back.
+Owns which parts are left out on a narrow terminal. It never wraps: a wrapped line cannot be erased.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ _LEAST_BAR: Final = 8
 _MOST_NAME: Final = 20
 _GAP: Final = "  "
 _ECHO: Final = 3
-"""Columns for the `^C` that a terminal shows: it would begin another line, and this one could not be taken back."""
+"""Columns for the `^C` that a terminal echoes, which would wrap the line."""
 
 
 class ProgressLine:
     """One line at the bottom of a terminal, while it is started.
 
     Args:
-        plan: what runs.
-        console: where; nothing is drawn where that is no terminal.
-        show: whether to draw it at all.
+        plan: the plan of the run.
+        console: where it is drawn, if that is a terminal.
+        show: False never draws it.
     """
 
     def __init__(self, plan: Plan, console: Console, *, show: bool) -> None:
@@ -46,21 +46,21 @@ class ProgressLine:
         self._live = Live(self, console=console, transient=True, refresh_per_second=10) if drawn else None
 
     def start(self) -> None:
-        """Draw it from now on."""
+        """Start to draw it."""
         if self._live is not None:
             self._live.start()
 
     def stop(self) -> None:
-        """Take it away."""
+        """Erase it."""
         if self._live is not None:
             self._live.stop()
 
     def status(self, status: MeshStatus) -> None:
-        """Show how far the mesh is."""
+        """Show this status of the mesh."""
         self._status = status
 
     def point(self, point: int) -> None:
-        """Show how far a run in this process is; its speed is measured from the first call on."""
+        """Show this point of a run in this process; the speed is measured from the first call on."""
         now = time.monotonic()
         self._started = now if self._started is None else self._started
         elapsed = now - self._started
@@ -70,12 +70,20 @@ class ProgressLine:
         self._status = MeshStatus(self._name, "running", point, last, at, rate, rate * grid.step_size, {})
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        """Rich asks for it ten times a second."""
+        """The line; Rich calls this ten times a second."""
         width = max(options.max_width - _ECHO, 1)
         name = shortened(self._name, min(_MOST_NAME, width // 4))
         parts = progress_parts(self._grid, self._status, width - len(name) - len(_GAP) - _LEAST_BAR - len(_GAP))
-        line = Table.grid(padding=(0, len(_GAP), 0, 0), pad_edge=False)
-        line.width = width
+        padding = (0, len(_GAP), 0, 0)
+        line = Table(
+            width=width,
+            padding=padding,
+            box=None,
+            collapse_padding=True,
+            show_header=False,
+            show_edge=False,
+            pad_edge=False,
+        )
         line.add_column(no_wrap=True)
         line.add_column(ratio=1, no_wrap=True)
         line.add_column(no_wrap=True)
@@ -87,12 +95,12 @@ class ProgressLine:
 
 
 def progress_parts(grid: TimeGrid, status: MeshStatus | None, width: int) -> list[str]:
-    """What the line says besides the name, as far as ``width`` columns allow: the first parts matter most.
+    """The parts of the line besides the name that fit into ``width`` columns, the most important first.
 
     Args:
         grid: the points of the run.
-        status: how far it is; None before anything is known.
-        width: room in columns.
+        status: the status of the mesh; None before the first one.
+        width: in columns.
     """
     if status is None or status.state in ("starting", "initializing"):
         return [status.state if status is not None else "starting"]
@@ -116,7 +124,7 @@ def progress_parts(grid: TimeGrid, status: MeshStatus | None, width: int) -> lis
 
 
 def _duration(seconds: float) -> str:
-    """A time in the form that a clock has: minutes and seconds, and hours or days where there are some."""
+    """A duration such as `0:23`, `1:02:03` or `2 d 5 h`."""
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     days, hours = divmod(hours, 24)

@@ -1,7 +1,7 @@
-"""A terminal that one page after the other is drawn on, until a key is pressed.
+"""A terminal that shows one page after another until a key is pressed.
 
-Owns what has to be put back as it was: the mode in which keys are read, and what the terminal showed before. It is put
-back however the block ends, at SIGTERM, too.
+Owns the state of the terminal that is restored at the end of the block, also at SIGTERM: how keys are read, and what
+was shown before.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class Screen:
     """The terminal of standard output, as long as the `with` block lasts.
 
     Args:
-        drawn: whether there is one to draw on; where there is none this only waits.
+        drawn: whether standard output is a terminal; if not, this only waits.
     """
 
     def __init__(self, *, drawn: bool) -> None:
@@ -47,7 +47,7 @@ class Screen:
             self._stack.callback(signal.signal, signal.SIGTERM, signal.signal(signal.SIGTERM, _end))
             if self._keys is not None:
                 self._stack.callback(termios.tcsetattr, self._keys, termios.TCSADRAIN, termios.tcgetattr(self._keys))
-                tty.setcbreak(self._keys)  # Ctrl-C stays what it is
+                tty.setcbreak(self._keys)  # Ctrl-C still sends SIGINT
             self._stack.callback(self._write, _FIRST_SCREEN)
             self._write(_OTHER_SCREEN)
         return self
@@ -61,20 +61,20 @@ class Screen:
 
     @property
     def width(self) -> int:
-        """Columns, as many as there are now."""
+        """The current width in columns."""
         return shutil.get_terminal_size().columns
 
     def show(self, lines: Sequence[str]) -> None:
-        """Draw a page; of one that is too long for the terminal the beginning, and how much more there is."""
+        """Draw a page; if it is too long for the terminal, its beginning and the number of further lines."""
         height = shutil.get_terminal_size().lines
         if len(lines) > height:
             lines = [*lines[: height - 1], f"({len(lines) - height + 1} more lines)"]
-        # The page before is erased ahead of each line: behind a full one the cursor is still on its last sign.
+        # Each line is erased before it is drawn: after a full line the cursor is still on its last character.
         text = "\r\n".join(_END_OF_LINE + "".join(map(_printable, line)) for line in lines)
         self._write(_HOME + text + ("\r\n" + _REST if len(lines) < height else ""))
 
     def quits_within(self, seconds: float) -> bool:
-        """Wait so long, or until somebody wakes this; whether `q` was pressed."""
+        """Wait for this time or until `wake` is called; True if `q` was pressed."""
         end = time.monotonic() + seconds
         watched = [self._woken, *([self._keys] if self._keys is not None else [])]
         while (left := end - time.monotonic()) > 0:
@@ -90,7 +90,7 @@ class Screen:
         return False
 
     def wake(self) -> None:
-        """From any thread: let `quits_within` come back, from now on at once."""
+        """From any thread: let `quits_within` return, now and from now on at once."""
         with suppress(OSError):
             os.write(self._waker, b".")
 

@@ -1,4 +1,4 @@
-"""Tables as plain text: columns in line, no colours; where a width is given, no line is longer."""
+"""Tables as plain text with aligned columns and without colours."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ def table(rows: Iterable[Sequence[str]], *, heading: Sequence[str] | None = None
 
 
 def width_of(rows: Iterable[Sequence[str]], heading: Sequence[str]) -> int:
-    """How many columns of a terminal a table takes."""
+    """The width of a table in columns of a terminal."""
     return max(map(len, table(rows, heading=heading)), default=0)
 
 
 def shortened(name: str, width: int) -> str:
-    """A name in ``width`` columns at most; what is left out is in its middle, because names differ at their ends."""
+    """A name in at most ``width`` columns, without its middle: names differ mostly at their ends."""
     if len(name) <= width:
         return name
     kept = max(width - len(_ELLIPSIS), 0)
@@ -34,5 +34,5 @@ def shortened(name: str, width: int) -> str:
 
 
 def pairs(items: Iterable[tuple[str, str]], *, indent: int = 0) -> list[str]:
-    """The lines of a list of names with their values; those without a value are left out."""
+    """The lines of a list of names and values, without the pairs whose value is empty."""
     return table([[name, value] for name, value in items if value], indent=indent)

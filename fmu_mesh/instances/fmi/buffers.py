@@ -1,4 +1,4 @@
-"""C memory that values of one type are handed over in, where it is not the memory of a ring itself.
+"""C memory for values of one type, where a function of an FMU cannot work on the memory of a ring.
 
 Owns the conversion between the elements of a row (numbers, `str`, `bytes`) and what a function of an FMU reads or
 writes. Knows no function of FMI.
@@ -23,26 +23,26 @@ class Buffer(Protocol):
 
     @property
     def address(self) -> int:
-        """Where the elements lie."""
+        """Address of the first element."""
         ...
 
     def load(self, elements: Sequence[Any] | NDArray[Any]) -> None:
-        """Put elements into the memory."""
+        """Write elements to the memory."""
         ...
 
     def values(self) -> Sequence[Any] | NDArray[Any]:
-        """The elements in the memory; text is a copy, because an FMU may free it with the next call."""
+        """The elements in the memory; text is copied, because the FMU may free it in its next call."""
         ...
 
 
 class NumberBuffer:
-    """Numbers of another size or kind than those of a row, such as the `int` that is a Boolean in FMI 2.0.
+    """Numbers whose C type differs from that of a row: a Boolean of FMI 2.0 is an `int`.
 
     Args:
         type_: the type of the elements.
         dtype: the C type.
         count: how many.
-        signs: -1 where an FMI 1.0 alias has the opposite sign, otherwise 1; None if there is none of that kind.
+        signs: -1 for an FMI 1.0 alias with the opposite sign, otherwise 1; None if all are 1.
     """
 
     def __init__(
@@ -54,10 +54,10 @@ class NumberBuffer:
         self.address: int = self._memory.ctypes.data
 
     def load(self, elements: Sequence[Any] | NDArray[Any]) -> None:
-        """Put numbers into the memory.
+        """Write numbers to the memory.
 
         Raises:
-            OverflowError: one of them, or its opposite, is none of the C type.
+            OverflowError: the C type cannot hold one of them, or its opposite.
         """
         if self._signs is None:
             self._memory[:] = elements
@@ -84,7 +84,7 @@ class NumberBuffer:
 
 
 class StringBuffer:
-    """Pointers to text that ends with a 0, in UTF-8; what an FMU gives that is no UTF-8 is marked with U+FFFD."""
+    """Pointers to null-terminated text in UTF-8; invalid bytes from an FMU become U+FFFD."""
 
     def __init__(self, count: int) -> None:
         self._pointers = (ctypes.c_char_p * count)()

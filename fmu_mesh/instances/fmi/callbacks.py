@@ -1,9 +1,9 @@
-"""The callbacks that FMUs of FMI 1.0 and 2.0 get, and the way of a message to its instance.
+"""Callbacks for FMUs of FMI 1.0 and 2.0, and the assignment of log messages to instances.
 
-FMPy's proxy, which formats the variadic messages of an FMU, has one logger for the whole process. So a message is given
-to the instance whose address comes with it: the environment that the instance was made with (FMI 2.0, 2.1.5), or the
-component (FMI 1.0, 2.3). Some FMUs pass neither; then the instance name decides. Some have another name of their own as
-well; then every instance gets the message, because it may be the reason why a call fails.
+FMPy's proxy, which formats the variadic messages of an FMU, has one logger for the whole process. So a message goes to
+the instance whose address comes with it: the environment that the instance was made with (FMI 2.0, 2.1.5), or the
+component (FMI 1.0, 2.3). Some FMUs pass neither; then the instance name decides. If this name is unknown as well, every
+instance gets the message, because it may be the reason why a call fails.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ __all__ = ["FMI1_CALLBACKS", "fmi2_callbacks", "register", "register_component",
 
 
 class Logged(Protocol):
-    """What takes messages."""
+    """Receives log messages."""
 
     def logged(self, status: int, category: bytes, message: bytes) -> None:
         """Take a message."""
@@ -42,7 +42,7 @@ _by_name: dict[bytes, Logged] = {}
 
 
 def register(name: str, instance: Logged) -> None:
-    """From now on messages of the instance called ``name`` go to ``instance``.
+    """Messages of the instance called ``name`` go to ``instance`` from now on.
 
     Raises:
         ValueError: the name is taken.
@@ -55,12 +55,12 @@ def register(name: str, instance: Logged) -> None:
 
 
 def register_component(component: int, instance: Logged) -> None:
-    """Messages that come with the address ``component`` go to ``instance`` as well."""
+    """Messages with the address ``component`` also go to ``instance``."""
     _by_address[component] = instance
 
 
 def unregister(instance: Logged) -> None:
-    """Messages of ``instance`` go nowhere any more."""
+    """Discard messages of ``instance`` from now on."""
     for name in [name for name, one in _by_name.items() if one is instance]:
         del _by_name[name]
     for address in [address for address, one in _by_address.items() if one is instance]:
@@ -90,7 +90,7 @@ def _fmi2_callbacks() -> fmi2CallbackFunctions:
 
 
 def _fmi1_callbacks() -> fmi1CallbackFunctions:
-    """As for FMI 2.0, whose logger has the same arguments; the proxy must not be added a second time."""
+    """The logger is that of FMI 2.0, which has the same arguments; the proxy must not be added twice."""
     callbacks = fmi1CallbackFunctions()
     callbacks.logger = ctypes.cast(_FMI2_CALLBACKS.logger, fmi1CallbackLoggerTYPE)
     callbacks.allocateMemory = fmi1CallbackAllocateMemoryTYPE(fmpy.calloc)

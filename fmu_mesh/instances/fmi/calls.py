@@ -1,18 +1,31 @@
-"""The C functions of an FMU as the hot loop calls them: through cffi, which takes about half the time of ctypes.
+"""How the C functions of an FMU are called.
 
-FMPy loads the library and declares what is called now and then; here is what is called in every step. Both release
-the interpreter's lock during a call. Addresses are turned into pointers once, and not in every call.
+The functions of every step go through cffi, which takes about half the time of ctypes; addresses become pointers once,
+not in every call. All other functions go through FMPy. Both release the interpreter's lock during a call.
 """
 
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any, TypeAlias
 
 from cffi import FFI
 
-__all__ = ["DirectCall", "Function", "Pointer", "Rows", "address_of", "hot", "memory", "pointer"]
+from ..call_guard import call_named
+
+__all__ = [
+    "DirectCall",
+    "FmpyCalls",
+    "Function",
+    "Pointer",
+    "RowPointers",
+    "address_of",
+    "cffi_function",
+    "memory",
+    "pointer",
+]
 
 Pointer: TypeAlias = Any
 """A C pointer to anything."""
@@ -23,12 +36,39 @@ Function: TypeAlias = Callable[..., int]
 _ffi = FFI()
 
 
-def hot(function: Function, declaration: str) -> Function:
-    """A function of a loaded library, to be called with `pointer` where ``declaration`` has one.
+class FmpyCalls:
+    """FMPy's object of an FMU; a deadline watch can ask which FMI function one of its methods is in.
+
+    Example:
+        >>> calls = FmpyCalls(FMU2Slave(...), "fmi2")
+        >>> calls.enterInitializationMode()  # meanwhile, `current_function` gives "fmi2EnterInitializationMode"
 
     Args:
-        function: as ctypes has it.
-        declaration: the type of a pointer to it in C, such as ``int (*)(void *, double)``.
+        fmu: FMPy's object; its attributes are attributes of this, too.
+        prefix: the prefix of the FMI functions.
+        names: FMI functions whose name is not the prefix and the name of the method, by the name of the method.
+    """
+
+    def __init__(self, fmu: Any, prefix: str, names: Mapping[str, str]) -> None:  # noqa: ANN401 FMPy is untyped
+        self._fmu = fmu
+        self._prefix = prefix
+        self._names = names
+
+    def __getattr__(self, name: str) -> Any:  # noqa: ANN401 as above
+        found = getattr(self._fmu, name)
+        if not callable(found):
+            return found
+        function = name if name.startswith("fmi") else f"{self._prefix}{name[0].upper()}{name[1:]}"
+        call = self.__dict__[name] = partial(call_named, self._names.get(name, function), found)
+        return call
+
+
+def cffi_function(function: Function, declaration: str) -> Function:
+    """A function of a loaded library, called through cffi.
+
+    Args:
+        function: the function as ctypes has it.
+        declaration: the C type of a pointer to it, such as ``int (*)(void *, double)``.
     """
     address = ctypes.cast(function, ctypes.c_void_p).value  # type: ignore[arg-type]  # it is one of ctypes' own
     called: Function = _ffi.cast(declaration, address or 0)
@@ -36,16 +76,16 @@ def hot(function: Function, declaration: str) -> Function:
 
 
 def pointer(address: int | None) -> Pointer:
-    """An address as an argument of what `hot` returns."""
+    """An address as an argument of a `cffi_function`."""
     return _ffi.cast("void *", address or 0)
 
 
-class Rows(dict[int, Pointer]):
-    """The rows of an array as arguments of what `hot` returns, by number; a pointer is made when it is first needed.
+class RowPointers(dict[int, Pointer]):
+    """Pointers to the rows of an array by row number; a pointer is made when it is first used.
 
     Args:
-        address: of row 0.
-        row_size: from one row to the next, in bytes.
+        address: address of row 0.
+        row_size: distance of two rows in bytes.
     """
 
     def __init__(self, address: int, row_size: int) -> None:
@@ -54,20 +94,20 @@ class Rows(dict[int, Pointer]):
         self.row_size = row_size
 
     def __missing__(self, row: int) -> Pointer:
-        """The pointer to a row, made now."""
+        """Make the pointer to a row."""
         made = self[row] = pointer(self.address + row * self.row_size)
         return made
 
 
-DirectCall: TypeAlias = tuple[Function, Pointer, int, Rows, int]
-"""A function on ring memory: it, the value references and their number, each row, number of values."""
+DirectCall: TypeAlias = tuple[Function, Pointer, int, RowPointers, int]
+"""A getter or setter on ring memory: function, value references and their number, rows, number of values per row."""
 
 
 def address_of(made: Function | Pointer) -> int:
-    """The address of what `hot`, `pointer` or `memory` made."""
+    """The address of what `cffi_function`, `pointer` or `memory` returned."""
     return int(_ffi.cast("uintptr_t", made))  # type: ignore[arg-type]  # it is one of cffi's own
 
 
 def memory(array: ctypes.Array[Any]) -> Pointer:
-    """The memory of an array as an argument of what `hot` returns; it lives as long as this."""
+    """The memory of an array as an argument of a `cffi_function`; the pointer keeps the array alive."""
     return _ffi.from_buffer(array)

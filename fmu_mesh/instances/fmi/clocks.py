@@ -1,7 +1,7 @@
 """Clocks of an FMI 3.0 instance: when its time-based input clocks tick, and which of its output clocks have ticked.
 
 Owns the arithmetic of intervals (FMI 3.0, 2.2.8): tick n of a periodic clock is at `start + shift + n * interval`, one
-multiplication. Event mode itself is entered by who steps the instance.
+multiplication. The caller enters and leaves event mode.
 """
 
 from __future__ import annotations
@@ -56,15 +56,10 @@ class Clocks:
         return bool(self._periodic or self._aperiodic or self._outputs)
 
     def start(self, time: float) -> None:
-        """In Initialization Mode: ask for the intervals that parameters decide; time in s."""
+        """In Initialization Mode at ``time`` (s): ask for the intervals that depend on parameters."""
         for clock in self._periodic:
-            if clock.interval is None:
-                clock.interval, _ = self._interval(clock.value_reference)
-                shifts = (fmi3Float64 * 1)()
-                self._fmu.getShiftDecimal(_references(clock.value_reference), shifts)
-                clock.shift = shifts[0]
-            clock.start = time
-        self._look()
+            clock.start(time, None if clock.is_known else self._interval_and_shift(clock.value_reference))
+        self._find_next()
 
     @property
     def place(self) -> tuple[float | None, ...]:
@@ -73,12 +68,12 @@ class Clocks:
         return (*(float(clock.ticks) for clock in self._periodic), *aperiodic)
 
     def resume(self, place: Sequence[float | None]) -> None:
-        """Go on where `place` was."""
+        """Continue where `place` was."""
         for clock, ticks in zip(self._periodic, place, strict=False):
-            clock.ticks = int(ticks or 0)
+            clock.resume(int(ticks or 0))
         for reference, tick in zip(self._aperiodic, place[len(self._periodic) :], strict=True):
             self._aperiodic[reference] = math.inf if tick is None else tick
-        self._look()
+        self._find_next()
 
     def set_due(self, time: float) -> None:
         """In event mode: activate every input clock whose tick is at ``time`` (s)."""
@@ -86,56 +81,83 @@ class Clocks:
         for clock in self._periodic:
             if not resolvable(time, clock.next_tick):
                 due.append(clock.value_reference)
-                clock.ticks += 1
+                clock.tick()
         for reference, tick in self._aperiodic.items():
             if not resolvable(time, tick):
                 due.append(reference)
                 self._aperiodic[reference] = math.inf
         if due:
             self._fmu.setClock(due, [True] * len(due))
-        self._look()
+        self._find_next()
 
     def read(self) -> None:
-        """In event mode: which output clocks tick (FMI 3.0, 2.2.8.3)."""
+        """In event mode: note which output clocks tick (FMI 3.0, 2.2.8.3)."""
         if self._outputs:
             active = self._fmu.getClock([clock.value_reference for clock in self._outputs])
             self.ticked.update(clock.name for clock, ticks in zip(self._outputs, active, strict=True) if ticks)
 
     def update_intervals(self, time: float) -> None:
-        """At the end of event mode: when aperiodic clocks tick next (FMI 3.0, 2.2.8.4)."""
+        """At the end of event mode: ask when aperiodic clocks tick next (FMI 3.0, 2.2.8.4)."""
         for reference in self._aperiodic:
             interval, qualifier = self._interval(reference)
             if qualifier == _INTERVAL_CHANGED:
                 self._aperiodic[reference] = time + interval
-        self._look()
+        self._find_next()
+
+    def _interval_and_shift(self, reference: int) -> tuple[float, float]:
+        interval, _ = self._interval(reference)
+        shifts = (fmi3Float64 * 1)()
+        self._fmu.getShiftDecimal(_references(reference), shifts)
+        return interval, float(shifts[0])
 
     def _interval(self, reference: int) -> tuple[float, int]:
         intervals, qualifiers = (fmi3Float64 * 1)(), (fmi3IntervalQualifier * 1)()
         self._fmu.getIntervalDecimal(_references(reference), intervals, qualifiers)
         return float(intervals[0]), int(qualifiers[0])
 
-    def _look(self) -> None:
+    def _find_next(self) -> None:
         ticks = [*(clock.next_tick for clock in self._periodic), *self._aperiodic.values()]
         self.next_tick = min(ticks, default=math.inf)
 
 
 class _Periodic:
-    """A periodic input clock and how often it has ticked."""
+    """A periodic input clock.
+
+    Attributes:
+        is_known: whether the model description has its interval.
+        ticks: number of ticks so far.
+    """
 
     def __init__(self, clock: Clock) -> None:
         self.value_reference = clock.value_reference
-        self.interval = clock.interval
-        self.shift = clock.shift
-        self.start = 0.0
+        self.is_known = clock.interval is not None
         self.ticks = 0
+        self._interval = clock.interval or math.inf
+        self._shift = clock.shift
+        self._start = 0.0
+
+    def start(self, time: float, interval_and_shift: tuple[float, float] | None) -> None:
+        """Start at ``time``; all in s; None keeps the interval and shift of the model description."""
+        self._start = time
+        if interval_and_shift is not None:
+            self._interval, self._shift = interval_and_shift
+
+    def tick(self) -> None:
+        """Count a tick."""
+        self.ticks += 1
+
+    def resume(self, ticks: int) -> None:
+        """Continue after so many ticks."""
+        self.ticks = ticks
 
     @property
     def next_tick(self) -> float:
-        return self.start + self.shift + self.ticks * (self.interval or math.inf)
+        """Time of the next tick in s."""
+        return self._start + self._shift + self.ticks * self._interval
 
 
 NO_CLOCKS: Final = Clocks(None, ())
-"""For an FMU without clocks: nothing of it is ever called."""
+"""For an FMU without clocks; it never calls the FMU."""
 
 
 def _references(reference: int) -> Any:  # noqa: ANN401 an array of ctypes

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Final, cast
 
-from ...system.step_options import StepOptions
 from ...variables.model_description import Kind, ModelDescription
 from ..contract import Instance
 from .archive.archive import Terms
@@ -14,9 +13,8 @@ from .co_simulation.fmi1 import Fmi1Instance
 from .co_simulation.fmi2 import Fmi2Instance
 from .co_simulation.fmi3 import Fmi3Instance
 from .fmu_instance import FmuInstance, LogSink
-from .model_exchange.fmi1_model import Fmi1ModelInstance
-from .model_exchange.fmi2_model import Fmi2ModelInstance
-from .model_exchange.fmi3_model import Fmi3ModelInstance
+from .model_exchange.model_instances import Fmi1ModelInstance, Fmi2ModelInstance, Fmi3ModelInstance
+from .step_options import StepOptions
 
 __all__ = ["open_instance", "stepped"]
 

@@ -1,51 +1,53 @@
-"""The state of an instance, to go back to it or to go on from it in another process (FMI 2.0, 2.1.8; FMI 3.0, 2.2.10).
+"""The state of an FMU instance, for going back to it or for going on in another process (FMI 2.0, 2.1.8; 3.0, 2.2.10).
 
-Owns what belongs to a state besides that of the FMU: where the instance stands. FMI 1.0 has none of this.
+A state is that of the FMU and our own `Bookkeeping`. FMI 1.0 has no states.
 """
 
 from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import msgspec
 from fmpy.fmi1 import FMICallException
 
-from ...errors import FmuError, FmuMeshError, StepFailed
+from ...errors import FmuError, StepFailed
 from ...variables.model_description import ModelDescription
+from ..instance_wrapper import of_kind, packed, unpacked
 
-__all__ = ["FmuState", "KeepsFmuState", "Standing"]
+__all__ = ["Bookkeeping", "FmuState", "KeepsFmuState"]
 
 T = TypeVar("T")
 
 
-class Standing(msgspec.Struct, frozen=True):
-    """Where an instance stands.
+class Bookkeeping(msgspec.Struct, frozen=True):
+    """What we know about an instance besides its FMU state.
 
     Attributes:
         step: own steps done; -1 in or before Initialization Mode.
-        time: the time of the FMU in s, where it is not that of the step.
-        next_event: that of its next time event; None if there is none.
-        row: the inputs that it was given in its last event mode.
-        ticks: where its clocks are; see `Clocks.place`.
-        last_event: the time of its last event mode in s, where the steps go by it; None if there was none.
+        time: the time of the FMU in s, where it does not follow from the step.
+        next_event: time of its next time event in s; None if there is none.
+        row: the inputs of its last event mode.
+        ticks: the clocks; see `Clocks.place`.
+        last_event: time of its last event mode in s, where the steps depend on it; None if there was none.
+        is_linear: whether inputs changed within its last step.
     """
 
     step: int
     time: float | None = None
     next_event: float | None = None
-    row: tuple[bytes | list[str], ...] = ()
+    row: tuple[bytes | list[Any], ...] = ()
     ticks: tuple[float | None, ...] = ()
     last_event: float | None = None
+    is_linear: bool = False
 
 
-class FmuState:
-    """One state of one instance; belongs to it until `KeepsFmuState.free_state`."""
+class FmuState(NamedTuple):
+    """One state of one instance; it belongs to this instance until `KeepsFmuState.free_state`."""
 
-    def __init__(self, handle: Any, standing: Standing) -> None:  # noqa: ANN401 a pointer of ctypes
-        self.handle = handle
-        self.standing = standing
+    handle: Any
+    kept: Bookkeeping
 
 
 class KeepsFmuState:
@@ -62,25 +64,24 @@ class KeepsFmuState:
     def get_state(self) -> FmuState:
         """See `KeepsState`."""
         self._check_state(self.description.can_get_and_set_state, "get and set its state")
-        return FmuState(self._on_state(self._fmu.getFMUState), self._standing())
+        return FmuState(self._on_state(self._fmu.getFMUState), self._bookkeeping())
 
     def set_state(self, state: object) -> None:
         """See `KeepsState`."""
-        own = _own(state)
+        own = of_kind(FmuState, state)
         self._on_state(lambda: self._fmu.setFMUState(own.handle))
-        self._stand(own.standing)
+        self._restore(own.kept)
 
     def free_state(self, state: object) -> None:
         """See `KeepsState`."""
-        own = _own(state)
+        own = of_kind(FmuState, state)
         self._on_state(lambda: self._fmu.freeFMUState(own.handle))
 
     def serialize_state(self, state: object) -> bytes:
-        """See `KeepsState`: where the instance stands as JSON, a zero, and what the FMU gives."""
+        """See `KeepsState`."""
         self._check_state(self.description.can_serialize_state, "serialize its state")
-        own = _own(state)
-        data: bytes = self._on_state(lambda: self._fmu.serializeFMUState(own.handle))
-        return msgspec.json.encode(own.standing) + b"\0" + data
+        own = of_kind(FmuState, state)
+        return packed(own.kept, self._on_state(lambda: self._fmu.serializeFMUState(own.handle)))
 
     def deserialize_state(self, data: bytes) -> FmuState:
         """See `KeepsState`.
@@ -89,20 +90,16 @@ class KeepsFmuState:
             FmuMeshError: ``data`` is no state of an instance.
         """
         self._check_state(self.description.can_serialize_state, "serialize its state")
-        head, _, rest = data.partition(b"\0")
-        try:
-            standing = msgspec.json.decode(head, type=Standing)
-        except msgspec.DecodeError as error:
-            raise FmuMeshError(f"this is no state of an instance: {error}", instance=self.name) from error
-        return FmuState(self._on_state(lambda: self._fmu.deserializeFMUState(rest)), standing)
+        kept, rest = unpacked(data, Bookkeeping, self.name)
+        return FmuState(self._on_state(lambda: self._fmu.deserializeFMUState(rest)), kept)
 
     @abstractmethod
-    def _standing(self) -> Standing:
-        """Where the instance stands now."""
+    def _bookkeeping(self) -> Bookkeeping:
+        """Our own part of the state now."""
 
     @abstractmethod
-    def _stand(self, standing: Standing) -> None:
-        """Stand there, now that the FMU does."""
+    def _restore(self, kept: Bookkeeping) -> None:
+        """Go back to this part after the FMU has gone back to its state."""
 
     def _check_state(self, can: bool, what: str) -> None:  # noqa: FBT001 a capability flag
         if not can:
@@ -113,10 +110,3 @@ class KeepsFmuState:
             return call()
         except FMICallException as error:
             raise StepFailed(f"{error.function} failed with status {error.status}", instance=self.name) from error
-
-
-def _own(state: object) -> FmuState:
-    if not isinstance(state, FmuState):
-        msg = f"{type(state).__name__} is no state of an FMU"
-        raise TypeError(msg)
-    return state

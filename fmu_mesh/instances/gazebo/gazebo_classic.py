@@ -3,15 +3,15 @@
 One own step from n to n + 1, in pseudocode::
 
     inputs of row n
-    applied effort of every joint = effort, plus effort_command where no actuator stands between; limited
+    applied effort of every joint = effort, plus effort_command if the joint has no actuator; limited
     Gazebo: physics_steps times
         these efforts, and force and moment of every link
         one step of the engine
     outputs into row n + 1
 
-The engine is a process of its own (`fmu_mesh.instances.gazebo.gazebo_process`) that moves only within a step. The host
-owns what is applied, as that of MuJoCo does. Positions and velocities are those of the point; accelerations are those
-of the engine's last step. A step of Gazebo cannot be taken back, so this instance has no state to get and set.
+The engine is a process of its own (`fmu_mesh.instances.gazebo.gazebo_process`) that advances only within a step. All
+efforts and forces are set anew in every step. Positions and velocities are those of the point; accelerations are those
+of the engine's last step. A step of Gazebo cannot be undone, so this instance has no state to get and set.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ...config.mesh import GazeboClassicConfig
 from ...errors import InitializationFailed, LoadFailed, StepFailed
 from ...rings.ring import Ring
 from ...simtime import TimeGrid, steps_between
 from ...variables.model_description import ModelDescription, Value
 from ..body_axes import relative_velocity, to_body
+from .gazebo_kind import GazeboClassicConfig
 from .gazebo_process import PROGRAM_VARIABLE, GazeboGone, GazeboProcess, check_program
-from .gazebo_world import JOINT_STATE, LINK_STATE, Place, load_gazebo_world
+from .gazebo_world import JOINT_STATE, LINK_STATE, GazeboPlace, load_gazebo_world
 
 __all__ = ["GazeboClassicInstance", "check_gazebo_classic"]
 
@@ -40,7 +40,7 @@ HOW_TO_GET_IT = f"Build bridges/gazebo_classic and put it on the path, or its co
 
 
 def check_gazebo_classic() -> None:
-    """See whether worlds of Gazebo classic can be opened on this host.
+    """Check that worlds of Gazebo classic can be opened on this host.
 
     Raises:
         LoadFailed: they cannot; says why.
@@ -112,7 +112,7 @@ class GazeboClassicInstance:
         self.set_values(start_values)
 
     def exit_initialization(self) -> None:
-        """The loaded world is the first point."""
+        """Nothing to do: the loaded world is the first point."""
 
     def set_values(self, values: Mapping[str, Value]) -> None:
         """Set inputs by name."""
@@ -174,15 +174,15 @@ class GazeboClassicInstance:
             raise StepFailed("the state of the world is not finite any more", instance=self.name, hint=hint)
 
     def _culprit(self) -> str | None:
-        """The first input that is no finite number."""
+        """The first input that is not finite."""
         bad = (name for name, place in self._inputs_by_name.items() if not math.isfinite(self._value(place)))
         return next(bad, None)
 
-    def _value(self, place: Place) -> float:
+    def _value(self, place: GazeboPlace) -> float:
         return float(self._arrays[place.where][place.index])
 
     def _derive(self, links: Sequence[int]) -> None:
-        """The wind and the velocity against it of these links, in their axes."""
+        """Compute the wind, and the velocity against it, for these links in their axes."""
         arrays, wind = self._arrays, self._arrays["wind"].tolist()
         for link in links:
             first = JOINT_STATE * len(self._world.joints) + LINK_STATE * link
@@ -200,8 +200,8 @@ class GazeboClassicInstance:
         return StepFailed(f"Gazebo classic: {error}", instance=self.name)
 
 
-def _derived_links(places: Sequence[Place]) -> list[int]:
-    """The links of which something has to be computed for these places."""
+def _derived_links(places: Sequence[GazeboPlace]) -> list[int]:
+    """The links for which these places need a computation."""
     return sorted({place.index // 3 for place in places if place.where in {"body_wind", "relative_velocity"}})
 
 

@@ -1,7 +1,7 @@
-"""Gazebo classic as a process that steps when it is told to.
+"""Gazebo classic as a process that steps on command.
 
 Owns the process, its pipes and the deadline of every answer; the protocol is described in
-``bridges/gazebo_classic/gazebo_lockstep.cc``. What the numbers mean is not known here.
+``bridges/gazebo_classic/gazebo_lockstep.cc``. This module does not know the meaning of the numbers.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ PROGRAM = "gazebo_lockstep"
 
 _START_S, _STEP_S, _END_S = 60.0, 60.0, 5.0
 _TAIL = 2000
-"""Bytes of what Gazebo wrote last that an error quotes from."""
+"""Length in bytes of the end of Gazebo's output, of which an error quotes the last line."""
 
 
 class GazeboGone(Exception):
-    """The process is not there, does not answer, or has given up; the message says which."""
+    """The process does not exist, does not answer, or has ended; the message says which."""
 
 
 def find_program() -> list[str]:
@@ -46,7 +46,7 @@ def find_program() -> list[str]:
 
 
 def check_program() -> None:
-    """See whether the lock-step program starts here, without a world.
+    """Check that the lock-step program starts on this host, without a world.
 
     Raises:
         GazeboGone: it does not, or does not answer.
@@ -98,7 +98,7 @@ class GazeboProcess:
                 stderr=self._errors,
                 bufsize=0,
                 env=_environment(),
-                start_new_session=True,  # Ctrl-C is for the node, which then closes it
+                start_new_session=True,  # Ctrl-C reaches the node only, which then closes this process
             )
             stack.callback(self.close)
             parts = [f"joint {name} {'free' if free else 'limited'}\n" for name, free in joints]
@@ -166,7 +166,7 @@ class GazeboProcess:
         return text
 
     def _last_words(self) -> str:
-        """That the process has ended, with the last line that it wrote."""
+        """The text of an error for a process that has ended."""
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(_END_S)
         size = os.fstat(self._errors.fileno()).st_size
@@ -175,18 +175,18 @@ class GazeboProcess:
 
 
 def _ended(code: int | None, tail: bytes) -> str:
-    """How a process has ended, with the last line of what it wrote."""
+    """The exit code of a process and the last line of its output, in words."""
     lines = [line.strip() for line in tail.decode(errors="replace").splitlines() if line.strip()]
     words = f"; the last it wrote is: {lines[-1]}" if lines else ""
     return f"its process has ended with {code}{words}"
 
 
 def _environment() -> dict[str, str]:
-    """What Gazebo needs to know: a server of its own on this host, and no model database."""
+    """Environment variables for Gazebo: a server of its own on this host, and no model database."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    # In a system of its own (chroot) there may be no such folder, and Gazebo's libraries look for it before all else.
+    # In a chroot this folder may not exist, and Gazebo's libraries fail without it.
     own = {name: value for name, value in os.environ.items() if name != "TMPDIR"}
     return {
         **own,

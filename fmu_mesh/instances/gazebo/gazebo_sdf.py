@@ -1,7 +1,7 @@
-"""An SDF world as Gazebo classic gets it: read, made complete, and with all that Gazebo would leave out without a word.
+"""An SDF world for Gazebo classic: read, completed, and checked for parts that Gazebo would silently leave out.
 
-Owns what of SDF can be simulated. What cannot is refused with its name; what is simulated but has no variables, or is
-not simulated and changes no motion, is a note. Knows nothing of variables: those are
+Owns which parts of SDF can be simulated. Other parts that change the motion are refused by name; parts that have no
+variables or do not change the motion are notes. Knows nothing of variables: those are
 `fmu_mesh.instances.gazebo.gazebo_world`.
 """
 
@@ -36,14 +36,14 @@ _GROUND = """
   </link>
 </model>
 """
-"""What Gazebo's own model of this name is for its motion."""
+"""Has the same effect on the motion as Gazebo's own model of this name."""
 
 
 class Model(msgspec.Struct, frozen=True):
     """A model, also one in another model.
 
     Attributes:
-        scoped: as Gazebo knows it, such as `outer::inner`.
+        scoped: the name in Gazebo, such as `outer::inner`.
         moving: whether it is not static; Gazebo lets a model in a static one move.
     """
 
@@ -56,11 +56,11 @@ class SdfWorld(msgspec.Struct, frozen=True):
     """A world.
 
     Attributes:
-        text: what Gazebo gets; the file as it is, where nothing had to be changed.
+        text: the SDF that Gazebo gets; the unchanged file if nothing had to be changed.
         source: the file.
         element: the world as Gazebo gets it.
         models: all models, outer ones first.
-        notes: what is not as the file says, or has no variables.
+        notes: parts that differ from the file or have no variables.
     """
 
     text: bytes
@@ -107,7 +107,7 @@ def _models(parent: ET.Element, scope: str) -> Iterator[Model]:
 
 
 def _without_known_includes(world: ET.Element) -> Iterator[str]:
-    """Put what stands for it into the place of each include that needs no file; yields what was done."""
+    """Replace each include that needs no file by its model; yields a note for each."""
     for number, include in enumerate([*world]):
         uri = include.findtext("uri", "").strip() if include.tag == "include" else ""
         name = _VERSION.sub("", unquote(uri).rstrip("/")).rpartition("/")[2].casefold().replace(" ", "_")
@@ -137,9 +137,9 @@ def _refuse_includes(world: ET.Element, path: Path) -> None:
 
 
 def _refuse_what_gazebo_leaves_out(world: ET.Element, models: tuple[Model, ...], path: Path) -> None:
-    """What Gazebo passes over, so that the world would move in another way than its file says; and names with spaces.
+    """Parts that Gazebo ignores although they change the motion; and names with spaces.
 
-    Spaces end a name in what Gazebo's process is told.
+    A space ends a name in the protocol of Gazebo's process.
     """
     problems = [f"the world '{inner.get('name')}' in a world" for inner in world.findall("world")]
     problems += [f"the joint '{joint.get('name')}' outside of a model" for joint in world.findall("joint")]
@@ -155,7 +155,7 @@ def _refuse_what_gazebo_leaves_out(world: ET.Element, models: tuple[Model, ...],
 
 
 def _make_revolute(joint: ET.Element) -> None:
-    """A revolute joint without limits of its position, which Gazebo classic has, for a continuous one."""
+    """Replace a continuous joint, which Gazebo classic does not have, by a revolute joint without position limits."""
     joint.set("type", "revolute")
     for limit in joint.iterfind("axis/limit"):
         for end in [*limit.findall("lower"), *limit.findall("upper")]:

@@ -1,8 +1,8 @@
-"""An SDF world as a model description, and where the value of each of its variables lies.
+"""An SDF world as a model description, and where the value of each variable is stored.
 
 Owns names, units and meaning of the variables, which are those of `fmu_mesh.instances.mujoco.mujoco_world`, so that one
-configuration serves both engines; there are no sensors and no actuators of the model. What of the file is simulated is
-`fmu_mesh.instances.gazebo.gazebo_sdf`, and what happens in a step is `fmu_mesh.instances.gazebo.gazebo_classic`.
+configuration fits both engines; sensors and actuators of the model have no variables. Which parts of the file are
+simulated is in `fmu_mesh.instances.gazebo.gazebo_sdf`; the steps are in `fmu_mesh.instances.gazebo.gazebo_classic`.
 
 A joint or link is named as in the file where that name is unique, and `model::name` where it is not.
 """
@@ -19,12 +19,12 @@ from typing import Literal
 
 import msgspec
 
-from ...config.mesh import GazeboClassicConfig
 from ...errors import LoadFailed
 from ...variables.model_description import Causality, DefaultExperiment, ModelDescription, Variable
+from .gazebo_kind import GazeboClassicConfig
 from .gazebo_sdf import Model, read_world
 
-__all__ = ["GazeboWorld", "Joint", "Link", "Place", "describe_gazebo_world", "load_gazebo_world"]
+__all__ = ["GazeboJoint", "GazeboLink", "GazeboPlace", "GazeboWorld", "describe_gazebo_world", "load_gazebo_world"]
 
 JOINT_STATE, LINK_STATE = 3, 13
 """Numbers per joint (position, velocity, acceleration) and link (position, attitude, two velocities) in a state."""
@@ -37,12 +37,12 @@ _DEFAULT_STEP_SIZE = 1e-3
 """s; of SDF (physics, max_step_size)."""
 
 
-class Joint(msgspec.Struct, frozen=True):
+class GazeboJoint(msgspec.Struct, frozen=True):
     """A revolute or prismatic joint.
 
     Attributes:
-        scoped: `model::joint`, as Gazebo knows it.
-        name: as in variables.
+        scoped: the name in Gazebo, `model::joint`.
+        name: the name in variables.
         effort_limit: largest absolute effort in N m or N; infinite without a limit.
         free: whether it has no limits, whatever the file says.
     """
@@ -54,15 +54,15 @@ class Joint(msgspec.Struct, frozen=True):
     free: bool
 
 
-class Link(msgspec.Struct, frozen=True):
-    """A link; `scoped` and `name` as those of a `Joint`."""
+class GazeboLink(msgspec.Struct, frozen=True):
+    """A link; `scoped` and `name` as those of a `GazeboJoint`."""
 
     scoped: str
     name: str
 
 
-class Place(msgspec.Struct, frozen=True):
-    """Where the value of a variable lies: the kind of value, and the place in the flat array of that kind."""
+class GazeboPlace(msgspec.Struct, frozen=True):
+    """Where the value of a variable is stored: the kind of value, and the index in the flat array of that kind."""
 
     where: Where
     index: int
@@ -72,17 +72,17 @@ class GazeboWorld(msgspec.Struct, frozen=True):
     """A world.
 
     Attributes:
-        text: what Gazebo gets.
+        text: the SDF that Gazebo gets.
         step_size: of the engine in s.
         places: by variable name.
     """
 
     text: bytes
     step_size: float
-    joints: tuple[Joint, ...]
-    links: tuple[Link, ...]
+    joints: tuple[GazeboJoint, ...]
+    links: tuple[GazeboLink, ...]
     description: ModelDescription
-    places: dict[str, Place]
+    places: dict[str, GazeboPlace]
 
 
 def describe_gazebo_world(path: Path, config: GazeboClassicConfig) -> ModelDescription:
@@ -123,7 +123,7 @@ def load_gazebo_world(path: Path, config: GazeboClassicConfig) -> GazeboWorld:
     return GazeboWorld(sdf.text, step_size, joints, links, description, places)
 
 
-def _joints(models: Sequence[Model], free: set[str], path: Path) -> tuple[Joint, ...]:
+def _joints(models: Sequence[Model], free: set[str], path: Path) -> tuple[GazeboJoint, ...]:
     found = [
         (f"{model.scoped}::{joint.get('name')}", joint)
         for model in models
@@ -132,7 +132,7 @@ def _joints(models: Sequence[Model], free: set[str], path: Path) -> tuple[Joint,
     ]
     names = _names([scoped for scoped, _ in found])
     return tuple(
-        Joint(
+        GazeboJoint(
             scoped=scoped,
             name=name,
             revolute=joint.get("type") == "revolute",
@@ -143,9 +143,9 @@ def _joints(models: Sequence[Model], free: set[str], path: Path) -> tuple[Joint,
     )
 
 
-def _links(models: Sequence[Model]) -> tuple[Link, ...]:
+def _links(models: Sequence[Model]) -> tuple[GazeboLink, ...]:
     scoped = [f"{model.scoped}::{link.get('name')}" for model in models for link in model.element.findall("link")]
-    return tuple(Link(*names) for names in zip(scoped, _names(scoped), strict=True))
+    return tuple(GazeboLink(*names) for names in zip(scoped, _names(scoped), strict=True))
 
 
 def _names(scoped: list[str]) -> list[str]:
@@ -170,7 +170,9 @@ def _number(text: str | None, default: float, path: Path) -> float:
         raise LoadFailed(f"'{path}' has '{text.strip()}' where a number should be") from error
 
 
-def _variables(joints: tuple[Joint, ...], links: tuple[Link, ...]) -> Iterator[tuple[Variable, Place]]:
+def _variables(
+    joints: tuple[GazeboJoint, ...], links: tuple[GazeboLink, ...]
+) -> Iterator[tuple[Variable, GazeboPlace]]:
     for number, joint in enumerate(joints):
         length, effort = ("rad", "N.m") if joint.revolute else ("m", "N")
         state, name = JOINT_STATE * number, joint.name
@@ -189,7 +191,7 @@ def _variables(joints: tuple[Joint, ...], links: tuple[Link, ...]) -> Iterator[t
         yield _entry(f"wind_{letter}", "input", "m/s", "velocity of the medium in world axes", "wind", axis)
 
 
-def _link_variables(name: str, number: int, state: int) -> Iterator[tuple[Variable, Place]]:
+def _link_variables(name: str, number: int, state: int) -> Iterator[tuple[Variable, GazeboPlace]]:
     in_state = (
         ("position", "xyz", "m", "of the link's origin in world axes"),
         ("orientation", "wxyz", "1", "attitude as a unit quaternion, link axes to world axes"),
@@ -214,7 +216,7 @@ def _link_variables(name: str, number: int, state: int) -> Iterator[tuple[Variab
 
 def _entry(  # noqa: PLR0913, PLR0917  each is a column of a table
     name: str, causality: Causality, unit: str, text: str, where: Where, index: int
-) -> tuple[Variable, Place]:
+) -> tuple[Variable, GazeboPlace]:
     variable = Variable(
         name=name,
         value_reference=0,
@@ -227,4 +229,4 @@ def _entry(  # noqa: PLR0913, PLR0917  each is a column of a table
         description=text,
         dependencies=(),  # at the first point the engine has not taken a step: nothing depends on an input
     )
-    return variable, Place(where, index)
+    return variable, GazeboPlace(where, index)

@@ -1,7 +1,7 @@
 """Which files a MuJoCo model is made of, and what is in all of them; needs no MuJoCo.
 
-Owns how MJCF and URDF refer to other files: included and attached models, meshes, textures, height fields, skins. Where
-a reference can mean several files that are there, all of them count, so that none is overlooked.
+Owns how MJCF and URDF refer to other files: included and attached models, meshes, textures, height fields, skins. If a
+reference can mean several files that exist, all of them count, so that none is missed.
 """
 
 from __future__ import annotations

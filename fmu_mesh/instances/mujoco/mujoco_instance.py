@@ -3,15 +3,15 @@
 One own step from n to n + 1, in pseudocode::
 
     inputs of row n
-    applied effort of every joint = effort, plus effort_command where no actuator stands between; limited
+    applied effort of every joint = effort, plus effort_command if the joint has no actuator; limited
     physics_steps times:
         force and moment of every driven body, turned into world axes and moved to its centre of mass
         mj_step
     refresh what is read at the point: positions, velocities, sensors
     outputs into row n + 1
 
-The host owns what is applied: every step starts from zero, never from what the last one left. Positions and velocities
-are those of the point; accelerations and forces are those of the engine's last step. Variables and their names are
+All efforts and forces are set anew in every step; none remains from the step before. Positions and velocities are those
+of the point; accelerations and forces are those of the engine's last step. Variables and their names are
 `fmu_mesh.instances.mujoco.mujoco_world`, changes of axes `fmu_mesh.instances.body_axes`.
 """
 
@@ -24,13 +24,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ...config.mesh import MujocoConfig
 from ...errors import InitializationFailed, StepFailed
 from ...rings.ring import Ring
 from ...simtime import TimeGrid, steps_between
 from ...variables.model_description import ModelDescription, Value
 from ..body_axes import relative_velocity, to_body, wrench_at_center
-from .mujoco_world import Entry, engine, load_world, warnings
+from .mujoco_kind import MujocoConfig
+from .mujoco_world import MujocoVariable, engine, load_world, warnings
 from .rendering import Picture
 
 __all__ = ["MujocoInstance"]
@@ -42,7 +42,7 @@ Floats = NDArray[np.float64]
 
 _OF_VELOCITIES = frozenset({"linear_velocity", "angular_velocity", "body_wind", "relative_velocity"})
 _OF_JOINTS = frozenset({"position", "velocity", "acceleration", "effort_applied", "actuator_force"})
-"""What needs no refreshing at the point."""
+"""These are up to date after a step."""
 _INPUTS = frozenset({"effort", "effort_command", "wrench", "control", "wind"})
 
 
@@ -54,7 +54,7 @@ class MujocoInstance:
         name: instance name.
         config: its section of the configuration.
         log: called with every message of the engine.
-        picture: a film or a window, shown the world after every own step.
+        picture: a film or a window that shows the world after every own step.
 
     Raises:
         LoadFailed: MuJoCo is not installed, or cannot load the model.
@@ -75,7 +75,7 @@ class MujocoInstance:
         self._log = log
         self._picture = picture
         self._model = world.model
-        # A world that became unstable is an error; MuJoCo would start it again from the beginning.
+        # An unstable world is an error; by default, MuJoCo would start it again from the beginning.
         self._model.opt.disableflags |= int(self._mujoco.mjtDisableBit.mjDSBL_AUTORESET)
         self._timestep = float(self._model.opt.timestep)
         self._data = data = self._mujoco.MjData(self._model)
@@ -105,7 +105,7 @@ class MujocoInstance:
             "sensor": data.sensordata,
             "actuator_force": data.actuator_force,
         }
-        # MuJoCo's own memory, looked up once: each access to an attribute makes an array.
+        # MuJoCo's own memory, looked up once, because each access to such an attribute makes an array.
         self._memory: dict[str, Floats] = {
             **{name: getattr(data, name) for name in ("qfrc_applied", "xfrc_applied", "ctrl", "qacc")},
             "wind": self._model.opt.wind,
@@ -125,7 +125,7 @@ class MujocoInstance:
         stop_time: float | None,  # noqa: ARG002  as in the Protocol
         start_values: Mapping[str, Value],
     ) -> None:
-        """Start from the keyframe or the model's own position, with ``start_values`` on top (time in s)."""
+        """Start from the keyframe or the model's own position, then set ``start_values`` (time in s)."""
         if self._world.keyframe is not None:
             self._mujoco.mj_resetDataKeyframe(self._model, self._data, self._world.keyframe)
             self._own["control"][:] = self._data.ctrl
@@ -133,7 +133,7 @@ class MujocoInstance:
         self.set_values(start_values)
 
     def exit_initialization(self) -> None:
-        """Compute what can be read at the first point: positions, velocities, and sensors without any effort."""
+        """Compute the outputs of the first point: positions, velocities, and sensors, without any effort."""
         warnings.clear()
         self._model.opt.wind[:] = self._own["wind"]
         self._mujoco.mj_forward(self._model, self._data)
@@ -193,7 +193,7 @@ class MujocoInstance:
         self._finish(step + 1)
 
     def get_state(self) -> bytes:
-        """All that the next steps and the outputs of this point depend on."""
+        """See `KeepsState`: everything that the next steps and the outputs of this point depend on."""
         mujoco = self._mujoco
         size = mujoco.mj_stateSize(self._model, mujoco.mjtState.mjSTATE_INTEGRATION)
         state = np.zeros(size)
@@ -201,7 +201,7 @@ class MujocoInstance:
         return b"".join(part.tobytes() for part in (state, *self._remembered()))
 
     def set_state(self, state: object) -> None:
-        """Go back to what `get_state` of this or an equal instance returned.
+        """See `KeepsState`; also for a state of an equal instance.
 
         Raises:
             StepFailed: it is no state of this model.
@@ -244,7 +244,7 @@ class MujocoInstance:
     # --- what is applied
 
     def _set_limits(self) -> None:
-        """Everything about the effort of joints that does not change: limits, and joints with an actuator between."""
+        """The constants of joint efforts: limits, and which joints have an actuator."""
         dofs = self._model.nv
         self._least, self._most = np.full(dofs, -math.inf), np.full(dofs, math.inf)
         for dof, lower, upper in self._world.limits:
@@ -256,13 +256,13 @@ class MujocoInstance:
                 self._direct[entry.index] = False
         self._limited = bool(self._world.limits)
 
-    def _drive(self, entries: Iterable[Entry]) -> None:
-        """From now on look in every step at the bodies whose force or moment is among these entries."""
+    def _drive(self, entries: Iterable[MujocoVariable]) -> None:
+        """From now on, every step applies forces and moments of the bodies of these variables."""
         bodies = {entry.index // 6 for entry in entries if entry.where == "wrench"}
         self._driven = tuple(sorted({*self._driven, *bodies}))
 
     def _apply(self) -> None:
-        """What holds for a whole own step: efforts of joints, controls of the model's actuators, the wind."""
+        """Apply what is constant during an own step: efforts of joints, controls of the model's actuators, the wind."""
         own, memory = self._own, self._memory
         effort = own["effort"] + np.where(self._direct, own["effort_command"], 0.0)
         if self._limited:
@@ -273,7 +273,7 @@ class MujocoInstance:
         memory["wind"][:] = own["wind"]
 
     def _push(self) -> None:
-        """Forces and moments of bodies as MuJoCo takes them: in world axes, at the centre of mass."""
+        """Apply forces and moments of bodies, for MuJoCo in world axes at the centre of mass."""
         data, wrench = self._data, self._own["wrench"]
         self._mujoco.mj_kinematics(self._model, data)
         for body in self._driven:
@@ -283,7 +283,7 @@ class MujocoInstance:
             data.xfrc_applied[body] = (*acting, *about)
 
     def _look_at_warnings(self) -> None:
-        """A world that cannot be computed any more is an error; all else goes to the log.
+        """Raise an error if the world cannot be computed any more; log all other warnings.
 
         Raises:
             StepFailed: names the input or the joint that is not finite or huge.
@@ -299,7 +299,7 @@ class MujocoInstance:
             self._log("warning", text, self._step)
 
     def _culprit(self) -> str | None:
-        """The first input that is no finite number, or the joint with a huge acceleration."""
+        """The first input that is not finite, or else the first joint with a huge acceleration."""
         for name, entry in self._entries.items():
             if entry.where in _INPUTS and not math.isfinite(self._arrays[entry.where][entry.index]):
                 return name
@@ -312,7 +312,7 @@ class MujocoInstance:
     # --- what is read
 
     def _refresh(self, *, sensors: bool, bodies: Iterable[int] = ()) -> None:
-        """Bring what is derived from positions and velocities to this point: `mj_step` leaves it one step behind."""
+        """Compute what follows from positions and velocities for this point: after `mj_step` it is one step old."""
         mujoco, model, data, own = self._mujoco, self._model, self._data, self._own
         if sensors:  # those of accelerations and forces keep what the last step found
             mujoco.mj_step1(model, data)
@@ -332,7 +332,7 @@ class MujocoInstance:
             own["relative_velocity"][place] = relative_velocity(rotation, velocity, wind)
 
     def _finish(self, step: int) -> None:
-        """Bring what is read to this point, write the outputs as row ``step``, and show the world."""
+        """Compute the outputs of this point, write them as row ``step``, and show the world."""
         if self._reads or self._picture is not None:
             self._refresh(sensors=self._reads_sensors, bodies=self._reads_bodies)
         for ring, groups in self._outputs:
@@ -345,13 +345,13 @@ class MujocoInstance:
                 self._picture.finish()
 
     def _remembered(self) -> list[Floats]:
-        """What `mj_getState` leaves out: the mesh's inputs, and what was found in the last step."""
+        """The parts of a state that `mj_getState` does not have: inputs, and results of the last step."""
         own = (self._own[name] for name in ("acceleration", "effort_applied", *sorted(_INPUTS)))
         return [*own, self._data.sensordata, self._data.actuator_force]
 
 
-def _grouped(entries: Sequence[Entry]) -> list[tuple[str, NDArray[np.intp], NDArray[np.intp]]]:
-    """(kind, places in its array, columns) of all entries, so that one assignment moves all of a kind."""
+def _grouped(entries: Sequence[MujocoVariable]) -> list[tuple[str, NDArray[np.intp], NDArray[np.intp]]]:
+    """(kind, indices in its array, columns) of all variables, so that one assignment copies all of a kind."""
     groups: dict[str, tuple[list[int], list[int]]] = {}
     for column, entry in enumerate(entries):
         places, columns = groups.setdefault(entry.where, ([], []))
@@ -360,8 +360,8 @@ def _grouped(entries: Sequence[Entry]) -> list[tuple[str, NDArray[np.intp], NDAr
     return [(where, np.array(places), np.array(columns)) for where, (places, columns) in groups.items()]
 
 
-def _bodies_of(entries: Iterable[Entry]) -> set[int]:
-    """The bodies whose velocities have to be computed for these entries."""
+def _bodies_of(entries: Iterable[MujocoVariable]) -> set[int]:
+    """The bodies whose velocities have to be computed for these variables."""
     return {entry.index // 3 for entry in entries if entry.where in _OF_VELOCITIES}
 
 

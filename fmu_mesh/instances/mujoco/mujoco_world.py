@@ -1,18 +1,18 @@
-"""A MuJoCo model as a model description, and where the value of each of its variables lies.
+"""A MuJoCo model as a model description, and where the value of each variable is stored.
 
 Owns names, units and meaning of the variables; the only module that loads a model. What happens in a step is
 `fmu_mesh.instances.mujoco.mujoco_instance`.
 
-The last part of a name tells the kind of the variable, and what is before it is unique among the model's names of that
-kind: no two variables have one name.
+The last part of a name is the kind of the variable; the part before it is unique among the model's names of that kind.
+So no two variables have the same name.
 
 | variable | causality | what |
 |---|---|---|
 | `<joint>.position`, `.velocity` | output | of a revolute or prismatic joint at the communication point |
 | `<joint>.acceleration` | output | of the engine's last step; 0 before the first |
 | `<joint>.effort_applied` | output | what was applied in the last step, after limits; 0 before the first |
-| `<joint>.effort_command` | input | what a controller asks for: applied, unless an actuator stands between |
-| `<joint>.effort` | input | what is applied besides: the torque of an actuator |
+| `<joint>.effort_command` | input | the effort that a controller asks for; applied if the joint has no actuator |
+| `<joint>.effort` | input | effort that is applied in addition: the torque of an actuator |
 | `<body>.position_x/y/z`, `.orientation_w/x/y/z` | output | of the body's origin in world axes, as a unit quaternion |
 | `<body>.linear_velocity_…`, `.angular_velocity_…` | output | of the body's origin, in world axes |
 | `<body>.wind_…`, `.relative_velocity_…` | output | the wind, and the origin's velocity against it, in body axes |
@@ -33,12 +33,12 @@ from typing import Any, Literal
 
 import msgspec
 
-from ...config.mesh import MujocoConfig
 from ...errors import LoadFailed
 from ...text import listed, nearest
 from ...variables.model_description import Causality, DefaultExperiment, ModelDescription, Variable
+from .mujoco_kind import MujocoConfig
 
-__all__ = ["Entry", "Where", "World", "describe_world", "engine", "load_world", "warnings"]
+__all__ = ["MujocoVariable", "Where", "World", "describe_world", "engine", "load_world", "warnings"]
 
 Where = Literal[
     "position",
@@ -61,14 +61,14 @@ Where = Literal[
 ]
 
 warnings: list[str] = []
-"""What MuJoCo warned of since somebody cleared this; it has one handler for the process, which would write a file."""
+"""Warnings of MuJoCo since this was cleared. It has one handler per process; the default one would write a file."""
 
 _WORLD_BODY = 0
 _WIND = ("wind_x", "wind_y", "wind_z")
 
 
-class Entry(msgspec.Struct, frozen=True):
-    """One variable and where its value lies.
+class MujocoVariable(msgspec.Struct, frozen=True):
+    """One variable and where its value is stored.
 
     Attributes:
         where: the kind of value.
@@ -92,7 +92,7 @@ class World(msgspec.Struct, frozen=True):
 
     model: Any
     description: ModelDescription
-    entries: tuple[Entry, ...]
+    entries: tuple[MujocoVariable, ...]
     limits: tuple[tuple[int, float, float], ...]
     keyframe: int | None
 
@@ -144,7 +144,7 @@ def load_world(path: Path, config: MujocoConfig) -> World:
 
 
 def engine() -> ModuleType:
-    """The module `mujoco`, imported when it is needed: an extra, and slow to import.
+    """The module `mujoco`; it is imported on first use, because it is optional and slow to import.
 
     Raises:
         LoadFailed: it is not installed.
@@ -170,7 +170,7 @@ def _keyframe(model: Any, name: str | None, path: Path) -> int | None:  # noqa: 
     raise LoadFailed(f"'{path}' has no keyframe '{name}', but {listed(names)}", hint=hint)
 
 
-def _entries(mujoco: ModuleType, model: Any, keyframe: int | None) -> Iterator[Entry]:  # noqa: ANN401  mujoco has no types
+def _entries(mujoco: ModuleType, model: Any, keyframe: int | None) -> Iterator[MujocoVariable]:  # noqa: ANN401  mujoco has no types
     yield from _joints(mujoco, model, keyframe)
     yield from _bodies(model)
     for number in range(model.nsensor):
@@ -188,7 +188,7 @@ def _entries(mujoco: ModuleType, model: Any, keyframe: int | None) -> Iterator[E
         yield _input(f"wind_{letter}", "wind", axis, "m/s", "velocity of the medium in world axes", start)
 
 
-def _joints(mujoco: ModuleType, model: Any, keyframe: int | None) -> Iterator[Entry]:  # noqa: ANN401  mujoco has no types
+def _joints(mujoco: ModuleType, model: Any, keyframe: int | None) -> Iterator[MujocoVariable]:  # noqa: ANN401  mujoco has no types
     positions = model.qpos0 if keyframe is None else model.key_qpos[keyframe]
     velocities = [0.0] * model.nv if keyframe is None else model.key_qvel[keyframe]
     for number in range(model.njnt):
@@ -208,7 +208,7 @@ def _joints(mujoco: ModuleType, model: Any, keyframe: int | None) -> Iterator[En
         yield _input(f"{name}.effort", "effort", dof, effort, "what is applied, such as the torque of an actuator")
 
 
-def _bodies(model: Any) -> Iterator[Entry]:  # noqa: ANN401  mujoco has no types
+def _bodies(model: Any) -> Iterator[MujocoVariable]:  # noqa: ANN401  mujoco has no types
     for number in range(_WORLD_BODY + 1, model.nbody):
         name = model.body(number).name
         if not name:
@@ -230,17 +230,19 @@ def _bodies(model: Any) -> Iterator[Entry]:  # noqa: ANN401  mujoco has no types
                 yield _input(f"{name}.{what}_{letter}", "wrench", place, unit, f"{acting}, in body axes")
 
 
-def _vector(body: str, what: str, where: Where, number: int, unit: str, text: str) -> Iterator[Entry]:  # noqa: PLR0913, PLR0917  each is a column of the table above
+def _vector(body: str, what: str, where: Where, number: int, unit: str, text: str) -> Iterator[MujocoVariable]:  # noqa: PLR0913, PLR0917  each is a column of the table above
     for axis, letter in enumerate("xyz"):
         yield _output(f"{body}.{what}_{letter}", where, 3 * number + axis, unit, text)
 
 
-def _output(name: str, where: Where, index: int, unit: str | None, text: str, start: float | None = None) -> Entry:  # noqa: PLR0913, PLR0917  each is a column of the table above
-    return Entry(_variable(name, "output", unit, text, start), where, index)
+def _output(  # noqa: PLR0913, PLR0917  each is a column of the table above
+    name: str, where: Where, index: int, unit: str | None, text: str, start: float | None = None
+) -> MujocoVariable:
+    return MujocoVariable(_variable(name, "output", unit, text, start), where, index)
 
 
-def _input(name: str, where: Where, index: int, unit: str | None, text: str, start: float = 0.0) -> Entry:  # noqa: PLR0913, PLR0917  each is a column of the table above
-    return Entry(_variable(name, "input", unit, text, start), where, index)
+def _input(name: str, where: Where, index: int, unit: str | None, text: str, start: float = 0.0) -> MujocoVariable:  # noqa: PLR0913, PLR0917  each is a column of the table above
+    return MujocoVariable(_variable(name, "input", unit, text, start), where, index)
 
 
 def _variable(name: str, causality: Causality, unit: str | None, text: str, start: float | None) -> Variable:
@@ -254,7 +256,7 @@ def _variable(name: str, causality: Causality, unit: str | None, text: str, star
         start=start,
         unit=unit,
         description=text,
-        # At the first point the engine has not taken a step: only the wind of that moment makes a difference.
+        # At the first point the engine has not taken a step: only the current wind has an effect.
         dependencies=_WIND if ".wind_" in name or ".relative_velocity_" in name else (),
     )
 
@@ -269,7 +271,7 @@ def _limits(mujoco: ModuleType, model: Any, free: set[str]) -> Iterator[tuple[in
 
 
 def _left_out(mujoco: ModuleType, model: Any, data: bytes) -> Iterator[str]:  # noqa: ANN401  mujoco has no types
-    """What is in the file and has no variables. Of a free joint, position and velocity are those of its body."""
+    """Parts of the file that have no variables. A free joint needs none: its body has position and velocity."""
     joints = [model.joint(number) for number in range(model.njnt)]
     for joint in joints:
         if joint.type[0] == mujoco.mjtJoint.mjJNT_BALL:
@@ -285,7 +287,7 @@ def _left_out(mujoco: ModuleType, model: Any, data: bytes) -> Iterator[str]:  # 
             yield f"{what} without a name have no variables; there are {count}"
     try:
         root = ET.fromstring(data)  # noqa: S314  a file of the user's own; it is run as a simulation anyway
-    except ET.ParseError:  # MuJoCo reads more than XML
+    except ET.ParseError:  # MuJoCo also reads formats that are not XML
         return
     bodies = {model.body(number).name for number in range(model.nbody)}
     links = [name for link in root.findall("link") if (name := link.get("name", "")) not in bodies]

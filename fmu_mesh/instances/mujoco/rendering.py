@@ -1,7 +1,7 @@
 """Pictures of a world: a film that is rendered off screen, and a window where there is a screen.
 
-Owns everything about OpenGL and film files; what it shows never depends on it. The main thread of the node renders, at
-points: a film costs time, but no value.
+Owns OpenGL and film files. Rendering never changes a value: the main thread of the node renders at points, so a film
+only takes time.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ _BACKENDS = (("egl", "EGL"), ("osmesa", "OSMesa"))
 
 
 class Picture(Protocol):
-    """What is shown a world at points: `finish` after the last one, `close` at the end of every run."""
+    """Shows a world. Call sequence: `show` at points, `finish` after the last one, `close` at the end of every run."""
 
     def show(self, model: Any, data: Any, time_s: float) -> None:  # noqa: ANN401  mujoco has no types
         """Show the world as it is at ``time_s``; may do nothing."""
         ...
 
     def finish(self) -> None:
-        """Nothing more will be shown: write what is to be written.
+        """Complete the film: `show` is not called again.
 
         Raises:
             LoadFailed: it cannot be written.
@@ -51,7 +51,7 @@ class Picture(Protocol):
         ...
 
     def close(self) -> None:
-        """End, also where a run ended early. Never raises; may be called twice."""
+        """Release everything, also after a run that ended early. Never raises; may be called twice."""
         ...
 
 
@@ -83,8 +83,8 @@ def check_window() -> None:
 class Film:
     """A film file.
 
-    A film cannot be read without its end, so it gets its name at its end: until then it is `<name>.unfinished.mp4`
-    beside it. A run that ends before the world has made a step leaves no film, and an older one as it was.
+    A film is unreadable until it is complete. Until then, its file is `<name>.unfinished.mp4` in the same folder. A run
+    that ends before the first step writes no film, and does not touch an older one.
 
     Args:
         path: the file; its suffix says the format.
@@ -112,7 +112,7 @@ class Film:
         if self._first is None:
             self._first = time_s
         self._has_moved = time_s > self._first
-        # A point may miss the time of its picture by the last bit.
+        # The time of a point may differ from that of its picture by rounding.
         due = math.floor((time_s - self._first) * self._rate * (1.0 + 1e-12)) + 1
         if due <= self._pictures:
             return
@@ -120,7 +120,7 @@ class Film:
             if self._renderer is None:
                 self._start(model)
             self._renderer.update_scene(data, camera=0 if model.ncam else -1)
-            # Five times the time of all the rest where the processor has to draw them.
+            # Without a graphics card, shadows take five times as long as everything else.
             self._renderer.scene.flags[engine().mjtRndFlag.mjRND_SHADOW] = 0
             picture = self._renderer.render()
             for _ in range(due - self._pictures):
@@ -134,7 +134,7 @@ class Film:
         self._end(keep=True)
 
     def close(self) -> None:
-        """Complete what there is of the file."""
+        """Complete the file as far as it goes."""
         try:
             self._end(keep=self._has_moved)
         except LoadFailed as error:
@@ -174,7 +174,7 @@ class Film:
 class Window:
     """A window of MuJoCo's own viewer; when a person closes it, the run goes on.
 
-    It shows a copy of the world: what a person pulls, pushes or resets there does not reach the run.
+    It shows a copy of the world, so that what a person does in the window does not change the run.
     """
 
     def __init__(self) -> None:
@@ -204,7 +204,7 @@ class Window:
             self._viewer.sync()
 
     def finish(self) -> None:
-        """The window stays until the run has ended."""
+        """Nothing to do: the window stays until the run has ended."""
 
     def close(self) -> None:
         """Close the window."""
@@ -214,7 +214,7 @@ class Window:
 
 
 def _choose_backend() -> None:
-    """Let MuJoCo render without a screen, unless somebody has chosen already; before `mujoco` is imported."""
+    """Let MuJoCo render without a screen, unless the user has chosen a backend; before `mujoco` is imported."""
     if os.environ.get("MUJOCO_GL"):
         return
     for backend, library in _BACKENDS:

@@ -1,1 +1,1 @@
-"""Bags (MCAP): recording into them, reading them, and playing them into a mesh."""
+"""Bags (MCAP): recording one, reading one, and playing one into a mesh."""

@@ -1,7 +1,7 @@
-"""A bag as input: recorded values go into the inputs of a running mesh, each at the point of its stamp.
+"""Playing a bag: recorded values are set on the inputs of a running mesh, each at the point of its stamp.
 
-Owns which sample belongs to which communication point, and holds the mesh there while it sets the values: the mesh runs
-from sample to sample, so the result depends on the bag alone and not on how fast anybody is.
+Owns which sample belongs to which communication point. The mesh is paused at that point while the values are set. So
+the result depends on the bag alone, and not on the speed of any process.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _LONGEST_LOOK_S = 0.05
 
 
 class Moment(msgspec.Struct, frozen=True):
-    """What the inputs are given at one point, by (instance, variable)."""
+    """The values that are set at one point, by (instance, variable)."""
 
     point: int
     values: dict[tuple[str, str], Value]
@@ -46,10 +46,10 @@ def grid_of(info: MeshInfo) -> TimeGrid:
 def schedule(
     samples: Iterable[Sample], grid: TimeGrid, step_points: Mapping[str, int], *, start: float | None
 ) -> tuple[list[Moment], int, int]:
-    """Put samples to the points from which on they hold.
+    """Find the point of every sample.
 
-    A value holds from the first point of its instance that is not before its stamp, as the value of a trajectory does.
-    Of several for one point the last one counts.
+    A value is set at the first point of its instance that is not before its stamp. If an input has several values for
+    one point, the last one is set.
 
     Args:
         samples: in any order.
@@ -58,7 +58,8 @@ def schedule(
         start: simulation time in s of the earliest stamp; None: stamps are simulation times.
 
     Returns:
-        The moments in order, how many samples were replaced, and how many are too late to be seen.
+        The moments in order of their points, the number of samples that a later one replaced, and the number of samples
+        at or after the last point.
     """
     ordered = sorted(samples, key=lambda sample: sample.stamp)
     shift = 0 if start is None or not ordered else nanoseconds(start) - ordered[0].stamp
@@ -78,25 +79,26 @@ def schedule(
 def play(
     client: MeshClient, moments: Sequence[Moment], step_points: Mapping[str, int], timeout_s: float
 ) -> tuple[int, int]:
-    """Let a mesh run from moment to moment, and set the values of each while it rests there; then let it run on.
+    """Set all values on a mesh: let it run to each moment, pause it there, set the values; at the end let it run on.
 
-    Moments that are past already count as the present: of each input the last one is set.
+    If the mesh is past a moment already, its values are set at once; for each input the last one counts.
 
     Args:
-        client: the mesh; it is paused, or is going to be.
+        client: the mesh; this pauses it if it is running.
         moments: in the order of their points.
         step_points: points per step of every instance.
-        timeout_s: how long the mesh may rest without having come where it should, in s.
+        timeout_s: how long in s the mesh may stay at one point before it has reached the next moment.
 
     Returns:
-        How many values were set, and the point of the first.
+        The number of values that were set, and the point of the first one.
 
     Raises:
         ConfigurationError: a value was refused.
-        MeshLost: the mesh has ended, or does not come to the next moment.
+        MeshLost: the mesh has ended, or somebody else commands it, too.
+        DeadlineExceeded: the mesh does not reach the next moment.
     """
     hold = _commanded(client, Command("pause"))
-    together = math.lcm(*step_points.values())  # where every instance can rest
+    together = math.lcm(*step_points.values())  # where every instance has a point of its own
     hold = _go_on(client, hold, -(-hold // together) * together)
     targets: dict[tuple[str, str], Target] = {}
     first, count = hold, 0
@@ -117,7 +119,7 @@ def play(
 
 
 def _commanded(client: MeshClient, command: Command) -> int:
-    """Give a command that lets the mesh rest; the point where it is going to."""
+    """Give a command that pauses the mesh; returns the point at which it will be paused."""
     hold = client.command(command).hold
     if hold is None:
         raise ConfigurationError("the mesh does not say where it rests.", hint="Is it another version of fmu_mesh?")
@@ -125,14 +127,14 @@ def _commanded(client: MeshClient, command: Command) -> int:
 
 
 def _go_on(client: MeshClient, hold: int, point: int) -> int:
-    """Let the mesh go on from the point where it rests, or is going to, to a later one; returns that."""
+    """Let the mesh run from the point at which it is or will be paused to a later one; returns that point."""
     if point > hold and _commanded(client, Command("step", point - hold)) != point:
         raise MeshLost(f"the mesh goes to another point than {point}: somebody else commands it, too.")
     return point
 
 
 def _from(point: int, moments: Sequence[Moment]) -> Iterator[Moment]:
-    """The moments from ``point`` on; what is past is one moment at ``point``."""
+    """The moments from ``point`` on; the earlier ones become a single moment at ``point``."""
     past: dict[tuple[str, str], Value] = {}
     for moment in moments:
         if moment.point <= point:
@@ -147,7 +149,7 @@ def _from(point: int, moments: Sequence[Moment]) -> Iterator[Moment]:
 
 
 def _wait_until_at(client: MeshClient, instance: str, point: int, timeout_s: float) -> None:
-    """Wait until an instance rests at ``point``."""
+    """Wait until an instance is paused at ``point``."""
     never = threading.Event()
     look, reached, moved = _LOOK_S, -1, time.monotonic()
     while (status := client.instance_status(instance)).point != point:
@@ -163,7 +165,7 @@ def _wait_until_at(client: MeshClient, instance: str, point: int, timeout_s: flo
 
 
 def _point_of(stamp: int, grid: TimeGrid, points: int) -> int:
-    """The first point of an instance that is not before ``stamp``; a stamp is good to a nanosecond."""
+    """The first point of an instance that is not before ``stamp``, which is exact to 1 ns."""
     exact = (stamp / 1e9 - grid.start_time) / (points * grid.step_size)
     near = round(exact)
     step = near if abs(nanoseconds(grid.time(near * points)) - stamp) <= 1 else math.ceil(exact)

@@ -1,6 +1,6 @@
-"""Reading bags: MCAP and SQLite, of `ros2 bag` and of our own, by `rosbags`; and which of their topics are inputs.
+"""Reading a bag (MCAP or SQLite, by `ros2 bag` or by a mesh) with `rosbags`, and which of its topics are inputs.
 
-Knows nothing of points: when a value holds is `fmu_mesh.ros.bags.playing`.
+Knows no communication points: `fmu_mesh.ros.bags.playing` finds the point of a sample.
 """
 
 from __future__ import annotations
@@ -22,11 +22,10 @@ from ...text import listed, nearest, nearest_file
 from ...variables.model_description import Value
 from ...variables.value_types import nested
 from ...wire.views import InstanceInfo
-from ..gateway.mapping import message_types
+from ..gateway.mapping import descriptions_of, message_types
 from ..gateway.resolver import Resolver
-from ..gateway.seen import descriptions_of
-from ..gateway.topics import Port, Topic
 from ..messages.definitions import MessageTypes, path_parts
+from ..messages.topics import Port, Topic
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
@@ -42,9 +41,10 @@ class Sample(msgspec.Struct, frozen=True):
     """One recorded value.
 
     Attributes:
-        stamp: when it holds from, in ns.
-        instance: of the input.
-        variable: name of the input.
+        stamp: the time from which on the value holds, in ns.
+        instance: name of the instance.
+        variable: name of its input.
+        value: an array has the shape of the variable.
     """
 
     stamp: int
@@ -60,7 +60,7 @@ class Bag:
         path: an MCAP file, or the folder of a `ros2 bag`.
 
     Raises:
-        ConfigurationError: it cannot be read, or `rosbags` is not installed.
+        ConfigurationError: the file cannot be read, or `rosbags` is not installed.
     """
 
     def __init__(self, path: Path) -> None:
@@ -99,7 +99,7 @@ class Bag:
         return {name: info.msgtype or "" for name, info in self._reader.topics.items()}
 
     def add_types(self, types: MessageTypes) -> None:
-        """Let ``types`` have the message types of this bag, too."""
+        """Add the message types of this bag to ``types``."""
         for name, definition in self._reader.typestore.fielddefs.items():
             types.store.fielddefs.setdefault(name, definition)
 
@@ -108,10 +108,10 @@ class Bag:
 
         Args:
             topics: subscribed topics.
-            stamps: `header` takes the stamp of the header where there is one, `log` when it was recorded.
+            stamps: `header` takes the stamp in the header if there is one; `log` takes the time of the recording.
 
         Raises:
-            ConfigurationError: a message does not have what its topic needs.
+            ConfigurationError: a message has no such array element, or an array of another size.
         """
         wanted = {topic.name: [(path_parts(port.path), port) for port in topic.ports] for topic in topics}
         connections = [connection for connection in self._reader.connections if connection.topic in wanted]
@@ -126,17 +126,17 @@ class Bag:
 def chosen_topics(
     loaded: LoadedConfig, infos: Mapping[str, InstanceInfo], bag: Bag, choices: Sequence[str] = ()
 ) -> list[Topic]:
-    """The topics of a bag that go into inputs of a mesh.
+    """The topics of a bag that are played into inputs of a mesh.
 
     Args:
         loaded: the configuration of the mesh.
-        infos: what its instances say of themselves.
+        infos: the information of every instance, by name.
         bag: the bag.
-        choices: `TOPIC=INSTANCE.VARIABLE` or `TOPIC:FIELD=INSTANCE.VARIABLE` each; without any, the topics are those
-            that the mesh subscribes to by its `ros` section, or by the names that it would give its inputs.
+        choices: each is `TOPIC=INSTANCE.VARIABLE` or `TOPIC:FIELD=INSTANCE.VARIABLE`. Without choices, the topics are
+            those that the mesh subscribes to: by its `ros` section, or by the default names of its inputs.
 
     Raises:
-        ConfigurationError: a choice is wrong, or no topic fits.
+        ConfigurationError: a choice is wrong, or the mesh subscribes to no topic of the bag.
     """
     there = bag.topics
     section = loaded.config.ros or RosConfig()
@@ -171,6 +171,7 @@ def chosen_topics(
 
 
 def _entries(choices: Sequence[str], there: Mapping[str, str]) -> Iterator[RosTopicConfig]:
+    """The choices as entries of a `ros` section; ``there`` has the message type of every topic of the bag."""
     fields: dict[str, dict[str, str]] = {}
     for choice in choices:
         found = _CHOICE.fullmatch(choice)
@@ -187,6 +188,7 @@ def _entries(choices: Sequence[str], there: Mapping[str, str]) -> Iterator[RosTo
 
 
 def _header_stamp(message: Any) -> int | None:  # noqa: ANN401 a message of rosbags
+    """The stamp of the header in ns; None without a header, or if it is 0."""
     stamp = getattr(getattr(message, "header", None), "stamp", None)
     if stamp is None or not (stamp.sec or stamp.nanosec):
         return None
@@ -194,7 +196,7 @@ def _header_stamp(message: Any) -> int | None:  # noqa: ANN401 a message of rosb
 
 
 def _value_at(message: Any, parts: Sequence[str | int], port: Port, topic: str) -> Value:  # noqa: ANN401 of rosbags
-    """A field as a value of a variable, an array in its shape."""
+    """A field as the value of a variable; an array gets the shape of the variable."""
     value = message
     try:
         for part in parts:

@@ -1,7 +1,6 @@
-"""Recording into MCAP: a file that `ros2 bag` and Foxglove read as ROS messages, by simulation time.
+"""Recording into MCAP, which `ros2 bag` and Foxglove read as ROS messages, by simulation time.
 
-Owns which topics a recording has and how rows become messages. What a topic is and how it is named is
-`fmu_mesh.ros.gateway.topics`; who hands over the rows does not matter.
+Owns which topics a recording has, and how rows become messages. `fmu_mesh.ros.messages.topics` says what a topic is.
 """
 
 from __future__ import annotations
@@ -12,28 +11,26 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-import msgspec
 import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from ...config.findings import Findings
-from ...config.loading import LoadedConfig
 from ...config.mesh import RosConfig
 from ...errors import ConfigurationError
 from ...files import Kept, open_alone
-from ...variables.value_types import nested, split_element
+from ...system.recording import Recording
+from ...variables.value_types import nested
 from ..gateway.mapping import message_types
 from ..gateway.resolver import Resolver
-from ..gateway.topics import Descriptions, RosPlan, Topic
 from ..messages.assembling import Assembler
 from ..messages.cdr import Codec
 from ..messages.definitions import CLOCK, MessageTypes
 from ..messages.stamp import nanoseconds, to_stamp
+from ..messages.topics import RosPlan, Topic
 
-__all__ = ["BagTopics", "McapFile", "bag_topics", "is_bag"]
+__all__ = ["McapFile"]
 
-SUFFIX = ".mcap"
 _BUFFER_BYTES = 1 << 16
 _QOS = (
     "- history: keep_last\n  depth: 10\n  reliability: reliable\n  durability: volatile\n"
@@ -42,102 +39,68 @@ _QOS = (
     "  liveliness: automatic\n  liveliness_lease_duration:\n    sec: 9223372036\n    nsec: 854775807\n"
     "  avoid_ros_namespace_conventions: false"
 )
-"""The quality of service that a player offers, in the words of rosbag2: reliable and volatile."""
-
-
-class BagTopics(msgspec.Struct, frozen=True):
-    """The topics of a recording.
-
-    Attributes:
-        plan: topics and clock.
-        types: their message types.
-    """
-
-    plan: RosPlan
-    types: MessageTypes
-
-
-def is_bag(path: str | Path | None) -> bool:
-    """Whether a result file is to be an MCAP."""
-    return path is not None and Path(path).suffix.lower() == SUFFIX
-
-
-def bag_topics(
-    loaded: LoadedConfig, descriptions: Descriptions, recorded: Sequence[tuple[str, str]], findings: Findings
-) -> BagTopics | None:
-    """The topics that hold the recorded variables.
-
-    A topic of the `ros` section whose variables are all recorded is there as it is; every other recorded variable has
-    one of its own, named and typed as that section does by default.
-
-    Args:
-        loaded: the configuration.
-        descriptions: the model descriptions by instance.
-        recorded: (instance, variable), or an element of an array as `y[1,2]`.
-        findings: where all that is wrong goes.
-
-    Returns:
-        None after a finding that leaves nothing to go on with.
-    """
-    section = loaded.config.ros or RosConfig()
-    config = replace(loaded.config, ros=section)
-    types = message_types(replace(loaded, config=config), findings)
-    if types is None:
-        return None
-    recorded = _whole(recorded, descriptions, findings)
-    wanted = set(recorded)
-    # What is wrong with the section itself is told where it is checked, and once is enough.
-    plan = Resolver(config, section, descriptions, types, Findings(str(loaded.file))).plan()
-    configured = tuple(topic for topic in plan.topics if _variables(topic) <= wanted) if loaded.config.ros else ()
-    covered = {variable for topic in configured for variable in _variables(topic)}
-    rest = replace(section, topics=[f"{i}.{v}" for i, v in recorded if (i, v) not in covered])
-    own = Findings(str(loaded.file))
-    others = Resolver(config, rest, descriptions, types, own).plan().topics
-    for finding in own:
-        findings.add("record.file", f"in '{loaded.config.record.file}': {finding.found}", finding.expected)
-    if loaded.config.simulation.start_time < 0.0:
-        findings.add("record.file", "an MCAP of times before 0, which it cannot hold", "a CSV file, or another start")
-    return BagTopics(replace(plan, topics=(*configured, *others)), types)
+"""The quality of service that a player offers, as rosbag2 writes it: reliable and volatile."""
 
 
 class McapFile:
     """Writes rows of results as ROS messages into an MCAP, and `/clock` with them.
 
-    A message is logged and published at its simulation time. There is one at every point of one of its variables.
+    The log time and the publish time of a message are its simulation time. A topic has a message at every point at
+    which one of its variables has a new value.
 
     Args:
-        path: the file; its folder is made, an older file is replaced by the first row.
-        columns: (name, type) of every column that `write` is given, the name being `instance.variable`.
-        topics: what to make of them.
+        path: the file. Its folder is made; the first row replaces an older file.
+        columns: (`instance.variable`, type) of every column that `write` is given.
+        plan: the topics, and how often the clock ticks.
+        types: the message types of the topics.
 
     Attributes:
         path: the file.
-        rows: rows written so far; once it is closed, those that are in the file.
-        kept: what the operating system has by now.
+        rows: number of rows written so far; after `close`, the number of rows in the file.
+        kept: what the operating system has.
 
     Raises:
-        ConfigurationError: the file cannot be written, or the package `mcap` is not there.
+        ConfigurationError: the file cannot be written, or the package `mcap` is not installed.
     """
 
-    def __init__(self, path: Path, columns: Sequence[tuple[str, str]], topics: BagTopics) -> None:
+    def __init__(self, path: Path, columns: Sequence[tuple[str, str]], plan: RosPlan, types: MessageTypes) -> None:
         writer = _writer_class()
         self.path = path
         self.rows = 0
-        index = {name: number for number, (name, _) in enumerate(columns)}
         self.kept = Kept()
+        index = {name: number for number, (name, _) in enumerate(columns)}
         self._own = open_alone(path)
         self._file = BufferedWriter(self._own, _BUFFER_BYTES)
         self._mcap = writer(self._file)
-        self._types = topics.types
+        self._types = types
         self._schemas: dict[str, int] = {}
-        self._outputs = [
-            _Output(topic, index, self._channel(topic.name, topic.message), topics.types)
-            for topic in topics.plan.topics
+        self._topics = [
+            _RecordedTopic(topic, index, self._channel(topic.name, topic.message), types) for topic in plan.topics
         ]
-        self._clock_points = topics.plan.clock_points
+        self._clock_points = plan.clock_points
         if self._clock_points is not None:
-            self._clock = Codec(topics.types, CLOCK)
+            self._clock = Codec(types, CLOCK)
             self._clock_channel = self._channel("/clock", CLOCK)
+
+    @classmethod
+    def check(cls, recording: Recording, findings: Findings) -> None:
+        """Check that topics can be made of what is recorded, and that their messages have a place for it."""
+        _writer_class()
+        _topics(recording, findings)
+
+    @classmethod
+    def open(cls, path: Path, recording: Recording) -> Self:
+        """Open a result file for what a run records."""
+        findings = recording.loaded.findings()
+        found = _topics(recording, findings)
+        findings.raise_any()
+        assert found is not None  # or there is a finding
+        return cls(path, recording.columns, *found)
+
+    @staticmethod
+    def keep_whole_rows(path: Path, kept: Kept) -> int:  # noqa: ARG004 the contract of a result format
+        """The rows that are known to be whole; a reader of MCAP finds the end of what follows by itself."""
+        return kept.rows
 
     def __enter__(self) -> Self:
         return self
@@ -156,18 +119,18 @@ class McapFile:
             point, stamp = self.rows, nanoseconds(time)
             if self._clock_points is not None and point % self._clock_points == 0:
                 self._add(self._clock_channel, stamp, self._clock.encode({"clock": to_stamp(time)}), point)
-            for output in self._outputs:
-                if output.due(point):
-                    self._add(output.channel, stamp, output.message(row, time), point)
+            for topic in self._topics:
+                if topic.due(point):
+                    self._add(topic.channel, stamp, topic.message(row, time), point)
             self.rows += 1
 
     def flush(self) -> None:
-        """Hand everything to the operating system, so that it survives the end of this process."""
+        """Give all rows to the operating system, so that they survive the end of this process."""
         self._mcap.flush()
         self.kept = Kept(self.rows, self._own.size)
 
     def close(self) -> None:
-        """Write what is left and close the file; without a row, nothing has changed."""
+        """Write what is left and close the file. Without a row, nothing has changed."""
         if self._file.closed:
             return
         written, self.rows = self.rows, self.kept.rows
@@ -190,7 +153,7 @@ class McapFile:
         return channel
 
 
-class _Output:
+class _RecordedTopic:
     """One topic of a recording."""
 
     def __init__(self, topic: Topic, index: dict[str, int], channel: int, types: MessageTypes) -> None:
@@ -201,7 +164,7 @@ class _Output:
         self._assembler = Assembler(topic, types)
 
     def due(self, point: int) -> bool:
-        """Whether one of the variables has a value of its own at ``point``."""
+        """Whether one of the variables has a new value at ``point``."""
         return any(point % step == 0 for step in self._steps)
 
     def message(self, row: Sequence[Any], time: float) -> bytes:
@@ -213,18 +176,48 @@ class _Output:
         return self._assembler.make(values, time)
 
 
-def _whole(
-    recorded: Sequence[tuple[str, str]], descriptions: Descriptions, findings: Findings
-) -> list[tuple[str, str]]:
-    """The recorded variables, each array once; a message has all of an array, so all of it has to be recorded."""
-    columns = set(recorded)
+def _topics(recording: Recording, findings: Findings) -> tuple[RosPlan, MessageTypes] | None:
+    """The topics that hold the recorded variables, and their message types.
+
+    A topic of the `ros` section is recorded as it is if all of its variables are recorded. Every other recorded
+    variable has a topic of its own, with the name and the type that the section gives it by default.
+
+    Args:
+        recording: what is recorded.
+        findings: where findings go.
+
+    Returns:
+        None if a finding makes it impossible to go on.
+    """
+    loaded, descriptions = recording.loaded, recording.descriptions
+    section = loaded.config.ros or RosConfig()
+    config = replace(loaded.config, ros=section)
+    types = message_types(replace(loaded, config=config), findings)
+    if types is None:
+        return None
+    recorded = _whole(recording, findings)
+    wanted = set(recorded)
+    # The findings about the section itself are reported where the section is checked.
+    plan = Resolver(config, section, descriptions, types, Findings(str(loaded.file))).plan()
+    configured = tuple(topic for topic in plan.topics if _variables(topic) <= wanted) if loaded.config.ros else ()
+    covered = {variable for topic in configured for variable in _variables(topic)}
+    rest = replace(section, topics=[f"{i}.{v}" for i, v in recorded if (i, v) not in covered])
+    own = Findings(str(loaded.file))
+    others = Resolver(config, rest, descriptions, types, own).plan().topics
+    for finding in own:
+        findings.add("record.file", f"in '{loaded.config.record.file}': {finding.found}", finding.expected)
+    if loaded.config.simulation.start_time < 0.0:
+        findings.add("record.file", "an MCAP of times before 0, which it cannot hold", "a CSV file, or another start")
+    return replace(plan, topics=(*configured, *others)), types
+
+
+def _whole(recording: Recording, findings: Findings) -> list[tuple[str, str]]:
+    """(instance, variable) of what is recorded. A message holds a whole array, so all of it must be recorded."""
+    columns = set(recording.recorded)
     whole: dict[tuple[str, str], None] = {}
-    for instance, name in recorded:
-        description = descriptions[instance]
-        split = split_element(name)
-        variable = description.variable(name) or (description.variable(split[0]) if split is not None else None)
-        if variable is None:
-            continue
+    for instance, name in recording.recorded:
+        variable = recording.descriptions[instance].variable_of(name)
+        assert variable is not None  # the system is valid
         if (instance, variable.name) not in whole and not {(instance, e) for e in variable.elements} <= columns:
             findings.add(
                 "record.variables", f"some elements of the array '{instance}.{variable.name}'", "all of it in an MCAP"
@@ -234,6 +227,7 @@ def _whole(
 
 
 def _variables(topic: Topic) -> set[tuple[str, str]]:
+    """(instance, variable) of what a topic publishes; what no recording has, if it is subscribed."""
     return {(port.instance, port.variable.name) for port in topic.ports} if topic.direction == "out" else {("", "")}
 
 

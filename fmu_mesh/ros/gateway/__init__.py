@@ -1,1 +1,1 @@
-"""The gateway to ROS: topics from and to variables, over a Zenoh bridge or rmw_zenoh."""
+"""The gateway to ROS: carries samples between variables and topics, over a Zenoh bridge or rmw_zenoh."""

@@ -1,8 +1,8 @@
-"""The gateway: what flows between the mesh and ROS while a mesh runs.
+"""The gateway: carries samples between a running mesh and ROS.
 
-It is a Zenoh client of the mesh like any other (docs/key-space.md), in a process and with a session towards ROS of its
-own: whatever becomes of ROS, no node and no master ever waits for it. All work is done on the thread that calls `run`;
-callbacks only put into a bounded queue. What does not fit is left out, counted and told.
+It is a Zenoh client of the mesh like any other (docs/key-space.md). It has its own process and its own session towards
+ROS, so no node and no master ever waits for ROS. All work is done on the thread that calls `Gateway.run`; callbacks
+only put into a bounded queue. Samples that do not fit into the queue are left out, counted and reported.
 """
 
 from __future__ import annotations
@@ -10,86 +10,107 @@ from __future__ import annotations
 import logging
 import queue
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from functools import partial
 from typing import Any
 
 import zenoh
 
+from ...config.mesh import RosConfig
 from ...errors import MeshLost, MessageRefused
 from ...simtime import TimeGrid
 from ...wire.client.readings import latecomers
 from ...wire.keys import Keys
 from ...wire.messages import decode_json
 from ...wire.refusals import Refusals
-from ...wire.session import ask, undeclare_all
+from ...wire.session import Question, ask, undeclare_all
 from ...wire.values import decode_stamp, encode_time, encode_value, json_encoding
 from ...wire.views import MeshInfo
 from ..messages.assembling import Assembler, Disassembler
-from ..messages.cdr import CdrError, Codec
-from ..messages.definitions import CLOCK, MessageTypes
-from ..messages.stamp import to_stamp
-from .profile import Profile, Put
-from .topics import Port, RosPlan, Topic
+from ..messages.cdr import CdrError
+from ..messages.topics import Port, RosPlan, Topic
+from .clock_progress import ClockPublisher, Progress, WarnOnce, WatchedVariable, clock_topic
+from .parameters import ParameterServices
+from .profile import Profile
+from .rmw_zenoh import RmwZenoh
+from .ros2dds import Ros2Dds
 
-__all__ = ["Gateway"]
+__all__ = ["Gateway", "open_profiles"]
 
 log = logging.getLogger(__name__)
 
-_WAITING_EVENTS = 1 << 16
+_MAX_EVENTS = 1 << 16
 _REPEAT_S = 1.0
 
 Event = Callable[[], None]
 
 
+@contextmanager
+def open_profiles(
+    section: RosConfig, ros: zenoh.Session, plan: RosPlan, mesh: zenoh.Session, keys: Keys
+) -> Iterator[dict[str, Profile]]:
+    """Open the profiles that a plan needs, and the parameter services of the node if it is one of rmw_zenoh.
+
+    Args:
+        section: the section `ros` of the configuration.
+        ros: the session towards ROS.
+        plan: the topics and the parameters.
+        mesh: a session that reaches the mesh.
+        keys: the keys of the mesh.
+
+    Yields:
+        The profiles by name, that of the section first.
+    """
+    profiles: dict[str, Profile] = {}
+    with ExitStack() as stack:
+        for name in dict.fromkeys((section.profile, *(topic.profile for topic in plan.topics))):
+            if name == "rmw_zenoh":
+                node = profiles[name] = RmwZenoh(ros, plan, section.domain)
+                stack.callback(node.close)
+                stack.enter_context(ParameterServices(plan, mesh, keys).served_by(node))
+            else:
+                profile = profiles[name] = Ros2Dds(ros, plan.types)
+                stack.callback(profile.close)
+        yield profiles
+
+
 class Gateway:
     """Carries topics between one mesh and ROS.
 
+    Call `open`, then `run`, then `close`.
+
     Args:
         plan: the topics.
-        types: the message types.
-        mesh: a session that reaches the mesh; stays the caller's.
+        mesh: a session that reaches the mesh; the caller closes it.
         keys: the keys of the mesh.
         grid: the communication points of the run.
-        profiles: the profile of every topic, by name, that of the clock first; they stay the caller's.
-        patience_s: how long `open` waits for the master, in s.
-
-    Call `open`, then `run`, then `close`.
+        profiles: the profiles of the topics by name, that of `/clock` first; the caller closes them.
     """
 
-    def __init__(  # noqa: PLR0913, PLR0917  the parts that it brings together
-        self,
-        plan: RosPlan,
-        types: MessageTypes,
-        mesh: zenoh.Session,
-        keys: Keys,
-        grid: TimeGrid,
-        profiles: dict[str, Profile],
-        patience_s: float = 60.0,
+    def __init__(
+        self, plan: RosPlan, mesh: zenoh.Session, keys: Keys, grid: TimeGrid, profiles: dict[str, Profile]
     ) -> None:
         self._plan = plan
-        self._types = types
         self._mesh = mesh
         self._keys = keys
         self._grid = grid
         self._profiles = profiles
-        self._patience_s = patience_s
         self._refusals = Refusals()
-        self._leaving = False
         self._events: queue.SimpleQueue[Event] = queue.SimpleQueue()
         self._left_out = 0
+        self._interrupted = False
         self._ended = False
         self._mesh_ended = False
         self._entities: list[zenoh.Subscriber[None] | zenoh.LivelinessToken] = []
         self._publishers: dict[str, zenoh.Publisher] = {}
-        self._watches: dict[str, _Watch] = {}
-        self._clock: _Clock | None = None
-        self._reached = -1
-        self._complete = -1
-        self._now = -1
+        self._progress = Progress()
 
-    def open(self) -> None:
-        """Declare everything; from now on nothing is missed.
+    def open(self, patience_s: float = 60.0) -> None:
+        """Declare all topics; every later sample is carried.
+
+        Args:
+            patience_s: how long to wait for the master, in s.
 
         Raises:
             MeshLost: the master does not answer.
@@ -99,30 +120,28 @@ class Gateway:
                 self._open_output(topic)
             else:
                 self._open_input(topic)
-        if not self._watches and self._plan.time_source is not None and self._plan.clock_points:
+        watched = self._progress.watched
+        if not watched and self._plan.time_source is not None and self._plan.clock_points:
             self._watch(self._plan.time_source)
         if self._plan.clock_points is not None:
-            profile = next(iter(self._profiles.values()))
-            self._clock = _Clock(
-                profile.publish(_clock_topic(self._plan)), self._types, self._plan.clock_points, self._grid
-            )
-        for key, watch in self._watches.items():
-            self._entities.append(self._mesh.declare_subscriber(key, partial(self._value_arrived, key, watch)))
+            put = next(iter(self._profiles.values())).publish(clock_topic(self._plan))
+            self._progress.start_clock(ClockPublisher(put, self._plan, self._grid))
+        for key, variable in watched.items():
+            self._entities.append(self._mesh.declare_subscriber(key, partial(self._value_arrived, key, variable)))
         self._entities.append(
             self._mesh.liveliness().declare_subscriber(self._keys.master, self._token_changed, history=True)
         )
-        self._follow()
+        self._follow(patience_s)
 
     def run(self) -> None:
-        """Carry until the mesh has ended and its last sample is carried, or until `end` is called."""
+        """Carry samples until the mesh has ended and its last sample is carried, or until `end` is called."""
         due = time.monotonic() + _REPEAT_S
         while not (self._ended or self._mesh_ended):
             now = time.monotonic()
             if now >= due:
                 due = now + _REPEAT_S
-                self._tell_left_out()
-                if self._clock is not None:
-                    self._clock.repeat()
+                self._report_left_out()
+                self._progress.repeat_clock()
             try:
                 event = self._events.get(timeout=due - now if due > now else 0)
             except queue.Empty:
@@ -133,26 +152,26 @@ class Gateway:
             self._handle(late_event)
 
     def end(self) -> None:
-        """From any thread: let `run` return once everything that has come is carried."""
-        self._leaving = True
+        """From any thread: let `run` return once every sample that has arrived is carried."""
+        self._interrupted = True
         self._events.put(self._end)
 
     def close(self) -> None:
-        """Undeclare what belongs to the mesh."""
-        self._tell_left_out()
+        """Undeclare everything that was declared on the session of the mesh."""
+        self._report_left_out()
         undeclare_all(self._entities, self._publishers.values())
 
-    def _handle(self, event: Callable[[], None]) -> None:
+    def _handle(self, event: Event) -> None:
         with self._refusals.guard("a topic or a variable"):
             event()
 
-    def _follow(self) -> None:
-        """Let the master, which may be a moment late, stay at the end until the last sample has come here."""
+    def _follow(self, patience_s: float) -> None:
+        """Wait for the master, which may start later, and make it stay at the end until the last sample is here."""
         key = self._keys.mesh_key("info")
         try:
-            answer = ask(self._mesh, key, None, self._patience_s, "the master", over=lambda: self._leaving)
+            answer = ask(self._mesh, Question(key, "the master", patience_s), lambda: self._interrupted)
         except MeshLost:
-            if not self._leaving:
+            if not self._interrupted:
                 raise
             return
         run = self._keys.run(decode_json(answer, MeshInfo).run)
@@ -162,89 +181,75 @@ class Gateway:
     # --- from the mesh to ROS
 
     def _open_output(self, topic: Topic) -> None:
-        output = _Output(Assembler(topic, self._types), self._profiles[topic.profile].publish(topic))
+        assembler = Assembler(topic, self._plan.types)
+        put = self._profiles[topic.profile].publish(topic)
         for index, port in enumerate(topic.ports):
-            self._watch(port).outputs.append((output, index))
+            self._watch(port).outputs.append((assembler, index, put))
 
-    def _watch(self, port: Port) -> _Watch:
+    def _watch(self, port: Port) -> WatchedVariable:
         key = self._keys.variable(port.instance, port.kind, port.variable.name)
-        return self._watches.setdefault(key, _Watch(f"{port.instance}.{port.variable.name}", port.step_points))
+        return self._progress.watch(key, f"{port.instance}.{port.variable.name}", port.step_points)
 
-    def _value_arrived(self, key: str, watch: _Watch, sample: zenoh.Sample) -> None:
-        # Without an attachment it is what somebody puts on the key of an input.
+    def _value_arrived(self, key: str, variable: WatchedVariable, sample: zenoh.Sample) -> None:
+        # A sample without an attachment is a value that somebody puts on the key of an input.
         if sample.attachment is not None and str(sample.key_expr) == key:
-            self._post(partial(self._take_value, watch, sample.payload.to_bytes(), sample.attachment.to_bytes()))
+            self._post(partial(self._take_value, variable, sample.payload.to_bytes(), sample.attachment.to_bytes()))
 
-    def _take_value(self, watch: _Watch, data: bytes, attachment: bytes) -> None:
+    def _take_value(self, variable: WatchedVariable, data: bytes, attachment: bytes) -> None:
         try:
             stamp = decode_stamp(attachment)
-        except MessageRefused:  # likewise: it says from when on it holds, and no point
+        except MessageRefused:  # somebody put it on the key of an input, with a time but without a point
             return
         try:
             value: Any = decode_json(data, object)
         except MessageRefused as error:
-            watch.complain(f"a value that is not understood: {error}")
+            variable.warn(f"a value that is not understood: {error}")
             return
-        for output, port in watch.outputs:
+        for assembler, port, put in variable.outputs:
             try:
-                for message, stamp_s in output.assembler.add(port, stamp.point, stamp.time, value):
-                    output.put(message, stamp_s)
+                for message, time_s in assembler.add(port, stamp.point, stamp.time, value):
+                    put(message, time_s)
             except CdrError as error:
-                watch.complain(f"{value!r} cannot be sent on '{output.assembler.topic.name}': {error}")
-        self._went_on(watch, stamp.point)
-
-    def _went_on(self, watch: _Watch, point: int) -> None:
-        """Everything up to a point that no watched variable is behind has been published."""
-        if watch.point < 0 and self._clock is not None:
-            self._clock.begin(point)
-        was_last = watch.holds_until <= self._complete
-        watch.point = point
-        self._reached = max(self._reached, point)
-        if was_last:
-            self._complete = min(other.holds_until for other in self._watches.values())
-        now = min(self._reached, self._complete)
-        if now > self._now:
-            self._now = now
-            if self._clock is not None:
-                self._clock.advance(now)
+                variable.warn(f"{value!r} cannot be sent on '{assembler.topic.name}': {error}")
+        self._progress.published(variable, stamp.point)
 
     # --- from ROS to the mesh
 
     def _open_input(self, topic: Topic) -> None:
-        own = _Input(Disassembler(topic, self._types), self._grid.stop_time)
-        for port in topic.ports:
-            key = self._keys.variable(port.instance, port.kind, port.variable.name)
+        keys = [self._keys.variable(port.instance, port.kind, port.variable.name) for port in topic.ports]
+        for key in keys:
             if key not in self._publishers:
                 self._publishers[key] = self._mesh.declare_publisher(
                     key, encoding=json_encoding, congestion_control=zenoh.CongestionControl.BLOCK
                 )
-            own.keys.append(key)
+        subscribed = _SubscribedTopic(Disassembler(topic, self._plan.types), keys, self._grid.stop_time)
 
         def take(data: bytes) -> None:
-            self._post(partial(self._take_message, own, data))
+            self._post(partial(self._take_message, subscribed, data))
 
         self._profiles[topic.profile].subscribe(topic, take)
 
-    def _take_message(self, own: _Input, data: bytes) -> None:
+    def _take_message(self, subscribed: _SubscribedTopic, data: bytes) -> None:
         try:
-            values, stamp = own.disassembler.values(data)
+            values, stamp = subscribed.disassembler.values(data)
         except CdrError as error:
-            own.complain(f"a message of {len(data)} bytes is no '{own.topic.message}' that can be used: {error}")
+            message = subscribed.disassembler.topic.message
+            subscribed.warn(f"a message of {len(data)} bytes is no '{message}' that can be used: {error}")
             return
-        attachment = own.attachment(stamp)
-        for key, value in zip(own.keys, values, strict=True):
+        attachment = subscribed.attachment(stamp)
+        for key, value in zip(subscribed.keys, values, strict=True):
             self._publishers[key].put(encode_value(value), attachment=attachment)
 
     # --- the queue
 
     def _post(self, event: Event) -> None:
-        """On a foreign thread: enqueue what came, unless too much is waiting already."""
-        if self._events.qsize() < _WAITING_EVENTS:
+        """On a thread of Zenoh or ROS: put an event into the queue, unless the queue is full."""
+        if self._events.qsize() < _MAX_EVENTS:
             self._events.put(event)
         else:
             self._left_out += 1
 
-    def _tell_left_out(self) -> None:
+    def _report_left_out(self) -> None:
         count, self._left_out = self._left_out, 0
         if count:
             log.warning("%d samples were left out: the mesh is faster than ROS can be told", count)
@@ -253,120 +258,35 @@ class Gateway:
         self._events.put(self._end_mesh if sample.kind == zenoh.SampleKind.DELETE else self._meet_mesh)
 
     def _is_over(self) -> bool:
-        """Whether nothing is left to be carried."""
-        return self._ended or not self._watches or self._complete >= self._grid.last_point
+        """Whether every sample has been carried."""
+        return self._ended or not self._progress.watched or self._progress.complete >= self._grid.last_point
 
     def _end_mesh(self) -> None:
         self._mesh_ended = True
 
     def _meet_mesh(self) -> None:
-        """If it had gone, it is another run, or this process was let go of: its samples are not all there."""
+        # A token after its end belongs to another run, or the connection was lost meanwhile: samples are missing.
         self._ended = self._ended or self._mesh_ended
 
     def _end(self) -> None:
         self._ended = True
 
 
-class _Complaints:
-    """Warns of each thing once, however often it happens."""
+class _SubscribedTopic(WarnOnce):
+    """A topic that the gateway subscribes to, and the keys of its variables."""
 
-    def __init__(self, name: str) -> None:
-        self._name = name
-        self._told: set[str] = set()
-
-    def complain(self, text: str) -> None:
-        """Warn, unless the same was told before."""
-        if text not in self._told and len(self._told) < 10:
-            self._told.add(text)
-            log.warning("'%s': %s", self._name, text)
-
-
-class _Output:
-    """A published topic."""
-
-    def __init__(self, assembler: Assembler, put: Put) -> None:
-        self.assembler = assembler
-        self.put = put
-
-
-class _Watch(_Complaints):
-    """A variable that is watched, for the topics that need it.
-
-    Attributes:
-        point: the last that was seen.
-        outputs: the topics, and which of their ports it is.
-    """
-
-    def __init__(self, name: str, step_points: int) -> None:
-        super().__init__(name)
-        self.step_points = step_points
-        self.point = -1
-        self.outputs: list[tuple[_Output, int]] = []
-
-    @property
-    def holds_until(self) -> int:
-        """The last point at which the value that was seen still holds."""
-        return self.point + self.step_points - 1 if self.point >= 0 else -1
-
-
-class _Input(_Complaints):
-    """A subscribed topic."""
-
-    def __init__(self, disassembler: Disassembler, stop_time: float | None) -> None:
+    def __init__(self, disassembler: Disassembler, keys: list[str], stop_time: float | None) -> None:
         super().__init__(disassembler.topic.name)
         self.disassembler = disassembler
-        self.topic = disassembler.topic
-        self.keys: list[str] = []
+        self.keys = keys
         self._stop_time = stop_time
 
     def attachment(self, stamp: float | None) -> bytes | None:
-        """What tells from when on a value holds, for a message with this stamp in s; None: as soon as it comes."""
+        """The time from which on a value with this stamp in s holds, encoded; None: as soon as it arrives."""
         if stamp is not None and self._stop_time is not None and stamp > self._stop_time:
-            self.complain(
+            self.warn(
                 "its stamps are behind the end of the simulation, so its messages hold as they come; "
                 "does its publisher run with use_sim_time?"
             )
             return None
         return encode_time(stamp) if stamp is not None else None
-
-
-class _Clock:
-    """`/clock`: the time of every n-th point, once everything up to it has been published."""
-
-    def __init__(self, put: Put, types: MessageTypes, stride: int, grid: TimeGrid) -> None:
-        self._put = put
-        self._codec = Codec(types, CLOCK)
-        self._stride = stride
-        self._grid = grid
-        self._next: int | None = None
-        self._last: int | None = None
-        self._moved = False
-
-    def begin(self, point: int) -> None:
-        """A first value has come, of this point: what was before it, nobody was there to publish."""
-        if self._last is None:
-            first = -(-point // self._stride) * self._stride
-            self._next = first if self._next is None else min(first, self._next)
-
-    def advance(self, point: int) -> None:
-        """Everything up to ``point`` has been published."""
-        while self._next is not None and self._next <= point:
-            self._publish(self._next)
-            self._last = self._next
-            self._next += self._stride
-            self._moved = True
-
-    def repeat(self) -> None:
-        """Tell the time to those who came while it stood still."""
-        if self._last is not None and not self._moved:
-            self._publish(self._last)
-        self._moved = False
-
-    def _publish(self, point: int) -> None:
-        time_s = self._grid.time(point)
-        self._put(self._codec.encode({"clock": to_stamp(time_s)}), time_s)
-
-
-def _clock_topic(plan: RosPlan) -> Topic:
-    profile: Any = plan.topics[0].profile if plan.topics else "ros2dds"
-    return Topic("/clock", CLOCK, "out", (), profile, stamped=False, frame_id="", reliability="reliable")

@@ -1,8 +1,8 @@
 """The link of a gateway to ROS: whether a bridge or router is there, and who else publishes `/clock`.
 
-Owns a thread that looks, warns of each change once, and keeps the view that `…/mesh/ros` answers. Nobody waits for it.
-A router passes no tokens on between peers, and the gateway is one. So a second session, a client, which is opened once
-somebody answers, sees the tokens of the others.
+Owns a thread that watches the link, warns of each change once, and keeps the answer to `…/mesh/ros`. Nothing waits for
+this thread. A router does not pass tokens on between peers, and the gateway is a peer. So a second session, a client,
+is opened as soon as the router answers, to see the tokens of others.
 """
 
 from __future__ import annotations
@@ -23,17 +23,16 @@ from ...wire.keys import Keys, escape, unescape
 from ...wire.session import Wiring, close_session, open_session, undeclare_all
 from ...wire.values import json_encoding
 from ...wire.views import RosView
-from ..node.clock_watch import two_clocks
 
-__all__ = ["RosLink"]
+__all__ = ["RosLink", "two_clocks"]
 
 log = logging.getLogger(__name__)
 
-_LOOK_S = 0.25
+_INTERVAL_S = 0.25
 _PATIENCE_S = 3.0
 _OPEN_S = 1.0
 _CLOSE_S = 3.0
-_MOST_WARNINGS = 20
+_MAX_WARNINGS = 20
 
 _BRIDGES = "@/*/@ros2_lv"
 _BRIDGED_CLOCKS = "@/*/@ros2_lv/MP/clock/**"
@@ -42,17 +41,23 @@ _GATEWAYS = "@/*/@fmu_mesh/*/*/*"
 _WHO = {"ros2dds": ("the bridge", "zenoh-bridge-ros2dds"), "rmw_zenoh": ("the router", "rmw_zenohd")}
 
 
+def two_clocks(other: str, setting: str) -> str:
+    """The warning that ``other`` publishes `/clock` as well; ``setting`` stops this process from publishing it."""
+    return (
+        f"{other} publishes /clock, too, so the time of nodes with use_sim_time jumps between the two. "
+        f"Let only one of them publish it (here: {setting}), or keep them in different ROS domains."
+    )
+
+
 class RosLink:
-    """Watches one link.
+    """Watches the link of one gateway. Call `open` first and `close` last.
 
     Args:
-        section: where the link goes to.
-        ros: the session towards ROS; stays the caller's.
-        mesh: a session that reaches the mesh; stays the caller's.
+        section: has the endpoints of the link.
+        ros: the session towards ROS; the caller closes it.
+        mesh: a session that reaches the mesh; the caller closes it.
         keys: the keys of the mesh.
         clock: whether this gateway publishes `/clock`.
-
-    Call `open`, and `close` at the end.
     """
 
     def __init__(self, section: RosConfig, ros: zenoh.Session, mesh: zenoh.Session, keys: Keys, *, clock: bool) -> None:
@@ -67,31 +72,31 @@ class RosLink:
         self._changed = threading.Lock()
         self._tokens: set[str] = set()
         self._client: zenoh.Session | None = None
-        self._watches = False
+        self._watches_tokens = False
         self._entities: list[zenoh.LivelinessToken | zenoh.Subscriber[None] | zenoh.Queryable[None]] = []
         self._since = time.monotonic()
         self._was_linked = False
-        self._told_absence = self._told_bridge = False
-        self._told_clocks: set[str] = set()
+        self._warned_absence = self._warned_bridge = False
+        self._warned_clocks: set[str] = set()
         self._warnings = 0
         self._view = self._seen(linked=False, clocks=())
         self._thread = threading.Thread(target=self._run, name="ros-link", daemon=True)
 
     def open(self) -> None:
-        """Say who this is, answer for it, and begin to look."""
+        """Declare the token of this gateway, answer queries about the link, and start to watch it."""
         chunks = map(escape, (self._keys.mesh, socket.gethostname(), str(os.getpid())))
         token = f"@/{self._ros.zid()}/@fmu_mesh/{'/'.join(chunks)}"
         self._entities.append(self._ros.liveliness().declare_token(token))
-        # A key of its own: of answers with one key, whoever asks gets the last one only.
+        # Each gateway answers with its own key: a query returns only the last of several answers with one key.
         key = f"{self._keys.mesh_key('ros')}/{self._ros.zid()}"
         self._entities.append(self._mesh.declare_queryable(key, lambda query: self._answer(key, query)))
         self._thread.start()
 
     def close(self) -> None:
-        """Look no more. Who was never reached is told now, at the latest."""
+        """Stop watching. If there never was a link, warn now at the latest."""
         self._over.set()
         self._thread.join(_CLOSE_S)
-        if not self._was_linked and not self._told_absence and not self._linked():
+        if not self._was_linked and not self._warned_absence and not self._linked():
             self._warn(f"{self._view.activity}, so ROS got nothing of mesh '{self._keys.mesh}'. {self._hint}")
         undeclare_all(self._entities)
         if self._client is not None:
@@ -109,29 +114,29 @@ class RosLink:
             was, linked = linked, self._linked()
             if linked != was:
                 self._since = time.monotonic()
-            if linked and not self._watches:
+            if linked and not self._watches_tokens:
                 self._watch_tokens()
             clocks = self._other_clocks() if linked else ()
             self._view = self._seen(linked=linked, clocks=clocks)
-            self._tell_link(linked=linked)
-            self._tell_clocks(clocks)
+            self._warn_of_link(linked=linked)
+            self._warn_of_clocks(clocks)
             self._was_linked = self._was_linked or linked
-            if self._over.wait(_LOOK_S):
+            if self._over.wait(_INTERVAL_S):
                 return
 
     def _linked(self) -> bool:
         return any(True for zids in (self._ros.info.routers_zid(), self._ros.info.peers_zid()) for _ in zids)
 
     def _watch_tokens(self) -> None:
-        session = self._ros  # where others connect to this gateway, nobody is between them
+        session = self._ros  # sees all tokens if others connect to this gateway directly
         if self._section.connect:
             try:
                 wiring = Wiring(mode="client", connect=tuple(self._section.connect), patience_s=_OPEN_S)
                 session = self._client = open_session(wiring)
-            except FmuMeshError:  # gone again: the next look tells
+            except FmuMeshError:  # the link is lost again, which the next look reports
                 return
-        self._watches = True
-        # In this order: who somebody is has come before it is told what he publishes.
+        self._watches_tokens = True
+        # In this order, the name of a gateway arrives before the topics that it publishes.
         for key in (_GATEWAYS, _BRIDGES, _BRIDGED_CLOCKS, f"@ros2_lv/{self._section.domain}/*/*/*/MP/*/*/*/%clock/**"):
             self._entities.append(session.liveliness().declare_subscriber(key, self._token_changed, history=True))
 
@@ -142,32 +147,32 @@ class RosLink:
             else:
                 self._tokens.discard(str(sample.key_expr))
 
-    def _tell_link(self, *, linked: bool) -> None:
+    def _warn_of_link(self, *, linked: bool) -> None:
         name = self._keys.mesh
         late = time.monotonic() - self._since > _PATIENCE_S
         if linked and self._lacks_bridge():
-            if late and not self._told_bridge:
-                self._told_bridge = True
+            if late and not self._warned_bridge:
+                self._warned_bridge = True
                 nothing = f"so ROS on DDS gets nothing of mesh '{name}', which runs on"
                 self._warn(f"{self._view.activity}, {nothing}. {self._hint}")
-        elif linked and (self._told_absence or self._told_bridge):
-            self._told_absence = self._told_bridge = False
+        elif linked and (self._warned_absence or self._warned_bridge):
+            self._warned_absence = self._warned_bridge = False
             self._warn(f"{self._view.activity}; ROS gets mesh '{name}' from now on")
-        elif not linked and not self._told_absence and (self._was_linked or late):
-            self._told_absence = True
+        elif not linked and not self._warned_absence and (self._was_linked or late):
+            self._warned_absence = True
             what = f"the link to {self._where} was lost" if self._was_linked else self._view.activity
             nothing = f"so ROS gets nothing of mesh '{name}', which runs on"
             self._warn(f"{what}, {nothing}. {self._hint} The gateway keeps trying.")
 
-    def _tell_clocks(self, clocks: tuple[str, ...]) -> None:
+    def _warn_of_clocks(self, clocks: tuple[str, ...]) -> None:
         for other in clocks:
-            if other not in self._told_clocks:
-                self._told_clocks.add(other)
+            if other not in self._warned_clocks:
+                self._warned_clocks.add(other)
                 self._warn(two_clocks(other, "`clock_rate: null` in the section `ros`"))
 
     def _warn(self, text: str) -> None:
         self._warnings += 1
-        if self._warnings <= _MOST_WARNINGS:  # a link that comes and goes would fill the log
+        if self._warnings <= _MAX_WARNINGS:  # a link that comes and goes would fill the log
             log.warning("%s", text)
 
     # --- what the tokens say
@@ -194,7 +199,7 @@ class RosLink:
             return self._section.profile == "ros2dds" and not any(key.endswith("/@ros2_lv") for key in self._tokens)
 
     def _other_clocks(self) -> tuple[str, ...]:
-        """Who else publishes `/clock`, in words; nobody where this gateway does not."""
+        """Who else publishes `/clock`, in words; empty if this gateway does not publish it."""
         if not self._clock:
             return ()
         with self._changed:
@@ -203,19 +208,19 @@ class RosLink:
         clocks = [key.split("/") for key in keys if "/MP/" in key]
         own = str(self._ros.zid())
         return tuple(
-            _spoken(chunks, names.get(zid))
+            _described(chunks, names.get(zid))
             for chunks in clocks
             if (zid := chunks[1 if _is_bridged(chunks) else 2]) != own
         )
 
 
 def _is_bridged(chunks: Sequence[str]) -> bool:
-    """Whether the chunks of a token are those of a bridge, and not those of rmw_zenoh."""
+    """Whether a token is that of a bridge; otherwise it is that of rmw_zenoh."""
     return chunks[0] == "@"
 
 
-def _spoken(chunks: Sequence[str], gateway: Sequence[str] | None) -> str:
-    """Who published this token; ``gateway`` is mesh, host and process, where it is a gateway."""
+def _described(chunks: Sequence[str], gateway: Sequence[str] | None) -> str:
+    """Who declared a token, in words; ``gateway`` is its mesh, host and process if it is a gateway."""
     if gateway is not None:
         mesh, host, pid = map(unescape, gateway)
         return f"mesh '{mesh}' (gateway process {pid} on {host})"

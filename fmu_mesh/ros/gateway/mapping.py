@@ -1,8 +1,11 @@
-"""The `ros` section as a whole: checked, with its custom message types, and its topics resolved."""
+"""From the `ros` section of a configuration to a plan: the section is checked and its topics are resolved."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+
+import msgspec
 
 from ...config.findings import Findings
 from ...config.loading import LoadedConfig
@@ -10,16 +13,19 @@ from ...config.mesh import Config, RosConfig
 from ...errors import ConfigurationError
 from ...system.start_values import sized
 from ...text import nearest_file
+from ...variables.model_description import Causality, ModelDescription, Variability, Variable
+from ...variables.value_types import FMI2_TYPES, VariableType
+from ...wire.views import InstanceInfo, VariableView
 from ..messages.definitions import MessageTypes, is_message_name
 from ..messages.ros_names import topic_problem
+from ..messages.topics import Descriptions, RosPlan
 from .resolver import Resolver
-from .topics import Descriptions, RosPlan
 
-__all__ = ["message_types", "resolve"]
+__all__ = ["descriptions_of", "message_types", "resolve"]
 
 
 def message_types(loaded: LoadedConfig, findings: Findings) -> MessageTypes | None:
-    """The message types of the `ros` section, custom ones included; None after a finding."""
+    """The message types of the `ros` section with its custom ones; None after a finding."""
     section = loaded.config.ros
     assert section is not None
     custom = {}
@@ -43,15 +49,15 @@ def message_types(loaded: LoadedConfig, findings: Findings) -> MessageTypes | No
 
 
 def resolve(loaded: LoadedConfig, descriptions: Descriptions, findings: Findings) -> RosPlan | None:
-    """Give the `ros` section its meaning.
+    """Make the plan of the `ros` section.
 
     Args:
-        loaded: the configuration and its places in the file.
-        descriptions: the model descriptions by instance name; what needs one that is missing is not checked.
-        findings: where all that is wrong goes.
+        loaded: the configuration.
+        descriptions: the model descriptions by instance name; a topic whose description is missing is not checked.
+        findings: where the findings go.
 
     Returns:
-        The plan; None where there is no section. With findings it is not complete.
+        The plan; None without a section or without message types. After findings it is incomplete.
     """
     section = loaded.config.ros
     if section is None:
@@ -60,15 +66,49 @@ def resolve(loaded: LoadedConfig, descriptions: Descriptions, findings: Findings
     _check_section(loaded.config, section, findings)
     if types is None:
         return None
-    # Sizes that are too large are found with the start values that give them.
-    instances, untold = loaded.config.instances, loaded.findings()
-    full = {name: sized(name, own, instances[name], untold) for name, own in descriptions.items() if name in instances}
+    # Array sizes that are too large are reported with the start values that set them, so not here.
+    instances, ignored = loaded.config.instances, loaded.findings()
+    full = {name: sized(name, own, instances[name], ignored) for name, own in descriptions.items() if name in instances}
     return Resolver(loaded.config, section, full, types, findings).plan()
 
 
+def descriptions_of(infos: Mapping[str, InstanceInfo]) -> dict[str, ModelDescription]:
+    """The model descriptions of running instances, from their answers, with only what topics need.
+
+    The instances may run on another host, so their FMUs cannot be read here.
+    """
+    return {
+        name: ModelDescription(
+            model_name=info.model_name,
+            model_identifier=info.model_name,
+            fmi_version=info.fmi_version,
+            kind="co_simulation",
+            guid="",
+            variables=tuple(_variable(view) for view in info.variables),
+        )
+        for name, info in infos.items()
+    }
+
+
+def _variable(view: VariableView) -> Variable:
+    return Variable(
+        name=view.name,
+        value_reference=0,
+        type=msgspec.convert(FMI2_TYPES.get(view.type, view.type), VariableType),
+        causality=msgspec.convert(view.causality, Causality),
+        variability=msgspec.convert(view.variability, Variability),
+        unit=view.unit,
+        description=view.description,
+        declared_type=view.type,
+        shape=view.shape,
+    )
+
+
 def _check_section(config: Config, section: RosConfig, findings: Findings) -> None:
-    if section.node is not None and (problem := _token_problem(section.node)):
-        findings.add("ros.node", f"'{section.node}': {problem}", "letters, digits and underscores, no digit first")
+    if section.node is not None:
+        problem = "a slash" if "/" in section.node else topic_problem(section.node)
+        if problem is not None:
+            findings.add("ros.node", f"'{section.node}': {problem}", "letters, digits and underscores, no digit first")
     if section.namespace != "/" and (problem := topic_problem(section.namespace)):
         findings.add("ros.namespace", f"'{section.namespace}': {problem}", "a name such as /robot")
     elif not section.namespace.startswith("/"):
@@ -80,7 +120,3 @@ def _check_section(config: Config, section: RosConfig, findings: Findings) -> No
     if config.simulation.start_time < 0:
         found = f"{config.simulation.start_time:g}, while `ros` is there"
         findings.add("simulation.start_time", found, "a time >= 0: a ROS clock has no negative times")
-
-
-def _token_problem(name: str) -> str | None:
-    return "a slash" if "/" in name else topic_problem(name)

@@ -1,7 +1,7 @@
-"""The parameters of all FMUs as the parameters of the node in ROS, by the services that ROS has for it.
+"""The services through which ROS reads and sets the parameters of all instances, as parameters of one node.
 
-A parameter is called `<instance>.<variable>`. What the mesh refuses (a fixed parameter, a value out of range) is
-refused with the same reason.
+A parameter is named `<instance>.<variable>`. If the mesh refuses a value (a fixed parameter, a value out of range), the
+service answers with the same reason.
 """
 
 from __future__ import annotations
@@ -19,13 +19,12 @@ from ...errors import FmuMeshError
 from ...variables.model_description import Value, Variable
 from ...wire.keys import Keys
 from ...wire.messages import decode_json
-from ...wire.session import ask
+from ...wire.session import Question, ask
 from ...wire.values import encode_value
 from ..messages.cdr import Codec, Message
-from ..messages.definitions import MessageTypes
 from ..messages.ros_names import absolute
+from ..messages.topics import NodeParameter, RosPlan
 from .rmw_zenoh import RmwZenoh, Service
-from .topics import Parameter, RosPlan
 
 __all__ = ["SERVICES", "ParameterServices"]
 
@@ -47,28 +46,27 @@ _VALUE_FIELDS = {_BOOL: "bool_value", _INTEGER: "integer_value", _DOUBLE: "doubl
 
 
 class ParameterServices:
-    """Answers for the parameters of one mesh, on a thread of its own: the mesh is asked, and may take its time.
+    """Answers for the parameters of one mesh, on its own thread, because the mesh may answer slowly.
 
     Args:
-        plan: the parameters.
-        types: the message types; gets those of the services.
-        mesh: a session that reaches the mesh; stays the caller's.
+        plan: the parameters; the messages of the services are added to its types.
+        mesh: a session that reaches the mesh; the caller closes it.
         keys: the keys of the mesh.
     """
 
-    def __init__(self, plan: RosPlan, types: MessageTypes, mesh: zenoh.Session, keys: Keys) -> None:
+    def __init__(self, plan: RosPlan, mesh: zenoh.Session, keys: Keys) -> None:
         self._plan = plan
         self._mesh = mesh
         self._keys = keys
         self._parameters = {parameter.name: parameter for parameter in plan.parameters}
         self._jobs: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
         for name, (request, response) in SERVICES.items():
-            types.define_service(f"rcl_interfaces/srv/{name}", request, response)
-        self._no_value = Codec(types, "rcl_interfaces/msg/ParameterValue").empty()
+            plan.types.define_service(f"rcl_interfaces/srv/{name}", request, response)
+        self._no_value = Codec(plan.types, "rcl_interfaces/msg/ParameterValue").empty()
 
     @contextmanager
     def served_by(self, node: RmwZenoh) -> Iterator[None]:
-        """Offer the services as those of ``node`` while inside."""
+        """Offer the services of ``node`` within the context."""
         thread = threading.Thread(target=self._run, name="parameters", daemon=True)
         thread.start()
         for name, kind, answer in (
@@ -79,14 +77,14 @@ class ParameterServices:
             ("describe_parameters", "DescribeParameters", self._describe),
         ):
             full_name = absolute(f"{self._plan.node}/{name}", self._plan.namespace)
-            node.serve(full_name, f"rcl_interfaces/srv/{kind}", self._later(answer))
+            node.serve(full_name, f"rcl_interfaces/srv/{kind}", self._queued(answer))
         try:
             yield
         finally:
             self._jobs.put(None)
             thread.join(_CLOSE_S)
 
-    def _later(self, answer: Callable[[Message], Message]) -> Service:
+    def _queued(self, answer: Callable[[Message], Message]) -> Service:
         def service(request: Message, reply: Callable[[Message], None]) -> None:
             self._jobs.put(lambda: reply(answer(request)))
 
@@ -96,7 +94,7 @@ class ParameterServices:
         while (job := self._jobs.get()) is not None:
             try:
                 job()
-            except zenoh.ZError as error:  # whoever asked is gone
+            except zenoh.ZError as error:  # the client is gone
                 log.info("answer_not_sent", extra={"error": str(error)})
 
     # --- the services
@@ -134,7 +132,7 @@ class ParameterServices:
         return {**self._no_value, "type": kind, _VALUE_FIELDS[kind]: float(value) if kind == _DOUBLE else value}
 
     def _set_one(self, name: str, value: Message) -> str:
-        """Set one parameter; the reason where it is refused, nothing where it is set."""
+        """Set one parameter; returns why it was refused, or an empty text."""
         parameter = self._parameters.get(name)
         if parameter is None:
             return f"there is no parameter '{name}'"
@@ -143,12 +141,13 @@ class ParameterServices:
             return f"'{name}' takes one value, a {parameter.variable.type}"
         return self._ask(parameter, value[field])[1]
 
-    def _ask(self, parameter: Parameter, value: Value | None = None) -> tuple[Any, str]:
-        """The current value, or what the mesh says to a new one, and the reason where it says no."""
+    def _ask(self, parameter: NodeParameter, value: Value | None = None) -> tuple[Any, str]:
+        """Get the value, or set a new one; returns the answer of the mesh, and why it refused or an empty text."""
         key = self._keys.variable(parameter.instance, "param", parameter.variable.name)
         payload = encode_value(value) if value is not None else None
+        question = Question(key, f"'{parameter.name}'", _ANSWER_S, payload)
         try:
-            return decode_json(ask(self._mesh, key, payload, _ANSWER_S, f"'{parameter.name}'"), object), ""
+            return decode_json(ask(self._mesh, question), object), ""
         except FmuMeshError as error:
             return None, error.message
 
@@ -160,13 +159,13 @@ def _kind(variable: Variable) -> int:
             return _BOOL
         case "String":
             return _STRING
-        case "Real" | "Float64" | "Float32":
+        case "Float64" | "Float32":
             return _DOUBLE
         case _:
             return _INTEGER
 
 
-def _descriptor(name: str, parameter: Parameter | None) -> Message:
+def _descriptor(name: str, parameter: NodeParameter | None) -> Message:
     variable = parameter.variable if parameter is not None else None
     ranges: list[Message] = []
     if variable is not None and variable.minimum is not None and variable.maximum is not None:

@@ -1,4 +1,4 @@
-"""What a profile is: how topics look on Zenoh to those who bridge them to ROS, or are ROS."""
+"""The interface of a profile: how topics look to ROS, or to a bridge to ROS."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Protocol
 
 import zenoh
 
-from .topics import Topic
+from ..messages.topics import Topic
 
 __all__ = ["DEPTH", "Profile", "Put", "Take", "congestion_control"]
 
@@ -15,25 +15,25 @@ Put = Callable[[bytes, float], None]
 """Publishes one message (CDR) that belongs to a simulation time in s."""
 
 Take = Callable[[bytes], None]
-"""Called on a foreign thread with every message (CDR) that arrives."""
+"""Called with every message (CDR) that arrives, on a thread of Zenoh or ROS."""
 
 DEPTH = 1000
-"""History depth that others see: how many samples a DDS writer may keep until a slow reader has acknowledged them."""
+"""History depth: how many samples a DDS writer keeps at most for a reader that has not acknowledged them."""
 
 
 class Profile(Protocol):
-    """Declares topics on a session; everything declared is undeclared by `close`."""
+    """Declares publishers and subscribers of topics. Call `publish` and `subscribe` in any order, and `close` last."""
 
     def publish(self, topic: Topic) -> Put:
-        """Be a publisher of ``topic``."""
+        """Declare a publisher of ``topic``."""
 
     def subscribe(self, topic: Topic, take: Take) -> None:
-        """Be a subscriber of ``topic``."""
+        """Declare a subscriber of ``topic``."""
 
     def close(self) -> None:
         """Undeclare everything."""
 
 
 def congestion_control(topic: Topic) -> zenoh.CongestionControl:
-    """A reliable topic waits for its subscribers; the gateway has a session of its own, so nobody else waits."""
+    """Wait for slow subscribers of a reliable topic; only the gateway waits, because its session is its own."""
     return zenoh.CongestionControl.BLOCK if topic.reliability == "reliable" else zenoh.CongestionControl.DROP

@@ -1,6 +1,6 @@
-"""From entries of the `ros` section to topics: every name in them resolved, or all that is wrong with them told.
+"""From the entries of the `ros` section to topics: resolves their names, or reports every problem with them.
 
-What passes here can be sent and received: a message of every topic is made on trial. Knows neither Zenoh nor FMPy.
+A topic that passes can be sent and received. Knows neither Zenoh nor FMPy.
 """
 
 from __future__ import annotations
@@ -11,22 +11,31 @@ from msgspec.structs import replace
 
 from ...config.findings import Findings
 from ...config.mesh import Config, RosConfig, RosTopicConfig
-from ...system.driven import driven_inputs
+from ...system.couplings import driven_inputs
 from ...text import listed, nearest
 from ...variables.model_description import Variable
-from ..messages.definitions import MessageTypes, default_type
-from ..messages.fitting import Entry, check_fields, why_not_carried
+from ..messages.definitions import MessageTypes
+from ..messages.fitting import TopicEntry, check_topic, default_type
 from ..messages.ros_names import absolute, name_problems, ros_name, topic_problem
-from .topics import Descriptions, Direction, Kind, Parameter, Port, RosPlan, Topic
+from ..messages.topics import Descriptions, Direction, Kind, NodeParameter, Port, RosPlan, Topic
 
 __all__ = ["Resolver"]
 
-_BY_HAND = "a name by hand: {topic: /a_name, variable: %s}"
+_CHOOSE_NAME = "a name of your choice: {topic: /a_name, variable: %s}"
 _DATA = "data"
+_KINDS: Mapping[str, Kind] = {"output": "out", "local": "local", "input": "in"}
 
 
 class Resolver:
-    """Resolves the topics of one section; what is wrong goes to ``findings``."""
+    """Resolves the topics of one section.
+
+    Args:
+        config: the configuration.
+        section: its section `ros`, or another one in its place.
+        descriptions: the model descriptions by instance name.
+        types: the message types.
+        findings: where the findings go.
+    """
 
     def __init__(
         self,
@@ -46,7 +55,7 @@ class Resolver:
         self._messages: dict[str, tuple[str, str]] = {}
 
     def plan(self) -> RosPlan:
-        """The plan; with findings it is not complete."""
+        """The plan; after findings it is incomplete."""
         topics = []
         for entry in self._entries():
             for topic in self._topics(entry):
@@ -54,6 +63,7 @@ class Resolver:
                 topics.append(topic)
         step_size, rate = self._config.simulation.step_size, self._section.clock_rate
         return RosPlan(
+            types=self._types,
             topics=tuple(topics),
             parameters=tuple(self._parameters()),
             node=self._section.node or ros_name(self._config.mesh),
@@ -62,21 +72,21 @@ class Resolver:
             time_source=next(self._time_sources(), None),
         )
 
-    def _entries(self) -> Iterator[Entry]:
+    def _entries(self) -> Iterator[TopicEntry]:
         if self._section.topics is None:
             for instance in self._config.instances:
-                yield Entry(RosTopicConfig(variable=instance), "ros", "ros")
+                yield TopicEntry(RosTopicConfig(variable=instance), "ros", "ros")
             return
         for index, entry in enumerate(self._section.topics):
             path = f"ros.topics[{index}]"
             if isinstance(entry, str):
-                yield Entry(RosTopicConfig(variable=entry), path, path)
+                yield TopicEntry(RosTopicConfig(variable=entry), path, path)
             else:
-                yield Entry(entry, path, f"{path}.variable")
+                yield TopicEntry(entry, path, f"{path}.variable")
 
     # --- topics
 
-    def _topics(self, entry: Entry) -> Iterator[Topic]:
+    def _topics(self, entry: TopicEntry) -> Iterator[Topic]:
         item = entry.item
         if (item.variable is None) == (not item.fields):
             found = "neither `variable` nor `fields`" if item.variable is None else "both `variable` and `fields`"
@@ -88,7 +98,7 @@ class Resolver:
         else:
             yield from self._single(entry, item.variable)
 
-    def _all_of_instance(self, entry: Entry, instance: str) -> Iterator[Topic]:
+    def _all_of_instance(self, entry: TopicEntry, instance: str) -> Iterator[Topic]:
         item = entry.item
         if item.type is not None:
             found = f"one type for all topics of the instance '{instance}'"
@@ -103,7 +113,7 @@ class Resolver:
         ]
         problems = name_problems(variable.name for variable in wanted)
         for problem in problems:
-            expected = _BY_HAND % f"'{instance}.{problem.variables[0]}'"
+            expected = _CHOOSE_NAME % f"'{instance}.{problem.variables[0]}'"
             self._findings.add(entry.variable_path, f"in '{instance}' {problem}", expected)
         unusable = {name for problem in problems for name in problem.variables}
         for variable in wanted:
@@ -112,16 +122,15 @@ class Resolver:
                 own = replace(item, topic=topic, variable=f"{instance}.{variable.name}")
                 yield from self._single(replace(entry, item=own), f"{instance}.{variable.name}")
 
-    def _single(self, entry: Entry, reference: str) -> Iterator[Topic]:
-        found = self._port(reference, _DATA, entry.variable_path)
-        if found is None:
+    def _single(self, entry: TopicEntry, reference: str) -> Iterator[Topic]:
+        port = self._port(reference, _DATA, entry.variable_path)
+        if port is None:
             return
-        port, direction = found
         name = entry.item.topic
         if name is None:
             problems = name_problems([port.variable.name])
             for problem in problems:
-                self._findings.add(entry.variable_path, str(problem), _BY_HAND % f"'{reference}'")
+                self._findings.add(entry.variable_path, str(problem), _CHOOSE_NAME % f"'{reference}'")
             if problems:
                 return
             name = f"{ros_name(port.instance)}/{ros_name(port.variable.name)}"
@@ -130,76 +139,63 @@ class Resolver:
             text = f"'{reference}' of the type {port.variable.type}, which no message of std_msgs carries"
             self._findings.add(entry.variable_path, text, "a message in `type` and its field in `fields`")
             return
-        yield from self._topic(entry, name, message, (port,), direction)
+        yield from self._topic(entry, name, message, (port,))
 
-    def _message_of_fields(self, entry: Entry) -> Iterator[Topic]:
+    def _message_of_fields(self, entry: TopicEntry) -> Iterator[Topic]:
         item = entry.item
         if item.topic is None or item.type is None:
             key = "topic" if item.topic is None else "type"
             self._findings.add(f"{entry.path}.{key}", f"no `{key}`", f"a {key}: several variables share this message")
             return
-        ports = []
+        found = [self._port(own, field, f"{entry.path}.fields.{field}") for field, own in item.fields.items()]
+        ports = [port for port in found if port is not None]
         directions: dict[Direction, str] = {}
-        for field, reference in item.fields.items():
-            found = self._port(reference, field, f"{entry.path}.fields.{field}")
-            if found is not None:
-                ports.append(found[0])
-                directions.setdefault(found[1], reference)
+        for port in ports:
+            directions.setdefault(port.direction, f"{port.instance}.{port.variable.name}")
         if len(directions) > 1:
             text = f"the output '{directions['out']}' and the input '{directions['in']}' in one message"
             self._findings.add(f"{entry.path}.fields", text, "a topic for each direction")
         elif len(ports) == len(item.fields):
-            yield from self._topic(entry, item.topic, item.type, tuple(ports), next(iter(directions)))
+            yield from self._topic(entry, item.topic, item.type, tuple(ports))
 
-    def _topic(
-        self, entry: Entry, name: str, message: str, ports: tuple[Port, ...], direction: Direction
-    ) -> Iterator[Topic]:
+    def _topic(self, entry: TopicEntry, name: str, message: str, ports: tuple[Port, ...]) -> Iterator[Topic]:
         full_name = absolute(name, self._section.namespace)
-        problem = topic_problem(full_name)
-        if problem is not None:
+        before = len(self._findings)
+        if (problem := topic_problem(full_name)) is not None:
             expected = "letters, digits, underscores and slashes, no part that starts with a digit"
             self._findings.add(f"{entry.path}.topic", f"'{name}': {problem}", expected)
-        before = len(self._findings)
-        check_fields(entry, message, ports, direction, self._types, self._findings)
-        if problem is None and len(self._findings) == before:
-            topic = Topic(
-                name=full_name,
-                message=message,
-                direction=direction,
-                ports=ports,
-                profile=entry.item.profile or self._section.profile,
-                stamped=self._types.has_header(message),
-                frame_id=entry.item.frame_id,
-                reliability=entry.item.reliability,
-                constants=tuple(entry.item.constants.items()),
-            )
-            if (reason := why_not_carried(topic, self._types)) is not None:
-                found = f"'{message}' for '{full_name}': {reason}"
-                self._findings.add(f"{entry.path}.type", found, "messages that can be sent and received")
-            else:
-                yield topic
+        topic = Topic(
+            name=full_name,
+            message=message,
+            direction=ports[0].direction,
+            ports=ports,
+            profile=entry.item.profile or self._section.profile,
+            frame_id=entry.item.frame_id,
+            reliability=entry.item.reliability,
+            constants=tuple(entry.item.constants.items()),
+        )
+        check_topic(entry, topic, self._types, self._findings)
+        if len(self._findings) == before:
+            yield topic
 
     # --- variables
 
-    def _port(self, reference: str, field: str, path: str) -> tuple[Port, Direction] | None:
-        instance = reference.partition(".")[0]
+    def _port(self, reference: str, field: str, path: str) -> Port | None:
+        """The variable with the name ``reference`` in a field; None after a finding."""
         variable = self._variable(reference, path)
-        match variable.causality if variable is not None else None:
-            case "output" | "local" as causality:
-                assert variable is not None
-                return self._as_port(instance, variable, "out" if causality == "output" else "local", field), "out"
-            case "input" if reference not in self._driven:
-                assert variable is not None
-                return self._as_port(instance, variable, "in", field), "in"
-            case "input":
-                self._findings.add(path, f"the connected input '{reference}'", self._driven[reference])
-            case str(causality):
-                expected = "an output, a local variable or an input; parameters are parameters in ROS, too"
-                self._findings.add(path, f"'{reference}', a {causality}", expected)
-        return None
+        if variable is None:
+            return None
+        if variable.causality == "input" and reference in self._driven:
+            self._findings.add(path, f"the connected input '{reference}'", self._driven[reference])
+            return None
+        if variable.causality not in _KINDS:
+            expected = "an output, a local variable or an input; parameters are parameters in ROS, too"
+            self._findings.add(path, f"'{reference}', a {variable.causality}", expected)
+            return None
+        return self._as_port(reference.partition(".")[0], variable, field)
 
     def _variable(self, reference: str, path: str) -> Variable | None:
-        """The variable that `instance.variable` names; None after a finding, or where the FMU could not be read."""
+        """The variable with the name `instance.variable`; None after a finding, or if the FMU could not be read."""
         instance, dot, name = reference.partition(".")
         names = list(self._config.instances)
         if instance not in names:
@@ -214,25 +210,24 @@ class Resolver:
             self._findings.add(path, found, f"one of {listed(near)}", nearest(name, near))
         return variable
 
-    def _as_port(self, instance: str, variable: Variable, kind: Kind, field: str) -> Port:
+    def _as_port(self, instance: str, variable: Variable, field: str) -> Port:
         step, base = self._config.instances[instance].step_size, self._config.simulation.step_size
         points = max(1, round(step / base)) if step is not None and base > 0 else 1
-        return Port(field, instance, variable, kind, points)
+        return Port(field, instance, variable, _KINDS[variable.causality], points)
 
-    def _parameters(self) -> Iterator[Parameter]:
+    def _parameters(self) -> Iterator[NodeParameter]:
         for instance, description in self._descriptions.items():
             own = [variable for variable in description.with_causality("parameter") if not variable.shape]
             unusable = {name for problem in name_problems(v.name for v in own) for name in problem.variables}
             for variable in own:
                 if variable.name not in unusable:
-                    yield Parameter(f"{ros_name(instance)}.{ros_name(variable.name)}", instance, variable)
+                    yield NodeParameter(f"{ros_name(instance)}.{ros_name(variable.name)}", instance, variable)
 
     def _time_sources(self) -> Iterator[Port]:
         for instance, description in self._descriptions.items():
             for variable in description.with_causality("output", "local", "input"):
                 if variable.type not in ("String", "Binary"):
-                    kinds: Mapping[str, Kind] = {"output": "out", "local": "local", "input": "in"}
-                    yield self._as_port(instance, variable, kinds[variable.causality], "")
+                    yield self._as_port(instance, variable, "")
 
     # --- the whole
 
@@ -242,7 +237,7 @@ class Resolver:
         message, owner = self._messages.setdefault(topic.name, (topic.message, owners))
         if first is not owners:
             found = f"the topic '{topic.name}' for {owners} and for {first}"
-            self._findings.add(path, found, _BY_HAND % owners.partition(",")[0])
+            self._findings.add(path, found, _CHOOSE_NAME % owners.partition(",")[0])
         elif message != topic.message:
             found = f"the topic '{topic.name}' with '{topic.message}' for {owners}, and with '{message}' for {owner}"
             self._findings.add(path, found, "one message type for one topic")

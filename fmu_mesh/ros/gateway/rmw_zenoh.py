@@ -1,4 +1,4 @@
-"""The profile of rmw_zenoh: the mesh as one ROS node with publishers, subscribers and services, without any bridge.
+"""The profile of rmw_zenoh: the mesh is one ROS node with publishers, subscribers and services, without a bridge.
 
 Keys are `<domain>/<name>/<type in DDS>/<hash>`. Tokens are
 `@ros2_lv/<domain>/<zid>/<node>/<entity>/<kind>/<enclave>/<namespace>/<node name>/<name>/<type>/<hash>/<qos>` with `%`
@@ -16,11 +16,10 @@ import zenoh
 
 from ...wire.session import undeclare_all
 from ..messages.cdr import CdrError, Codec, Message
-from ..messages.definitions import MessageTypes
 from ..messages.ros_names import dds_type
 from ..messages.stamp import nanoseconds
+from ..messages.topics import RosPlan, Topic
 from .profile import DEPTH, Put, Take, congestion_control
-from .topics import RosPlan, Topic
 
 __all__ = ["RmwZenoh", "Service", "decode_attachment"]
 
@@ -31,22 +30,21 @@ _RELIABLE, _BEST_EFFORT, _VOLATILE, _KEEP_LAST = 1, 2, 2, 1
 _NO_HASH = "TypeHashNotSupported"
 
 Service = Callable[[Message, Callable[[Message], None]], None]
-"""Gets a request on a foreign thread, and a function that takes the response, now or later and on any thread."""
+"""Called on a thread of Zenoh with a request and a function that sends the response, now or later, on any thread."""
 
 
 class RmwZenoh:
     """One ROS node on Zenoh.
 
     Args:
-        session: stays the caller's.
-        types: message types, for their hashes.
-        plan: the name and the namespace of the node.
+        session: towards ROS; the caller closes it.
+        plan: name and namespace of the node, and the message types.
         domain: ROS_DOMAIN_ID.
     """
 
-    def __init__(self, session: zenoh.Session, types: MessageTypes, plan: RosPlan, domain: int) -> None:
+    def __init__(self, session: zenoh.Session, plan: RosPlan, domain: int) -> None:
         self._session = session
-        self._types = types
+        self._types = plan.types
         self._plan = plan
         self._domain = domain
         self._entities = itertools.count(1)
@@ -56,7 +54,7 @@ class RmwZenoh:
         self._tokens = [session.liveliness().declare_token(node)]
 
     def publish(self, topic: Topic) -> Put:
-        """Be a publisher of ``topic``; the time of a sample is its simulation time."""
+        """Declare a publisher of ``topic``; the source time of a sample is its simulation time."""
         publisher = self._session.declare_publisher(
             self._key(topic.name, topic.message),
             encoding=zenoh.Encoding.APPLICATION_CDR,
@@ -72,13 +70,13 @@ class RmwZenoh:
         return put
 
     def subscribe(self, topic: Topic, take: Take) -> None:
-        """Be a subscriber of ``topic``."""
+        """Declare a subscriber of ``topic``."""
         key = self._key(topic.name, topic.message)
         self._others.append(self._session.declare_subscriber(key, lambda sample: take(sample.payload.to_bytes())))
         self._announce("MS", topic.name, topic.message, reliable=topic.reliability == "reliable")
 
     def serve(self, name: str, kind: str, service: Service) -> None:
-        """Be the server of the service ``name`` of the type ``kind``, which `MessageTypes` has to know."""
+        """Declare the server of the service ``name``; its type ``kind`` has to be defined in the message types."""
         key = self._key(name, kind)
         request_codec = Codec(self._types, f"{kind}_Request")
         response_codec = Codec(self._types, f"{kind}_Response")
@@ -103,11 +101,11 @@ class RmwZenoh:
         self._announce("SS", name, kind, reliable=True)
 
     def close(self) -> None:
-        """Undeclare everything; announcements first."""
+        """Undeclare everything, tokens first."""
         undeclare_all(self._tokens, self._publishers, self._others)
 
     def _announce(self, kind: str, name: str, message: str, *, reliable: bool) -> bytes:
-        """Declare the token of an entity, and return what identifies it."""
+        """Declare the token of an entity, and return the 16 bytes that identify the entity."""
         import xxhash  # noqa: PLC0415  an optional dependency
 
         qos = f"{_RELIABLE if reliable else _BEST_EFFORT}:{_VOLATILE}:{_KEEP_LAST},{DEPTH}:,:,:,,"
@@ -132,7 +130,7 @@ def decode_attachment(attachment: zenoh.ZBytes | None) -> tuple[int, int, bytes]
     """Sequence number, time in ns and sender of an attachment, with or without the length of the sender.
 
     Raises:
-        CdrError: it is none.
+        CdrError: it is not an attachment of rmw_zenoh.
     """
     data = attachment.to_bytes() if attachment is not None else b""
     if len(data) == _ATTACHMENT.size and data[_ATTACHMENT.size - _GID_SIZE - 1] == _GID_SIZE:

@@ -1,8 +1,8 @@
-"""The profile of zenoh-bridge-ros2dds: keys are topic names, payloads CDR, and tokens announce topics as a bridge does.
+"""The profile of zenoh-bridge-ros2dds: keys are topic names, payloads are CDR, tokens announce topics as a bridge does.
 
 A token is `@/<zid>/@ros2_lv/MP/<key>/<type>/<qos>` (MS for a subscriber), with `§` for every slash within a part. Its
 QoS is `<keyless>:<reliability>:<durability>:<history>,<depth>:<user data>` in the numbers of Cyclone DDS; the user data
-carry the type hash, as ROS writes it from Iron on.
+contain the type hash, as in ROS since Iron.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ import zenoh
 
 from ...wire.session import undeclare_all
 from ..messages.definitions import MessageTypes
+from ..messages.topics import Topic
 from .profile import DEPTH, Put, Take, congestion_control
-from .topics import Topic
 
 __all__ = ["Ros2Dds"]
 
@@ -24,7 +24,7 @@ class Ros2Dds:
     """Topics as a bridge between Zenoh and DDS expects them.
 
     Args:
-        session: stays the caller's.
+        session: towards ROS; the caller closes it.
         types: message types, for their hashes.
     """
 
@@ -36,7 +36,7 @@ class Ros2Dds:
         self._tokens: list[zenoh.LivelinessToken] = []
 
     def publish(self, topic: Topic) -> Put:
-        """Be a publisher of ``topic``."""
+        """Declare a publisher of ``topic``."""
         publisher = self._session.declare_publisher(
             _key(topic), encoding=zenoh.Encoding.APPLICATION_CDR, congestion_control=congestion_control(topic)
         )
@@ -45,14 +45,14 @@ class Ros2Dds:
         return lambda data, _time: publisher.put(data)
 
     def subscribe(self, topic: Topic, take: Take) -> None:
-        """Be a subscriber of ``topic``."""
+        """Declare a subscriber of ``topic``."""
         self._subscribers.append(
             self._session.declare_subscriber(_key(topic), lambda sample: take(sample.payload.to_bytes()))
         )
         self._announce("MS", topic)
 
     def close(self) -> None:
-        """Undeclare everything; announcements first."""
+        """Undeclare everything, tokens first."""
         undeclare_all(self._tokens, self._publishers, self._subscribers)
 
     def _announce(self, kind: str, topic: Topic) -> None:

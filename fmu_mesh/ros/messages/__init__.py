@@ -1,1 +1,1 @@
-"""ROS messages: definitions, CDR, names, stamps, and how variables fit into them."""
+"""ROS messages: topics, definitions, CDR, names, stamps, and which variables fit into which fields."""

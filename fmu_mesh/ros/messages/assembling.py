@@ -1,6 +1,6 @@
-"""Between values of the mesh and ROS messages: assembling a message of values, and taking one apart.
+"""From values of the mesh to ROS messages, and back.
 
-Owns which values belong into one message: those of one communication point, never those that came last.
+Owns which values belong into one message: those of one communication point, not those that arrived last.
 """
 
 from __future__ import annotations
@@ -15,22 +15,29 @@ import numpy as np
 
 from ...variables.model_description import Value
 from ...variables.value_types import flattened, nested
-from ..gateway.topics import Port, Topic
 from .cdr import CdrError, Codec, Message
 from .definitions import HEADER, Array, Basic, FieldType, MessageTypes, Nested, Sequence, path_parts
 from .stamp import from_stamp, to_stamp
+from .topics import Port, Topic
 
 __all__ = ["Assembler", "Disassembler"]
 
-_WAITING = 1 << 14
+_MAX_WAITING = 1 << 14
 _FLOATS = {"NaN": float("nan"), "INF": float("inf"), "-INF": float("-inf")}
 
 
 class Assembler:
     """Makes the messages of one published topic.
 
-    A message belongs to one point. Where its variables are of instances with different step sizes, there is one at
-    every point of any of them, with the values that hold there.
+    A message belongs to one point. If the variables have different step sizes, every point of one of them has a
+    message, with the values that hold at that point.
+
+    Args:
+        topic: the topic.
+        types: the message types.
+
+    Raises:
+        CdrError: messages of this type cannot be encoded.
     """
 
     def __init__(self, topic: Topic, types: MessageTypes) -> None:
@@ -42,7 +49,7 @@ class Assembler:
             owner, last = self._place(path, types)
             owner[last] = value
         self._steps = [port.step_points for port in topic.ports]
-        self._waiting: list[deque[tuple[int, float, Any]]] = [deque(maxlen=_WAITING) for _ in topic.ports]
+        self._waiting: list[deque[tuple[int, float, Any]]] = [deque(maxlen=_MAX_WAITING) for _ in topic.ports]
         self._last = -1
         self._headers = list(_headers(self._message, Nested(topic.message), types))
         named = {path for path, _ in topic.constants} | {port.path for port in topic.ports}
@@ -51,7 +58,16 @@ class Assembler:
                 header["frame_id"] = topic.frame_id
 
     def add(self, port: int, point: int, time: float, value: Value) -> Iterator[tuple[bytes, float]]:
-        """Take the value of a port at a point, and yield the messages that are complete now, with their times in s.
+        """Take the value of a port at a point, and yield every message that is complete now.
+
+        Args:
+            port: index of the port.
+            point: of the value.
+            time: of the point, in s.
+            value: of the variable.
+
+        Yields:
+            Each message in CDR, and its time in s.
 
         Raises:
             CdrError: a value does not fit into its field.
@@ -61,7 +77,7 @@ class Assembler:
             heads = [waiting[0] for waiting in self._waiting]
             ends = [head[0] + step for head, step in zip(heads, self._steps, strict=True)]
             now = max(head[0] for head in heads)
-            # What holds no longer at this point goes; after a message, what ends first.
+            # Drop the values that do not hold at this point any more; after a message, those that end first.
             until = now if now > self._last else min(ends)
             over = [waiting for waiting, end in zip(self._waiting, ends, strict=True) if end <= until]
             for waiting in over:
@@ -72,7 +88,7 @@ class Assembler:
                 yield self.make([head[2] for head in heads], stamp), stamp
 
     def make(self, values: list[Any], time: float) -> bytes:
-        """The message that has these values, one per port, at ``time`` s.
+        """Make the message with these values, one per port, at ``time`` in s.
 
         Raises:
             CdrError: a value does not fit into its field.
@@ -85,7 +101,7 @@ class Assembler:
         return self._codec.encode(self._message)
 
     def _setter(self, port: Port, types: MessageTypes) -> Callable[[Any], None]:
-        """A function that puts a value of the mesh into its field."""
+        """Make a function that puts a value of the mesh into its field."""
         container, last = self._place(port.path, types)
         kind = types.field(self.topic.message, port.path)
         element = kind if isinstance(kind, Basic) else getattr(kind, "element", None)
@@ -106,9 +122,9 @@ class Assembler:
         return put
 
     def _place(self, path: str, types: MessageTypes) -> tuple[Any, str | int]:
-        """What holds the field at ``path``, and its name or index there; every sequence on the way is long enough.
+        """The message or list that holds the field at ``path``, and the name or index of the field there.
 
-        Elements that this adds are empty, as is all that nobody gives a value.
+        Sequences on the way are made as long as the path needs them; new elements are empty.
         """
         parts = path_parts(path)
         container: Any = self._message
@@ -122,8 +138,8 @@ class Assembler:
         return container, parts[-1]
 
     def _with_length(self, elements: Any, length: int, kind: FieldType) -> list[Any]:  # noqa: ANN401 an array or a list
-        """The elements as a list, of at least ``length`` where it is a sequence."""
-        # The list that another port has already.
+        """The elements as a list; a sequence is made at least ``length`` long."""
+        # It is a list already if another port has a field in it.
         listed: list[Any] = elements if isinstance(elements, list) else elements.tolist()
         if isinstance(kind, Sequence):
             listed += [self._codec.empty_field(kind.element) for _ in range(length - len(listed))]
@@ -131,18 +147,24 @@ class Assembler:
 
 
 class Disassembler:
-    """Takes the messages of one subscribed topic apart."""
+    """Reads the values of the variables from the messages of one subscribed topic.
+
+    Args:
+        topic: the topic.
+        types: the message types.
+    """
 
     def __init__(self, topic: Topic, types: MessageTypes) -> None:
         self.topic = topic
         self._codec = Codec(types, topic.message)
+        self._stamped = types.has_header(topic.message)
         self._paths = [path_parts(port.path) for port in topic.ports]
 
     def values(self, data: bytes) -> tuple[list[Value], float | None]:
-        """The values of the ports, and the stamp in s; None without a header, or with a stamp of zero.
+        """The values of the ports, and the stamp in s; the stamp is None if it is 0 or if there is no header.
 
         Raises:
-            CdrError: the bytes are no such message, or an element that a port needs is not in it.
+            CdrError: the bytes are not such a message, or an element of a port is not in it.
         """
         message = self._codec.decode(data)
         values = []
@@ -154,7 +176,7 @@ class Disassembler:
             except IndexError as error:
                 raise CdrError(f"it has no '{port.path}'") from error
             values.append(_in_shape(value, port))
-        if not self.topic.stamped:
+        if not self._stamped:
             return values, None
         stamp = message["header"]["stamp"]
         time = from_stamp(stamp["sec"], stamp["nanosec"])
@@ -162,7 +184,7 @@ class Disassembler:
 
 
 def _headers(value: Any, kind: FieldType, types: MessageTypes, path: str = "") -> Iterator[tuple[str, Message]]:  # noqa: ANN401 any field
-    """The path and the value of every header in a message, also in its elements."""
+    """The path and the value of every header in a message and in the elements of its arrays."""
     match kind:
         case Nested(message) if message == HEADER and path:
             yield path, value
@@ -175,10 +197,10 @@ def _headers(value: Any, kind: FieldType, types: MessageTypes, path: str = "") -
 
 
 def _in_shape(value: Any, port: Port) -> Value:  # noqa: ANN401 a field of any message
-    """A field as a value of the mesh: an array in the shape of its variable.
+    """A field as a value of the mesh, an array in the shape of its variable.
 
     Raises:
-        CdrError: there are too many elements, or too few.
+        CdrError: the number of elements is wrong.
     """
     plain: Value = value.tolist() if isinstance(value, np.ndarray | np.generic) else value
     if not port.variable.shape:

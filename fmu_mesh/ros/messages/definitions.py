@@ -1,7 +1,7 @@
-"""ROS message types: their fields, their RIHS01 hashes, and which of them carries a variable.
+"""ROS message types: their fields and their RIHS01 hashes.
 
-Definitions and hashes come from `rosbags`, as pure data: of it nothing is generated or evaluated here. How a message is
-written as bytes is `fmu_mesh.ros.messages.cdr`.
+The definitions come from `rosbags` as data; no code that `rosbags` could generate from them is run. The bytes of a
+message are the matter of `fmu_mesh.ros.messages.cdr`.
 """
 
 from __future__ import annotations
@@ -31,8 +31,6 @@ __all__ = [
     "Sequence",
     "UnknownField",
     "UnknownType",
-    "carries",
-    "default_type",
     "is_message_name",
     "path_parts",
 ]
@@ -42,7 +40,7 @@ TIME = "builtin_interfaces/msg/Time"
 HEADER = "std_msgs/msg/Header"
 
 MAX_ELEMENTS: Final = 1 << 16
-"""Strings and nested messages that all sequences and arrays of a message may hold together; an index is below it."""
+"""Largest number of strings and nested messages in all arrays of one message; every index is below it."""
 
 Distribution = Literal["humble", "jazzy", "kilted", "lyrical"]
 
@@ -53,7 +51,7 @@ _PART = re.compile(r"[^.\[\]]+|\[[0-9]+\]")
 
 
 class Basic(msgspec.Struct, frozen=True):
-    """A number, a bool or a string; ``bound`` is the length limit of a string, 0 for none."""
+    """A number, a bool or a string; ``bound`` is the length limit of a string, 0 for no limit."""
 
     kind: str
     bound: int = 0
@@ -66,14 +64,14 @@ class Nested(msgspec.Struct, frozen=True):
 
 
 class Array(msgspec.Struct, frozen=True):
-    """A fixed number of elements."""
+    """An array with a fixed number of elements."""
 
     element: Basic | Nested
     length: int
 
 
 class Sequence(msgspec.Struct, frozen=True):
-    """Any number of elements, at most ``bound`` if that is not 0."""
+    """An array with any number of elements, at most ``bound`` if that is not 0."""
 
     element: Basic | Nested
     bound: int = 0
@@ -83,7 +81,7 @@ FieldType = Basic | Nested | Array | Sequence
 
 
 class UnknownType(ValueError):
-    """There is no message type with this name; ``names`` has those that there are."""
+    """No message type has this name; ``names`` lists the known types."""
 
     def __init__(self, message: str, names: tuple[str, ...]) -> None:
         super().__init__(f"there is no message type '{message}'")
@@ -91,7 +89,7 @@ class UnknownType(ValueError):
 
 
 class UnknownField(ValueError):
-    """A message has no field at this place, and why; ``names`` has the paths of those that it has."""
+    """A message has no field at this path; ``names`` lists the paths of its fields."""
 
     def __init__(self, message: str, path: str, names: tuple[str, ...], reason: str = "") -> None:
         super().__init__(f"'{message}' has no field '{path}'{f': {reason}' if reason else ''}")
@@ -102,7 +100,7 @@ class MessageTypes:
     """The message types of a ROS distribution, and custom ones.
 
     Args:
-        distribution: the ROS 2 distribution whose definitions hold.
+        distribution: the ROS 2 distribution whose definitions are used.
         custom: definitions in the syntax of a `.msg` file, by full name (`my_msgs/msg/Wheel`).
 
     Raises:
@@ -117,9 +115,10 @@ class MessageTypes:
                 "ROS message types need the package rosbags", hint="Install it: pip install 'fmu-mesh[ros]'."
             ) from error
         self.distribution = distribution
+        # New types are put into `fielddefs`: `register` would execute code that it generates from a definition.
         self.store: Typestore = get_typestore(Stores[f"ROS2_{distribution.upper()}"])
         self._hashes: dict[str, str] = {}
-        # ROS 2 means uint8 by char, in hashes too; rosbags hashes it as a type of its own.
+        # In ROS 2 char is uint8, in type hashes too; rosbags would hash it as a separate type.
         for name, (constants, fields) in self.store.fielddefs.items():
             if any("char" in repr(kind) for _, kind in fields):
                 self.store.fielddefs[name] = (constants, [(own, _without_char(kind)) for own, kind in fields])
@@ -132,7 +131,7 @@ class MessageTypes:
         """Add a definition in the syntax of a `.msg` file.
 
         Raises:
-            ConfigurationError: the text is no definition, or another one with this name is there.
+            ConfigurationError: the text is not a definition, or the name has another definition already.
         """
         from rosbags.typesys import TypesysError, get_types_from_msg  # noqa: PLC0415  as above
 
@@ -164,7 +163,7 @@ class MessageTypes:
 
         Raises:
             UnknownType: there is no such type.
-            UnknownField: there is no such field, or its index is not one of the array.
+            UnknownField: there is no such field, or the array has no such index.
         """
         kind: FieldType = Nested(message)
         reached = ""
@@ -184,7 +183,7 @@ class MessageTypes:
         return kind
 
     def paths(self, message: str, prefix: str = "") -> Iterator[str]:
-        """The paths of all fields that are no message themselves; of arrays of messages, those of the first element."""
+        """The paths of all fields that are not messages; for an array of messages, the paths in its first element."""
         for name, kind in self.fields(message):
             if isinstance(kind, Nested):
                 yield from self.paths(kind.message, f"{prefix}{name}.")
@@ -194,18 +193,18 @@ class MessageTypes:
                 yield f"{prefix}{name}"
 
     def has_header(self, message: str) -> bool:
-        """Whether a message starts with a `std_msgs/msg/Header`, and so has a stamp."""
+        """Whether a message has a field `header` of the type `std_msgs/msg/Header`, and so a stamp."""
         return ("header", Nested(HEADER)) in self.fields(message)
 
     def type_hash(self, message: str) -> str:
-        """The RIHS01 hash of a message or of a service defined by `define_service` (REP 2016)."""
+        """The RIHS01 hash of a message, or of a service that `define_service` has added (REP 2016)."""
         if message not in self._hashes:
             self.fields(message)
             self._hashes[message] = self.store.hash_rihs01(message)
         return self._hashes[message]
 
     def define_service(self, name: str, request: str, response: str) -> None:
-        """Add a service as the messages that ROS makes of it: request, response and event (REP 2016)."""
+        """Add a service as the messages that ROS derives from it: request, response and event (REP 2016)."""
         one: dict[str, object] = {}
         for part, text in (("Request", request), ("Response", response)):
             as_message = f"{name.replace('/srv/', '/msg/')}_{part}"
@@ -222,10 +221,10 @@ class MessageTypes:
             ("response_message", one["Response"]),
             ("event_message", (2, f"{name}_Event")),
         ]
-        self.store.fielddefs |= msgspec.convert({f"{name}_Event": ([], event), name: ([], whole)}, Any)
+        self.store.fielddefs.update(msgspec.convert({f"{name}_Event": ([], event), name: ([], whole)}, Any))
 
     def definition(self, message: str) -> str:
-        """The text of a definition with all that it refers to, as MCAP and Foxglove want it (`ros2msg`)."""
+        """The text of a definition with every type that it refers to, in the format `ros2msg` of MCAP and Foxglove."""
         self.fields(message)
         text, _md5 = self.store.generate_msgdef(message, ros_version=2)
         return text
@@ -239,89 +238,13 @@ class MessageTypes:
 
 
 def path_parts(path: str) -> list[str | int]:
-    """`pose.covariance[7]` as `pose`, `covariance`, 7."""
+    """Split a path: `pose.covariance[7]` becomes `["pose", "covariance", 7]`."""
     return [int(part[1:-1]) if part.startswith("[") else part for part in _PART.findall(path)]
 
 
 def is_message_name(name: str) -> bool:
     """Whether ``name`` has the form `package/msg/Name`."""
     return _MESSAGE_NAME.fullmatch(name) is not None
-
-
-_MESSAGES: Mapping[str, str] = {
-    "Real": "Float64",
-    "Float64": "Float64",
-    "Float32": "Float32",
-    "Integer": "Int32",
-    "Int8": "Int8",
-    "Int16": "Int16",
-    "Int32": "Int32",
-    "Int64": "Int64",
-    "UInt8": "UInt8",
-    "UInt16": "UInt16",
-    "UInt32": "UInt32",
-    "UInt64": "UInt64",
-    "Boolean": "Bool",
-    "Enumeration": "Int64",
-    "String": "String",
-}
-
-
-def default_type(variable_type: str, *, array: bool = False) -> str | None:
-    """The message that carries a variable of an FMI type on a topic of its own; None if there is none.
-
-    An array goes as a multi-array (`std_msgs/msg/Float64MultiArray`), which there is for numbers only.
-    """
-    name = _MESSAGES.get(variable_type)
-    if name is None or (array and name in ("Bool", "String")):
-        return None
-    return f"std_msgs/msg/{name}{'MultiArray' if array else ''}"
-
-
-_BITS: Mapping[str, tuple[int, bool]] = {
-    "int8": (8, True),
-    "int16": (16, True),
-    "int32": (32, True),
-    "int64": (64, True),
-    "uint8": (8, False),
-    "byte": (8, False),
-    "char": (8, False),
-    "uint16": (16, False),
-    "uint32": (32, False),
-    "uint64": (64, False),
-}
-"""Width of an integer, and whether it has a sign."""
-
-_KINDS: Mapping[str, str] = {
-    "Real": "float64",
-    "Integer": "int32",
-    "Boolean": "bool",
-    "Enumeration": "int64",
-    **{name: name.lower() for name in _MESSAGES if name[0] in "FIU" and name[-1].isdigit()},
-    "String": "string",
-}
-
-
-def carries(target: str, source: str) -> bool:
-    """Whether a value of the kind ``source`` fits into ``target``; both are kinds of fields, or FMI types.
-
-    Whole numbers never lose anything. Between the two kinds of floats the user chooses, so float64 may go into float32.
-    """
-    to, of = _KINDS.get(target, target), _KINDS.get(source, source)
-    if to == of:
-        return True
-    if to in ("float64", "float32"):
-        exact = 53 if to == "float64" else 24
-        return of in ("float64", "float32", "bool") or (of in _BITS and _BITS[of][0] <= exact)
-    if to in _BITS:
-        bits, signed = _BITS[to]
-        if of == "bool":
-            return True
-        if of not in _BITS:
-            return False
-        other, other_signed = _BITS[of]
-        return other <= bits if signed == other_signed else signed and other < bits
-    return False
 
 
 def _without_char(description: Any) -> Any:  # noqa: ANN401 a nested tuple of rosbags
@@ -331,7 +254,7 @@ def _without_char(description: Any) -> Any:  # noqa: ANN401 a nested tuple of ro
 
 
 def _field_type(description: object) -> FieldType:
-    """A field as `rosbags` describes it: (kind, (name, bound)), (kind, name), or (kind, (element, length))."""
+    """The field that `rosbags` describes as (kind, (name, bound)), (kind, name), or (kind, (element, length))."""
     match description:
         case (1, (str(kind), int(bound))):
             return Basic(kind, bound)
@@ -351,7 +274,7 @@ def _element_type(description: object) -> Basic | Nested:
 
 
 def _index_problem(kind: FieldType, index: str) -> str:
-    """Why a field has no element with this index; empty if it has, or can have."""
+    """Why a field cannot have an element with this index; empty if it can."""
     last = MAX_ELEMENTS - 1
     match kind:
         case Array(_, length):

@@ -1,7 +1,7 @@
-"""Whether messages of a type can carry what an entry of `ros.topics` puts into them, and out of them.
+"""Whether messages of a type can carry the variables of a topic, and which type carries a variable by default.
 
-Knows fields and their types, and no names of the mesh. What passes here can be sent and received: the last check
-makes a message on trial, in the way in which it is made when the mesh runs.
+Knows the fields of messages and their types, but not the names in a configuration. The last check makes or prepares a
+message in the same way as the running gateway, so a topic that passes can be sent or received.
 """
 
 from __future__ import annotations
@@ -9,13 +9,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import msgspec
+import numpy as np
 
 from ...config.findings import Findings
 from ...config.mesh import RosTopicConfig
 from ...text import listed, nearest, shown
 from ...variables.model_description import Variable
-from ...variables.value_types import nested
-from ..gateway.topics import Direction, Port, Topic
+from ...variables.value_types import VariableType, nested
 from .assembling import Assembler, Disassembler
 from .cdr import MAX_MESSAGE_SIZE, CdrError
 from .definitions import (
@@ -28,12 +28,15 @@ from .definitions import (
     Sequence,
     UnknownField,
     UnknownType,
-    carries,
-    default_type,
     path_parts,
 )
+from .topics import Direction, Port, Topic
 
-__all__ = ["Entry", "check_fields", "why_not_carried"]
+__all__ = ["TopicEntry", "carries", "check_topic", "default_type"]
+
+_FLOATS = ("float32", "float64")
+_NUMBERS = frozenset({"bool", *_FLOATS, *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64))})
+_OTHER_NAMES: Mapping[str, str] = {"byte": "uint8", "char": "uint8", "Boolean": "bool", "Enumeration": "int64"}
 
 _PLAIN: Mapping[str, type | tuple[type, ...]] = {
     "string": str,
@@ -41,43 +44,77 @@ _PLAIN: Mapping[str, type | tuple[type, ...]] = {
     "float32": (int, float),
     "float64": (int, float),
 }
-"""What a constant is in the file, by the kind of its field; for any other kind, an int."""
+"""The type of a constant in the configuration by the kind of its field; for any other kind it is an int."""
 
 
-class Entry(msgspec.Struct, frozen=True):
-    """One entry of `ros.topics`, where it stands, and where its variable stands."""
+class TopicEntry(msgspec.Struct, frozen=True):
+    """One entry of `ros.topics`, with its path in the file and the path of its variable."""
 
     item: RosTopicConfig
     path: str
     variable_path: str
 
 
-def check_fields(  # noqa: PLR0913, PLR0917  an entry, what was found for it, and where findings go
-    entry: Entry,
-    message: str,
-    ports: tuple[Port, ...],
-    direction: Direction,
-    types: MessageTypes,
-    findings: Findings,
-) -> None:
-    """See whether each field is there, holds its variable or constant, and is given once."""
+def default_type(variable_type: VariableType, *, array: bool = False) -> str | None:
+    """The message type that carries a variable on a topic of its own; None if std_msgs has none.
+
+    An array becomes a multi-array (`std_msgs/msg/Float64MultiArray`); std_msgs has these for numbers only.
+
+    Example:
+        >>> default_type("Boolean")
+        'std_msgs/msg/Bool'
+    """
+    if variable_type == "Binary" or (array and variable_type in ("Boolean", "String")):
+        return None
+    name = {"Boolean": "Bool", "Enumeration": "Int64"}.get(variable_type, variable_type)
+    return f"std_msgs/msg/{name}{'MultiArray' if array else ''}"
+
+
+def carries(target: str, source: str) -> bool:
+    """Whether every value of the kind ``source`` fits into ``target``; both are kinds of fields, or FMI types.
+
+    Whole numbers are never rounded. float64 may go into float32: the user has chosen that precision.
+    """
+    to, of = (_OTHER_NAMES.get(name, name.lower()) for name in (target, source))
+    if to == of:
+        return True
+    if not {to, of} <= _NUMBERS:
+        return False
+    if to in _FLOATS and of in _FLOATS:
+        return True
+    # numpy counts 64-bit integers into float64 as safe, although they may be rounded.
+    return np.can_cast(of, to) and not (to in _FLOATS and of in ("int64", "uint64"))
+
+
+def check_topic(entry: TopicEntry, topic: Topic, types: MessageTypes, findings: Findings) -> None:
+    """Add a finding for everything that keeps the messages of ``topic`` from carrying its variables and constants.
+
+    Args:
+        entry: where the topic stands in the configuration.
+        topic: the topic, whose message type may be unknown.
+        types: the message types.
+        findings: where the findings go.
+    """
     before = len(findings)
-    for port in ports:
-        _check_port(entry, message, port, direction, types, findings)
+    for port in topic.ports:
+        _check_port(entry, topic, port, types, findings)
     if len(findings) > before:
         return
-    if entry.item.constants and direction == "in":
+    if topic.constants and topic.direction == "in":
         found = "constants of a topic that is subscribed"
         findings.add(f"{entry.path}.constants", found, "constants of published messages only")
         return
-    for field, value in entry.item.constants.items():
-        _check_constant(f"{entry.path}.constants.{field}", message, field, value, types, findings)
-    if len(findings) == before and direction == "out":
-        _check_places(entry, message, ports, types, findings)
+    for field, value in topic.constants:
+        _check_constant(f"{entry.path}.constants.{field}", topic.message, (field, value), types, findings)
+    if len(findings) == before and topic.direction == "out":
+        _check_places(entry, topic, types, findings)
+    if len(findings) == before and (reason := _why_not_carried(topic, types)) is not None:
+        found = f"'{topic.message}' for '{topic.name}': {reason}"
+        findings.add(f"{entry.path}.type", found, "messages that can be sent and received")
 
 
-def why_not_carried(topic: Topic, types: MessageTypes) -> str | None:
-    """Why no message of a topic can be made or read, as found by a trial; None if it can."""
+def _why_not_carried(topic: Topic, types: MessageTypes) -> str | None:
+    """Why no message of a topic can be made or read; None if it can. A message is made to find out."""
     try:
         if topic.direction == "in":
             Disassembler(topic, types)
@@ -92,10 +129,8 @@ def why_not_carried(topic: Topic, types: MessageTypes) -> str | None:
     return None if size <= MAX_MESSAGE_SIZE else f"{size} bytes are too many for a message"
 
 
-def _check_port(  # noqa: PLR0913, PLR0917  as above
-    entry: Entry, message: str, port: Port, direction: Direction, types: MessageTypes, findings: Findings
-) -> None:
-    written = bool(entry.item.fields)
+def _check_port(entry: TopicEntry, topic: Topic, port: Port, types: MessageTypes, findings: Findings) -> None:
+    message, written = topic.message, bool(entry.item.fields)
     place = f"{entry.path}.fields.{port.path}" if written else f"{entry.path}.type"
     try:
         kind = types.field(message, port.path)
@@ -107,16 +142,17 @@ def _check_port(  # noqa: PLR0913, PLR0917  as above
         expected = f"one of {listed(error.names)}{'' if written else ', given in `fields`'}"
         findings.add(place, str(error), expected, nearest(port.path, error.names) if written else None)
         return
-    reason = _unfit(kind, port.variable, direction)
+    reason = _unfit(kind, port.variable, topic.direction)
     if reason is not None:
         found = f"'{port.path}' of '{message}' for '{port.instance}.{port.variable.name}': {reason}"
         best = default_type(port.variable.type, array=bool(port.variable.shape))
         findings.add(place, found, f"a field that holds it, as in {best}")
 
 
-def _check_constant(  # noqa: PLR0913, PLR0917  as above
-    place: str, message: str, field: str, value: str | float, types: MessageTypes, findings: Findings
+def _check_constant(
+    place: str, message: str, constant: tuple[str, str | float], types: MessageTypes, findings: Findings
 ) -> None:
+    field, value = constant
     try:
         kind = types.field(message, field)
     except UnknownField as error:
@@ -129,10 +165,10 @@ def _check_constant(  # noqa: PLR0913, PLR0917  as above
         findings.add(place, found, f"a value of the type {kind.kind}")
 
 
-def _check_places(entry: Entry, message: str, ports: tuple[Port, ...], types: MessageTypes, findings: Findings) -> None:
-    """Whether each place of a message is given once; the stamp of a header is the simulation time already."""
+def _check_places(entry: TopicEntry, topic: Topic, types: MessageTypes, findings: Findings) -> None:
+    """Check that each field has one source; the stamp of a header is the simulation time already."""
     given: dict[tuple[str | int, ...], str] = {}
-    fields = [*(("fields", port.path) for port in ports), *(("constants", field) for field in entry.item.constants)]
+    fields = [("fields", port.path) for port in topic.ports] + [("constants", field) for field, _ in topic.constants]
     for section, field in sorted(fields, key=lambda own: len(path_parts(own[1]))):
         parts = path_parts(field)
         heads = [tuple(parts[:end]) for end in range(1, len(parts) + 1)]
@@ -142,7 +178,7 @@ def _check_places(entry: Entry, message: str, ports: tuple[Port, ...], types: Me
             findings.add(f"{entry.path}.{section}.{field}", found, "a value once for each field")
         given[heads[-1]] = field
         stamp = field.rpartition(".stamp")[0]
-        if stamp and types.field(message, stamp) == Nested(HEADER):
+        if stamp and types.field(topic.message, stamp) == Nested(HEADER):
             found = f"'{field}', which is the simulation time"
             findings.add(f"{entry.path}.{section}.{field}", found, "a field that is no stamp of a header")
 

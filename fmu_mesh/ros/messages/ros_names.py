@@ -1,7 +1,7 @@
-"""Names: from FMI variables to ROS topics and parameters, and what a ROS name may be.
+"""ROS names of topics and parameters: how FMI variables are named, and which names ROS allows.
 
-The rule is that of `fmi_adapter`: every character that is no letter, digit or underscore becomes an underscore, and
-leading underscores go. Where that gives no usable name, or one name twice, it is told; nothing is renamed in silence.
+The rule is that of `fmi_adapter`: every character other than a letter, digit or underscore becomes an underscore, and
+leading underscores are removed. A name that is unusable or not unique is reported; nothing is renamed silently.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ _TOKEN = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 
 
 class NameProblem(msgspec.Struct, frozen=True):
-    """Variables whose names cannot be used in ROS as they are.
+    """Variables that the rule gives no usable name.
 
     Attributes:
-        name: what the rule makes of them.
+        name: the name that the rule gives them.
         variables: the variables with this name, in the order of the model description.
-        kind: several variables get one name, the name starts with a digit, or nothing is left of it.
+        kind: several variables have the same name, the name starts with a digit, or the name is empty.
     """
 
     name: str
@@ -43,12 +43,17 @@ class NameProblem(msgspec.Struct, frozen=True):
 
 
 def ros_name(variable: str) -> str:
-    """The ROS name of an FMI variable, as `fmi_adapter` makes it: `der(a,2)` becomes `der_a_2_`."""
+    """The ROS name of an FMI variable, as in `fmi_adapter`.
+
+    Example:
+        >>> ros_name("der(a,2)")
+        'der_a_2_'
+    """
     return _NO_NAME_CHARACTER.sub("_", variable).lstrip("_")
 
 
 def name_problems(variables: Iterable[str]) -> list[NameProblem]:
-    """What is wrong with the ROS names of ``variables`` if all of them are used side by side."""
+    """The problems with the ROS names of ``variables`` if all of them are used together."""
     by_name: dict[str, list[str]] = {}
     for variable in variables:
         by_name.setdefault(ros_name(variable), []).append(variable)
@@ -65,12 +70,12 @@ def name_problems(variables: Iterable[str]) -> list[NameProblem]:
 
 
 def absolute(topic: str, namespace: str = "/") -> str:
-    """The absolute name of ``topic``; a relative one is in ``namespace``."""
+    """The absolute name of ``topic``; a relative name is in ``namespace``."""
     return topic if topic.startswith("/") else f"{namespace.rstrip('/')}/{topic}"
 
 
 def topic_problem(topic: str) -> str | None:
-    """Why ``topic`` is no ROS name (ROS 2 design, "Topic and Service name mapping to DDS"); None if it is one."""
+    """Why ``topic`` is not allowed as a name (ROS 2 design, "Topic and Service name mapping to DDS"); None if it is."""
     tokens = topic.removeprefix("/").split("/")
     for token in tokens:
         if not token:
@@ -83,6 +88,6 @@ def topic_problem(topic: str) -> str | None:
 
 
 def dds_type(message: str) -> str:
-    """The name that a ROS type has in DDS: `std_msgs/msg/Float64` is `std_msgs::msg::dds_::Float64_`."""
+    """The name of a ROS type in DDS: `std_msgs/msg/Float64` is `std_msgs::msg::dds_::Float64_`."""
     package, kind, name = message.split("/")
     return f"{package}::{kind}::dds_::{name}_"

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 
-__all__ = ["from_stamp", "nanoseconds", "to_stamp"]
+__all__ = ["from_stamp", "in_nanoseconds", "nanoseconds", "to_stamp"]
 
 _PER_SECOND = 1_000_000_000
 
 
 def nanoseconds(time: float) -> int:
-    """``time`` s in ns, rounded to the nearest; the fraction is scaled on its own, which keeps its last digits."""
+    """``time`` s in ns, rounded to the nearest; the fraction is scaled on its own to keep its last digits."""
     whole = math.floor(time)
     return whole * _PER_SECOND + round((time - whole) * _PER_SECOND)
 
@@ -22,5 +22,10 @@ def to_stamp(time: float) -> dict[str, int]:
 
 
 def from_stamp(sec: int, nanosec: int) -> float:
-    """The time in s of a `builtin_interfaces/msg/Time`: the float nearest to it."""
-    return (sec * _PER_SECOND + nanosec) / _PER_SECOND
+    """The time in s of a `builtin_interfaces/msg/Time`: the nearest float."""
+    return in_nanoseconds(sec, nanosec) / _PER_SECOND
+
+
+def in_nanoseconds(sec: int, nanosec: int) -> int:
+    """The time in ns of a `builtin_interfaces/msg/Time`."""
+    return int(sec) * _PER_SECOND + int(nanosec)

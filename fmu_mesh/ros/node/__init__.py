@@ -1,8 +1,11 @@
-"""An FMU, or the gateway of a mesh, as a ROS 2 lifecycle node; `python -m fmu_mesh.ros.node` runs it.
+"""An FMU, or the gateway of a mesh, as a ROS 2 lifecycle node; and what a user's own node needs for an FMU.
 
-rclpy comes from the user's own ROS; importing this package does not need it.
+`python -m fmu_mesh.ros.node` runs the node. rclpy comes from the user's own ROS; importing this package does not need
+it.
 """
 
+from ..messages.ros_names import ros_name
 from .entry import create_node, main
+from .variable_parameters import declare_parameters, initialize_from_parameters
 
-__all__ = ["create_node", "main"]
+__all__ = ["create_node", "declare_parameters", "initialize_from_parameters", "main", "ros_name"]

@@ -1,4 +1,4 @@
-"""`autostart` of a ROS node: it configures and activates itself, and waits for a mesh that is a moment late."""
+"""The parameter `autostart`: the node configures and activates itself, and waits for a mesh that starts later."""
 
 from __future__ import annotations
 
@@ -6,29 +6,27 @@ import threading
 import time
 from pathlib import Path
 
-from ...config.loading import load
 from ...errors import FmuMeshError
+from ...instances.configuration import load
 from ...wire.client.reaching import Meshes
-from .node_parameters import RosNode
-from .rclpy_modules import ros_module
+from .rclpy_modules import RosNode, ros_module
 
 __all__ = ["Autostart"]
 
 _ATTEMPT_S = 2.0
-_LOOK_S = 0.25
+_INTERVAL_S = 0.25
 _CLOSE_S = 5.0
 
 
 class Autostart:
-    """Configures and activates a node, if its parameter `autostart` says so.
+    """Configures and activates a node if its parameter `autostart` is true.
 
-    The gateway of a mesh waits for that on a thread of its own: services answer meanwhile, and Ctrl-C ends it.
+    The gateway of a mesh waits for the mesh on another thread, so services answer meanwhile and Ctrl-C ends the wait.
+    Use it as a context manager around the spinning of the node.
 
     Args:
         node: the lifecycle node.
         executor: the executor of rclpy that spins the node; the transitions run there.
-
-    Use it as a context manager around the spinning.
     """
 
     def __init__(self, node: RosNode, executor: object) -> None:
@@ -39,7 +37,7 @@ class Autostart:
         self._thread: threading.Thread | None = None
 
     def __enter__(self) -> None:
-        """Start, or begin to wait."""
+        """Start the node, or begin to wait for the mesh."""
         if not self._node.get_parameter("autostart").value:
             return
         if self._node.get_parameter("config").value and not self._node.get_parameter("fmu_path").value:
@@ -49,7 +47,7 @@ class Autostart:
             self._start()
 
     def __exit__(self, *_: object) -> None:
-        """Wait no more."""
+        """Stop waiting."""
         self._over.set()
         if self._thread is not None:
             self._thread.join(_CLOSE_S)
@@ -64,15 +62,15 @@ class Autostart:
             self._executor.create_task(self._start)  # type: ignore[attr-defined]  # a class of rclpy
 
     def _mesh_is_there(self) -> bool:
-        """Wait until the mesh answers for all its instances; False where it did not in time, which is told."""
+        """Wait until all instances of the mesh answer; False after the timeout, which is logged."""
         config = self._node.get_parameter("config").value
         timeout_s = self._node.get_parameter("autostart_timeout").value
         try:
             mesh = load(Path(config)).config.mesh
         except FmuMeshError:
-            return True  # configuring tells what is wrong with the file
+            return True  # `configure` reports what is wrong with the file
         deadline = time.monotonic() + timeout_s
-        told = False
+        reported = False
         while not self._over.is_set():
             reason = self._absence(mesh)
             if reason is None:
@@ -80,17 +78,17 @@ class Autostart:
             if time.monotonic() >= deadline:
                 self._log.error(
                     f"mesh '{mesh}' did not come within {timeout_s:g} s (autostart_timeout): {reason} "
-                    f"Once it runs, configure and activate this node: {self._by_hand()}"
+                    f"Once it runs, configure and activate this node: {self._manual_start()}"
                 )
                 return False
-            if not told:
-                told = True
+            if not reported:
+                reported = True
                 self._log.info(f"waiting up to {timeout_s:g} s (autostart_timeout) for mesh '{mesh}': {reason}")
-            self._over.wait(_LOOK_S)
+            self._over.wait(_INTERVAL_S)
         return False
 
     def _absence(self, mesh: str) -> str | None:
-        """Why the mesh cannot be carried yet; None where it can."""
+        """Why the gateway cannot start yet; None if it can."""
         endpoints = [endpoint for endpoint in self._node.get_parameter("connect").value if endpoint]
         try:
             with Meshes(endpoints, _ATTEMPT_S) as meshes:
@@ -101,6 +99,6 @@ class Autostart:
             return str(error)
         return None
 
-    def _by_hand(self) -> str:
+    def _manual_start(self) -> str:
         name = self._node.get_fully_qualified_name()
         return f"`ros2 lifecycle set {name} configure`, then `ros2 lifecycle set {name} activate`."

@@ -1,23 +1,34 @@
-"""One FMU driven by the time of a ROS node, without ROS: what happens at each turn of the node's timer.
+"""One FMU that follows the time of a ROS node, and the thread that calls it; without ROS.
 
-Owns the `FMIAdapter`, catching up within a bound, pauses, the stop time, and what follows when time jumps back. Knows
-nothing of topics, of ROS parameters and of rclpy. All times are nanoseconds of the node's clock.
+Owns the `FMIAdapter`, the limit on catching up, pauses, the stop time and jumps back of time. Knows nothing of topics,
+ROS parameters and rclpy. All times are in ns of the clock of the node.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import TimeoutError as FutureTimeout
 from pathlib import Path
+from typing import ParamSpec, TypeVar
 
 import msgspec
 
 from ...adapter import FMIAdapter, Nanoseconds
 from ...adapter.argument_checks import Arguments
+from ...errors import DeadlineExceeded, FmuError, FmuMeshError
 from ...simtime import steps_between
 from ...variables.model_description import ModelDescription, Value
 
-__all__ = ["DriveSettings", "FmuDriver", "Turn"]
+__all__ = ["DriveSettings", "FmuDriver", "FmuThread", "Update"]
+
+_ANSWER_S = 60.0
+_CLOSE_S = 5.0
+
+Result = TypeVar("Result")
+Parameters = ParamSpec("Parameters")
 
 
 class DriveSettings(msgspec.Struct, frozen=True, kw_only=True):
@@ -26,8 +37,8 @@ class DriveSettings(msgspec.Struct, frozen=True, kw_only=True):
     Attributes:
         fmu_path: the .fmu file.
         step_size: communication step size in s; None takes the default experiment's.
-        stop_time: the last step ends here at the latest, in s of the FMU's time; None: no end.
-        max_steps: how many steps a turn may take to catch up.
+        stop_time: end of the last step at the latest, in s of the FMU's time; None: no end.
+        max_steps: largest number of steps in one update.
     """
 
     fmu_path: Path
@@ -36,15 +47,15 @@ class DriveSettings(msgspec.Struct, frozen=True, kw_only=True):
     max_steps: int = 1000
 
 
-class Turn(msgspec.Struct, frozen=True, kw_only=True):
-    """What one turn did.
+class Update(msgspec.Struct, frozen=True, kw_only=True):
+    """The result of one update.
 
     Attributes:
-        time: the time that the outputs belong to, in ns.
-        values: the outputs that were asked for, by name.
-        steps: how many steps were taken.
-        behind: by how much the FMU is behind although it took all the steps it may, in s; else 0.
-        jumped_back: by how much time had jumped back before this turn, in s; else 0.
+        time: the time of the outputs, in ns.
+        values: the requested outputs, by name.
+        steps: number of steps that were taken.
+        behind: how far the FMU is behind after the largest number of steps, in s; else 0.
+        jumped_back: how far time had jumped back before this update, in s; else 0.
         ended: whether the stop time is reached.
     """
 
@@ -57,18 +68,19 @@ class Turn(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class FmuDriver:
-    """One FMU driven by a clock that may pause, jump ahead and jump back. All calls come from one thread.
+    """One FMU that follows a clock, which may pause, jump ahead and jump back. All calls come from one thread.
 
-    Call sequence: `set_value` as often as needed, then `resume`, and `turn` and `set_input` as long as time goes on;
+    Call sequence: `set_value` as often as needed, then `resume`, then `update` and `set_input` while time runs;
     `resume` again after each pause; `close` at the end.
 
-    The FMU's time is 0.0 at the first turn, and does not go on between the last turn before a pause and `resume`.
+    The time of the FMU is 0.0 at the first update, and stands still between the last update before a pause and
+    `resume`.
 
     Args:
         settings: how the FMU is driven.
 
     Raises:
-        CallRefused: a setting is out of its range.
+        CallRefused: a setting is out of range.
         LoadFailed: the FMU cannot be read, extracted or instantiated.
     """
 
@@ -98,19 +110,19 @@ class FmuDriver:
         return self._started
 
     def check_value(self, name: str, value: Value) -> Value:
-        """The value that `set_value` would set now, in the type of the variable. Any thread may call this.
+        """Convert a value to the type of its variable, as `set_value` would do now. Any thread may call this.
 
         Raises:
-            CallRefused: the variable cannot be set now, or has another type or range.
+            CallRefused: the variable cannot be set now, or the value has a wrong type or range.
         """
         variable = self._arguments.tunable(name) if self._started else self._arguments.settable(name)
         return self._arguments.value(variable, value)
 
     def set_value(self, name: str, value: Value) -> None:
-        """Set a start value before the first turn, or a tunable parameter later; it outlives a jump back of time.
+        """Set a start value before the first update, or a tunable parameter later; a restart keeps it.
 
         Raises:
-            CallRefused: the variable cannot be set now, or has another type or range.
+            CallRefused: the variable cannot be set now, or the value has a wrong type or range.
             FmuError: the FMU refuses it.
         """
         if self._started:
@@ -125,28 +137,28 @@ class FmuDriver:
         return value
 
     def set_input(self, name: str, time: int, value: Value) -> None:
-        """An input has ``value`` from ``time`` on.
+        """Give an input a value that holds from ``time`` in ns on.
 
         Raises:
-            CallRefused: there is no such input, or it has another type or range.
+            CallRefused: there is no such input, or the value has a wrong type or range.
         """
         self._adapter.set_input_value(name, Nanoseconds(time - self._shift), value)
 
     def resume(self, time: int) -> None:
-        """Go on at ``time`` where the FMU is; from its beginning if it has reached the stop time."""
+        """Continue at ``time`` in ns from the state of the FMU; restart the FMU if it has reached the stop time."""
         if self._started and self._ended:
             self._restart()
         elif self._started:
             self._shift = time - self._adapter.simulation_time_ns
 
-    def turn(self, time: int, outputs: Sequence[str], *, restart: bool) -> Turn:
-        """Step until ``time``, as far as the bound of steps and the stop time allow, and read outputs.
+    def update(self, time: int, outputs: Sequence[str], *, restart: bool) -> Update:
+        """Step until ``time``, at most to the stop time and at most `max_steps` steps, and read outputs.
 
         Args:
-            time: now.
+            time: the present time in ns.
             outputs: names of variables to read.
-            restart: what to do when time has jumped back by more than half a step: start from the beginning, which is
-                what simulated time means by it; or go on from where the FMU is, as when somebody sets the wall clock.
+            restart: what to do if time has jumped back by more than half a step. True, for simulated time: restart the
+                FMU. False, for a wall clock that was set back: continue from the state of the FMU.
 
         Raises:
             FmuError: the FMU failed; only `close` is allowed now.
@@ -162,7 +174,7 @@ class FmuDriver:
         if not self._started:
             self._begin(time)
         steps, behind = self._advance(time - self._shift)
-        return Turn(
+        return Update(
             time=self._adapter.simulation_time_ns + self._shift,
             values={name: self._adapter.get_value(name) for name in outputs},
             steps=steps,
@@ -172,11 +184,11 @@ class FmuDriver:
         )
 
     def close(self) -> None:
-        """Free the FMU and remove its files. Never raises; may be called twice."""
+        """Free the FMU and remove its files. Never raises; may be called more than once."""
         self._adapter.close()
 
     def remove_files(self) -> None:
-        """From any thread, when the process is about to be ended while the FMU does not return: remove its files."""
+        """From any thread: remove the files of an FMU that does not return, before the process is ended."""
         self._adapter.remove_files()
 
     @property
@@ -199,7 +211,7 @@ class FmuDriver:
         self._started = True
 
     def _restart(self) -> None:
-        """A new instance with the same values: what a variable was set to holds again, what it came to does not."""
+        """Replace the FMU by a new instance, and set again every variable that was set."""
         self._adapter.close()
         self._started = False
         self._shift = 0
@@ -208,7 +220,7 @@ class FmuDriver:
             self._adapter.set_initial_value(name, value)
 
     def _advance(self, time: int) -> tuple[int, float]:
-        """Step until ``time`` on the adapter's clock; how many steps that were, and how far behind it is then, in s."""
+        """Step until ``time`` on the clock of the adapter; returns the number of steps, and the rest in s."""
         before = self._steps
         allowed = min(self._settings.max_steps, self._last_step - before)
         if allowed >= 1:
@@ -218,3 +230,54 @@ class FmuDriver:
         missing = (time - reached) / 1e9
         behind = missing if missing > self.step_size / 2 and not self._ended else 0.0
         return self._steps - before, behind
+
+
+class FmuThread:
+    """The only thread that calls one FMU, whatever executor the node is in (FMI does not require thread safety).
+
+    The services of the node answer while the FMU computes. Call `close` last.
+    """
+
+    def __init__(self) -> None:
+        self._thread: threading.Thread | None = None
+        self._pool = ThreadPoolExecutor(1, thread_name_prefix="fmu", initializer=self._keep_thread)
+
+    def submit(
+        self, function: Callable[Parameters, Result], *args: Parameters.args, **kwargs: Parameters.kwargs
+    ) -> Future[Result]:
+        """Call a function on the thread later, after all earlier calls."""
+        return self._pool.submit(function, *args, **kwargs)
+
+    def call(
+        self, function: Callable[Parameters, Result], *args: Parameters.args, **kwargs: Parameters.kwargs
+    ) -> Result:
+        """Call a function on the thread and return its result.
+
+        Raises:
+            FmuMeshError: the function raised it.
+            DeadlineExceeded: the function did not return within 60 s.
+            FmuError: the function raised another exception.
+        """
+        return self.result(self.submit(function, *args, **kwargs))
+
+    def result(self, future: Future[Result]) -> Result:
+        """The result of a call that was submitted; raises as `call` does."""
+        try:
+            return future.result(_ANSWER_S)
+        except FutureTimeout as error:
+            raise DeadlineExceeded(f"the FMU has not returned for {_ANSWER_S:g} s.") from error
+        except FmuMeshError:
+            raise
+        except Exception as error:
+            raise FmuError(f"the FMU's thread failed: {error!r}.") from error
+
+    def close(self) -> bool:
+        """Cancel the calls that have not started, and wait up to 5 s; returns whether the thread has ended."""
+        self._pool.shutdown(wait=False, cancel_futures=True)
+        if self._thread is None:
+            return True
+        self._thread.join(_CLOSE_S)
+        return not self._thread.is_alive()
+
+    def _keep_thread(self) -> None:
+        self._thread = threading.current_thread()

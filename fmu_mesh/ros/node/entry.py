@@ -1,8 +1,6 @@
-"""`python -m fmu_mesh.ros.node`: an FMU, or a mesh, as a ROS 2 lifecycle node; a drop-in for `fmi_adapter_node`.
+"""An FMU, or the gateway of a mesh, as a ROS 2 lifecycle node; a drop-in for `fmi_adapter_node`.
 
-With the parameter `fmu_path` it runs an FMU; with `config` it is the gateway of the mesh that this file describes.
-rclpy comes from the user's own ROS; importing this module does not need it. A program of its own can put the node into
-its executor: `create_node`.
+With the parameter `fmu_path` the node runs an FMU; with `config` it is the gateway of the mesh in that file.
 """
 
 from __future__ import annotations
@@ -18,9 +16,8 @@ from ...errors import ConfigurationError, FmuMeshError, Interrupted
 from .autostart import Autostart
 from .fmu_node import FmuNode
 from .gateway_node import GatewayNode
-from .node_parameters import RosNode
 from .node_settings import PARAMETERS
-from .rclpy_modules import ros_module
+from .rclpy_modules import RosNode, ros_module
 
 __all__ = ["create_node", "main"]
 
@@ -29,19 +26,11 @@ _END_S = 20.0
 NODE_NAME = "fmi_adapter_node"
 
 
-_MORE_PARAMETERS: dict[str, tuple[Any, str]] = {
-    "config": ("", "Configuration of a running mesh, instead of an FMU: the node is its gateway."),
-    "connect": ([""], "With config: Zenoh endpoints of the mesh; default: the meshes of this user on this host."),
-    "autostart": (False, "Whether the node configures and activates itself."),
-    "autostart_timeout": (60.0, "With autostart and config: how long to wait for the mesh, in s; 0.0: not at all."),
-}
-
-
 class Managed(Protocol):
-    """What a lifecycle node is about; the methods are its transitions, and raise `FmuMeshError`.
+    """The behaviour of a lifecycle node; the methods are its transitions, and raise `FmuMeshError`.
 
     Attributes:
-        failure: why it failed while it was active, until it is configured again.
+        failure: the error with which it failed while it was active, until it is configured again.
     """
 
     failure: FmuMeshError | None
@@ -58,66 +47,83 @@ class Managed(Protocol):
 
 
 def create_node(name: str = NODE_NAME, **options: Any) -> RosNode:  # noqa: ANN401 those of rclpy
-    """A lifecycle node that runs an FMU, or is the gateway of a mesh; `rclpy.init` comes before it.
+    """Create a lifecycle node that runs an FMU or is the gateway of a mesh.
 
-    Its attribute `managed` is the `Managed` behind it. Call `managed.close()` before `destroy_node()`.
+    Call `rclpy.init` before it. The attribute `managed` of the node is its `Managed`; call `managed.close()` before
+    `destroy_node()`.
 
     Args:
         name: of the node.
         options: more arguments of `rclpy.lifecycle.LifecycleNode`, such as ``namespace`` or ``parameter_overrides``.
 
     Raises:
-        ConfigurationError: there is no ROS in this Python.
+        ConfigurationError: this Python has no ROS.
+
+    Example:
+        >>> node = create_node("pendulum", namespace="/lab")  # doctest: +SKIP
+        >>> executor.add_node(node)  # doctest: +SKIP
     """
-    lifecycle = ros_module("rclpy.lifecycle")
-    # The base class is not there to derive from before this moment, so the class is made here.
-    transitions = {
-        "on_configure": _transition(_configure),
-        "on_activate": _transition(lambda node: node.managed.activate()),
-        "on_deactivate": _transition(lambda node: node.managed.deactivate()),
-        "on_cleanup": _transition(lambda node: node.managed.cleanup()),
-        "on_shutdown": _transition(lambda node: node.managed.cleanup()),
-        "on_error": _transition(lambda node: node.managed.cleanup()),
-    }
-    node = type("FmuLifecycleNode", (lifecycle.LifecycleNode,), transitions)(name, **options)
-    descriptor = ros_module("rcl_interfaces.msg").ParameterDescriptor
-    for parameter, (default, description) in {**PARAMETERS, **_MORE_PARAMETERS}.items():
-        node.declare_parameter(parameter, default, descriptor(description=description))
-    node.managed = FmuNode(node)
-    return node
+    return _node_class()(name, **options)
 
 
-def _configure(node: RosNode) -> None:
-    """Become what the parameters say, and configure that."""
-    config, fmu_path = (node.get_parameter(name).value for name in ("config", "fmu_path"))
-    if config and fmu_path:
-        raise ConfigurationError("the parameters 'config' and 'fmu_path' are both set.", hint="Set one of them.")
-    kind = GatewayNode if config else FmuNode
-    if not isinstance(node.managed, kind):
-        node.managed.close()
-        node.managed = kind(node)
-    managed: Managed = node.managed
-    managed.configure()
+def _node_class() -> Any:  # noqa: ANN401, C901 a type of rclpy; a class, not one function
+    """The class of the node; it is defined in a function because its base class exists only where ROS is."""
+    lifecycle: Any = ros_module("rclpy.lifecycle")
+    answer = lifecycle.TransitionCallbackReturn
 
+    class FmuLifecycleNode(lifecycle.LifecycleNode):  # type: ignore[misc]  # rclpy has no types where ROS is missing
+        """A lifecycle node whose transitions are those of `managed`."""
 
-def _transition(act: Callable[[RosNode], None]) -> Callable[[Any, Any], Any]:
-    """A transition of the lifecycle: an error that is nobody's fault leaves the state as it is, with the reason."""
+        def __init__(self, name: str, **options: object) -> None:
+            super().__init__(name, **options)
+            descriptor = ros_module("rcl_interfaces.msg").ParameterDescriptor
+            for parameter, (default, description) in PARAMETERS.items():
+                self.declare_parameter(parameter, default, descriptor(description=description))
+            self.managed: Managed = FmuNode(self)
 
-    def on_transition(node: Any, _state: Any) -> Any:  # noqa: ANN401 types of rclpy
-        answer = ros_module("rclpy.lifecycle").TransitionCallbackReturn
-        try:
-            act(node)
-        except FmuMeshError as error:
-            if node.managed.failure is not None:
-                return answer.ERROR  # told already; `on_error` cleans up, and the node can be configured again
-            node.get_logger().error(str(error))
-            return answer.FAILURE
-        except Exception as error:  # noqa: BLE001 rclpy would swallow it
-            node.get_logger().fatal(f"internal error: {error!r}")
-            return answer.ERROR
-        return answer.SUCCESS
+        def on_configure(self, _state: object) -> object:
+            return self._answer(self._configure)
 
-    return on_transition
+        def on_activate(self, _state: object) -> object:
+            return self._answer(self.managed.activate)
+
+        def on_deactivate(self, _state: object) -> object:
+            return self._answer(self.managed.deactivate)
+
+        def on_cleanup(self, _state: object) -> object:
+            return self._answer(self.managed.cleanup)
+
+        on_shutdown = on_cleanup
+        on_error = on_cleanup
+
+        def _configure(self) -> None:
+            """Choose the behaviour that the parameters ask for, and configure it."""
+            config, fmu_path = (self.get_parameter(own).value for own in ("config", "fmu_path"))
+            if config and fmu_path:
+                raise ConfigurationError(
+                    "the parameters 'config' and 'fmu_path' are both set.", hint="Set one of them."
+                )
+            kind = GatewayNode if config else FmuNode
+            if not isinstance(self.managed, kind):
+                self.managed.close()
+                self.managed = kind(self)
+            self.managed.configure()
+
+        def _answer(self, transition: Callable[[], None]) -> object:
+            """Make a transition. An `FmuMeshError` is logged and keeps the state, unless the FMU has failed."""
+            try:
+                transition()
+            except FmuMeshError as error:
+                if self.managed.failure is not None:
+                    return answer.ERROR  # logged already; `on_error` cleans up, and the node can be configured again
+                self.get_logger().error(str(error))
+                return answer.FAILURE
+            except Exception as error:  # noqa: BLE001 rclpy would ignore it
+                self.get_logger().fatal(f"internal error: {error!r}")
+                return answer.ERROR
+            return answer.SUCCESS
+
+    return FmuLifecycleNode
 
 
 def _wrong_arguments(error: Exception) -> str:
@@ -129,17 +135,28 @@ def _wrong_arguments(error: Exception) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the node until ROS is shut down; returns the exit code."""
+    """Run the node until ROS is shut down.
+
+    Args:
+        arguments: of the command line, without the name of the program; None takes those of this process.
+
+    Returns:
+        The exit code.
+
+    Example:
+        >>> main(["--ros-args", "-p", "fmu_path:=fmus/DampedPendulum.fmu", "-p", "autostart:=true"])  # doctest: +SKIP
+        0
+    """
     try:
         rclpy = ros_module("rclpy")
         executors = ros_module("rclpy.executors")
     except ConfigurationError as error:
-        print(f"fmu_mesh.ros.node: {error}", file=sys.stderr)  # noqa: T201 nobody else is there to tell
+        print(f"fmu_mesh.ros.node: {error}", file=sys.stderr)  # noqa: T201 no logger of ROS is there
         return error.exit_code
     try:
         rclpy.init(args=None if arguments is None else [sys.argv[0], *arguments])
         node = create_node()
-    except Exception as error:  # noqa: BLE001 whatever rclpy raises: the arguments are wrong, and it says which
+    except Exception as error:  # noqa: BLE001 rclpy raises many types for wrong arguments, and each says which
         print(f"fmu_mesh.ros.node: {_wrong_arguments(error)}", file=sys.stderr)  # noqa: T201 as above
         rclpy.try_shutdown()
         return ConfigurationError.exit_code
@@ -150,10 +167,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (KeyboardInterrupt, executors.ExternalShutdownException):
         pass
     finally:
-        # Whoever presses Ctrl-C again does not wait for the rest, and is shown no traceback either.
+        # A second Ctrl-C ends the process at once, without a traceback.
         signal.signal(signal.SIGINT, lambda *_: os._exit(Interrupted.exit_code))
         managed: Managed = node.managed
-        # Neither an FMU that hangs nor the middleware's own shutdown may keep this process for ever.
+        # Neither an FMU that hangs nor the shutdown of the middleware may keep this process alive.
         end = threading.Timer(_END_S, os._exit, (3,))
         end.daemon = True
         end.start()
@@ -162,11 +179,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         rclpy.try_shutdown()
     exit_code = managed.failure.exit_code if managed.failure is not None else 0
     if not returned:
-        # A thread that is inside the FMU for ever would keep this process alive for ever.
+        # Python waits at its end for the thread that is still inside the FMU.
         os._exit(exit_code or 3)
     end.cancel()
     return exit_code
-
-
-if __name__ == "__main__":
-    sys.exit(main())

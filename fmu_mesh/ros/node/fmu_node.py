@@ -1,23 +1,26 @@
 """One FMU as a ROS lifecycle node: its parameters, topics and timer around an `FmuDriver`.
 
-Owns the thread that calls the FMU, so that it is always the same one, whatever executor the node is in, and the node's
-services answer while the FMU computes. What is not said here is as in `fmi_adapter_node` (docs/ros-node.md).
+Where this module does not say otherwise, the node behaves as `fmi_adapter_node` (docs/ros-node.md).
 """
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Sequence
+from concurrent.futures import Future
 from concurrent.futures import TimeoutError as FutureTimeout
-from typing import Any, ParamSpec, TypeVar
+from typing import Any
 
-from ...errors import CallRefused, ConfigurationError, DeadlineExceeded, FmuError, FmuMeshError
+from ...errors import CallRefused, ConfigurationError, FmuMeshError
 from ...variables.model_description import Value, Variable
+from ..messages.definitions import CLOCK
+from ..messages.topics import Topic
 from .clock_watch import CLOCK_TOPIC, ClockWatch
-from .driving import DriveSettings, FmuDriver, Turn
-from .node_parameters import (
-    RosNode,
+from .driving import DriveSettings, FmuDriver, FmuThread, Update
+from .fmu_topics import LOG_INTERVAL_S, FmuTopics
+from .node_settings import RESERVED, PacedTime, read_settings
+from .node_topics import topics_of
+from .rclpy_modules import RosNode, message_class, ros_module, steady_timer, time_message
+from .variable_parameters import (
     declare_parameters,
     names_of,
     parameter_values,
@@ -25,32 +28,22 @@ from .node_parameters import (
     undeclared,
     value_of,
 )
-from .node_settings import RESERVED, PacedTime, read_settings
-from .node_topics import Topic, fill, message_time, topics_of, values_in
-from .rclpy_modules import message_class, ros_module
 
 __all__ = ["FmuNode"]
 
-_DEPTH = 1000
-_MAX_WAITING = 10_000
-_ANSWER_S = 60.0
 _CLOSE_S = 5.0
-_COMPLAIN_S = 10.0
-
-Result = TypeVar("Result")
-Arguments = ParamSpec("Arguments")
 
 
 class FmuNode:
-    """What a lifecycle node does that runs one FMU.
+    """The behaviour of a lifecycle node that runs one FMU.
 
-    The methods are its transitions; they are called by one thread at a time.
+    The methods are the transitions of the node; one thread at a time calls them.
 
     Args:
         node: the lifecycle node, with `PARAMETERS` declared.
 
     Attributes:
-        failure: why the FMU failed, until it is configured again.
+        failure: the error with which the FMU failed; None again after `configure`.
     """
 
     def __init__(self, node: RosNode) -> None:
@@ -58,26 +51,22 @@ class FmuNode:
         self._node = node
         self._log = node.get_logger()
         self._driver: FmuDriver | None = None
+        self._topics: FmuTopics | None = None
         self._variables: dict[str, Variable] = {}
         self._declared: list[str] = []
-        self._publishers: list[tuple[Topic, Any, Any]] = []
-        self._subscriptions: list[Any] = []
         self._clock_publisher: Any = None
         self._clock_watch: ClockWatch | None = None
         self._checking: Any = None
         self._timer: Any = None
-        self._turn: Future[Turn] | None = None
-        self._held: dict[str, tuple[Topic, Any, int]] = {}
-        self._waiting = 0
-        self._count = threading.Lock()
+        self._update: Future[Update] | None = None
         self._paced = PacedTime(1.0)
-        self._fmu_thread = ThreadPoolExecutor(1, thread_name_prefix="fmu")
+        self._thread = FmuThread()
 
     def configure(self) -> None:
         """Load the FMU, declare and read its parameters, and open its topics.
 
         Raises:
-            FmuMeshError: something is wrong; nothing is left of this attempt.
+            FmuMeshError: something is wrong; everything that was done is undone.
         """
         self.failure = None
         try:
@@ -87,75 +76,70 @@ class FmuNode:
             raise
 
     def activate(self) -> None:
-        """Start, or go on after a pause; from the beginning if the stop time was reached.
+        """Start the FMU, or continue after a pause; restart it if the stop time was reached.
 
         Raises:
             FmuMeshError: the FMU does not start.
         """
-        driver = self._live()
-        self._paced.go_on()
-        now = self._now()
-        self._call(driver.resume, now)
-        for topic, message, arrived in self._held.values():
-            self._call(self._take, topic, message, arrived)
-        self._held.clear()
-        steady = ros_module("rclpy.clock").Clock(clock_type=ros_module("rclpy.clock").ClockType.STEADY_TIME)
-        period = read_settings(self._node).update_period
-        self._timer = self._node.create_timer(period, self._tick, clock=steady)
+        driver, topics = self._live()
+        self._paced.resume()
+        self._thread.call(driver.resume, self._now())
+        topics.start()
+        self._timer = steady_timer(self._node, read_settings(self._node).update_period, self._tick)
 
     def deactivate(self) -> None:
-        """Stop stepping; the FMU stays where it is.
+        """Stop stepping; the FMU keeps its state.
 
         Raises:
             FmuMeshError: the FMU has failed.
         """
         self._stop_timer()
         self._paced.pause()
-        turn, self._turn = self._turn, None
-        if turn is not None and self.failure is None:
-            self._result(turn)
+        update, self._update = self._update, None
+        if update is not None and self.failure is None:
+            self._thread.result(update)
         if self.failure is not None:
             raise self.failure
 
     def cleanup(self) -> None:
-        """Close the FMU and its topics, and take its parameters back. Never raises."""
+        """Close the FMU and its topics, and undeclare its parameters. Never raises."""
         self._stop_timer()
         if self._checking is not None:
             self._node.remove_on_set_parameters_callback(self._checking)
             self._checking = None
-        for subscription in self._subscriptions:
-            self._node.destroy_subscription(subscription)
         driver, self._driver = self._driver, None
+        topics, self._topics = self._topics, None
+        if topics is not None:
+            topics.close_inputs()
         if driver is not None:
             try:
-                self._fmu_thread.submit(driver.close).result(_CLOSE_S)
+                self._thread.submit(driver.close).result(_CLOSE_S)
             except FutureTimeout:
                 self._log.error(f"the FMU did not return within {_CLOSE_S:g} s; it is left behind")
                 driver.remove_files()
-        for _, publisher, _ in self._publishers:
-            self._node.destroy_publisher(publisher)
+        if topics is not None:
+            topics.close_outputs()
         if self._clock_watch is not None:
             self._clock_watch.close()
             self._clock_watch = None
         if self._clock_publisher is not None:
             self._node.destroy_publisher(self._clock_publisher)
+            self._clock_publisher = None
         undeclare_parameters(self._node, self._declared)
-        self._subscriptions, self._publishers, self._clock_publisher, self._declared = [], [], None, []
-        self._turn = None
-        self._held.clear()
+        self._declared = []
+        self._update = None
 
     def close(self) -> bool:
-        """`cleanup`, and end the thread; returns whether the FMU's last call has come back."""
+        """Clean up and end the thread of the FMU; returns whether the last call of the FMU has returned."""
         self.cleanup()
-        self._fmu_thread.shutdown(wait=False, cancel_futures=True)
-        return not any(thread.is_alive() for thread in _joined(self._fmu_thread))
+        return self._thread.close()
 
     # --- the transitions in detail
 
     def _configure(self) -> None:
         settings = read_settings(self._node)
         self._paced = PacedTime(settings.real_time_factor)
-        driver = self._driver = self._call(FmuDriver, settings.drive)
+        driver = self._driver = self._thread.call(FmuDriver, settings.drive)
         description = driver.description
         names = names_of(description.variables, settings.names)
         taken = sorted(RESERVED.intersection(names.values()))
@@ -168,19 +152,19 @@ class FmuNode:
         before = [name for name in names.values() if self._node.has_parameter(name)]
         self._variables = declare_parameters(self._node, description, settings.names)
         self._declared = [name for name in self._variables if name not in before]
-        self._set_values(parameter_values(self._node, self._variables))
+        self._set_values(driver, parameter_values(self._node, self._variables))
+        opened = self._topics = FmuTopics(self._node, driver, self._thread, self._now)
         for topic in topics:
-            self._open(topic)
+            opened.open(topic)
         if settings.publish_clock:
-            kind = message_class("rosgraph_msgs/msg/Clock")
-            self._clock_publisher = self._node.create_publisher(kind, CLOCK_TOPIC, 10)
+            self._clock_publisher = self._node.create_publisher(message_class(CLOCK), CLOCK_TOPIC, 10)
             self._clock_watch = ClockWatch(self._node, "publish_clock: false")
         self._checking = self._check_parameters
         self._node.add_on_set_parameters_callback(self._checking)
-        self._tell(driver, settings.drive, topics)
+        self._report(driver, settings.drive, topics)
 
-    def _tell(self, driver: FmuDriver, settings: DriveSettings, topics: Sequence[Topic]) -> None:
-        """What a user may want to know of this FMU."""
+    def _report(self, driver: FmuDriver, settings: DriveSettings, topics: Sequence[Topic]) -> None:
+        """Log what a user may want to know of this FMU."""
         for name, near in undeclared(self._node).items():
             hint = f"did you mean '{near}'?" if near is not None else "it is ignored"
             self._log.warning(f"the parameter '{name}' is set, but is no variable of the FMU; {hint}")
@@ -190,7 +174,7 @@ class FmuNode:
         proposed = description.default_experiment.stop_time
         if settings.stop_time is None and proposed is not None:
             self._log.info(f"the FMU proposes to stop at {proposed!r} s; set stop_time to end there")
-        carried = {variable for topic in topics for _, variable in topic.fields}
+        carried = {port.variable.name for topic in topics for port in topic.ports}
         for variable in description.with_causality("input", "output"):
             if variable.name not in carried:
                 what = f"no message of std_msgs carries {variable.type_name}"
@@ -198,13 +182,12 @@ class FmuNode:
         for problem in description.problems:
             self._log.warning(f"{settings.fmu_path}: {problem}")
 
-    def _set_values(self, values: dict[str, Value]) -> None:
-        """Give the FMU the values of parameters; all that are wrong are told."""
-        driver = self._live()
+    def _set_values(self, driver: FmuDriver, values: dict[str, Value]) -> None:
+        """Give the FMU the values of parameters; one error names all that are wrong."""
         refused = []
         for name, value in values.items():
             try:
-                self._call(driver.set_value, name, value)
+                self._thread.call(driver.set_value, name, value)
             except CallRefused as error:
                 refused.append(str(error))
             else:
@@ -212,88 +195,52 @@ class FmuNode:
         if refused:
             raise ConfigurationError(" ".join(refused))
 
-    def _open(self, topic: Topic) -> None:
-        kind = message_class(topic.message)
-        overrides = ros_module("rclpy.qos_overriding_options").QoSOverridingOptions.with_default_policies()
-        if topic.direction == "out":
-            publisher = self._node.create_publisher(kind, topic.name, _DEPTH, qos_overriding_options=overrides)
-            self._publishers.append((topic, publisher, kind))
-        else:
-            self._subscriptions.append(
-                self._node.create_subscription(
-                    kind,
-                    topic.name,
-                    lambda message: self._arrived(topic, message),
-                    _DEPTH,
-                    qos_overriding_options=overrides,
-                )
-            )
-
-    # --- the timer and the topics, on a thread of the executor
+    # --- the timer and the parameters, on a thread of the executor
 
     def _tick(self) -> None:
-        """One turn of the FMU on its own thread, unless the last one is not over yet."""
-        if self._turn is not None:
-            if not self._turn.done():
+        """Start an update on the thread of the FMU, unless the last update is not over yet."""
+        if self._update is not None:
+            if not self._update.done():
                 self._log.warning(
                     "the FMU has not finished its last update; is update_period too short?",
-                    throttle_duration_sec=_COMPLAIN_S,
+                    throttle_duration_sec=LOG_INTERVAL_S,
                 )
                 return
-            turn, self._turn = self._turn, None
-            if not self._look_at(turn):
+            update, self._update = self._update, None
+            if not self._finish(update):
                 return
         now = self._now()
         if now == 0 and self._simulated_time():
-            self._log.info("waiting for a first /clock", throttle_duration_sec=_COMPLAIN_S)
+            self._log.info("waiting for a first /clock", throttle_duration_sec=LOG_INTERVAL_S)
             return
-        self._turn = self._fmu_thread.submit(self._do_turn, now, self._simulated_time())
+        self._update = self._thread.submit(self._update_fmu, now, self._simulated_time())
 
-    def _look_at(self, done: Future[Turn]) -> bool:
-        """What came of a turn; whether the next one may follow."""
+    def _finish(self, done: Future[Update]) -> bool:
+        """Log the result of an update, or fail with it; returns whether another update may follow."""
         try:
-            turn = self._result(done)
+            update = self._thread.result(done)
         except FmuMeshError as error:
             self.failure = error
             self._log.error(str(error))
             self._node.trigger_deactivate()
             return False
-        if turn.jumped_back:
+        if update.jumped_back:
             what = "the FMU starts from the beginning" if self._simulated_time() else "the FMU goes on where it is"
-            self._log.warning(f"time has jumped back by {turn.jumped_back:.3f} s: {what}")
-        if turn.behind:
+            self._log.warning(f"time has jumped back by {update.jumped_back:.3f} s: {what}")
+        if update.behind:
             self._log.warning(
-                f"the FMU is {turn.behind:.3f} s behind after {turn.steps} steps in one update",
-                throttle_duration_sec=_COMPLAIN_S,
+                f"the FMU is {update.behind:.3f} s behind after {update.steps} steps in one update",
+                throttle_duration_sec=LOG_INTERVAL_S,
             )
-        if turn.ended:
+        if update.ended:
             self._log.info("the stop time is reached")
             self._node.trigger_deactivate()
-        return not turn.ended
-
-    def _arrived(self, topic: Topic, message: Any) -> None:  # noqa: ANN401 a ROS message
-        """Take an input; while the FMU does not step only the last one of each topic counts."""
-        arrived = self._now()
-        if self._timer is None:
-            self._held[topic.name] = (topic, message, arrived)
-            return
-        with self._count:
-            self._waiting += 1
-            full = self._waiting > _MAX_WAITING
-            if full:
-                self._waiting -= 1
-        if full:
-            self._log.error(
-                f"{_MAX_WAITING} messages wait for the FMU; one on '{topic.name}' is lost",
-                throttle_duration_sec=_COMPLAIN_S,
-            )
-            return
-        self._fmu_thread.submit(self._take_waiting, topic, message, arrived)
+        return not update.ended
 
     def _check_parameters(self, parameters: Sequence[Any]) -> Any:  # noqa: ANN401 types of rclpy
-        """Refuse what cannot be set now, with the reason; what can is set at the FMU's next turn."""
+        """Refuse values that cannot be set now, with the reason; the FMU gets the others before its next step."""
         result = ros_module("rcl_interfaces.msg").SetParametersResult
-        driver = self._live()
+        driver, _ = self._live()
         accepted = []
         for parameter in parameters:
             variable = self._variables.get(parameter.name)
@@ -304,39 +251,18 @@ class FmuNode:
             except CallRefused as error:
                 return result(successful=False, reason=str(error))
         for name, value in accepted:
-            self._fmu_thread.submit(self._set_value, name, value)
+            self._thread.submit(self._set_value, name, value)
         return result(successful=True)
 
-    # --- on the FMU's thread
+    # --- on the thread of the FMU
 
-    def _do_turn(self, now: int, restart: bool) -> Turn:  # noqa: FBT001 passed through an executor
-        driver = self._live()
-        variables = [variable for topic, _, _ in self._publishers for _, variable in topic.fields]
-        turn = driver.turn(now, variables, restart=restart)
+    def _update_fmu(self, now: int, restart: bool) -> Update:  # noqa: FBT001 passed through an executor
+        driver, topics = self._live()
+        update = driver.update(now, topics.outputs, restart=restart)
         if self._clock_publisher is not None:
-            clock = message_class("rosgraph_msgs/msg/Clock")()
-            clock.clock.sec, clock.clock.nanosec = divmod(turn.time, 1_000_000_000)
-            self._clock_publisher.publish(clock)
-        for topic, publisher, kind in self._publishers:
-            message = kind()
-            fill(topic, message, turn.values, turn.time)
-            publisher.publish(message)
-        return turn
-
-    def _take_waiting(self, topic: Topic, message: Any, arrived: int) -> None:  # noqa: ANN401 a ROS message
-        with self._count:
-            self._waiting -= 1
-        self._take(topic, message, arrived)
-
-    def _take(self, topic: Topic, message: Any, arrived: int) -> None:  # noqa: ANN401 a ROS message
-        driver = self._driver
-        if driver is None:
-            return
-        try:
-            for variable, value in values_in(topic, message).items():
-                driver.set_input(variable, message_time(message, arrived), value)
-        except (CallRefused, IndexError) as error:
-            self._log.error(f"a message on '{topic.name}' was left out: {error}", throttle_duration_sec=_COMPLAIN_S)
+            self._clock_publisher.publish(message_class(CLOCK)(clock=time_message(update.time)))
+        topics.publish(update)
+        return update
 
     def _set_value(self, name: str, value: Value) -> None:
         if self._driver is None:
@@ -357,34 +283,14 @@ class FmuNode:
     def _simulated_time(self) -> bool:
         return self._clock_publisher is None and bool(self._node.get_clock().ros_time_is_active)
 
-    def _live(self) -> FmuDriver:
-        if self._driver is None:
+    def _live(self) -> tuple[FmuDriver, FmuTopics]:
+        if self._driver is None or self._topics is None:
             raise ConfigurationError("the node has no FMU yet.", hint="Configure it first.")
-        return self._driver
+        return self._driver, self._topics
 
     def _stop_timer(self) -> None:
+        if self._topics is not None:
+            self._topics.stop()
         if self._timer is not None:
             self._node.destroy_timer(self._timer)
             self._timer = None
-
-    def _call(self, function: Callable[Arguments, Result], *args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
-        """Call something on the FMU's thread and wait for it."""
-        return self._result(self._fmu_thread.submit(function, *args, **kwargs))
-
-    def _result(self, future: Future[Result]) -> Result:
-        try:
-            return future.result(_ANSWER_S)
-        except FutureTimeout as error:
-            raise DeadlineExceeded(f"the FMU has not returned for {_ANSWER_S:g} s.") from error
-        except FmuMeshError:
-            raise
-        except Exception as error:
-            raise FmuError(f"the FMU's thread failed: {error!r}.") from error
-
-
-def _joined(executor: ThreadPoolExecutor) -> list[threading.Thread]:
-    """The threads of an executor that is shut down, after they were given time to end."""
-    threads = list(executor._threads)  # noqa: SLF001 there is no public way to wait with a deadline
-    for thread in threads:
-        thread.join(_CLOSE_S)
-    return threads

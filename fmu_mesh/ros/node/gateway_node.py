@@ -1,7 +1,7 @@
-"""The gateway of a mesh as a ROS lifecycle node: its topics are those of the node, on whatever middleware ROS has.
+"""The gateway of a mesh as a ROS lifecycle node: rclpy carries its topics, so every middleware of ROS works.
 
-What flows is the matter of `fmu_mesh.ros.gateway.gateway`; here is the profile that lets rclpy carry it, and the mesh's
-parameters as those of the node.
+`fmu_mesh.ros.gateway.gateway` carries the samples. Here are the profile for rclpy, and the parameters of the mesh as
+parameters of the node.
 """
 
 from __future__ import annotations
@@ -15,35 +15,32 @@ from typing import Any
 import msgspec
 from msgspec.structs import replace
 
-from ...config.loading import load
 from ...config.mesh import RosConfig
 from ...errors import ConfigurationError, FmuMeshError, MeshLost
+from ...instances.configuration import load
 from ...wire.client.mesh_client import MeshClient
 from ...wire.client.reaching import Meshes
 from ...wire.client.readings import Target
 from ...wire.session import tokens
 from ..bags.playing import grid_of
 from ..gateway.gateway import Gateway
-from ..gateway.mapping import message_types, resolve
+from ..gateway.mapping import descriptions_of, resolve
 from ..gateway.profile import DEPTH, Profile, Put, Take
-from ..gateway.seen import descriptions_of
-from ..gateway.topics import RosPlan, Topic
-from ..messages.definitions import MessageTypes
+from ..messages.topics import RosPlan, Topic
 from .clock_watch import ClockWatch
-from .node_parameters import RosNode
-from .rclpy_modules import message_class, ros_module
+from .rclpy_modules import RosNode, message_class, ros_module, steady_timer
 
 __all__ = ["GatewayNode", "RclpyProfile"]
 
 _TIMEOUT_S = 10.0
-_LOOK_S = 0.25
+_INTERVAL_S = 0.25
 
 
 class RclpyProfile:
-    """A profile whose topics are those of a node of rclpy. Messages pass as the CDR bytes that they are.
+    """A profile whose topics are those of a node of rclpy, which takes and returns messages as CDR bytes.
 
     Args:
-        node: the node; stays the caller's.
+        node: the node; the caller destroys it.
     """
 
     def __init__(self, node: RosNode) -> None:
@@ -52,7 +49,7 @@ class RclpyProfile:
         self._subscriptions: list[Any] = []
 
     def publish(self, topic: Topic) -> Put:
-        """Be a publisher of ``topic``."""
+        """Create a publisher of ``topic``."""
         publisher = self._node.create_publisher(message_class(topic.message), topic.name, _quality(topic))
         self._publishers.append(publisher)
 
@@ -60,14 +57,14 @@ class RclpyProfile:
             try:
                 publisher.publish(data)
             except Exception:
-                # Ctrl-C shuts ROS down while samples still come; nobody is there any more to take them.
+                # Ctrl-C shuts ROS down while samples still arrive; nothing can be published any more.
                 if self._node.context.ok():
                     raise
 
         return put
 
     def subscribe(self, topic: Topic, take: Take) -> None:
-        """Be a subscriber of ``topic``."""
+        """Create a subscription of ``topic``."""
         kind = message_class(topic.message)
         self._subscriptions.append(self._node.create_subscription(kind, topic.name, take, _quality(topic), raw=True))
 
@@ -81,13 +78,13 @@ class RclpyProfile:
 
 
 class GatewayNode:
-    """What a lifecycle node does that is the gateway of a running mesh.
+    """The behaviour of a lifecycle node that is the gateway of a running mesh.
 
     Args:
         node: the lifecycle node, with the parameters `config` and `connect` declared.
 
     Attributes:
-        failure: None; a mesh that ends is no failure of its gateway.
+        failure: always None; the end of a mesh is not a failure of its gateway.
     """
 
     failure: FmuMeshError | None = None
@@ -98,7 +95,6 @@ class GatewayNode:
         self._stack = ExitStack()
         self._client: MeshClient | None = None
         self._plan: RosPlan | None = None
-        self._types: MessageTypes | None = None
         self._targets: dict[str, Target] = {}
         self._run = ""
         self._active = ExitStack()
@@ -107,7 +103,7 @@ class GatewayNode:
         """Find the mesh, resolve its topics, and declare its parameters.
 
         Raises:
-            FmuMeshError: something is wrong; nothing is left of this attempt.
+            FmuMeshError: something is wrong; everything that was done is undone.
         """
         try:
             self._configure()
@@ -116,10 +112,10 @@ class GatewayNode:
             raise
 
     def activate(self) -> None:
-        """Let topics flow.
+        """Open the topics and carry their samples.
 
         Raises:
-            FmuMeshError: a topic cannot be opened, or the mesh has ended; nothing is left of this attempt.
+            FmuMeshError: a topic cannot be opened, or the mesh has ended; everything that was done is undone.
         """
         try:
             self._activate()
@@ -128,17 +124,17 @@ class GatewayNode:
             raise
 
     def deactivate(self) -> None:
-        """Let nothing flow any more; what has come from the mesh is published before."""
+        """Close the topics; samples that have arrived from the mesh are published before."""
         self._active.close()
 
     def cleanup(self) -> None:
-        """Leave the mesh, and take its parameters back. Never raises."""
+        """Disconnect from the mesh and undeclare its parameters. Never raises."""
         self.deactivate()
         self._stack.close()
-        self._client, self._plan, self._types, self._targets = None, None, None, {}
+        self._client, self._plan, self._targets = None, None, {}
 
     def close(self) -> bool:
-        """`cleanup`; returns that nothing is left running."""
+        """Clean up; returns True, because nothing is left running."""
         self.cleanup()
         return True
 
@@ -153,7 +149,6 @@ class GatewayNode:
         self._run = info.run
         infos = {name: client.instance_info(name) for name in info.instances}
         findings = loaded.findings()
-        self._types = message_types(loaded, findings)
         plan = self._plan = resolve(loaded, descriptions_of(infos), findings)
         findings.raise_any()
         if plan is not None:
@@ -161,8 +156,8 @@ class GatewayNode:
         self._log.info(f"gateway of mesh '{loaded.config.mesh}' with {len(plan.topics) if plan else 0} topics")
 
     def _activate(self) -> None:
-        client, plan, types = self._client, self._plan, self._types
-        if client is None or plan is None or types is None:
+        client, plan = self._client, self._plan
+        if client is None or plan is None:
             raise ConfigurationError("the gateway has no mesh yet.", hint="Configure it first.")
         if not tokens(client.session, client.keys.master) or (info := client.info()).run != self._run:
             raise MeshLost(
@@ -173,22 +168,20 @@ class GatewayNode:
         self._active.callback(profile.close)
         names = {topic.profile for topic in plan.topics} or {"ros2dds"}
         profiles: dict[str, Profile] = dict.fromkeys(map(str, sorted(names)), profile)
-        gateway = Gateway(plan, types, client.session, client.keys, grid_of(info), profiles, _TIMEOUT_S)
+        gateway = Gateway(plan, client.session, client.keys, grid_of(info), profiles)
         self._active.callback(gateway.close)
-        gateway.open()
+        gateway.open(_TIMEOUT_S)
         thread = threading.Thread(target=gateway.run, name="gateway", daemon=True)
         thread.start()
         self._active.callback(thread.join, _TIMEOUT_S)
         self._active.callback(gateway.end)
-        clock = ros_module("rclpy.clock")
-        steady = clock.Clock(clock_type=clock.ClockType.STEADY_TIME)
-        timer = self._node.create_timer(_LOOK_S, lambda: self._look(thread), clock=steady)
+        timer = steady_timer(self._node, _INTERVAL_S, lambda: self._look(thread))
         self._active.callback(self._node.destroy_timer, timer)
         if plan.clock_points is not None:
             self._active.callback(ClockWatch(self._node, "`clock_rate: null` in the section `ros`").close)
 
     def _declare_parameters(self, client: MeshClient, plan: RosPlan) -> None:
-        """The parameters of the mesh as those of the node, with their current values."""
+        """Declare the parameters of the mesh as parameters of the node, with their current values."""
         references = {
             parameter.name: f"{parameter.instance}.{parameter.variable.name}" for parameter in plan.parameters
         }
@@ -199,7 +192,7 @@ class GatewayNode:
             view = target.variable
             about = f"{target.instance}.{view.name}: {view.description or view.causality}"
             about += f" ({view.variability} {view.type}{f' in {view.unit}' if view.unit else ''})"
-            # ROS never lets go of a read-only parameter, and the next run has others: the mesh refuses what is fixed.
+            # Not read-only: ROS cannot undeclare those, and the next run has others. The mesh refuses fixed ones.
             self._node.declare_parameter(
                 name, values.get(target.key), descriptor(description=about, dynamic_typing=True)
             )
@@ -208,7 +201,7 @@ class GatewayNode:
         self._stack.callback(self._node.remove_on_set_parameters_callback, self._set_parameters)
 
     def _set_parameters(self, parameters: Sequence[Any]) -> Any:  # noqa: ANN401 types of rclpy
-        """Set tunable parameters of the mesh; what the mesh refuses is refused with its reason."""
+        """Set tunable parameters of the mesh; if the mesh refuses a value, answer with its reason."""
         result = ros_module("rcl_interfaces.msg").SetParametersResult
         for parameter in parameters:
             target = self._targets.get(parameter.name)

@@ -1,4 +1,4 @@
-"""What a node that runs an FMU is told by its own parameters, and the time that it can make itself."""
+"""The parameters of the node itself, and the simulated time that the node can generate."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import msgspec
 
 from ...errors import ConfigurationError
 from .driving import DriveSettings
-from .node_parameters import RosNode
 from .node_topics import own_names
+from .rclpy_modules import RosNode
 
 __all__ = ["PARAMETERS", "RESERVED", "NodeSettings", "PacedTime", "read_settings"]
 
@@ -27,30 +27,28 @@ PARAMETERS: dict[str, tuple[Any, str]] = {
     "messages": ([""], "Fields of messages, each as 'TOPIC: {type: TYPE, fields: {PATH: VARIABLE}}'."),
     "publish_clock": (False, "Whether this node is the source of simulated time: it starts at 0 and goes to /clock."),
     "real_time_factor": (1.0, "With publish_clock: simulated over wall-clock time."),
+    "config": ("", "Configuration of a running mesh, instead of an FMU: the node is its gateway."),
+    "connect": ([""], "With config: Zenoh endpoints of the mesh; default: the meshes of this user on this host."),
+    "autostart": (False, "Whether the node configures and activates itself."),
+    "autostart_timeout": (60.0, "With autostart and config: how long to wait for the mesh, in s; 0.0: not at all."),
 }
-"""The parameters of the node itself, which it has before an FMU is there: default and description."""
+"""The parameters of the node itself, which it declares before it has an FMU: default and description."""
 
-RESERVED = frozenset(
-    {
-        *PARAMETERS,
-        *("autostart", "autostart_timeout", "config", "connect"),
-        *("use_sim_time", "start_type_description_service"),
-    }
-)
-"""Names of parameters that a node has without its FMU."""
+RESERVED = frozenset({*PARAMETERS, "use_sim_time", "start_type_description_service"})
+"""Names of the parameters that every node has, which a variable of an FMU cannot have."""
 
 
 class NodeSettings(msgspec.Struct, frozen=True, kw_only=True):
-    """The parameters of the node itself, checked.
+    """The checked parameters of a node that runs an FMU.
 
     Attributes:
         drive: how the FMU is driven.
-        update_period: of the timer in s.
-        stamped: whether numbers have a second topic with a header.
-        names: ROS names by variable, where the usual ones do not do.
+        update_period: period of the timer in s.
+        stamped: whether numeric variables have a second topic with a header.
+        names: ROS names by variable, for variables whose usual name cannot be used.
         messages: entries of the parameter `messages`.
         publish_clock: whether the node is the source of simulated time.
-        real_time_factor: of that time.
+        real_time_factor: simulated over wall-clock time.
     """
 
     drive: DriveSettings
@@ -63,10 +61,10 @@ class NodeSettings(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def read_settings(node: RosNode) -> NodeSettings:
-    """Read `PARAMETERS` of a node.
+    """Read the parameters of a node that runs an FMU.
 
     Raises:
-        ConfigurationError: a value is missing or out of its range.
+        ConfigurationError: a value is missing or out of range.
     """
     value = {name: node.get_parameter(name).value for name in (*PARAMETERS, "use_sim_time")}
     if not value["fmu_path"]:
@@ -98,7 +96,11 @@ def read_settings(node: RosNode) -> NodeSettings:
 
 
 class PacedTime:
-    """Simulated time that this node makes itself: 0 at first, then wall-clock time by a factor; it can be paused."""
+    """Simulated time that starts at 0 and runs at a multiple of wall-clock time; it starts paused.
+
+    Args:
+        factor: simulated over wall-clock time.
+    """
 
     def __init__(self, factor: float) -> None:
         self._factor = factor
@@ -110,11 +112,11 @@ class PacedTime:
         running = 0 if self._since is None else time.monotonic_ns() - self._since
         return self._before + round(running * self._factor)
 
-    def go_on(self) -> None:
-        """Start, or go on."""
+    def resume(self) -> None:
+        """Start, or continue after a pause."""
         if self._since is None:
             self._since = time.monotonic_ns()
 
     def pause(self) -> None:
-        """Hold it."""
+        """Stop the time until `resume`."""
         self._before, self._since = self.now(), None

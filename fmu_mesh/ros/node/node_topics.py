@@ -1,6 +1,7 @@
-"""Which topics an FMU has as a ROS node, and how their messages and the values of its variables become one another.
+"""Which topics an FMU has in a ROS node, and how values are put into their messages and taken out of them.
 
-Owns the node's parameters `names`, `messages` and `stamped`. Knows nothing of publishers and subscriptions.
+Owns the parameters `names`, `messages` and `stamped` of the node. Knows nothing of publishers and subscriptions. The
+messages are objects of the user's own ROS, with the default values that ROS gives their fields.
 """
 
 from __future__ import annotations
@@ -8,7 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import pairwise
-from typing import Any, Literal
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -19,40 +20,25 @@ from ...errors import ConfigurationError
 from ...text import listed, nearest
 from ...variables.model_description import ModelDescription, Value, Variable
 from ...variables.value_types import flattened, nested
-from ..messages.definitions import MAX_ELEMENTS, default_type, path_parts
+from ..messages.definitions import MAX_ELEMENTS, path_parts
+from ..messages.fitting import default_type
 from ..messages.ros_names import topic_problem
-from .node_parameters import names_of
-from .rclpy_modules import message_class
+from ..messages.stamp import in_nanoseconds
+from ..messages.topics import Port, Topic
+from .rclpy_modules import message_class, time_message
+from .variable_parameters import names_of
 
-__all__ = ["Topic", "fill", "message_time", "own_names", "topics_of", "values_in"]
+__all__ = ["fill", "message_time", "own_names", "topics_of", "values_in"]
 
 STAMPED = "geometry_msgs/msg/PointStamped"
-"""The smallest message with a header and a float64 that every ROS has: the value is in `point.x`."""
+"""The smallest message type in every ROS that has a header and a float64."""
 STAMPED_FIELD = "point.x"
 
 _PATH = re.compile(r"\w+(\[\d{1,9}\])?(\.\w+(\[\d{1,9}\])?)*", re.ASCII)
 _SEQUENCE = re.compile(r"sequence<(?P<element>.*?)(, (?P<bound>\d+))?>")
 
 _EMPTY: Mapping[str, str | bytes | bool] = {"string": "", "wstring": "", "boolean": False, "octet": b"\0"}
-"""What an element of a sequence has until it is given a value; a number has 0."""
-
-
-class Topic(msgspec.Struct, frozen=True):
-    """One topic.
-
-    Attributes:
-        name: relative to the node's namespace unless it starts with `/`.
-        message: type, such as `std_msgs/msg/Float64`.
-        direction: seen from the FMU.
-        fields: (path in the message, variable).
-        shape: of the variable, where the message carries one array.
-    """
-
-    name: str
-    message: str
-    direction: Literal["in", "out"]
-    fields: tuple[tuple[str, str], ...]
-    shape: tuple[int, ...] = ()
+"""The value of a new element of a sequence, by type; a number is 0."""
 
 
 class _Message(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -63,10 +49,10 @@ class _Message(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def own_names(entries: Iterable[str]) -> dict[str, str]:
-    """The parameter `names`: ROS names by variable, from entries `VARIABLE: NAME`.
+    """Read the parameter `names`: ROS names by variable, from entries `VARIABLE: NAME`.
 
     Raises:
-        ConfigurationError: an entry is something else.
+        ConfigurationError: an entry has another form.
     """
     names: dict[str, str] = {}
     for entry in entries:
@@ -80,25 +66,25 @@ def own_names(entries: Iterable[str]) -> dict[str, str]:
 def topics_of(
     description: ModelDescription, names: Mapping[str, str], messages: Sequence[str], *, stamped: bool
 ) -> list[Topic]:
-    """The topics of an FMU: one per input and output, as `fmi_adapter` has them, and those of ``messages``.
+    """The topics of an FMU: one per input and output, as in `fmi_adapter`, and those of ``messages``.
 
-    What no message of `std_msgs` carries (Binary, arrays of Boolean or String) has none.
+    A variable that no message of `std_msgs` carries (Binary, an array of Boolean or String) has no topic of its own.
 
     Args:
-        description: of the FMU.
-        names: ROS names by variable where the usual ones do not do.
+        description: the model description.
+        names: ROS names by variable, for variables whose usual name cannot be used.
         messages: entries `TOPIC: {type: PACKAGE/msg/TYPE, fields: {PATH: VARIABLE}}`; a variable in one of them has no
             topic of its own.
-        stamped: whether every numeric input and output has a second topic `NAME_stamped` of messages with a header.
+        stamped: whether every numeric input and output has a second topic `NAME_stamped` whose messages have a header.
 
     Raises:
-        ConfigurationError: with everything that is wrong.
+        ConfigurationError: names everything that is wrong.
     """
     ends = {variable.name: variable for variable in description.with_causality("input", "output")}
     by_variable = names_of(description.variables, names)
     problems: list[str] = []
     topics = [topic for entry in messages if (topic := _mapped(entry, ends, problems)) is not None]
-    mapped = {variable for topic in topics for _, variable in topic.fields}
+    mapped = {port.variable.name for topic in topics for port in topic.ports}
     for variable in ends.values():
         if variable.name not in mapped:
             topics += _own_topics(variable, by_variable[variable.name], stamped=stamped)
@@ -113,59 +99,71 @@ def topics_of(
 
 
 def fill(topic: Topic, message: Any, values: Mapping[str, Value], time: int) -> None:  # noqa: ANN401 a ROS message
-    """Set the fields of a message, and the stamp of its header if it has one, to ``time`` in ns.
+    """Set the fields of a message to the values of their variables, and the stamp of its headers.
 
-    Sequences get the elements that a path needs; so does the header of such an element get the stamp.
+    Sequences are made as long as the paths need them.
+
+    Args:
+        topic: the topic.
+        message: a new message of the type of the topic.
+        values: by variable.
+        time: the stamp, in ns.
     """
-    _stamp(message, time)
-    for path, variable in topic.fields:
-        owner, last = _place(message, path, lambda own: _stamp(own, time))
+    _set_stamp(message, time)
+    for port in topic.ports:
+        owner, last = _place(message, port.path, lambda element: _set_stamp(element, time))
+        value = values[port.variable.name]
         if isinstance(last, int):
-            owner[last] = values[variable]
-            continue
-        value = values[variable]
-        if topic.shape:
-            value = flattened(value, len(topic.shape))
-        # A field takes its own type only; a truth value or a whole number is a number there.
-        setattr(owner, last, value if topic.shape else type(getattr(owner, last))(value))
+            owner[last] = value
+        elif port.variable.shape:
+            setattr(owner, last, flattened(value, len(port.variable.shape)))
+        else:
+            # A field of a ROS message refuses every type but its own, so an int must become a float.
+            setattr(owner, last, type(getattr(owner, last))(value))
 
 
 def values_in(topic: Topic, message: Any) -> dict[str, Value]:  # noqa: ANN401 a ROS message
     """The values in a message, by variable.
 
     Raises:
-        IndexError: the message has a sequence that is shorter than a path needs.
+        IndexError: a sequence in the message is too short for a path.
     """
     values: dict[str, Value] = {}
-    for path, variable in topic.fields:
+    for port in topic.ports:
         value = message
-        for part in path_parts(path):
+        for part in path_parts(port.path):
             value = value[part] if isinstance(part, int) else getattr(value, part)
-        values[variable] = nested(list(value), topic.shape) if topic.shape else value
+        shape = port.variable.shape
+        values[port.variable.name] = nested(list(value), shape) if shape else value
     return values
 
 
 def message_time(message: Any, now: int) -> int:  # noqa: ANN401 a ROS message
-    """When a message is valid, in ns: what its header says, or else ``now``."""
+    """The time from which on a message holds, in ns: the stamp of its header, or ``now`` without one."""
     stamp = getattr(getattr(message, "header", None), "stamp", None)
-    if stamp is None or not (stamp.sec or stamp.nanosec):
-        return now
-    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+    return now if stamp is None else in_nanoseconds(stamp.sec, stamp.nanosec) or now
 
 
 def _own_topics(variable: Variable, name: str, *, stamped: bool) -> list[Topic]:
-    direction: Literal["in", "out"] = "in" if variable.causality == "input" else "out"
     message = default_type(variable.type, array=bool(variable.shape))
     if message is None:
         return []
-    topics = [Topic(name, message, direction, (("data", variable.name),), variable.shape)]
+    topics = [_topic(name, message, {"data": variable})]
     if stamped and not variable.shape and message != "std_msgs/msg/String":
-        topics.append(Topic(f"{name}_stamped", STAMPED, direction, ((STAMPED_FIELD, variable.name),)))
+        topics.append(_topic(f"{name}_stamped", STAMPED, {STAMPED_FIELD: variable}))
     return topics
 
 
+def _topic(name: str, message: str, fields: Mapping[str, Variable]) -> Topic:
+    """A topic whose variables, by the paths of their fields, are all inputs or all outputs."""
+    ports = tuple(
+        Port(path, "", variable, "in" if variable.causality == "input" else "out") for path, variable in fields.items()
+    )
+    return Topic(name, message, ports[0].direction, ports)
+
+
 def _mapped(entry: str, ends: Mapping[str, Variable], problems: list[str]) -> Topic | None:
-    """One entry of the parameter `messages`; None if it is wrong, which is told."""
+    """The topic of one entry of the parameter `messages`; None after a problem, which is added to ``problems``."""
     found = _parsed(entry)
     if found is None:
         problems.append(f"'{entry}' is not of the form 'TOPIC: {{type: PACKAGE/msg/TYPE, fields: {{PATH: VARIABLE}}}}'")
@@ -174,21 +172,20 @@ def _mapped(entry: str, ends: Mapping[str, Variable], problems: list[str]) -> To
     before = len(problems)
     if (problem := topic_problem(name)) is not None:
         problems.append(f"'{name}' is no topic: {problem}")
-    directions = set()
     for path, variable in mapping.fields.items():
         if variable not in ends:
             near = nearest(variable, ends)
             hint = f"did you mean '{near}'?" if near else f"there are {listed(tuple(ends))}"
             problems.append(f"'{variable}' in '{name}' is no input and no output; {hint}")
-            continue
-        directions.add(ends[variable].causality)
-        _check_field(name, mapping.type, path, problems)
-    if len(directions) > 1:
+        elif ends[variable].shape:
+            problems.append(f"'{variable}' in '{name}' is an array, and a field of `messages` takes one value")
+        else:
+            _check_field(name, mapping.type, path, problems)
+    if len({ends[own].causality for own in mapping.fields.values() if own in ends}) > 1:
         problems.append(f"'{name}' has inputs and outputs; a topic goes in one direction")
     if len(problems) > before:
         return None
-    direction: Literal["in", "out"] = "in" if directions == {"input"} else "out"
-    return Topic(name, mapping.type, direction, tuple(mapping.fields.items()))
+    return _topic(name, mapping.type, {path: ends[variable] for path, variable in mapping.fields.items()})
 
 
 def _parsed(entry: str) -> tuple[str, _Message] | None:
@@ -226,17 +223,19 @@ def _check_field(topic: str, message: str, path: str, problems: list[str]) -> No
 
 
 def _place(message: Any, path: str, passed: Callable[[Any], None] = lambda _owner: None) -> tuple[Any, str | int]:  # noqa: ANN401 a ROS message
-    """What holds the field at a path, and its name or index there; sequences on the way are made long enough.
+    """The message or array that holds the field at a path, and the name or index of the field there.
+
+    Sequences on the way are made as long as the path needs them.
 
     Args:
         message: a ROS message.
         path: such as `poses[0].position.x`.
-        passed: called with every message in an array that is on the way.
+        passed: called with every message on the way that is an element of an array.
 
     Raises:
         AttributeError: there is no such field.
-        IndexError: an array cannot have so many elements; the text is how many it can have.
-        TypeError: something that has an index is no array.
+        IndexError: an array cannot have so many elements; its text is the largest number of elements.
+        TypeError: a field with an index is not an array.
     """
     parts = path_parts(path)
     owner = message
@@ -254,7 +253,7 @@ def _place(message: Any, path: str, passed: Callable[[Any], None] = lambda _owne
 
 
 def _lengthen(owner: Any, name: str, length: int) -> None:  # noqa: ANN401 a ROS message
-    """Let the array ``name`` of a message have ``length`` elements at least; new ones are empty."""
+    """Make the array ``name`` of a message at least ``length`` elements long; new elements are empty."""
     elements = getattr(owner, name)
     sequence = _SEQUENCE.fullmatch(owner.get_fields_and_field_types()[name])
     most = len(elements) if sequence is None else int(sequence["bound"] or MAX_ELEMENTS)
@@ -267,6 +266,6 @@ def _lengthen(owner: Any, name: str, length: int) -> None:  # noqa: ANN401 a ROS
         elements.extend(make() for _ in range(length - len(elements)))
 
 
-def _stamp(message: Any, time: int) -> None:  # noqa: ANN401 a ROS message
+def _set_stamp(message: Any, time: int) -> None:  # noqa: ANN401 a ROS message
     if hasattr(message, "header"):
-        message.header.stamp.sec, message.header.stamp.nanosec = divmod(time, 1_000_000_000)
+        message.header.stamp = time_message(time)

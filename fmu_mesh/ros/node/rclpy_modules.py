@@ -1,23 +1,28 @@
-"""The modules of ROS itself, which come from the user's own ROS and are imported when they are needed.
+"""Access to ROS itself: its modules, the classes of its messages, and timers on its steady clock.
 
-They are no dependency of this package: a ROS is installed, and sourced, by its user.
+The user installs and sources ROS; it is not a dependency of this package. So its modules are imported when they are
+needed.
 """
 
 from __future__ import annotations
 
 import importlib
+from collections.abc import Callable
 from typing import Any
 
 from ...errors import ConfigurationError
 
-__all__ = ["message_class", "ros_module"]
+__all__ = ["RosNode", "message_class", "ros_module", "steady_timer", "time_message"]
+
+RosNode = Any
+"""`rclpy.node.Node`, which has no types where ROS is not installed."""
 
 
-def ros_module(name: str) -> Any:  # noqa: ANN401 its types are not there where ROS is not
-    """A module of ROS, such as `rclpy.lifecycle`.
+def ros_module(name: str) -> Any:  # noqa: ANN401 a module of ROS has no types where ROS is not installed
+    """Import a module of ROS, such as `rclpy.lifecycle`.
 
     Raises:
-        ConfigurationError: this Python has no ROS, or not this part of it.
+        ConfigurationError: this Python has no ROS, or ROS has no such module.
     """
     try:
         return importlib.import_module(name)
@@ -34,7 +39,7 @@ def message_class(type_name: str) -> Any:  # noqa: ANN401 as above
     """The class of a message type such as `std_msgs/msg/Float64`.
 
     Raises:
-        ConfigurationError: there is no such type in the user's ROS.
+        ConfigurationError: ROS has no such type.
     """
     parts = type_name.split("/")
     if len(parts) != 3 or parts[1] != "msg":
@@ -44,3 +49,15 @@ def message_class(type_name: str) -> Any:  # noqa: ANN401 as above
     if found is None:
         raise ConfigurationError(f"the ROS package '{parts[0]}' has no message type '{parts[2]}'.")
     return found
+
+
+def time_message(time: int) -> Any:  # noqa: ANN401 as above
+    """``time`` in ns as a `builtin_interfaces/msg/Time`."""
+    sec, nanosec = divmod(time, 1_000_000_000)
+    return message_class("builtin_interfaces/msg/Time")(sec=sec, nanosec=nanosec)
+
+
+def steady_timer(node: RosNode, period_s: float, callback: Callable[[], None]) -> Any:  # noqa: ANN401 as above
+    """Create a timer of a node that also runs while simulated time stands still."""
+    clock = ros_module("rclpy.clock")
+    return node.create_timer(period_s, callback, clock=clock.Clock(clock_type=clock.ClockType.STEADY_TIME))

@@ -7,22 +7,20 @@ program can do (docs/key-space.md), with deadlines and with names instead of key
 
 from __future__ import annotations
 
-import re
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import msgspec
 import zenoh
 
-from ...errors import ConfigurationError, DeadlineExceeded, MessageRefused
-from ...text import listed, nearest
+from ...errors import ConfigurationError, DeadlineExceeded, MeshLost, MessageRefused
+from ...text import fits, listed, nearest
 from ..keys import Keys
 from ..messages import decode_json
-from ..session import matches, reason_of
-from ..values import json_encoding
+from ..session import Question, answer_of, answers, reason_of
 from ..views import (
     Command,
     CommandAnswer,
@@ -39,9 +37,6 @@ from .readings import Keeper, Reading, Target, reading_of
 __all__ = ["MeshClient", "is_key", "key_expression"]
 
 View = TypeVar("View")
-
-_TIMEOUT = "Timeout"  # what Zenoh itself answers in the name of somebody who did not
-_LOOK_S = 0.05
 
 
 class MeshClient:
@@ -80,9 +75,9 @@ class MeshClient:
     def ros(self) -> list[RosView]:
         """What the gateways to ROS reach; none where the mesh has none."""
         # A get: a mesh without a gateway has nobody to wait for.
-        replies = self._session.get(f"{self.keys.mesh_key('ros')}/*", timeout=self._timeout_s)
+        samples = self._get(f"{self.keys.mesh_key('ros')}/*")
         try:
-            return [decode_json(sample.payload.to_bytes(), RosView) for sample in _answers(replies) or ()]
+            return [decode_json(sample.payload.to_bytes(), RosView) for sample in samples]
         except MessageRefused as error:
             raise _not_understood(f"the gateway of mesh '{self.keys.mesh}'", error) from error
 
@@ -97,13 +92,12 @@ class MeshClient:
     def all_status(self) -> tuple[MeshStatus, dict[str, InstanceStatus]]:
         """How far the mesh and all its instances are, by one question; an instance that does not answer is left out."""
         # A querier for a key that spans several queryables is not told that they match (zenoh 1.10): this is a get.
-        replies = self._session.get(f"{self.keys.root}/*/status", timeout=self._timeout_s)
-        answers = {str(sample.key_expr): sample.payload.to_bytes() for sample in _answers(replies) or ()}
-        mesh = answers.pop(self.keys.mesh_key("status"), None)
+        found = {str(s.key_expr): s.payload.to_bytes() for s in self._get(f"{self.keys.root}/*/status")}
+        mesh = found.pop(self.keys.mesh_key("status"), None)
         status = self.status() if mesh is None else None  # nothing is known of the mesh yet, or it is gone
         try:
             status = status or decode_json(mesh or b"", MeshStatus)
-            views = [decode_json(data, InstanceStatus) for data in answers.values()]
+            views = [decode_json(data, InstanceStatus) for data in found.values()]
         except MessageRefused as error:
             raise _not_understood(f"mesh '{self.keys.mesh}'", error) from error
         return status, {view.instance: view for view in views}
@@ -228,16 +222,16 @@ class MeshClient:
         instance, _, name = reference.partition(".")
         names = self.info().instances
         if not name:
-            if not any(_fits(instance, candidate) for candidate in names):
+            if not any(fits(instance, candidate) for candidate in names):
                 instance = "INSTANCE"
             raise ConfigurationError(
                 f"'{reference}' names no variable.", hint=f"Write '{instance}.VARIABLE', or '{instance}.*' for all."
             )
-        instances = [candidate for candidate in names if _fits(instance, candidate)]
+        instances = [candidate for candidate in names if fits(instance, candidate)]
         if not instances:
             raise self._unknown_instance(instance)
         found = [target for candidate in instances for target in self._variables(candidate)]
-        matching = [target for target in found if _fits(name, target.variable.name)]
+        matching = [target for target in found if fits(name, target.variable.name)]
         if not matching:
             where = (
                 f"instance '{instances[0]}' has" if len(instances) == 1 else f"the instances {listed(instances)} have"
@@ -268,29 +262,21 @@ class MeshClient:
             raise _not_understood(who, error) from error
 
     def _ask(self, key: str, who: str, payload: bytes | None = None) -> list[zenoh.Sample]:
-        """The answers to a query, at least one of them.
+        try:
+            return answers(self._session, Question(key, who, self._timeout_s, payload))
+        except DeadlineExceeded:
+            text = f"no answer from {who} within {self._timeout_s:g} s."
+            raise DeadlineExceeded(text, hint="--timeout waits longer.") from None
+        except MeshLost as error:
+            raise ConfigurationError(error.message) from error
 
-        A query sent before the queryable is known gets no answer at all, so this waits until one matches; and again
-        where one matches that has no answer yet.
-        """
-        end = time.monotonic() + self._timeout_s
-        changed = threading.Event()
-        encoding = json_encoding if payload is not None else None
-        with self._session.declare_querier(key, timeout=self._timeout_s) as querier:
-            listener: zenoh.MatchingListener[Any] = querier.declare_matching_listener(lambda _status: changed.set())
-            try:
-                while (left := end - time.monotonic()) > 0:
-                    if matches(querier):
-                        samples = _answers(querier.get(payload=payload, encoding=encoding))
-                        if samples is None:
-                            break
-                        if samples:
-                            return samples
-                    changed.wait(min(left, _LOOK_S))
-                    changed.clear()
-            finally:
-                listener.undeclare()
-        raise DeadlineExceeded(f"no answer from {who} within {self._timeout_s:g} s.", hint="--timeout waits longer.")
+    def _get(self, key: str) -> list[zenoh.Sample]:
+        """What whoever is there answers now; a question that waits for nobody."""
+        try:
+            replies = self._session.get(key, timeout=self._timeout_s)
+            return [sample for reply in replies if (sample := answer_of(reply)) is not None]
+        except MeshLost as error:
+            raise ConfigurationError(error.message) from error
 
 
 def is_key(reference: str, keys: Keys) -> bool:
@@ -309,32 +295,6 @@ def key_expression(text: str) -> zenoh.KeyExpr:
     except zenoh.ZError as error:
         reason = reason_of(error).rpartition("`: ")[2].removesuffix(".")
         raise ConfigurationError(f"'{text}' is no key expression: {reason}") from error
-
-
-def _answers(replies: Any) -> list[zenoh.Sample] | None:  # noqa: ANN401 a Zenoh handler
-    """What was answered; None if somebody did not in time.
-
-    Raises:
-        ConfigurationError: somebody refused.
-    """
-    samples: list[zenoh.Sample] = []
-    late = False
-    for reply in replies:
-        if reply.ok is not None:
-            samples.append(reply.ok)
-            continue
-        text = reply.err.payload.to_bytes().decode(errors="replace")
-        if text != _TIMEOUT:
-            raise ConfigurationError(text)
-        late = True
-    return samples or (None if late else [])
-
-
-def _fits(pattern: str, name: str) -> bool:
-    """Whether a name is the pattern, in which `*` stands for any characters."""
-    if "*" not in pattern:
-        return pattern == name
-    return re.fullmatch(".*".join(map(re.escape, pattern.split("*"))), name) is not None
 
 
 def _not_understood(who: str, error: MessageRefused) -> ConfigurationError:

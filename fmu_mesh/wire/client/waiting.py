@@ -104,8 +104,7 @@ def _ended(status: MeshStatus, what: str) -> FmuMeshError:
     if status.error is None:
         return MeshLost(f"mesh '{status.mesh}' is {status.state} at point {status.point}, and does not {what} any more")
     error = from_report(status.error)
-    error.message = f"mesh '{status.mesh}' has failed and does not {what}: {error.message}"
-    return error
+    return error.saying(f"mesh '{status.mesh}' has failed and does not {what}: {error.message}")
 
 
 def _gone(mesh: str, what: str) -> MeshLost:

@@ -1,9 +1,9 @@
-"""The files of an FMU: a ZIP archive from anywhere, or a folder that somebody unpacked.
+"""The files of an FMU: a ZIP archive from any source, or a folder that somebody has unpacked.
 
-Owns the protection against hostile archives, and the private folder that an instance lives in. That folder is laid out
-like the FMU and always safe to remove: where the FMU is a folder, it holds copies of the binaries and links to the
-rest. It is made below a folder that is handed in, so that it is removed even when the process that used it was killed.
-Knows nothing of what the files mean; that is `fmu_mesh.instances.fmi.archive.examining`.
+Owns the protection against hostile archives, and the private folder that an instance uses. That folder has the layout
+of the FMU and can always be removed: if the FMU is a folder, it holds copies of the binaries and links to all other
+files. It lies below a folder that is passed in, so that it is removed even if the process that used it was killed.
+Does not know what the files mean; see `fmu_mesh.instances.fmi.archive.examining`.
 """
 
 from __future__ import annotations
@@ -17,10 +17,9 @@ import tempfile
 import zipfile
 import zlib
 from collections.abc import Iterator
-from contextlib import contextmanager
-from io import BufferedReader
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path, PurePosixPath
-from typing import Final
+from typing import Final, Protocol
 
 import msgspec
 
@@ -28,10 +27,10 @@ from .... import files
 from ....config.mesh import LimitsConfig
 from ....errors import LoadFailed
 
-__all__ = ["Contents", "Terms", "content_of", "look_into", "sha256_of", "unpack"]
+__all__ = ["Contents", "OpenFmu", "Terms", "content_of", "opened", "sha256_of", "unpacked"]
 
 _HARMLESS_BYTES: Final = 64 * 2**20
-"""An archive that unpacks to less is no bomb, however well it compresses."""
+"""An archive with fewer unpacked bytes is not a ZIP bomb, whatever its compression ratio is."""
 
 _CHUNK: Final = 2**20
 _ENCRYPTED: Final = 0x1
@@ -39,54 +38,88 @@ _XML_FILES: tuple[str, ...] = ("modelDescription.xml", "sources/buildDescription
 
 
 class Terms(msgspec.Struct, frozen=True):
-    """What an FMU has to keep to before anything of it is used.
+    """The conditions that an FMU must meet before it is used.
 
     Attributes:
-        sha256: the SHA-256 that the archive must have, as hexadecimal digits.
+        sha256: the SHA-256 that the configuration asks for, in hexadecimal digits.
+        content: what `content_of` returned when the run was planned.
     """
 
     limits: LimitsConfig = LimitsConfig()
     sha256: str | None = None
+    content: str | None = None
 
 
 class Contents(msgspec.Struct, frozen=True):
     """What is in an FMU.
 
     Attributes:
-        names: of all files, with `/` between the parts.
-        xml: the XML files that tell what the FMU is, by name.
+        names: the names of all files, with `/` between the parts.
+        xml: the contents of the XML files that describe the FMU, by name.
     """
 
     names: frozenset[str]
     xml: dict[str, bytes]
 
 
-def look_into(path: Path, terms: Terms = Terms()) -> Contents:  # noqa: B008 a frozen Struct
-    """The names and the descriptions in the FMU at ``path``; unpacks nothing.
+class OpenFmu(Protocol):
+    """An FMU that is open and meets its terms.
+
+    Whoever needs several things from one FMU opens it once:
+
+    ```python
+    with opened(path, terms) as fmu:
+        description = description_of(fmu)
+        compile_sources(fmu, description, tell)
+    ```
+
+    Attributes:
+        path: where it lies.
 
     Raises:
-        LoadFailed: there is no FMU, or it breaks the terms.
+        LoadFailed: by each method: a file cannot be read or is damaged.
     """
-    if files.is_folder(path):
-        _refuse_sha256_of_folder(path, terms)
-        try:
-            return _look_into_folder(path, terms.limits)
-        except OSError as error:
-            raise LoadFailed(f"'{path}' cannot be read: {error.strerror}.") from error
-    with _opened(path, terms) as archive:
-        entries = {_name(entry): entry for entry in archive.infolist() if not entry.is_dir()}
-        present = [name for name in _XML_FILES if name in entries]
-        _refuse_large_description(path, {name: entries[name].file_size for name in present}, terms.limits)
-        return Contents(frozenset(entries), {name: archive.read(entries[name]) for name in present})
+
+    path: Path
+
+    def contents(self) -> Contents:
+        """The names of its files and its descriptions; nothing is unpacked."""
+        ...
+
+    def content_sha256(self) -> str:
+        """Calculate the SHA-256 of the archive, or of the names and contents of all files of a folder."""
+        ...
+
+    def unpack_into(self, folder: Path) -> None:
+        """Unpack all files into an empty folder."""
+        ...
+
+
+@contextmanager
+def opened(path: Path, terms: Terms = Terms()) -> Iterator[OpenFmu]:  # noqa: B008 a frozen Struct
+    """Open the FMU at ``path`` and check that it meets ``terms``.
+
+    Raises:
+        LoadFailed: there is no FMU, or it does not meet the terms.
+    """
+    kind = _Folder if files.is_folder(path) else _Archive
+    with closing(kind(path, terms)) as fmu:
+        if terms.content is not None and fmu.content_sha256() != terms.content:
+            raise LoadFailed(f"'{path}' is not the FMU that this run was planned with.", hint="Start the run again.")
+        yield fmu
 
 
 def sha256_of(path: Path) -> str | None:
-    """The SHA-256 of an archive as hexadecimal digits; None for a folder."""
+    """The SHA-256 of an archive in hexadecimal digits; None for a folder."""
     return None if files.is_folder(path) else files.sha256_of(path)
 
 
 def content_of(path: Path) -> str:
-    """A SHA-256 that tells an FMU from any other: of its archive, or of the names and contents of a folder's files."""
+    """A SHA-256 that identifies an FMU; see `OpenFmu.content_sha256`.
+
+    Raises:
+        OSError: it cannot be read.
+    """
     if not files.is_folder(path):
         return files.sha256_of(path)
     digest = hashlib.sha256()
@@ -96,28 +129,23 @@ def content_of(path: Path) -> str:
 
 
 @contextmanager
-def unpack(path: Path, parent: Path, terms: Terms = Terms()) -> Iterator[Path]:  # noqa: B008 a frozen Struct
-    """Unpack the FMU at ``path`` into a new private folder below ``parent``.
+def unpacked(fmu: OpenFmu, parent: Path) -> Iterator[Path]:
+    """Unpack an FMU into a new private folder below ``parent``.
 
-    The folder is given while it still has another name; it takes its own (the same without `.part`) when the block
-    ends without an exception, in one step, and is removed otherwise. So no reader sees half of an FMU.
+    Inside the block the folder has the suffix `.part`. It gets its final name, without the suffix, when the block ends
+    without an exception; otherwise it is removed. So no reader sees an incomplete FMU.
 
     Raises:
-        LoadFailed: the archive is broken, or breaks the terms; nothing is left behind.
+        LoadFailed: the FMU is damaged, or the folder cannot be written; nothing is left behind.
     """
+    path = fmu.path
     try:
         parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         partial = Path(tempfile.mkdtemp(prefix=f"{path.stem[:40]}-", suffix=".part", dir=parent))
     except OSError as error:
         raise LoadFailed(f"'{path}' cannot be extracted into '{parent}': {error.strerror}") from error
     try:
-        if files.is_folder(path):
-            _refuse_sha256_of_folder(path, terms)
-            _link_folder(path, partial)
-        else:
-            with _opened(path, terms) as archive:
-                for entry in archive.infolist():
-                    _write(archive, entry, partial)
+        fmu.unpack_into(partial)
         yield partial
         partial.rename(partial.with_suffix(""))
     except OSError as error:
@@ -129,15 +157,51 @@ def unpack(path: Path, parent: Path, terms: Terms = Terms()) -> Iterator[Path]: 
 # --- an archive
 
 
+class _Archive:
+    def __init__(self, path: Path, terms: Terms) -> None:
+        self.path = path
+        self._limits = terms.limits
+        # Bytes that have to be the right ones are read; it does not matter what the file was before.
+        self._verifies = terms.sha256 is not None or terms.content is not None
+        self._digest: str | None = None
+        with ExitStack() as stack, _reading(path):
+            self._file = stack.enter_context(path.open("rb"))
+            if terms.sha256 is not None:
+                _verify(path, self._sha256(), terms.sha256.lower())
+            self._zip = stack.enter_context(zipfile.ZipFile(self._file))
+            _check(path, self._zip, terms.limits)
+            self._open = stack.pop_all()
+
+    def close(self) -> None:
+        self._open.close()
+
+    def contents(self) -> Contents:
+        entries = {_name(entry): entry for entry in self._zip.infolist() if not entry.is_dir()}
+        present = [name for name in _XML_FILES if name in entries]
+        _refuse_large_description(self.path, {name: entries[name].file_size for name in present}, self._limits)
+        with _reading(self.path):
+            return Contents(frozenset(entries), {name: self._zip.read(entries[name]) for name in present})
+
+    def content_sha256(self) -> str:
+        with _reading(self.path):
+            return self._sha256()
+
+    def unpack_into(self, folder: Path) -> None:
+        with _reading(self.path):
+            for entry in self._zip.infolist():
+                _write(self._zip, entry, folder)
+
+    def _sha256(self) -> str:
+        if self._digest is None:
+            self._digest = files.sha256_of_open(self._file, again=self._verifies)
+        return self._digest
+
+
 @contextmanager
-def _opened(path: Path, terms: Terms) -> Iterator[zipfile.ZipFile]:
-    """The archive, if it keeps to the terms; what breaks while it is read is a `LoadFailed`, too."""
+def _reading(path: Path) -> Iterator[None]:
+    """Convert what can go wrong while an archive is read to `LoadFailed`."""
     try:
-        with path.open("rb") as file:
-            _verify(path, file, terms.sha256)
-            with zipfile.ZipFile(file) as archive:
-                _check(path, archive, terms.limits)
-                yield archive
+        yield
     except FileNotFoundError as error:
         raise LoadFailed(f"'{path}' does not exist.") from error
     except zipfile.BadZipFile as error:
@@ -148,26 +212,23 @@ def _opened(path: Path, terms: Terms) -> Iterator[zipfile.ZipFile]:
         raise LoadFailed(f"'{path}' is a damaged ZIP archive: {error}") from error
     except OSError as error:
         raise LoadFailed(f"'{path}' cannot be read: {error.strerror or error}.") from error
-    except (RuntimeError, ValueError) as error:  # what `zipfile` has for entries that it does not know how to read
+    except (RuntimeError, ValueError) as error:  # `zipfile` raises them for entries that it cannot read
         raise LoadFailed(f"'{path}' cannot be extracted: {error}") from error
 
 
-def _verify(path: Path, file: BufferedReader, expected: str | None) -> None:
-    if expected is None:
-        return
-    found = hashlib.file_digest(file, "sha256").hexdigest()
-    if found != expected.lower():
+def _verify(path: Path, found: str, expected: str) -> None:
+    if found != expected:
         raise LoadFailed(
-            f"'{path}' has the SHA-256 {found}, not {expected.lower()}, which the configuration asks for.",
+            f"'{path}' has the SHA-256 {found}, not {expected}, which the configuration asks for.",
             hint="It is another file, or was changed. If it is the right one, correct `sha256`.",
         )
 
 
 def _check(path: Path, archive: zipfile.ZipFile, limits: LimitsConfig) -> None:
-    """Whether everything in an archive may be unpacked.
+    """Check that all entries of an archive may be unpacked.
 
     Raises:
-        LoadFailed: what breaks a limit or would leave the folder.
+        LoadFailed: an entry exceeds a limit or would be written outside the folder.
     """
     entries = archive.infolist()
     hint = "If you trust it, raise `limits` in the configuration."
@@ -191,7 +252,7 @@ def _check(path: Path, archive: zipfile.ZipFile, limits: LimitsConfig) -> None:
 
 
 def _name(entry: zipfile.ZipInfo) -> str:
-    """The name of an entry, without the `./` that some tools write before it, or for the folder of the FMU itself."""
+    """The name of an entry without the leading `./` that some tools write."""
     return str(PurePosixPath(entry.filename))
 
 
@@ -217,7 +278,7 @@ def _check_entry(path: Path, entry: zipfile.ZipInfo) -> None:
 
 
 def _write(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, folder: Path) -> None:
-    """Unpack one entry, never more of it than was announced, for this user only."""
+    """Unpack one entry, with permissions for this user only, and never more bytes than the archive declares."""
     target = folder / PurePosixPath(entry.filename)
     if entry.is_dir():
         target.mkdir(parents=True, exist_ok=True)
@@ -225,7 +286,7 @@ def _write(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, folder: Path) -> No
     target.parent.mkdir(parents=True, exist_ok=True)
     executable = (entry.external_attr >> 16) & stat.S_IXUSR
     with archive.open(entry) as source, target.open("xb") as file:
-        shutil.copyfileobj(source, file, _CHUNK)  # `ZipExtFile` ends at the announced size
+        shutil.copyfileobj(source, file, _CHUNK)  # `ZipExtFile` ends at the declared size
     target.chmod(0o700 if executable else 0o600)
 
 
@@ -241,11 +302,42 @@ def _refuse_large_description(path: Path, sizes: dict[str, int], limits: LimitsC
 # --- a folder
 
 
-def _look_into_folder(path: Path, limits: LimitsConfig) -> Contents:
-    names = _names_in(path)
-    sizes = {name: (path / name).stat().st_size for name in _XML_FILES if name in names}
-    _refuse_large_description(path, sizes, limits)
-    return Contents(names, {name: (path / name).read_bytes() for name in sizes})
+class _Folder:
+    def __init__(self, path: Path, terms: Terms) -> None:
+        if terms.sha256 is not None:
+            text = f"'{path}' is a folder, and `sha256` is that of an archive."
+            raise LoadFailed(text, hint="Zip it, or leave it out.")
+        self.path = path
+        self._limits = terms.limits
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+    def contents(self) -> Contents:
+        try:
+            names = _names_in(self.path)
+            sizes = {name: (self.path / name).stat().st_size for name in _XML_FILES if name in names}
+            _refuse_large_description(self.path, sizes, self._limits)
+            return Contents(names, {name: (self.path / name).read_bytes() for name in sizes})
+        except OSError as error:
+            raise LoadFailed(f"'{self.path}' cannot be read: {error.strerror}.") from error
+
+    def content_sha256(self) -> str:
+        try:
+            return content_of(self.path)
+        except OSError as error:
+            raise LoadFailed(f"'{self.path}' cannot be read: {error.strerror}.") from error
+
+    def unpack_into(self, folder: Path) -> None:
+        """Give ``folder`` the layout of the FMU without writing to the FMU: binaries are copied, the rest is linked.
+
+        Each instance has a library file of its own, so that two instances in one process share no variables of it.
+        """
+        for entry in self.path.resolve().iterdir():
+            if entry.name == "binaries" and entry.is_dir():
+                shutil.copytree(entry, folder / entry.name, copy_function=shutil.copyfile)
+            else:
+                (folder / entry.name).symlink_to(entry)
 
 
 def _names_in(path: Path) -> frozenset[str]:
@@ -253,20 +345,3 @@ def _names_in(path: Path) -> frozenset[str]:
     return frozenset(
         Path(parent, name).relative_to(path).as_posix() for parent, _, names in os.walk(path) for name in names
     )
-
-
-def _refuse_sha256_of_folder(path: Path, terms: Terms) -> None:
-    if terms.sha256 is not None:
-        raise LoadFailed(f"'{path}' is a folder, and `sha256` is that of an archive.", hint="Zip it, or leave it out.")
-
-
-def _link_folder(source: Path, target: Path) -> None:
-    """Lay ``target`` out like ``source`` without writing into it: binaries as copies, everything else as links.
-
-    A copy of a library of its own keeps the variables of two instances in one process apart.
-    """
-    for entry in source.resolve().iterdir():
-        if entry.name == "binaries" and entry.is_dir():
-            shutil.copytree(entry, target / entry.name, copy_function=shutil.copyfile)
-        else:
-            (target / entry.name).symlink_to(entry)

@@ -1,7 +1,8 @@
-"""What can be said of an FMU before FMPy reads it: whether its XML is safe and legal, and whether it can run here.
+"""The checks of an FMU before FMPy reads it: whether its XML is safe and valid, and whether it can run here.
 
-Everything that cannot run is refused here, with a sentence that says why; what is only odd is left to the reader, which
-keeps it as a problem of the description. FMPy is only handed XML that has passed `safe_xml`: it resolves entities.
+An FMU that cannot run is refused here, and the error says why. Problems that do not keep it from running are left to
+`reading`, which keeps them in the description. FMPy gets only XML that has passed `safe_xml`, because it resolves
+entities.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import fmpy
 from lxml import etree
 
 from ....errors import LoadFailed
-from .archive import Contents, Terms, look_into
+from .archive import Contents, OpenFmu
 
 __all__ = ["examine", "find_library", "library_name", "safe_xml", "source_names"]
 
@@ -32,18 +33,18 @@ _DECIDING: Final = re.compile(
     r"valueReference|causality|variability|initial|index|dependencies|dependenciesKind|derivative|previous|reinit"
     r"|can[A-Z]\w*|needs[A-Z]\w*|has[A-Z]\w*|numberOf\w+|intervalVariability|clocks"
 )
-"""Attributes that decide how an FMU is called; an illegal date or unit is only odd."""
+"""Attributes that decide how an FMU is called; an invalid date or unit is only a problem of the description."""
 
 _ATTRIBUTE = re.compile(r"attribute '([^']+)': (?:\[[^]]*\] )?(.*)")
 
 
-def examine(path: Path, terms: Terms) -> Contents:
-    """Look into the FMU at ``path`` and refuse what must not be read, or cannot run anywhere.
+def examine(fmu: OpenFmu) -> Contents:
+    """Read the descriptions of an FMU; refuse it if they must not be parsed, or if it cannot run anywhere.
 
     Raises:
-        LoadFailed: it is no FMU, breaks the terms, or its XML is unsafe or illegal.
+        LoadFailed: it is not an FMU, or its XML is unsafe or has invalid values.
     """
-    contents = look_into(path, terms)
+    path, contents = fmu.path, fmu.contents()
     if "modelDescription.xml" not in contents.names:
         kind = "a folder" if path.is_dir() else "a ZIP archive"
         raise LoadFailed(
@@ -69,16 +70,16 @@ def examine(path: Path, terms: Terms) -> Contents:
 
 
 def safe_xml(data: bytes, what: str) -> Any:  # noqa: ANN401 lxml ships no types
-    """The root element of ``data``, which is named ``what`` in errors.
+    """Parse ``data``, which errors call ``what``, and return the root element.
 
-    A document type is refused before it is read: that is where entities are declared that expand without end or reach
-    for other files, and no FMI document has one.
+    A document type declaration is refused before it is read, because it can declare entities that expand without end
+    or read other files. No FMI document has one.
 
     Raises:
         LoadFailed: there is a document type, or it is not well-formed XML.
     """
     try:
-        # Two readers: a target sees the document type before lxml does anything with it, but builds no tree.
+        # Two passes: a parser target gets the declaration before lxml acts on it, but it builds no tree.
         etree.fromstring(data, _parser(target=_NoDocumentType()))
         return etree.fromstring(data, _parser())
     except _DocumentTypeError as error:
@@ -91,7 +92,7 @@ def safe_xml(data: bytes, what: str) -> Any:  # noqa: ANN401 lxml ships no types
 
 
 def library_name(identifier: str, fmi_version: str) -> str:
-    """Where an FMU has its library for this platform (FMI 1.0, 2.3; 2.0, 2.3; 3.0, 2.5.1)."""
+    """The path of the library for this platform inside an FMU (FMI 1.0, 2.3; 2.0, 2.3; 3.0, 2.5.1)."""
     platform = fmpy.platform_tuple if fmi_version.startswith("3") else fmpy.platform
     return f"binaries/{platform}/{identifier}{_SUFFIX}"
 
@@ -102,19 +103,19 @@ def source_names(names: Iterable[str]) -> list[str]:
 
 
 def find_library(path: Path, names: Collection[str], identifiers: Sequence[str], fmi_version: str) -> str | None:
-    """The library of an FMU for this platform: that of its name, or else the only one that there is.
+    """Find the library of an FMU for this platform: the one with the required name, or else the only one.
 
     Args:
         path: the FMU.
-        names: of its files.
+        names: the names of its files.
         identifiers: the model identifier of the kind to use, then that of the other kind if there is one.
-        fmi_version: of it.
+        fmi_version: its FMI version.
 
     Returns:
-        The name of its file; None if there are sources to make it from.
+        The name of the file; None if the library has to be compiled from sources.
 
     Raises:
-        LoadFailed: it can run elsewhere only, or which library it is cannot be told; the message says what it has.
+        LoadFailed: there is no library for this platform, or there are several; the message lists them.
     """
     identifier, *others_of_it = identifiers
     if "/" in identifier or "\\" in identifier or identifier.startswith("."):
@@ -152,17 +153,17 @@ def find_library(path: Path, names: Collection[str], identifiers: Sequence[str],
 
 
 class _DocumentTypeError(Exception):
-    """A document type was found."""
+    """The document has a document type declaration."""
 
 
 class _NoDocumentType:
-    """Reads a document for its document type only."""
+    """A parser target that only looks for a document type declaration."""
 
     def doctype(self, *_declared: str | None) -> None:
         raise _DocumentTypeError
 
     def close(self) -> None:
-        """The document has none."""
+        """The document has no such declaration."""
 
 
 def _parser(**options: object) -> Any:  # noqa: ANN401 lxml ships no types
@@ -177,7 +178,7 @@ def _schema(generation: str) -> Any:  # noqa: ANN401 lxml ships no types
 
 
 def _illegal_values(root: Any, generation: str) -> Iterable[str]:  # noqa: ANN401 lxml ships no types
-    """In words, the attributes that decide how the FMU is called and have a value that the schema does not know."""
+    """Describe the attributes of `_DECIDING` whose values the schema does not allow."""
     schema = _schema(generation)
     schema.validate(root)
     for error in schema.error_log:

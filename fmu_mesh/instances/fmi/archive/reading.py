@@ -1,7 +1,7 @@
-"""Reading the model description of an FMU into the mesh's own Structs, without extracting or loading it.
+"""Reads the model description of an FMU into our own Structs, without unpacking or loading the FMU.
 
-Owns the judgement what can run (co-simulation of FMI 1.0, 2.0 and 3.0 with a binary for this platform) and what is only
-odd: problems that a strict validator finds are kept in `ModelDescription.problems`, and the FMU runs.
+Decides which FMUs can run: those of FMI 1.0, 2.0 and 3.0 with a library or sources for this platform. Problems that a
+strict validator finds do not keep an FMU from running; they are kept in `ModelDescription.problems`.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from msgspec.structs import replace
 from .... import files
 from ....errors import LoadFailed
 from ....variables.model_description import Causality, Clock, DefaultExperiment, Kind, ModelDescription
-from .archive import Contents, Terms
+from .archive import Contents, OpenFmu, Terms, opened
 from .declared_variables import variables_of
 from .examining import examine, find_library, library_name
 
-__all__ = ["read_description"]
+__all__ = ["description_of", "read_description"]
 
 _VERSIONS = ("1.0", "2.0", "3.0")
 _WORDS: Final[dict[Kind, str]] = {"co_simulation": "co-simulation", "model_exchange": "model exchange"}
@@ -40,16 +40,27 @@ def read_description(
 ) -> ModelDescription:
     """Read the model description of the FMU at ``path``.
 
+    ```python
+    description = read_description(Path("fmus/DampedPendulum.fmu"))
+    print(description.model_name, [variable.name for variable in description.variables])
+    ```
+
     Args:
-        path: the .fmu file, or the folder of an unpacked one.
-        terms: what it has to keep to.
-        kind: which kind of it is wanted; ``auto``: co-simulation if it has both.
+        path: the .fmu file, or the folder of an unpacked FMU.
+        terms: the conditions that the FMU must meet.
+        kind: the kind to use; ``auto``: co-simulation if the FMU has both.
         to_run: whether it must be able to run on this platform.
 
     Raises:
-        LoadFailed: it is no FMU, or one that cannot run here; the message says which and what would help.
+        LoadFailed: it is not an FMU, or it cannot run here; the message says why and what would help.
     """
-    contents = examine(path, terms)
+    with opened(path, terms) as fmu:
+        return description_of(fmu, kind, to_run=to_run)
+
+
+def description_of(fmu: OpenFmu, kind: Literal["auto"] | Kind = "auto", *, to_run: bool = True) -> ModelDescription:
+    """As `read_description`, for an FMU that is open."""
+    path, contents = fmu.path, examine(fmu)
     source, problems = _parse(path, contents)
     version = source.fmiVersion or ""
     if not version.startswith(_VERSIONS) or "-" in version:  # 3.0-beta.1 is another interface than 3.0
@@ -74,7 +85,7 @@ def read_description(
 
 
 def _kind(source: FmpyDescription, wanted: str, path: Path) -> Kind:
-    """The kind to use: the wanted one, or the one that there is; co-simulation comes first."""
+    """The kind to use: the wanted one; for `auto` the first that the FMU has, co-simulation before model exchange."""
     there = [kind for kind in _WORDS if _interface(source, kind) is not None]
     for kind in there:
         if wanted in ("auto", kind):
@@ -98,7 +109,7 @@ def _interface(source: FmpyDescription, kind: Kind) -> Any:  # noqa: ANN401 FMPy
 
 
 def _readable(path: Path, contents: Contents) -> str | BytesIO:
-    """What FMPy reads an FMU from: the folder, or an archive whose names have no `./` before them, which it minds."""
+    """What FMPy reads an FMU from: the folder, or an archive without leading `./`, which FMPy does not understand."""
     if files.is_folder(path):
         return str(path)
     archive = BytesIO()
@@ -110,7 +121,7 @@ def _readable(path: Path, contents: Contents) -> str | BytesIO:
 
 
 def _parse(path: Path, contents: Contents) -> tuple[FmpyDescription, tuple[str, ...]]:
-    """FMPy's model description, and what a strict validation of it finds."""
+    """FMPy's model description, and the problems that a strict validation finds in it."""
     source = _readable(path, contents)
     try:
         return read_model_description(source, validate=True), ()
@@ -129,7 +140,7 @@ def _convert(
 ) -> ModelDescription:
     interface = _interface(source, kind)
     experiment = source.defaultExperiment
-    capabilities = root.find("Implementation/*/Capabilities")  # of FMI 1.0, which FMPy does not read
+    capabilities = root.find("Implementation/*/Capabilities")  # FMPy does not read those of FMI 1.0
 
     def can(attribute: str) -> bool:
         if capabilities is not None:
@@ -160,7 +171,7 @@ def _convert(
         only_once_per_process=can("canBeInstantiatedOnlyOncePerProcess"),
         needs_execution_tool=bool(interface.needsExecutionTool)
         or root.find("Implementation/CoSimulation_Tool") is not None,
-        # FMI 1.0 has no flag for it, and wants to be told.
+        # FMI 1.0 has no flag for this and always requires the call.
         tell_completed_steps=can("needsCompletedIntegratorStep") or (source.fmiVersion or "").startswith("1."),
         continuous_states=int(source.numberOfContinuousStates),
         event_indicators=int(source.numberOfEventIndicators),
@@ -172,7 +183,7 @@ def _convert(
 
 
 def _clock(element: ET.Element) -> Clock:
-    """A clock; one that has a fraction for an interval counts in units of its resolution (FMI 3.0, 2.2.8.4)."""
+    """A clock; an interval given as a fraction is counted in units of its resolution (FMI 3.0, 2.2.8.4)."""
     interval, shift = _number(element.get("intervalDecimal")), _number(element.get("shiftDecimal"))
     counter, resolution = element.get("intervalCounter"), element.get("resolution")
     if counter is not None and resolution is not None:

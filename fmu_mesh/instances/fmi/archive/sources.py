@@ -1,7 +1,8 @@
-"""FMUs that bring C sources instead of a binary for this platform: compiled once, into the user's cache.
+"""FMUs with C sources and no library for this platform: their sources are compiled once, into the user's cache.
 
-Owns the cache and the command of the compiler. A compiled library is kept under the hash of all that it was made from,
-so it is never out of date, and moved into its place in one step, so that two processes at once do no harm.
+Owns the cache and the command line of the compiler. The name of a compiled library contains the hash of everything it
+was made from, so it is never out of date. It is moved to its place in one step, so that two processes can do this at
+the same time.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ import tempfile
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Sequence
 from pathlib import Path, PurePosixPath
-from typing import Final
+from typing import Final, Literal
 
 import fmpy
 import msgspec
@@ -26,11 +27,12 @@ from fmpy.model_description import ModelDescription as FmpyDescription
 from fmpy.model_description import read_model_description
 
 from ....errors import LoadFailed
-from ....variables.model_description import ModelDescription
-from .archive import Terms, unpack
+from ....variables.model_description import Kind, ModelDescription
+from .archive import OpenFmu, Terms, opened, unpacked
 from .examining import library_name, source_names
+from .reading import description_of
 
-__all__ = ["cache_folder", "compile_sources", "extract"]
+__all__ = ["cache_folder", "describe", "extract"]
 
 log = logging.getLogger(__name__)
 
@@ -41,17 +43,17 @@ _SHOWN_LINES: Final = 12
 _SUFFIX = str(fmpy.sharedLibraryExtension)
 _HEADERS = Path(fmpy.__file__).parent / "c-code"
 _OWN_HEADERS = Path(__file__).parent / "headers"
-"""Those of FMI 1.0 under its own names."""
+"""The headers of FMI 1.0."""
 _FLAGS: Final = ("-O2", "-fPIC", "-ffp-contract=off", "-w")
-# -Bsymbolic: sources call their own functions, even if the C library or Python has one of that name, too.
+# -Bsymbolic: calls go to the FMU's own functions, even if the C library or Python has one with the same name.
 _LINK_FLAGS: Final = ("-shared", "-Wl,--no-undefined", "-Wl,-Bsymbolic", "-lm", "-ldl", "-lpthread")
 
 
 class _Build(msgspec.Struct, frozen=True):
-    """What the compiler has to do.
+    """What to compile and how.
 
     Attributes:
-        sources: paths in the folder `sources` of the FMU.
+        sources: paths relative to the folder `sources` of the FMU.
     """
 
     identifier: str
@@ -67,42 +69,53 @@ def extract(
     tell: Callable[[str], None] = log.info,
     model: ModelDescription | None = None,
 ) -> Path:
-    """Unpack the FMU at ``path`` into a new private folder below ``parent`` and return it, ready to be loaded.
+    """Unpack the FMU at ``path`` into a new private folder below ``parent``; returns the folder, ready to be loaded.
 
-    Without a binary for this platform its sources are compiled, or what was compiled before is used again. With
-    ``model``, that is the library of its kind; else of co-simulation, or of model exchange if there is nothing else.
+    If it has no library for this platform, its sources are compiled, or the library of an earlier compilation is used.
+    ``model`` says for which kind; without it, the library is for co-simulation if the FMU has that.
 
     Raises:
-        LoadFailed: the archive is broken or breaks ``terms``, or the sources do not compile; nothing is left behind.
+        LoadFailed: the archive is damaged or does not meet ``terms``, or the sources do not compile; nothing is left
+            behind.
     """
-    with unpack(path, parent, terms) as folder:
+    with opened(path, terms) as fmu:
+        return _extract(fmu, parent, tell, model)
+
+
+def describe(path: Path, terms: Terms, kind: Literal["auto"] | Kind, tell: Callable[[str], None]) -> ModelDescription:
+    """Read the model description of an FMU and get it ready to run, while its archive is open once.
+
+    If it has no library for this platform, its sources are compiled into the cache; ``tell`` is called before that.
+    Its SHA-256 is known afterwards, so that `content_of` does not read it again.
+
+    Raises:
+        LoadFailed: it cannot run here. If its sources do not compile, the message has the first lines of the compiler.
+    """
+    with opened(path, terms) as fmu:
+        fmu.content_sha256()
+        model = description_of(fmu, kind)
+        if model.library is None:
+            with tempfile.TemporaryDirectory(prefix="fmu_mesh-") as folder:
+                _extract(fmu, Path(folder), tell, model)
+    return model
+
+
+def _extract(fmu: OpenFmu, parent: Path, tell: Callable[[str], None], model: ModelDescription | None) -> Path:
+    with unpacked(fmu, parent) as folder:
         if model is not None and model.library is not None:
             _name_library(folder, model, folder / model.library)
         elif model is not None or not _has_binaries(folder):
-            _add_library(path, folder, model, tell)
+            _add_library(fmu.path, folder, model, tell)
     return folder.with_suffix("")
 
 
-def compile_sources(path: Path, model: ModelDescription, terms: Terms, tell: Callable[[str], None]) -> None:
-    """Compile the sources of the FMU at ``path`` into the cache, if they are not there yet; ``tell`` before it begins.
-
-    Nothing happens if it has a binary of the kind of ``model`` for this platform.
-
-    Raises:
-        LoadFailed: there is no compiler, or they do not compile; the message has the compiler's first lines.
-    """
-    if model.library is not None:
-        return
-    with tempfile.TemporaryDirectory(prefix="fmu_mesh-") as folder:
-        extract(path, Path(folder), terms, tell, model)
-
-
 def cache_folder() -> Path:
-    """The user's own folder for what can be made again: ``$FMU_MESH_CACHE_DIR``, else below ``$XDG_CACHE_HOME``."""
+    """The user's cache folder: ``$FMU_MESH_CACHE_DIR``, or else a folder below ``$XDG_CACHE_HOME``."""
     if chosen := os.environ.get("FMU_MESH_CACHE_DIR"):
         return Path(chosen)
-    base = os.environ.get("XDG_CACHE_HOME")
-    return (Path(base) if base else Path.home() / ".cache") / "fmu_mesh"
+    from platformdirs import user_cache_path  # noqa: PLC0415 only FMUs of sources need it
+
+    return user_cache_path("fmu_mesh")
 
 
 def _has_binaries(folder: Path) -> bool:
@@ -111,17 +124,17 @@ def _has_binaries(folder: Path) -> bool:
 
 
 def _name_library(folder: Path, model: ModelDescription, library: Path) -> None:
-    """Give a library the name that it is loaded by, beside its own, by which libraries around it may know it."""
+    """Add a link with the name that FMI requires; other libraries of the FMU may refer to the original name."""
     named = folder / library_name(model.model_identifier, model.fmi_version)
     if not named.exists():
         named.symlink_to(library.name)
 
 
 def _add_library(path: Path, folder: Path, model: ModelDescription | None, tell: Callable[[str], None]) -> None:
-    """Put the compiled library of an FMU where its binary would be."""
+    """Copy the compiled library of an FMU to where FMI expects it."""
     names = [file.relative_to(folder).as_posix() for file in folder.glob("sources/**/*") if file.is_file()]
     if not source_names(names):
-        return  # loading it says what is missing
+        return  # the error of loading it says what is missing
     description = read_model_description(str(folder), validate=False)
     kind = model.kind if model is not None else "co_simulation" if description.coSimulation else "model_exchange"
     build = _build(path, description, names, kind, _listed_files(folder / "modelDescription.xml", kind))
@@ -132,9 +145,9 @@ def _add_library(path: Path, folder: Path, model: ModelDescription | None, tell:
 
 
 def _listed_files(file: Path, kind: str) -> list[str]:
-    """The source files that FMI 2.0 lists for a kind, or for the other one of the same library.
+    """The source files that FMI 2.0 lists for a kind, or for the other kind with the same model identifier.
 
-    FMPy keeps the list of only one of them.
+    FMPy keeps only one of the two lists.
     """
     root = ET.parse(file).getroot()  # noqa: S314 `examine` has found it safe
     own, other = ("CoSimulation", "ModelExchange")[:: 1 if kind == "co_simulation" else -1]
@@ -147,14 +160,14 @@ def _listed_files(file: Path, kind: str) -> list[str]:
 def _build(path: Path, description: FmpyDescription, names: Sequence[str], kind: str, listed: list[str]) -> _Build:
     """The files and options that a description lists (FMI 2.0, 2.2.3 SourceFiles; FMI 3.0, 2.5.1.4 buildDescription).
 
-    FMI 1.0 has no list, and some tools forget theirs; then all files at the root of `sources` are taken.
+    FMI 1.0 has no list, and some tools omit it; then all files directly in `sources` are compiled.
     """
     unit = description.coSimulation if kind == "co_simulation" else description.modelExchange
     identifier = str(unit.modelIdentifier)
     fitting = [one for one in description.buildConfigurations if one.modelIdentifier in (identifier, None)]
     sets = fitting[0].sourceFileSets if fitting else []
     sources = [_inside(path, name) for name in listed or [name for one in sets for name in one.sourceFiles]]
-    # OpenModelica lists `./`, too: a folder is nothing to compile.
+    # OpenModelica also lists `./`, and a folder cannot be compiled.
     folders = {str(folder) for name in names for folder in PurePosixPath(name.removeprefix("sources/")).parents}
     sources = [name for name in dict.fromkeys(sources) if name not in folders]
     if not sources:
@@ -165,7 +178,7 @@ def _build(path: Path, description: FmpyDescription, names: Sequence[str], kind:
         raise LoadFailed(f"'{path}' lists the source '{missing[0]}', but does not contain it.")
     defined = [one for file_set in sets for one in file_set.preprocessorDefinitions if not one.optional]
     options = [f"-D{one.name}={one.value}" if one.value else f"-D{one.name}" for one in defined]
-    # A library exports the plain names; sources ask for a prefix so that they can be linked statically, too.
+    # A shared library exports the names without the prefix that static linking would need.
     if description.fmiVersion.startswith("2"):
         options += ["-include", str(_HEADERS / "fmi2Functions.h")]
     elif description.fmiVersion.startswith("3"):
@@ -179,7 +192,7 @@ def _build(path: Path, description: FmpyDescription, names: Sequence[str], kind:
 
 
 def _inside(path: Path, name: str) -> str:
-    """A path that a description lists, relative to the folder `sources`, in its plain form: `./a.c` is `a.c`."""
+    """A listed path relative to the folder `sources`, normalized: `./a.c` becomes `a.c`."""
     plain = posixpath.normpath(name)
     if plain == ".." or plain.startswith(("/", "../")):
         raise LoadFailed(f"'{path}' lists a source outside its own folder: '{name}'.")
@@ -187,7 +200,7 @@ def _inside(path: Path, name: str) -> str:
 
 
 def _compiled(path: Path, sources: Path, build: _Build, tell: Callable[[str], None]) -> Path:
-    """The library that was made of these sources, from the cache if it is there."""
+    """The library of these sources: that in the cache, or a new one."""
     plus = any(not name.endswith(".c") for name in build.sources)
     compiler = _compiler(path, plus=plus)
     own = [*compiler, *_FLAGS, *build.options]
@@ -230,7 +243,7 @@ def _run(path: Path, command: Sequence[str], folder: Path) -> None:
 
 
 def _compiler(path: Path, *, plus: bool) -> list[str]:
-    """The command of the C (``plus``: C++) compiler: ``$CC`` (``$CXX``), or the first that there is.
+    """The command of the C compiler, or of the C++ compiler if ``plus``: ``$CC`` (``$CXX``), or the first one found.
 
     Raises:
         LoadFailed: there is none.
@@ -248,7 +261,7 @@ def _compiler(path: Path, *, plus: bool) -> list[str]:
 
 
 def _key(sources: Path, build: _Build, command: Sequence[str]) -> str:
-    """A hash of everything that a library is made from."""
+    """The hash of everything that a library is made from."""
     digest = hashlib.sha256(msgspec.json.encode([build, command, fmpy.__version__, fmpy.platform_tuple]))
     for folder in (sources, _OWN_HEADERS):
         for file in sorted(folder.rglob("*")):

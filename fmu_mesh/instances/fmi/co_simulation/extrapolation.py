@@ -1,26 +1,25 @@
 """Inputs that change linearly within a communication step (`extrapolation: linear` of a connection).
 
-Owns the derivative of an input from two neighbouring rows, the same in every process because it depends on nothing but
-the rows. A connection with delay 1 gives the value at the start of a step, which is extrapolated with the derivative
-of the step before; one with delay 0 gives the value at its end, so the input is interpolated. How an FMU takes a
-derivative is its own matter (`TakesDerivatives`).
+Owns the derivative of an input. It follows from two neighbouring rows only, so it is the same in every process. A
+connection with delay 1 gives the value at the start of a step: the input is extrapolated with the derivative of the
+step before. A connection with delay 0 gives the value at the end: the input is interpolated. `TakesDerivatives` says
+how an FMU gets a derivative.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import msgspec
 import numpy as np
 
-from ....errors import FmuMeshError
 from ....rings.ring import Ring
 from ....simtime import TimeGrid
 from ....system.layout import Layout
-from ....system.step_options import LinearInput
+from ....system.linear_inputs import LinearInput
 from ...contract import Instance, KeepsState
-from ...instance_wrapper import AroundInstance
+from ...instance_wrapper import AroundInstance, of_kind, packed, unpacked
 
 __all__ = ["LinearInputs", "TakesDerivatives"]
 
@@ -32,12 +31,16 @@ class TakesDerivatives(Instance, KeepsState, Protocol):
         """Time derivatives (1/s) of inputs for the next step; see FMI 2.0, 4.2.1, fmi2SetRealInputDerivatives."""
         ...
 
+    def remove_files(self) -> None:
+        """See `KeepsFiles`."""
+        ...
+
 
 class LinearInputs(AroundInstance[TakesDerivatives]):
-    """An instance of whose inputs some change linearly; for the rest it is the instance itself.
+    """An instance with inputs that change linearly within a step.
 
     Args:
-        instance: it; is closed with this.
+        instance: the inner instance; `close` closes it.
         inputs: the linear inputs.
     """
 
@@ -52,10 +55,14 @@ class LinearInputs(AroundInstance[TakesDerivatives]):
         self._columns = np.zeros(0, dtype=np.intp)
         self._step_size = 0.0
 
+    def remove_files(self) -> None:
+        """See `KeepsFiles`."""
+        self._instance.remove_files()
+
     def bind(self, inputs: Ring, outputs: Sequence[Ring], grid: TimeGrid, points: int, step: int = 0) -> None:
         """See `Instance`."""
         if not self._previous.size:
-            # Before the first step, the inputs are what Initialization Mode has left in the FMU.
+            # Before the first step, the FMU has the inputs of Initialization Mode.
             self._previous = np.array(self._instance.get_values(self._names), dtype=np.float64)
         self._outer = inputs
         self._inner = Ring(inputs.layout, 1)
@@ -72,7 +79,7 @@ class LinearInputs(AroundInstance[TakesDerivatives]):
         given, previous = reals[0, self._columns], self._previous
         slopes = (given - previous) / self._step_size
         if not self._stepped:
-            slopes[~self._at_end] = 0.0  # there is no step before, whose derivative could be gone on with
+            slopes[~self._at_end] = 0.0  # there is no step before that has a derivative
             self._stepped = True
         reals[0, self._columns] = np.where(self._at_end, previous, given)
         self._previous = given
@@ -81,23 +88,23 @@ class LinearInputs(AroundInstance[TakesDerivatives]):
 
     def get_state(self) -> object:
         """See `KeepsState`."""
-        return _State(self._instance.get_state(), _Slopes(self._previous.tolist(), self._stepped))
+        return _LinearState(super().get_state(), _Slopes(self._previous.tolist(), self._stepped))
 
     def set_state(self, state: object) -> None:
         """See `KeepsState`."""
-        own = _own(state)
-        self._instance.set_state(own.inner)
+        own = of_kind(_LinearState, state)
+        super().set_state(own.inner)
         self._previous = np.array(own.slopes.previous, dtype=np.float64)
         self._stepped = own.slopes.stepped
 
     def free_state(self, state: object) -> None:
         """See `KeepsState`."""
-        self._instance.free_state(_own(state).inner)
+        super().free_state(of_kind(_LinearState, state).inner)
 
     def serialize_state(self, state: object) -> bytes:
-        """See `KeepsState`: the values of the linear inputs as JSON, a zero, and what the instance gives."""
-        own = _own(state)
-        return msgspec.json.encode(own.slopes) + b"\0" + self._instance.serialize_state(own.inner)
+        """See `KeepsState`."""
+        own = of_kind(_LinearState, state)
+        return packed(own.slopes, super().serialize_state(own.inner))
 
     def deserialize_state(self, data: bytes) -> object:
         """See `KeepsState`.
@@ -105,31 +112,19 @@ class LinearInputs(AroundInstance[TakesDerivatives]):
         Raises:
             FmuMeshError: ``data`` is no state of an instance with linear inputs.
         """
-        head, _, rest = data.partition(b"\0")
-        try:
-            slopes = msgspec.json.decode(head, type=_Slopes)
-        except msgspec.DecodeError as error:
-            raise FmuMeshError(f"this is no state of an instance with linear inputs: {error}") from error
-        return _State(self._instance.deserialize_state(rest), slopes)
+        slopes, rest = unpacked(data, _Slopes, None)
+        return _LinearState(super().deserialize_state(rest), slopes)
 
 
 class _Slopes(msgspec.Struct, frozen=True):
-    """What the slopes of the next step follow from: the last values, and whether there was a step."""
+    """The slopes of the next step follow from this: the last values, and whether there was a step."""
 
     previous: list[float]
     stepped: bool
 
 
-class _State:
-    """A state of the instance, and the slopes."""
+class _LinearState(NamedTuple):
+    """A state of the inner instance, and the slopes."""
 
-    def __init__(self, inner: object, slopes: _Slopes) -> None:
-        self.inner = inner
-        self.slopes = slopes
-
-
-def _own(state: object) -> _State:
-    if not isinstance(state, _State):
-        msg = f"{type(state).__name__} is no state of an instance with linear inputs"
-        raise TypeError(msg)
-    return state
+    inner: object
+    slopes: _Slopes

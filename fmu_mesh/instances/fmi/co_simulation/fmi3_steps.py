@@ -7,8 +7,8 @@
         discarded: again with half of it
         an event, or its time has come: event mode; update the discrete states; step mode
 
-So the communication points of the mesh stay where they are; only the FMU sees more of them. Owns event mode and early
-return of co-simulation; it knows neither variables nor rings.
+The communication points of the mesh stay the same; only the FMU sees more of them. Owns event mode and early return of
+co-simulation; it knows neither variables nor rings.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ from fmpy.fmi1 import FMICallException
 
 from ....simtime import step_within
 from ....variables.model_description import ModelDescription
-from ..calls import hot, pointer
+from ..calls import cffi_function, pointer
 from ..clocks import Clocks
+from ..fmu_values import WARNING
 from ..model_exchange.solver import SolverFailed, resolvable
-from .fused import Step, fmi3_step
-from .substeps import DISCARD, SMALLEST
+from .compiled_step import StepCall, fmi3_step
+from .discarded_steps import DISCARD, SMALLEST
 
 __all__ = ["Fmi3Steps"]
 
-WARNING: Final = 1
 MOST_RETURNS: Final = 1000
-"""Returns of fmi3DoStep or events, without any advance of time, after which an FMU is taken to be stuck."""
+"""After this many returns of fmi3DoStep, or events, at the same time, an FMU makes no progress."""
 
 _DO_STEP = "int (*)(void *, double, double, _Bool, void *, void *, void *, void *)"
 
@@ -47,11 +47,10 @@ class Fmi3Steps:
     Attributes:
         terminated: whether the FMU has asked to end the simulation; no step may be taken then.
         clocks: its clocks.
-        time: where the FMU is in s.
-        quiet_until: up to this time in s, a step is one call of fmi3DoStep, unless that says otherwise.
+        quiet_until: up to this time in s, a step is a single call of fmi3DoStep, unless its results say otherwise.
 
     Call sequence: `start` in Initialization Mode, `exit_initialization` after it, then `step`, and `event` wherever
-    values are set in event mode. Instead of `step`, who calls fmi3DoStep (`fuse`) goes on with `finish` where needed.
+    values are set in event mode. A caller that calls fmi3DoStep itself (`compiled`) continues with `finish` if needed.
 
     Raises:
         FMICallException: by every method: the FMU did not return OK.
@@ -65,24 +64,22 @@ class Fmi3Steps:
         self._self = pointer(fmu.component)
         self._has_event_mode = description.has_event_mode
         self._varies = description.can_handle_variable_step_size
-        self._do_step = hot(fmu.dll.fmi3DoStep, _DO_STEP)
+        self._do_step = cffi_function(fmu.dll.fmi3DoStep, _DO_STEP)
         self._results = _Results()
         self._pointers = [pointer(address) for address in self._results.addresses]
-        self.time = 0.0
         self._next_event = math.inf
         self._event_time = -math.inf
         self._look_ahead()
 
     def start(self, time: float) -> None:
         """In Initialization Mode at ``time`` (s)."""
-        self.time = time
         if self.clocks:
             self.clocks.start(time)
 
-    def exit_initialization(self) -> None:
-        """After Initialization Mode: the first events, then step mode."""
+    def exit_initialization(self, time: float) -> None:
+        """After Initialization Mode at ``time`` (s): the first events, then step mode."""
         if self._has_event_mode:
-            self._update()
+            self._update(time)
             self._look_ahead()
 
     @property
@@ -91,46 +88,47 @@ class Fmi3Steps:
         next_event, event_time = (t if math.isfinite(t) else None for t in (self._next_event, self._event_time))
         return next_event, event_time
 
-    def resume(self, time: float, next_event: float | None, event_time: float | None) -> None:
-        """Go on at ``time`` (s), where `place` was."""
+    def resume(self, next_event: float | None, event_time: float | None) -> None:
+        """Continue where `place` was."""
         self.terminated = False
-        self.time = time
         self._next_event = math.inf if next_event is None else next_event
         self._event_time = -math.inf if event_time is None else event_time
         self._look_ahead()
 
-    def event(self, set_values: Callable[[], None]) -> None:
-        """Set values in event mode, or between two steps if there is none."""
+    def event(self, time: float, set_values: Callable[[], None]) -> None:
+        """Set values in event mode at ``time`` (s), or between two steps if the FMU has no event mode."""
         if not self._has_event_mode:
             set_values()
             return
         self._fmu.enterEventMode()
         set_values()
-        self._update()
+        self._update(time)
         self._look_ahead()
 
-    def fused(self, step_size: float) -> Step:
+    def compiled(self, step_size: float) -> StepCall:
         """fmi3DoStep by ``step_size`` (s) as a part of one compiled call."""
         return fmi3_step(self._do_step, step_size, self._pointers, self._results.addresses[0])
 
-    def step(self, start: float, step_size: float, end: float) -> bool:
-        """Go on from ``start`` by ``step_size`` to ``end`` (s); False if the FMU asked to end the simulation before."""
+    def step(self, start: float, step_size: float, end: float) -> float:
+        """Take the step from ``start`` by ``step_size`` to ``end`` (s).
+
+        Returns:
+            The time reached in s: ``end``, or an earlier time at which the FMU asked to end the simulation.
+        """
         status = None
         if self.quiet_until > end:
             status = self._attempt(start, step_size)
-            if status <= WARNING and not self._results.any[0]:  # the step was nothing but a step
-                self.time = end
-                return True
+            if status <= WARNING and not self._results.any[0]:
+                return end
         return self.finish(status, start, step_size, end)
 
-    def finish(self, status: int | None, start: float, step_size: float, end: float) -> bool:
-        """As `step`, where fmi3DoStep from ``start`` by ``step_size`` (s) has returned ``status`` already, if any."""
+    def finish(self, status: int | None, start: float, step_size: float, end: float) -> float:
+        """As `step`, after fmi3DoStep from ``start`` by ``step_size`` (s) has returned ``status``; None: not called."""
         results = self._results
         time, largest, stuck = start, step_size, 0
-        self.time = start
         while not self.terminated and resolvable(time, end):
             if self._is_due(time):
-                self._handle_event()
+                self._handle_event(time)
                 continue
             target = self._target(time, min(end, time + largest))
             if status is None:
@@ -145,12 +143,11 @@ class Fmi3Steps:
             stuck = 0 if time > before else stuck + 1
             if stuck > MOST_RETURNS:
                 raise SolverFailed(f"fmi3DoStep returned early {MOST_RETURNS} times at t = {time:.12g} s")
-            self.time = time
             self.terminated = results.terminate
             if not self.terminated and (results.event_needed or self._is_due(time)):
-                self._handle_event()
+                self._handle_event(time)
         self._look_ahead()
-        return not resolvable(time, end)
+        return time
 
     def _look_ahead(self) -> None:
         self.quiet_until = -math.inf if self.terminated or self.clocks else self._next_event
@@ -168,26 +165,26 @@ class Fmi3Steps:
     def _is_due(self, time: float) -> bool:
         """Whether event mode is needed at ``time`` (s).
 
-        An FMU whose own time differs by rounding may not see its time event yet: then it is not asked a second time.
+        The time of the FMU may differ by rounding, so that it does not see its time event yet: we ask only once.
         """
         if not self._has_event_mode:
             return False
         return (self._next_event <= time and time > self._event_time) or not resolvable(time, self.clocks.next_tick)
 
     def _target(self, time: float, end: float) -> float:
-        """Where the next fmi3DoStep ends: an FMU with a fixed step size is not asked for another one."""
+        """The end of the next fmi3DoStep: an FMU with a fixed step size is never asked for another one."""
         if not (self._has_event_mode and self._varies):
             return end
         return min(t for t in (end, self._next_event, self.clocks.next_tick) if t > time)
 
-    def _handle_event(self) -> None:
+    def _handle_event(self, time: float) -> None:
         self._fmu.enterEventMode()
-        self._update()
+        self._update(time)
 
-    def _update(self) -> None:
-        """Event mode at the current time, and back to step mode."""
-        self._event_time = self.time
-        self.clocks.set_due(self.time)
+    def _update(self, time: float) -> None:
+        """In event mode at ``time`` (s): update the discrete states, then step mode."""
+        self._event_time = time
+        self.clocks.set_due(time)
         for _ in range(MOST_RETURNS):
             again, self.terminated, _nominals, _states, defined, next_event = self._fmu.updateDiscreteStates()
             self.clocks.read()
@@ -196,18 +193,18 @@ class Fmi3Steps:
             if not again:
                 break
         else:
-            raise SolverFailed(f"the discrete states at t = {self.time:.12g} s need more than {MOST_RETURNS} updates")
+            raise SolverFailed(f"the discrete states at t = {time:.12g} s need more than {MOST_RETURNS} updates")
         self._next_event = next_event if defined else math.inf
-        self.clocks.update_intervals(self.time)
+        self.clocks.update_intervals(time)
         self._fmu.enterStepMode()
 
 
 class _Results:
-    """What fmi3DoStep says besides its status (FMI 3.0, 4.2.1).
+    """The results of fmi3DoStep besides its status (FMI 3.0, 4.2.1).
 
     Attributes:
-        any: the flags as one number, which is 0 if none is set; one look instead of three.
-        last_time: how far an early return has come, in s.
+        any: the flags as one number, which is 0 if none is set: one comparison instead of three.
+        last_time: the time of an early return in s.
         addresses: of eventHandlingNeeded, terminateSimulation, earlyReturn and lastSuccessfulTime.
     """
 

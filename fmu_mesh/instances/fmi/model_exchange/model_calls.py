@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import ctypes
 import math
-from typing import Any, Final, NamedTuple
+from typing import Any, NamedTuple
 
 from fmpy.fmi1 import FMICallException, fmi1EventInfo
 from fmpy.fmi2 import fmi2EventInfo
 
-__all__ = ["EventInfo", "Fmi1Calls", "Fmi3Calls", "ModelCalls"]
+from ..fmu_values import WARNING
 
-WARNING: Final = 1
+__all__ = ["EventInfo", "Fmi1Calls", "Fmi3Calls", "ModelCalls"]
 
 _ARRAY = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_size_t)
 _TIME = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_double)

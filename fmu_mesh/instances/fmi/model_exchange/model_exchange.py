@@ -7,9 +7,9 @@
         tell the FMU that the step is completed
         if a state, step or time event happened:
             event mode; update the discrete states until they converge; continuous-time mode
-            the solver begins anew
+            the solver starts anew
 
-Owns events and modes. It knows neither variables nor rings, and not which version of FMI it calls.
+Owns events and modes. It knows neither variables nor rings, nor the version of FMI.
 """
 
 from __future__ import annotations
@@ -18,15 +18,16 @@ import math
 from collections.abc import Callable
 from typing import Final
 
-from ....system.step_options import SolverSettings
 from ..clocks import NO_CLOCKS, Clocks
+from ..step_options import SolverSettings
+from .cvode import CVodeSolver
 from .model_calls import ModelCalls
-from .solver import Equations, Solver, SolverFailed, make_solver, resolvable
+from .solver import Equations, EulerSolver, NothingToSolve, Solver, SolverFailed, resolvable
 
 __all__ = ["EventLoop"]
 
 EVENT_ITERATIONS: Final = 1000
-"""Event iterations, or events without any advance of time, after which a model is taken not to converge."""
+"""After this many event iterations, or events at the same time, a model does not converge."""
 
 
 class EventLoop:
@@ -35,9 +36,9 @@ class EventLoop:
     Args:
         calls: the functions of the model.
         settings: of the solver.
-        tell_completed_steps: whether the FMU wants to know of completed integrator steps.
-        stop_time: what the FMU was told, in s; its time is never set to a later one.
-        clocks: the clocks of the model, if it has some.
+        tell_completed_steps: whether the FMU needs to know of completed integrator steps.
+        stop_time: the stop time of the FMU in s; its time is never set to a later one.
+        clocks: the clocks of the model.
 
     Attributes:
         terminated: whether the FMU has asked to end the simulation; nothing may be advanced then.
@@ -56,10 +57,10 @@ class EventLoop:
         *,
         tell_completed_steps: bool,
         stop_time: float = math.inf,
-        clocks: Clocks | None = None,
+        clocks: Clocks = NO_CLOCKS,
     ) -> None:
         self.terminated = False
-        self._clocks = clocks if clocks is not None else NO_CLOCKS
+        self._clocks = clocks
         self._calls = calls
         self._tell = tell_completed_steps
         self._stop_time = stop_time
@@ -67,10 +68,8 @@ class EventLoop:
         self._next_event = math.inf
         self._event_time = -math.inf
         self._events_there = 0
-        self.extrapolate: Callable[[float], None] | None = None
-        self._solver: Solver = make_solver(
-            settings.name, _Extrapolated(self, calls), settings.relative_tolerance, settings.maximum_step_size
-        )
+        self._equations = _TimedEquations(calls)
+        self._solver = _make_solver(settings, self._equations)
 
     def start(self, time: float) -> None:
         """Handle the first event at ``time`` (s), in event mode after Initialization Mode."""
@@ -83,8 +82,19 @@ class EventLoop:
         set_values()
         self._update()
 
+    def set_inputs(self, set_values: Callable[[], None], line: Callable[[float], None] | None) -> None:
+        """Set inputs as an `event` at the start of a step.
+
+        Args:
+            set_values: sets all inputs.
+            line: sets the inputs that change within the step, at a time in s; None if all are constant.
+        """
+        self._equations.follow(None)
+        self.event(set_values)
+        self._equations.follow(line)
+
     def advance(self, end: float) -> bool:
-        """Go on to the time ``end`` in s; False if the FMU asked to end the simulation before."""
+        """Advance to the time ``end`` in s; False if the FMU asked to end the simulation before."""
         while resolvable(self._time, end):
             self._advance_once(end)
             if self.terminated:
@@ -97,10 +107,15 @@ class EventLoop:
         return self._time, self._next_event
 
     def resume(self, time: float, next_event: float) -> None:
-        """Go on where `place` was, in continuous-time mode; the solver begins anew."""
+        """Continue where `place` was, in continuous-time mode; the solver starts anew."""
         self.terminated = False
+        self._equations.follow(None)
         self._time, self._next_event = time, next_event
-        self._solver.restart(time)
+        self.restart()
+
+    def restart(self) -> None:
+        """Let the solver start anew here."""
+        self._solver.restart(self._time)
 
     def close(self) -> None:
         """Free the solver."""
@@ -119,7 +134,7 @@ class EventLoop:
                 event = event or step_event
         if not resolvable(self._time, self._next_event):
             event = True
-            if self._next_event > self._time:  # by rounding: the model has to see that its time has come
+            if self._next_event > self._time:  # only by rounding: let the model see the time of its event
                 self._time = min(self._next_event, self._stop_time)
                 self._calls.set_time(self._time)
         if event and not self.terminated:
@@ -159,24 +174,33 @@ class EventLoop:
         raise SolverFailed(f"the discrete states at t = {self._time:.12g} s need more than {EVENT_ITERATIONS} updates")
 
 
-class _Extrapolated:
-    """The equations of a model whose inputs are functions of time within a communication step."""
+class _TimedEquations:
+    """The equations of a model whose inputs may be functions of time within a communication step."""
 
-    def __init__(self, loop: EventLoop, calls: ModelCalls) -> None:
+    def __init__(self, calls: ModelCalls) -> None:
         self.n_states = calls.n_states
         self.n_indicators = calls.n_indicators
-        self._loop = loop
         self._calls = calls
+        self._line: Callable[[float], None] | None = None
         self.get_states = calls.get_states
         self.get_nominals = calls.get_nominals
         self.get_derivatives = calls.get_derivatives
         self.get_indicators = calls.get_indicators
 
+    def follow(self, line: Callable[[float], None] | None) -> None:
+        """From now on, ``line`` sets inputs at the time of every evaluation; None: they stay as they are."""
+        self._line = line
+
     def set_point(self, time: float, states: int) -> None:
         """See `Equations.set_point`."""
         self._calls.set_point(time, states)
-        if self._loop.extrapolate is not None:
-            self._loop.extrapolate(time)
+        if self._line is not None:
+            self._line(time)
 
 
-_checked: type[Equations] = _Extrapolated
+def _make_solver(settings: SolverSettings, equations: Equations) -> Solver:
+    if equations.n_states == 0 and equations.n_indicators == 0:
+        return NothingToSolve()
+    if settings.name == "euler":
+        return EulerSolver(equations, settings.maximum_step_size)
+    return CVodeSolver(equations, settings.relative_tolerance, settings.maximum_step_size)

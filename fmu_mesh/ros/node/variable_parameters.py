@@ -1,7 +1,7 @@
-"""The variables of an FMU as parameters of a ROS node: declaring them, and initializing an FMU from those that are set.
+"""The variables of an FMU as parameters of a ROS node.
 
-For a node of your own, as `declareROSParameters` and `initializeFromROSParameters` of `fmi_adapter`. A node is anything
-with the methods of `rclpy.node.Node`; rclpy itself comes from the user's ROS.
+`declare_parameters` and `initialize_from_parameters` are for a user's own node, as `declareROSParameters` and
+`initializeFromROSParameters` of `fmi_adapter` are. A node is any object with the methods of `rclpy.node.Node`.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from ...text import nearest
 from ...variables.model_description import ModelDescription, Value, Variable
 from ...variables.value_types import nested
 from ..messages.ros_names import NameProblem, name_problems, ros_name
-from .rclpy_modules import ros_module
+from .rclpy_modules import RosNode, ros_module
 
 __all__ = [
     "declare_parameters",
@@ -27,15 +27,12 @@ __all__ = [
     "value_of",
 ]
 
-RosNode = Any
-"""`rclpy.node.Node`, which has no types where ROS is not installed."""
-
 
 def names_of(variables: Sequence[Variable], names: Mapping[str, str] | None = None) -> dict[str, str]:
-    """The ROS name of every variable: as `fmi_adapter` makes it, or as ``names`` has it by variable.
+    """The ROS name of every variable: the one in ``names``, or the one that `fmi_adapter` makes.
 
     Raises:
-        ConfigurationError: two names are the same, or one is none in ROS; says how to give others.
+        ConfigurationError: two names are the same, or one is not allowed in ROS; says how to choose others.
     """
     own = dict(names or {})
     known = [variable.name for variable in variables]
@@ -59,22 +56,27 @@ def names_of(variables: Sequence[Variable], names: Mapping[str, str] | None = No
 def declare_parameters(
     node: RosNode, description: ModelDescription, names: Mapping[str, str] | None = None, prefix: str = ""
 ) -> dict[str, Variable]:
-    """Declare a parameter, not set, for every variable; one that the node has already stays as it is.
+    """Declare a parameter without a value for every variable; a parameter that the node has already is kept.
 
-    Every type is accepted at first, because a file that says `l: 2` means the Real 2.0; what is set is checked against
-    the variable when it is used.
+    A parameter accepts every type, because a file that says `l: 2` means the Real 2.0. A value is checked against the
+    variable when it is used.
 
     Args:
         node: the node.
-        description: of the FMU.
-        names: ROS names by variable, where the usual ones do not do.
-        prefix: what comes before each name, such as `pendulum.` where a node has several FMUs.
+        description: the model description, such as `adapter.description`.
+        names: ROS names by variable, for variables whose usual name cannot be used.
+        prefix: put before each name, such as `pendulum.` if a node has several FMUs.
 
     Returns:
         The variables by the names of their parameters.
 
     Raises:
-        ConfigurationError: two variables have one name, or one has none in ROS.
+        ConfigurationError: two variables have the same name, or a variable has no name in ROS.
+
+    Example:
+        >>> variables = declare_parameters(node, adapter.description)  # doctest: +SKIP
+        >>> variables["l"].unit  # doctest: +SKIP
+        'm'
     """
     settable = {}
     names_by_variable = names_of(description.variables, names)
@@ -91,28 +93,28 @@ def declare_parameters(
 
 
 def undeclared(node: RosNode) -> dict[str, str | None]:
-    """Parameters that somebody has set and that the node does not have, each with the nearest one that it has."""
-    # rclpy takes what is set for a parameter that nobody declares without a word, and shows it nowhere else.
+    """Parameters that the user has set but the node does not have, each with the most similar name that it has."""
+    # rclpy ignores a value for an undeclared parameter silently, and shows it nowhere else.
     there = node.list_parameters([], 0).names
-    set_ = node._parameter_overrides  # noqa: SLF001 nothing public tells them
-    names = [name for name in set_ if not node.has_parameter(name)]
+    overrides = node._parameter_overrides  # noqa: SLF001 rclpy has no public way to read them
+    names = [name for name in overrides if not node.has_parameter(name)]
     return {name: nearest(name, there) for name in names if not name.startswith("qos_overrides.")}
 
 
 def undeclare_parameters(node: RosNode, names: Sequence[str]) -> None:
-    """Take parameters back, so that another FMU can declare its own."""
+    """Undeclare parameters, so that another FMU can declare its own."""
     for name in names:
         node.undeclare_parameter(name)
 
 
 def parameter_values(node: RosNode, variables: Mapping[str, Variable]) -> dict[str, Value]:
-    """The values of the parameters that are set, by variable; ``variables`` are by parameter."""
+    """The values of the parameters that are set, by variable; ``variables`` are by parameter name."""
     values = [(variable, node.get_parameter(name).value) for name, variable in variables.items()]
     return {variable.name: value_of(variable, value) for variable, value in values if value is not None}
 
 
 def value_of(variable: Variable, parameter: Any) -> Value:  # noqa: ANN401 any type that a parameter can have
-    """The value of a parameter as that of a variable: an array of ROS has one dimension, that of FMI has its own."""
+    """The value of a parameter in the shape of its variable; an array in ROS has one dimension."""
     value: Value = parameter
     if variable.shape and not isinstance(parameter, str) and hasattr(parameter, "__len__"):
         elements = list(parameter)
@@ -123,20 +125,25 @@ def value_of(variable: Variable, parameter: Any) -> Value:  # noqa: ANN401 any t
 def initialize_from_parameters(
     node: RosNode, adapter: FMIAdapter, names: Mapping[str, str] | None = None, prefix: str = ""
 ) -> list[str]:
-    """Declare a parameter for every variable of an FMU, and give the FMU the values of those that are set.
+    """Declare a parameter for every variable of an FMU, and set the variables whose parameters have values.
 
     Args:
         node: the node.
-        adapter: in initialization mode.
-        names: ROS names by variable, where the usual ones do not do.
-        prefix: what comes before each name, such as `pendulum.` where a node has several FMUs.
+        adapter: the FMU, in Initialization Mode.
+        names: ROS names by variable, for variables whose usual name cannot be used.
+        prefix: put before each name, such as `pendulum.` if a node has several FMUs.
 
     Returns:
-        The variables that were given a value.
+        The names of the variables that were set.
 
     Raises:
-        ConfigurationError: two variables have one name, or one has none in ROS.
-        CallRefused: a value has the wrong type or range, or cannot be set; all of them are named.
+        ConfigurationError: two variables have the same name, or a variable has no name in ROS.
+        CallRefused: a value has the wrong type or range, or cannot be set; names every such value.
+
+    Example:
+        >>> adapter = FMIAdapter("fmus/DampedPendulum.fmu")  # doctest: +SKIP
+        >>> initialize_from_parameters(node, adapter)  # started with `-p l:=1.0`  # doctest: +SKIP
+        ['l']
     """
     values = parameter_values(node, declare_parameters(node, adapter.description, names, prefix))
     refused = []

@@ -1,8 +1,8 @@
-"""The calls of one step as one call: a function that is compiled when an instance is bound to its rings.
+"""All calls of one step as one compiled function, made when an instance is bound to its rings.
 
-The way from Python into C and back takes longer than a step of a small FMU, and is taken for every setter, for the step
-itself and for every getter. llvmlite makes one function of them, in some milliseconds and without a compiler on the
-user's machine; the addresses are constants in it. Where there is no llvmlite, `fuse` gives None.
+A call from Python into C takes longer than a step of a small FMU, and a step has a call for every setter, for the step
+itself and for every getter. llvmlite makes one function of them within milliseconds, and needs no compiler on the
+user's machine; the addresses are constants of the function. Without llvmlite, `compile_step` returns None.
 """
 
 from __future__ import annotations
@@ -13,28 +13,39 @@ from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 from ....compiled import Compiled, compile_function
-from ..calls import DirectCall, Function, Pointer, address_of, hot
-from ..fmu_instance import WARNING
+from ..calls import DirectCall, Function, Pointer, address_of, cffi_function
+from ..fmu_values import WARNING
 
-__all__ = ["DOING", "GETTING", "SETTING", "STATUS_BITS", "STEPPING", "Fused", "Step", "fmi2_step", "fmi3_step", "fuse"]
+__all__ = [
+    "DOING",
+    "GETTING",
+    "SETTING",
+    "STATUS_BITS",
+    "STEPPING",
+    "CompiledStep",
+    "StepCall",
+    "compile_step",
+    "fmi2_step",
+    "fmi3_step",
+]
 
 SETTING: Final = 1
 STEPPING: Final = 2
 GETTING: Final = 3
 STATUS_BITS: Final = 24
 DOING: Final = {SETTING: "setting the inputs", GETTING: "reading the outputs"}
-"""What an error says of a stage other than the step itself."""
+"""The words of an error for the other stages."""
 
 _DECLARATION: Final = "int (*)(size_t, double, size_t)"
 
 
-class Step(NamedTuple):
+class StepCall(NamedTuple):
     """The call that takes the step.
 
     Attributes:
         function: what is called.
-        arguments: those after the component, as LLVM writes them; ``%time`` is the start of the step in s.
-        flags: address of 32 bits that are 0 before the call, and afterwards, too, if it was nothing but a step.
+        arguments: those after the component, in LLVM's language; ``%time`` is the start of the step in s.
+        flags: address of 32 bits: 0 before the call, and 0 afterwards if the step needs nothing more.
     """
 
     function: Function
@@ -42,38 +53,43 @@ class Step(NamedTuple):
     flags: int | None = None
 
 
-def fmi2_step(function: Function, step_size: float) -> Step:
+def fmi2_step(function: Function, step_size: float) -> StepCall:
     """fmi2DoStep by ``step_size`` (s) (FMI 2.0, 4.2.1)."""
-    return Step(function, f"double %time, double {_double(step_size)}, i32 1")
+    return StepCall(function, f"double %time, double {_double(step_size)}, i32 1")
 
 
-def fmi3_step(function: Function, step_size: float, results: Sequence[Pointer], flags: int) -> Step:
-    """fmi3DoStep by ``step_size`` (s); ``results`` are what it says besides its status (FMI 3.0, 4.2.1)."""
+def fmi3_step(function: Function, step_size: float, results: Sequence[Pointer], flags: int) -> StepCall:
+    """fmi3DoStep by ``step_size`` (s); ``results`` are its other results (FMI 3.0, 4.2.1)."""
     said = ", ".join(f"ptr {_pointer(result)}" for result in results)
-    return Step(function, f"double %time, double {_double(step_size)}, i1 zeroext true, {said}", flags)
+    return StepCall(function, f"double %time, double {_double(step_size)}, i1 zeroext true, {said}", flags)
 
 
-class Fused(NamedTuple):
-    """A compiled function as it is called, and where it is."""
+class CompiledStep(NamedTuple):
+    """A compiled function, and what keeps its code alive."""
 
     call: Function
     code: Compiled
 
 
-def fuse(
-    component: Pointer, setters: Sequence[DirectCall], step: Step, getters: Sequence[DirectCall], *, sized: bool = False
-) -> Fused | None:
+def compile_step(
+    component: Pointer,
+    setters: Sequence[DirectCall],
+    step: StepCall,
+    getters: Sequence[DirectCall],
+    *,
+    sized: bool = False,
+) -> CompiledStep | None:
     """Compile ``(input row, time in s, output row)``: set the inputs, take the step, get the outputs.
 
-    The function returns 0. At the first status above warning, and after a step with a flag, it calls nothing more, and
-    returns ``stage << STATUS_BITS | status``. The references, the rings and the flags have to be kept alive for it.
+    The function returns 0. After the first status above warning, and after a step with a flag, it makes no other call
+    and returns ``stage << STATUS_BITS | status``. The caller keeps the references, the rings and the flags alive.
 
     Args:
         component: first argument of all calls.
         setters: how the inputs are set.
         step: how the step is taken.
         getters: how the outputs are read.
-        sized: whether setters and getters take the number of values, too (FMI 3.0, 2.2.7).
+        sized: whether setters and getters also take the number of values (FMI 3.0, 2.2.7).
     """
     calls: list[str] = []
 
@@ -125,7 +141,7 @@ next{number}:"""
     text = f"define i32 @step(i64 %in, double %time, i64 %out) {{{''.join(calls)}\n  ret i32 0\n}}"
     if (code := compile_function("step", text)) is None:
         return None
-    return Fused(hot(ctypes.CFUNCTYPE(ctypes.c_int)(code.address), _DECLARATION), code)
+    return CompiledStep(cffi_function(ctypes.CFUNCTYPE(ctypes.c_int)(code.address), _DECLARATION), code)
 
 
 def _pointer(made: Function | Pointer) -> str:

@@ -11,16 +11,16 @@ import pytest
 
 from fmu_mesh import compiled
 from fmu_mesh.instances.fmi import open_instance, read_description
-from fmu_mesh.instances.fmi.calls import DirectCall, Rows, hot, memory, pointer
-from fmu_mesh.instances.fmi.co_simulation.fused import (
+from fmu_mesh.instances.fmi.calls import DirectCall, RowPointers, cffi_function, memory, pointer
+from fmu_mesh.instances.fmi.co_simulation.compiled_step import (
     GETTING,
     SETTING,
     STATUS_BITS,
     STEPPING,
-    Fused,
+    CompiledStep,
+    compile_step,
     fmi2_step,
     fmi3_step,
-    fuse,
 )
 from fmu_mesh.rings.ring import Ring
 from fmu_mesh.simtime import TimeGrid
@@ -53,10 +53,10 @@ class Recorded:
         self._setters = [self._move("set_real", 3, 1), self._move("set_integer", 5)]
         self._getters = [self._move("get_real", 7, 8, 9)]
         self._keep.append(_STEP(self._stepped))
-        self._step = hot(self._keep[-1], "int (*)(void *, double, double, int)")
+        self._step = cffi_function(self._keep[-1], "int (*)(void *, double, double, int)")
 
-    def fuse(self) -> Fused:
-        one = fuse(pointer(COMPONENT), self._setters, fmi2_step(self._step, 0.1), self._getters)
+    def compile_step(self) -> CompiledStep:
+        one = compile_step(pointer(COMPONENT), self._setters, fmi2_step(self._step, 0.1), self._getters)
         assert one is not None
         return one
 
@@ -69,8 +69,8 @@ class Recorded:
             return self._statuses.get(name, 0)
 
         self._keep.append(_MOVE(moved))
-        called = hot(self._keep[-1], "int (*)(void *, void *, size_t, void *)")
-        return called, memory(array), len(references), Rows(self.rows, ROW_SIZE), len(references)
+        called = cffi_function(self._keep[-1], "int (*)(void *, void *, size_t, void *)")
+        return called, memory(array), len(references), RowPointers(self.rows, ROW_SIZE), len(references)
 
     def _stepped(self, component: int, time: float, step_size: float, no_set_state: int) -> int:
         self.calls.append(("step", component, time, step_size, no_set_state))
@@ -87,7 +87,7 @@ ALL = [
 
 def test_all_functions_are_called_in_their_order_on_their_rows() -> None:
     recorded = Recorded(set_real=1, step=1)  # a warning is none of our business
-    one = recorded.fuse()
+    one = recorded.compile_step()
 
     assert one.call(4, 0.3, 6) == 0
     assert recorded.calls == ALL
@@ -107,7 +107,7 @@ def test_the_first_status_above_warning_ends_the_step_and_is_told_with_its_stage
     name: str, status: int, stage: int, calls: int
 ) -> None:
     recorded = Recorded(**{name: status})
-    one = recorded.fuse()
+    one = recorded.compile_step()
 
     assert divmod(one.call(4, 0.3, 6), 1 << STATUS_BITS) == (stage, status)
     assert recorded.calls == ALL[:calls]
@@ -124,13 +124,13 @@ class Recorded3:
         first = ctypes.addressof(self._flags)
         self.addresses = (first, first + 1, first + 2, ctypes.addressof(self._memory))
         self._keep = [_MOVE_3(self._moved), _STEP_3(self._stepped)]
-        moved = hot(self._keep[0], "int (*)(void *, void *, size_t, void *, size_t)")
-        stepped = hot(self._keep[1], "int (*)(void *, double, double, _Bool, void *, void *, void *, void *)")
+        moved = cffi_function(self._keep[0], "int (*)(void *, void *, size_t, void *, size_t)")
+        stepped = cffi_function(self._keep[1], "int (*)(void *, double, double, _Bool, void *, void *, void *, void *)")
         self._references = (ctypes.c_uint * 2)(6, 5)
-        rows = Rows(ctypes.addressof(self._memory), ROW_SIZE)
+        rows = RowPointers(ctypes.addressof(self._memory), ROW_SIZE)
         moves = [(moved, memory(self._references), 2, rows, 9)]
         step = fmi3_step(stepped, 0.1, [pointer(address) for address in self.addresses], first)
-        one = fuse(pointer(COMPONENT), moves, step, moves, sized=True)
+        one = compile_step(pointer(COMPONENT), moves, step, moves, sized=True)
         assert one is not None
         self.one = one
 
@@ -204,7 +204,7 @@ def rows_of_steps(
                 part[step & inputs.mask] = 0.37 * step
             instance.do_step(step)
             rows.append(tuple(tuple(part[(step + 1) & outputs.mask].tolist()) for part in outputs.parts))
-        return rows, vars(instance)["_fused"] is not None
+        return rows, vars(instance)["_compiled"] is not None
 
 
 def is_number(type_: VariableType) -> bool:

@@ -1,0 +1,83 @@
+"""Results as JSON lines: every row is an object, as `{"time": 0.002, "pendulum.a": 1.3}`."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fmu_mesh.config.findings import Findings
+from fmu_mesh.files import Kept, open_alone
+from fmu_mesh.system.recording import Recording
+
+_BUFFER_BYTES = 1 << 16
+
+
+class JsonLinesFile:
+    """Writes each row of the results as one line of JSON.
+
+    Args:
+        path: the file.
+        names: `instance.variable` of every column.
+    """
+
+    def __init__(self, path: Path, names: Sequence[str]) -> None:
+        self.path = path
+        self.rows = 0
+        self.kept = Kept()
+        self._names = ("time", *names)
+        self._waiting = bytearray()
+        self._file = open_alone(path)
+
+    @classmethod
+    def check(cls, recording: Recording, findings: Findings) -> None:
+        """JSON has no place for bytes."""
+        for name, type_ in recording.columns:
+            if type_ == "Binary":
+                findings.add("record.variables", f"'{name}', which is Binary", "types that JSON has, or a .csv file")
+
+    @classmethod
+    def open(cls, path: Path, recording: Recording) -> Self:
+        """Open a file for what a run records."""
+        return cls(path, [name for name, _ in recording.columns])
+
+    @staticmethod
+    def keep_whole_rows(path: Path, kept: Kept) -> int:
+        """Every line is a row, and a row without its line end is not whole."""
+        with path.open("r+b") as file:
+            file.seek(kept.size)
+            rest = file.read()
+            file.truncate(kept.size + rest.rfind(b"\n") + 1)
+        return kept.rows + rest.count(b"\n")
+
+    def write(self, times: NDArray[np.float64], columns: Sequence[NDArray[Any]]) -> None:
+        """Append one row per time."""
+        for row in zip(times.tolist(), *(column.tolist() for column in columns), strict=True):
+            self._waiting += json.dumps(dict(zip(self._names, row, strict=True))).encode() + b"\n"
+            self.rows += 1
+        if len(self._waiting) >= _BUFFER_BYTES:
+            self.flush()
+
+    def flush(self) -> None:
+        """Give all rows to the operating system."""
+        if not self._waiting:
+            return
+        try:
+            while self._waiting:
+                del self._waiting[: self._file.write(self._waiting)]
+        except OSError:
+            self._waiting.clear()  # nothing may follow a gap
+            self.rows = self.keep_whole_rows(self.path, self.kept) if self.path.is_file() else self.kept.rows
+            raise
+        self.kept = Kept(self.rows, self._file.size)
+
+    def close(self) -> None:
+        """Write what is left and close the file."""
+        try:
+            self.flush()
+        finally:
+            self._file.close()

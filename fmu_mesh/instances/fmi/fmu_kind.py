@@ -1,0 +1,211 @@
+"""FMUs as a kind of instances: the section of a configuration, and how it is checked against the model description.
+
+The code that reads, loads and calls FMUs is imported when it is used.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, ClassVar, Literal, Self
+
+from msgspec import Meta
+from msgspec.structs import replace
+
+from ...config.base import POSITIVE, Base, Sha256
+from ...config.findings import Findings
+from ...config.instance_sections import KIND, Group, Host, InstanceSection, StartValues, StepSize
+from ...config.mesh import LimitsConfig
+from ...variables.model_description import ModelDescription
+from ..contract import Instance, Kind, Opening
+from .step_options import SolverSettings, StepOptions
+
+__all__ = ["KIND_OF_FMUS", "FmuConfig", "SolverConfig"]
+
+_DEFAULT_TOLERANCE = 1e-6
+
+
+class SolverConfig(Base, frozen=True, kw_only=True):
+    """How the continuous states of a model-exchange FMU are solved."""
+
+    name: Annotated[
+        Literal["cvode", "euler"],
+        Meta(description="cvode: variable step and order, finds events exactly; euler: fixed steps, for checks."),
+    ] = "cvode"
+    relative_tolerance: Annotated[
+        float | None,
+        Meta(
+            description="Relative tolerance of cvode; default: that of the FMU's default experiment, or 1e-6.",
+            extra_json_schema=POSITIVE,
+            examples=[1e-6],
+        ),
+    ] = None
+    maximum_step_size: Annotated[
+        float | None,
+        Meta(
+            description="Longest step of the solver in s; default: the instance's own step size.",
+            extra_json_schema=POSITIVE,
+        ),
+    ] = None
+
+
+class FmuConfig(Base, InstanceSection, frozen=True, kw_only=True, tag_field=KIND, tag="fmu"):
+    """One instance of an FMU."""
+
+    follows_fmi: ClassVar[bool] = True
+
+    fmu: Annotated[
+        str,
+        Meta(
+            title="the path of an FMU",
+            description="Path of the .fmu file, or of an unpacked one, relative to this file.",
+        ),
+    ]
+    kind: Annotated[
+        Literal["auto", "co_simulation", "model_exchange"],
+        Meta(description="Which kind of the FMU to use; auto: co-simulation if it has both."),
+    ] = "auto"
+    solver: Annotated[SolverConfig, Meta(description="The solver of a model-exchange FMU.")] = SolverConfig()
+    tolerance: Annotated[
+        float | None,
+        Meta(
+            description="Relative tolerance that a co-simulation FMU of FMI 2.0 or 3.0 is told for its own solver; "
+            "default: that of its default experiment, if it has one. For model exchange: `solver.relative_tolerance`.",
+            extra_json_schema=POSITIVE,
+            examples=[1e-6],
+        ),
+    ] = None
+    retry_discarded_steps: Annotated[
+        bool,
+        Meta(
+            description="Whether a step that an FMI 2.0 FMU discards is tried again in smaller ones; then its state is "
+            "kept before every step. FMI 1.0 and 3.0 need no such wish."
+        ),
+    ] = False
+    start_values: StartValues = {}
+    step_size: StepSize = None
+    group: Group = None
+    host: Host = None
+    interpolation: Annotated[
+        Literal["hold", "linear"] | None,
+        Meta(
+            description="How a value that is sent to an unconnected input with a time in its attachment is used: it "
+            "holds from that time on, or Reals go to it linearly; null: the time is ignored, and it holds from the "
+            "next point on."
+        ),
+    ] = None
+    sha256: Annotated[
+        Sha256 | None, Meta(description="SHA-256 that the .fmu file must have; any other is refused.")
+    ] = None
+    strict: Annotated[
+        bool | None,
+        Meta(description="Whether what FMI forbids is an error for this FMU (default: top level)."),
+    ] = None
+
+    @property
+    def retries_steps(self) -> bool:
+        """Whether a step that the FMU discards is repeated in smaller steps."""
+        return self.retry_discarded_steps
+
+    def agreed(self) -> Self:
+        """The section without the path, without the expected SHA-256, and without what is only about findings."""
+        return replace(self, fmu="", sha256=None, strict=None)
+
+    def check(self, place: str, description: ModelDescription, findings: Findings) -> None:
+        """Add a finding for every wish that the FMU cannot fulfil, by its capability flags."""
+        settings = {
+            "tolerance": self.tolerance,
+            "solver.relative_tolerance": self.solver.relative_tolerance,
+            "solver.maximum_step_size": self.solver.maximum_step_size,
+        }
+        for key, value in settings.items():
+            if value is not None and not (math.isfinite(value) and value > 0.0):
+                findings.add(f"{place}.{key}", f"{value:g}", "a number > 0")
+        if description.kind == "co_simulation" and self.solver != SolverConfig():
+            name = place.removeprefix("instances.")
+            found = f"a solver for '{name}', which runs as co-simulation and has a solver of its own"
+            findings.add(f"{place}.solver", found, "`kind: model_exchange`, or no solver")
+        if self.tolerance is not None and (refusal := _takes_no_tolerance(description)) is not None:
+            why, expected = refusal
+            findings.add(f"{place}.tolerance", f"{self.tolerance:g}, but {why}", expected)
+        if self.retry_discarded_steps and (reason := _cannot_retry(description)) is not None:
+            findings.add(f"{place}.retry_discarded_steps", f"true, but {reason}", "false")
+
+    def summary(self, description: ModelDescription) -> str:
+        """The version of FMI and the solver; for co-simulation, which has its own, the tolerance if one is set."""
+        if description.kind == "co_simulation":
+            solver = f", tolerance {self.tolerance:g}" if self.tolerance is not None else ""
+        else:
+            settings = self.solver_settings(description)
+            tolerance = f" {settings.relative_tolerance:g}" if settings.name == "cvode" else ""
+            solver = f" model exchange, {settings.name}{tolerance}"
+        return f"FMI {description.fmi_version}{solver}"
+
+    def solver_settings(self, description: ModelDescription) -> SolverSettings:
+        """How the continuous states of a model-exchange FMU are solved."""
+        tolerance = self.solver.relative_tolerance or description.default_experiment.tolerance or _DEFAULT_TOLERANCE
+        return SolverSettings(self.solver.name, tolerance, self.solver.maximum_step_size)
+
+
+class FmuKind(Kind[FmuConfig]):
+    """FMUs of FMI 1.0, 2.0 and 3.0, for co-simulation or model exchange."""
+
+    section = FmuConfig
+    expected = "an FMI 1.0, 2.0 or 3.0 FMU for this platform"
+
+    def describe(
+        self, path: Path, section: FmuConfig, limits: LimitsConfig, tell: Callable[[str], None]
+    ) -> ModelDescription:
+        """Read the model description; compile the FMU if it has no binary for this platform."""
+        from .archive.archive import Terms  # noqa: PLC0415  FMPy is slow to import
+        from .archive.sources import describe  # noqa: PLC0415  as above
+
+        return describe(path, Terms(limits, section.sha256), section.kind, tell)
+
+    def content(self, path: Path) -> str:
+        """A SHA-256 of the archive, or of all files of an unpacked FMU."""
+        from .archive.archive import content_of  # noqa: PLC0415  as above
+
+        return content_of(path)
+
+    def open(self, opening: Opening[FmuConfig]) -> Instance:
+        """Extract, load and instantiate the FMU."""
+        from .archive.archive import Terms  # noqa: PLC0415  as above
+        from .opening import open_instance, stepped  # noqa: PLC0415  as above
+
+        section, description = opening.section, opening.description
+        options = StepOptions(
+            solver=section.solver_settings(description),
+            tolerance=section.tolerance,
+            retry_discarded_steps=section.retry_discarded_steps,
+            linear_inputs=opening.linear_inputs,
+        )
+        terms = Terms(opening.limits, section.sha256, opening.content)
+        instance = open_instance(opening.path, opening.name, description, opening.folder, opening.log, terms, options)
+        return stepped(instance, options)
+
+
+KIND_OF_FMUS = FmuKind()
+"""What the entry point `fmu` names."""
+
+
+def _takes_no_tolerance(description: ModelDescription) -> tuple[str, str] | None:
+    """Why an FMU cannot be told a tolerance, and what to write instead; None if it can."""
+    if description.kind == "model_exchange":
+        return "the FMU runs as model exchange, with a solver of ours", "`solver: {relative_tolerance: ...}`"
+    if description.fmi_version.startswith("1."):
+        return "co-simulation in FMI 1.0 cannot be told one (fmiInitializeSlave)", "no tolerance"
+    return None
+
+
+def _cannot_retry(description: ModelDescription) -> str | None:
+    if description.kind == "model_exchange":
+        return "a model-exchange FMU has no steps of its own to discard"
+    if not description.can_handle_variable_step_size:
+        return "the FMU does not handle a variable communication step size"
+    if description.fmi_version.startswith("1.") and not description.can_reject_steps:
+        return "the FMU cannot repeat a step (canRejectSteps)"
+    if description.fmi_version.startswith("2.") and not description.can_get_and_set_state:
+        return "the FMU cannot get and set its state, so it cannot go back to where the step began"
+    return None

@@ -1,0 +1,62 @@
+"""Model exchange behind the `Instance` Protocol, for FMI 1.0, 2.0 and 3.0."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from fmpy.fmi1 import FMU1Model
+from fmpy.fmi2 import FMU2Model
+from fmpy.fmi3 import FMU3Model
+
+from ....variables.value_types import Value
+from ..clocks import Clocks
+from ..fmi_versions import Fmi1Values, Fmi2Values, Fmi3Values
+from .continuous import ContinuousInstance
+from .model_calls import Fmi1Calls, Fmi3Calls, ModelCalls
+
+__all__ = ["Fmi1ModelInstance", "Fmi2ModelInstance", "Fmi3ModelInstance"]
+
+
+class Fmi1ModelInstance(ContinuousInstance, Fmi1Values):
+    """One instance of an FMI 1.0 FMU for model exchange (FMI 1.0, 2.8)."""
+
+    _library = FMU1Model
+    _function_names: Mapping[str, str] = {"instantiate": "fmiInstantiateModel", "freeInstance": "fmiFreeModelInstance"}
+
+    def _instantiated(self) -> None:
+        self._calls = Fmi1Calls(self._fmu, self._description.continuous_states, self._description.event_indicators)
+
+    def _initialize(self, start_time: float, stop_time: float | None) -> None:  # noqa: ARG002 only for co-simulation
+        """FmiInitialize (FMI 1.0, 2.5)."""
+        tolerance = self._options.solver.relative_tolerance
+        self._initializing("fmiInitialize", lambda: self._calls.initialize(start_time, tolerance))
+
+    def _terminate_initialized(self) -> None:
+        self._calls.terminate()
+
+    def _model_calls(self) -> ModelCalls:
+        return self._calls
+
+
+class Fmi2ModelInstance(ContinuousInstance, Fmi2Values):
+    """One instance of an FMI 2.0 FMU for model exchange (FMI 2.0, 3.2)."""
+
+    _library = FMU2Model
+
+    def _model_calls(self) -> ModelCalls:
+        return ModelCalls(self._fmu, self._description.continuous_states, self._description.event_indicators, "fmi2")
+
+
+class Fmi3ModelInstance(ContinuousInstance, Fmi3Values):
+    """One instance of an FMI 3.0 FMU for model exchange (FMI 3.0, 3.2)."""
+
+    _library = FMU3Model
+    _function_names: Mapping[str, str] = {"instantiate": "fmi3InstantiateModelExchange"}
+
+    def _enter_initialization(self, start_time: float, stop_time: float | None, start_values: dict[str, Value]) -> None:
+        super()._enter_initialization(start_time, stop_time, start_values)
+        self._clocks = Clocks(self._fmu, self._description.clocks)
+        self._clocks.start(start_time)
+
+    def _model_calls(self) -> ModelCalls:
+        return Fmi3Calls(self._fmu)

@@ -1,0 +1,40 @@
+"""How the steps of an FMU are taken, as its section of the configuration and its model description say."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import msgspec
+
+from ...system.linear_inputs import LinearInput
+
+__all__ = ["SolverSettings", "StepOptions"]
+
+
+class SolverSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """How the continuous states of a model-exchange FMU are solved.
+
+    Attributes:
+        relative_tolerance: bound of the local error. The absolute tolerance of a state is this times its nominal value.
+        maximum_step_size: in s; None: at most the communication step.
+    """
+
+    name: Literal["cvode", "euler"] = "cvode"
+    relative_tolerance: float = 1e-6
+    maximum_step_size: float | None = None
+
+
+class StepOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """How the steps of one instance are taken. The configuration has been checked against what its FMU can do.
+
+    Attributes:
+        solver: of a model-exchange FMU.
+        tolerance: relative tolerance for a co-simulation FMU; None: that of its default experiment.
+        retry_discarded_steps: whether a step that the FMU discards is repeated in smaller steps.
+        linear_inputs: the inputs whose connections are extrapolated.
+    """
+
+    solver: SolverSettings = SolverSettings()
+    tolerance: float | None = None
+    retry_discarded_steps: bool = False
+    linear_inputs: tuple[LinearInput, ...] = ()

@@ -1,0 +1,101 @@
+"""Worlds of the physics engine MuJoCo as a kind of instances. It is imported when a world is described or opened."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated
+
+from msgspec import Meta
+
+from ...config.base import Base
+from ...config.instance_sections import (
+    KIND,
+    Actuators,
+    Controllers,
+    FluidDynamics,
+    Group,
+    Host,
+    PhysicsSection,
+    StartValues,
+    StepSize,
+)
+from ...config.mesh import LimitsConfig
+from ...variables.model_description import ModelDescription
+from ..contract import Instance, Kind, LogMessage, Opening, Showing
+
+__all__ = ["KIND_OF_MUJOCO", "MujocoConfig"]
+
+
+class MujocoConfig(Base, PhysicsSection, frozen=True, kw_only=True, tag_field=KIND, tag="mujoco"):
+    """A world that the physics engine MuJoCo computes: its joints and bodies are variables."""
+
+    mujoco: Annotated[str, Meta(description="Path of the model (MJCF or URDF), relative to this file.")]
+    physics_steps: Annotated[
+        Annotated[int, Meta(ge=1)] | None,
+        Meta(
+            description="Steps of the engine per own step; default: as few as make none longer than the model's "
+            "timestep.",
+        ),
+    ] = None
+    keyframe: Annotated[str | None, Meta(description="The model's keyframe to start from.")] = None
+    controllers: Controllers = []
+    actuators: Actuators = []
+    fluid_dynamics: FluidDynamics = []
+    start_values: StartValues = {}
+    step_size: StepSize = None
+    group: Group = None
+    host: Host = None
+
+
+class MujocoKind(Kind[MujocoConfig]):
+    """Worlds that MuJoCo computes."""
+
+    section = MujocoConfig
+    expected = "a MuJoCo model (MJCF or URDF)"
+    can_be_shown = True
+
+    def describe(
+        self,
+        path: Path,
+        section: MujocoConfig,
+        limits: LimitsConfig,  # noqa: ARG002  for FMUs
+        tell: Callable[[str], None],  # noqa: ARG002  loading a model is fast
+    ) -> ModelDescription:
+        """Load the model; its joints, bodies, sensors and actuators are the variables."""
+        from .mujoco_world import describe_world  # noqa: PLC0415  only where there is a world
+
+        return describe_world(path, section)
+
+    def content(self, path: Path) -> str:
+        """A SHA-256 of the model and of all files that it includes."""
+        from .mujoco_files import world_content  # noqa: PLC0415  as above
+
+        return world_content(path)
+
+    def check_showing(self, showing: Showing) -> None:
+        """Check that there is a screen, or what a film needs. Call it before MuJoCo is imported."""
+        from .rendering import check_film, check_window  # noqa: PLC0415  as above
+
+        if showing.view:
+            check_window()
+        if showing.video is not None:
+            check_film(showing.video)
+
+    def open(self, opening: Opening[MujocoConfig]) -> Instance:
+        """Load the world, and start a film or a window if one is asked for."""
+        from .mujoco_instance import MujocoInstance  # noqa: PLC0415  as above
+        from .rendering import Film, Picture, Window  # noqa: PLC0415  as above
+
+        picture: Picture | None = Window() if opening.showing.view else None
+        if opening.showing.video is not None:
+            picture = Film(opening.showing.video, opening.name)
+
+        def log(status: str, text: str, step: int) -> None:
+            opening.log(LogMessage(opening.name, status, "engine", text, step))
+
+        return MujocoInstance(opening.path, opening.name, opening.section, log, picture)
+
+
+KIND_OF_MUJOCO = MujocoKind()
+"""What the entry point `mujoco` names."""

@@ -1,0 +1,173 @@
+"""The options of a run: what may be chosen beside the configuration file.
+
+Owns one list of them. The flags of the command line, their help and the configuration keys that they replace follow
+from the annotations of `Options`. Knows nothing of argparse.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+from typing import Annotated, Any, Literal, NamedTuple, get_type_hints
+
+import msgspec
+from msgspec import inspect
+from msgspec.structs import replace
+
+from ..config.base import Base, Endpoint
+from ..config.findings import Findings
+from ..config.loading import LoadedConfig
+from ..config.mesh import RecordConfig, SimulationConfig, ZenohConfig
+from ..config.structure import check
+from ..instances.contract import Showing
+
+__all__ = ["Flag", "Options", "Setting", "settings", "with_options"]
+
+_SECTIONS: dict[str, type[Base]] = {"simulation": SimulationConfig, "record": RecordConfig, "zenoh": ZenohConfig}
+
+
+class Flag(NamedTuple):
+    """How an option is written on the command line.
+
+    Attributes:
+        name: with its dashes.
+        metavar: what stands for its value in the help; None for an option without a value.
+        key: key of the configuration that it replaces.
+        text: its help, where that of the key does not fit or there is no key.
+        bare: its value where the flag is given without one; None if it needs a value.
+    """
+
+    name: str
+    metavar: str | None = None
+    key: str | None = None
+    text: str | None = None
+    bare: Path | None = None
+
+
+class Options(msgspec.Struct, frozen=True):
+    """What is chosen beside the configuration; None and an empty tuple leave what the configuration says.
+
+    Each field is an option, and its annotation says how the command line spells it.
+
+    Example:
+        >>> prepare(Path("mesh.yaml"), Options(window=1, start_values=("gain.k=2.5",)))
+    """
+
+    step_size: Annotated[float | None, Flag("--step-size", "S", "simulation.step_size")] = None
+    stop_time: Annotated[float | None, Flag("--stop-time", "S", "simulation.stop_time")] = None
+    window: Annotated[int | Literal["auto"] | None, Flag("--window", "N", "simulation.window")] = None
+    real_time_factor: Annotated[float | None, Flag("--real-time-factor", "F", "simulation.real_time_factor")] = None
+    update_period: Annotated[float | None, Flag("--update-period", "S", "simulation.update_period")] = None
+    catch_up: Annotated[float | None, Flag("--catch-up", "S", "simulation.catch_up")] = None
+    start_values: Annotated[
+        tuple[str, ...], Flag("--set", "INSTANCE.VARIABLE=VALUE", text="start value of a variable")
+    ] = ()
+    output: Annotated[
+        Path | None, Flag("--output", "FILE", "record.file", "result file; its ending chooses the format")
+    ] = None
+    listen: Annotated[tuple[Endpoint, ...], Flag("--listen", "ENDPOINT", "zenoh.listen")] = ()
+    connect: Annotated[tuple[Endpoint, ...], Flag("--connect", "ENDPOINT", "zenoh.connect")] = ()
+    paused: Annotated[
+        bool, Flag("--paused", text="stay paused at the first point until `resume`, `step` or `play`")
+    ] = False
+    view: Annotated[bool, Flag("--view", text="show the world of the physics engine in a window")] = False
+    video: Annotated[
+        Path | None, Flag("--video", "FILE.mp4", text="film that world into a file, .mp4 or .gif; needs no screen")
+    ] = None
+    profile: Annotated[
+        Path | None,
+        Flag(
+            "--profile",
+            "FILE.json",
+            text="show where the time went; with a file, also write a trace for Perfetto",
+            bare=Path(),
+        ),
+    ] = None
+
+    @property
+    def showing(self) -> Showing:
+        """Whether and how a physics engine shows its world."""
+        return Showing(view=self.view, video=self.video.absolute() if self.video is not None else None)
+
+
+class Setting(NamedTuple):
+    """One option.
+
+    Attributes:
+        name: that of its field.
+        type: what a value is; for an option that may be repeated, what each value is.
+        repeatable: whether it may be given more than once.
+        flag: how the command line spells it.
+        help: one line about it.
+    """
+
+    name: str
+    type: Any
+    repeatable: bool
+    flag: Flag
+    help: str
+
+
+@cache
+def settings() -> dict[str, Setting]:
+    """All options by the names of their fields."""
+    found = {}
+    for name, hint in get_type_hints(Options, include_extras=True).items():
+        kind, flag = hint.__origin__, hint.__metadata__[0]
+        repeatable = getattr(kind, "__origin__", None) is tuple
+        value = kind.__args__[0] if repeatable else next((a for a in _alternatives(kind) if a is not type(None)), kind)
+        text = flag.text or _description(flag.key)
+        found[name] = Setting(name, value, repeatable, flag, f"{text}; repeatable" if repeatable else text)
+    return found
+
+
+def with_options(loaded: LoadedConfig, options: Options, findings: Findings | None = None) -> LoadedConfig:
+    """The configuration with its keys replaced by the options that are given.
+
+    Args:
+        loaded: the configuration, whose start values were replaced when it was read.
+        options: what replaces its keys.
+        findings: collects what is wrong with the values of options; None where they were checked before.
+    """
+    config, overrides = loaded.config, dict(loaded.overrides)
+    for setting in settings().values():
+        value, flag = getattr(options, setting.name), setting.flag
+        if flag.key is None or value in (None, ()):
+            continue
+        section, _, key = flag.key.partition(".")
+        overrides[flag.key] = f"{flag.name} {_written(value)}"
+        plain = list(value) if setting.repeatable else str(value.absolute()) if isinstance(value, Path) else value
+        config = replace(config, **{section: replace(getattr(config, section), **{key: plain})})
+        if findings is not None:
+            wrong = Findings(str(loaded.file), loaded.lines, overrides)
+            check(plain, _type_of(section, key), flag.key, wrong)
+            findings.merge(wrong)
+    return replace(loaded, config=config, overrides=overrides)
+
+
+def _alternatives(kind: Any) -> tuple[Any, ...]:  # noqa: ANN401 a type, which has no common class
+    return getattr(kind, "__args__", (kind,))
+
+
+def _type_of(section: str, key: str) -> inspect.Type:
+    kind = inspect.type_info(_SECTIONS[section])
+    assert isinstance(kind, inspect.StructType)
+    return next(field.type for field in kind.fields if field.encode_name == key)
+
+
+def _description(key: str) -> str:
+    """What the configuration says about a key, as help: no full stop, and nothing about null, which no option takes."""
+    section, _, name = key.partition(".")
+    hint = get_type_hints(_SECTIONS[section], include_extras=True)[name]
+    text: str = next(meta.description for meta in hint.__metadata__)
+    return f"{text[0].lower()}{text[1:]}".partition("; null:")[0].removesuffix(".")
+
+
+def _written(value: object) -> str:
+    match value:
+        case float():
+            return f"{value:g}"
+        case tuple():
+            return ", ".join(value)
+        case _:
+            return str(value)

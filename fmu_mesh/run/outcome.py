@@ -1,0 +1,56 @@
+"""How a run ended, as a value: the same for a run in one process, in many, and with a manually started master."""
+
+from __future__ import annotations
+
+from typing import Literal, Self
+
+import msgspec
+
+from ..errors import ErrorReport, from_report
+from ..wire.time_profile import MeshProfile
+from .results import what_is_kept
+
+__all__ = ["Outcome"]
+
+
+class Outcome(msgspec.Struct, frozen=True, tag="end"):
+    """How a run ended; the master also sends it to its launcher, as the last event.
+
+    Attributes:
+        state: `done`, or `failed` if there is an error.
+        point: the last point that all instances reached.
+        time: the simulation time of that point in s.
+        seconds: wall-clock time from the first grant to the last point in s.
+        rows: number of rows in the result file.
+        file: the result file; None if nothing was recorded.
+        error: why the run failed.
+        ended_by: what ended the simulation before its last point although nothing failed.
+        profile: where the time went, if that was asked for.
+        signal: name of the signal by which the process of the master was asked to end, if it was.
+    """
+
+    state: Literal["done", "failed"]
+    point: int
+    time: float
+    seconds: float
+    rows: int
+    file: str | None
+    error: ErrorReport | None = None
+    ended_by: ErrorReport | None = None
+    profile: MeshProfile | None = None
+    signal: str | None = None
+
+    @property
+    def kept(self) -> str | None:
+        """A sentence about the rows that a failed run has left; None if there are none."""
+        return what_is_kept(self.file, self.rows)
+
+    def checked(self) -> Self:
+        """Return this outcome if the run went well.
+
+        Raises:
+            FmuMeshError: the run failed; the error says why, and what was recorded.
+        """
+        if self.error is not None:
+            raise from_report(self.error).with_hint(self.kept)
+        return self

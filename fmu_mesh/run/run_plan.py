@@ -1,0 +1,238 @@
+"""The plan of one run: made once by whoever starts the run, and the only thing that its other processes get.
+
+Owns the file through which they get it. Each process decodes only the parts of that file that it needs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+import msgspec
+from msgspec.structs import replace
+
+from ..config.loading import LoadedConfig
+from ..config.mesh import ZenohConfig
+from ..errors import ConfigurationError
+from ..instances.contract import Showing
+from ..instances.registry import decode_section
+from ..system.plan import RECORDER, NodePlan, Plan
+from ..text import listed, nearest
+from ..variables.model_description import ModelDescription
+from .options import Options
+
+__all__ = ["MANUAL", "Model", "NodeRun", "RunPlan", "read_node", "read_run"]
+
+MANUAL = "hand"
+"""Name of a run whose processes are started manually."""
+
+_FILE_NAME = "run.plan"
+_MOST_BYTES = 1 << 30
+_ELSEWHERE = ModelDescription("", "", "", "co_simulation", "", ())
+"""Stands in the file where a model description would stand a second time."""
+
+T = TypeVar("T")
+
+
+class Model(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The model of one instance as it was when the run was planned.
+
+    Attributes:
+        description: its model description.
+        content: the SHA-256 of its files.
+    """
+
+    description: ModelDescription
+    content: str
+
+
+class NodeRun(msgspec.Struct, frozen=True):
+    """The part of a run plan that one node needs.
+
+    Attributes:
+        config_file: the configuration file.
+        run: name of the run.
+        zenoh: the `zenoh` section.
+        showing: whether and how a physics engine shows its world.
+        plan: the plan of the node.
+        models: the models of its instances, by instance name.
+    """
+
+    config_file: Path
+    run: str
+    zenoh: ZenohConfig
+    showing: Showing
+    plan: NodePlan
+    models: Mapping[str, Model]
+
+
+class RunPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Everything that follows from a configuration and the options of one run.
+
+    ```python
+    run = plan_run(Path("configs/pendulum_delay.yaml"), Options(window=64))
+    file = run.write(folder)
+    read_node(file, "pendulum").plan.window  # in another process
+    ```
+
+    Attributes:
+        loaded: the configuration, options applied.
+        options: what the command line changed.
+        plan: the plan of the mesh.
+        contents: the SHA-256 of the model of each instance, by instance name.
+        run: name of the run: the process id of the launcher, or `MANUAL`.
+        restarts: how often the run was started before.
+    """
+
+    loaded: LoadedConfig
+    options: Options
+    plan: Plan
+    contents: dict[str, str]
+    run: str = MANUAL
+    restarts: int = 0
+
+    @property
+    def config_file(self) -> Path:
+        """The configuration file, absolute."""
+        return self.loaded.file.absolute()
+
+    @property
+    def mesh(self) -> str:
+        """Name of the mesh."""
+        return self.loaded.config.mesh
+
+    def node(self, name: str) -> NodeRun:
+        """What the node ``name`` needs; a node with one instance and no group has the name of the instance.
+
+        Raises:
+            ConfigurationError: there is no such node.
+        """
+        plan = self.plan
+        if name not in plan.nodes or name == RECORDER:
+            raise _no_node(plan, name)
+        return NodeRun(
+            config_file=self.config_file,
+            run=self.run,
+            zenoh=self.loaded.config.zenoh,
+            showing=self.options.showing,
+            plan=replace(plan.nodes[name], restarts=self.restarts),
+            models={item.name: self._model(item.name) for item in plan.nodes[name].instances},
+        )
+
+    def write(self, folder: Path) -> Path:
+        """Write the plan into a private folder, for the other processes of the run; returns the file.
+
+        The format is MessagePack: unlike JSON, it can hold any float and bytes.
+        """
+        system = self.plan.system
+        bare = {name: replace(own, description=_ELSEWHERE) for name, own in system.instances.items()}
+        rest = replace(self, plan=replace(self.plan, nodes={}, system=replace(system, instances=bare)))
+        parts = _Parts(
+            config_file=self.config_file,
+            run=self.run,
+            restarts=self.restarts,
+            zenoh=self.loaded.config.zenoh,
+            showing=self.options.showing,
+            nodes={name: _encoded(plan) for name, plan in self.plan.nodes.items()},
+            models={name: _encoded(self._model(name)) for name in system.instances},
+            rest=_encoded(rest),
+        )
+        file = folder / _FILE_NAME
+        file.write_bytes(_encoded(parts))
+        return file
+
+    def _model(self, instance: str) -> Model:
+        return Model(self.plan.system.instances[instance].description, self.contents[instance])
+
+
+class _Parts(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The file: what every node needs, and the parts that are decoded only where they are needed."""
+
+    config_file: Path
+    run: str
+    restarts: int
+    zenoh: ZenohConfig
+    showing: Showing
+    nodes: dict[str, msgspec.Raw]
+    models: dict[str, msgspec.Raw]
+    rest: msgspec.Raw
+
+
+def read_node(file: Path, name: str) -> NodeRun:
+    """Read what one node needs from the file of a run plan.
+
+    Raises:
+        ConfigurationError: it cannot be read, or is no run plan.
+    """
+    parts = _read(file)
+    if name not in parts.nodes:
+        raise ConfigurationError(f"the run plan '{file}' has no node '{name}'.")
+    plan = _decoded(file, parts.nodes[name], NodePlan)
+    return NodeRun(
+        config_file=parts.config_file,
+        run=parts.run,
+        zenoh=parts.zenoh,
+        showing=parts.showing,
+        plan=replace(plan, restarts=parts.restarts),
+        models={item.name: _decoded(file, parts.models[item.name], Model) for item in plan.instances},
+    )
+
+
+def read_run(file: Path) -> RunPlan:
+    """Read all of a run plan.
+
+    Raises:
+        ConfigurationError: it cannot be read, or is no run plan.
+    """
+    parts = _read(file)
+    run = _decoded(file, parts.rest, RunPlan)
+    models = {name: _decoded(file, raw, Model) for name, raw in parts.models.items()}
+    system = run.plan.system
+    instances = {name: replace(own, description=models[name].description) for name, own in system.instances.items()}
+    nodes = {name: _decoded(file, raw, NodePlan) for name, raw in parts.nodes.items()}
+    return replace(run, plan=replace(run.plan, nodes=nodes, system=replace(system, instances=instances)))
+
+
+def _read(file: Path) -> _Parts:
+    try:
+        with file.open("rb") as source:
+            data = source.read(_MOST_BYTES + 1)
+    except OSError as error:
+        raise ConfigurationError(f"the run plan '{file}' cannot be read: {error.strerror}.") from error
+    if len(data) > _MOST_BYTES:
+        raise ConfigurationError(f"the run plan '{file}' has more than {_MOST_BYTES} bytes.")
+    return _decoded(file, data, _Parts)
+
+
+def _encoded(value: object) -> msgspec.Raw:
+    return msgspec.Raw(msgspec.msgpack.encode(value, enc_hook=_path_to_text))
+
+
+def _decoded(file: Path, data: bytes | msgspec.Raw, type_: type[T]) -> T:
+    try:
+        return msgspec.msgpack.decode(data, type=type_, dec_hook=_decoded_value)
+    except (msgspec.MsgspecError, ValueError, RecursionError) as error:
+        raise ConfigurationError(f"'{file}' is no run plan of this version of fmu_mesh: {error}.") from error
+
+
+def _path_to_text(value: object) -> str:
+    if isinstance(value, Path):
+        return str(value)
+    raise NotImplementedError(f"a {type(value).__name__} cannot be part of a run plan")
+
+
+def _decoded_value(type_: type[Any], value: object) -> object:
+    if type_ is Path and isinstance(value, str):
+        return Path(value)
+    return decode_section(type_, value)
+
+
+def _no_node(plan: Plan, name: str) -> ConfigurationError:
+    if name in plan.system.instances:
+        group = plan.node_of(name)
+        return ConfigurationError(f"instance '{name}' runs in the group '{group}'", hint=f"Start node '{group}'.")
+    names = [node for node in plan.nodes if node != RECORDER]
+    suggestion = nearest(name, names)
+    hint = f"Did you mean '{suggestion}'?" if suggestion else None
+    return ConfigurationError(f"there is no node '{name}'; there are: {listed(names)}.", hint=hint)

@@ -1,0 +1,167 @@
+"""What a run records, the contract of what writes it into a file, and how that is found.
+
+A package offers a result format through the entry points `fmu_mesh.recorders`, under the ending of its files without
+the dot. CSV and MCAP are found in the same way. `docs/extending.md` shows how to write one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Protocol, cast
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from fmu_mesh.config.findings import Findings
+from fmu_mesh.config.loading import LoadedConfig
+from fmu_mesh.files import Kept
+from fmu_mesh.plugins import plugin, plugin_names
+from fmu_mesh.variables.model_description import ModelDescription
+from fmu_mesh.variables.value_types import VariableType
+
+__all__ = ["Recording", "ResultFile", "ResultFormat", "result_endings", "result_format"]
+
+_GROUP = "fmu_mesh.recorders"
+_DEFAULT = "csv"
+_PLAIN = ("", "txt")
+"""Endings that ask for no format in particular; a number, as in `result.2`, does not either."""
+
+
+class Recording(msgspec.Struct, frozen=True):
+    """What a run records.
+
+    Attributes:
+        loaded: the configuration; `loaded.resolve` gives the absolute path of a path in it.
+        descriptions: the model descriptions by instance name, with the units of all variables.
+        recorded: (instance, variable) of every column, in order; of an array every element is a column of its own,
+            as `y[1,2]`.
+    """
+
+    loaded: LoadedConfig
+    descriptions: Mapping[str, ModelDescription]
+    recorded: tuple[tuple[str, str], ...]
+
+    @property
+    def columns(self) -> list[tuple[str, VariableType]]:
+        """(`instance.variable`, type) of every column, in order; the time is not among them."""
+        columns: list[tuple[str, VariableType]] = []
+        for instance, name in self.recorded:
+            variable = self.descriptions[instance].variable_of(name)
+            assert variable is not None  # the system is valid
+            columns.append((f"{instance}.{name}", variable.type))
+        return columns
+
+
+class ResultFormat(Protocol):
+    """What an entry point names: a class with these three methods, whose instances are `ResultFile`s.
+
+    The call sequence of both is:
+
+    1. `check`, before anything is started, in another process than the rest.
+    2. `open`, when the run starts. Another run must not be able to open the same file, and what is at ``path`` must
+       not change before the first row. `fmu_mesh.files.open_alone` opens a file in this way.
+    3. `write`, with rows in the order of their points, from point 0 on and without a gap; `flush` in between, about
+       five times a second. Both are called from one thread at a time.
+    4. `close`, once, also after an error. It may be called from another thread than `write`.
+    5. `keep_whole_rows`, only if the process was killed before `close`, in another process.
+
+    A format whose files cannot be read without their end writes into a file of another name, which `close` renames to
+    ``path``.
+    """
+
+    def check(self, recording: Recording, findings: Findings) -> None:
+        """Add a finding for everything that a file of this format cannot hold.
+
+        Args:
+            recording: what is to be recorded.
+            findings: where findings go, each with its path in the configuration, such as `record.variables`.
+
+        Raises:
+            ConfigurationError: a package that the format needs is missing.
+        """
+        ...
+
+    def open(self, path: Path, recording: Recording) -> ResultFile:
+        """Open a result file.
+
+        Args:
+            path: absolute path of the file; its folder may not exist yet.
+            recording: what is recorded; `check` has found nothing wrong with it.
+
+        Raises:
+            ConfigurationError: the file cannot be written, or another run is writing it.
+        """
+        ...
+
+    def keep_whole_rows(self, path: Path, kept: Kept) -> int:
+        """Cut a file off after its last whole row; its writer was killed.
+
+        Args:
+            path: the file; nobody is writing it any more.
+            kept: the last `ResultFile.kept` that was noted. What follows these bytes may end within a row.
+
+        Returns:
+            The number of rows in the file.
+        """
+        ...
+
+
+class ResultFile(Protocol):
+    """An open result file. `ResultFormat` has the call sequence.
+
+    `write`, `flush` and `close` raise OSError if the file cannot be written; the run ends with it.
+
+    Attributes:
+        path: the file.
+        rows: number of rows written so far. After `close` it is the number of rows in the file, also on a full disk.
+        kept: how many rows the operating system has, and in how many bytes of the file. These rows survive if the
+            process is killed.
+    """
+
+    @property
+    def path(self) -> Path: ...  # noqa: D102 see above
+
+    @property
+    def rows(self) -> int: ...  # noqa: D102 see above
+
+    @property
+    def kept(self) -> Kept: ...  # noqa: D102 see above
+
+    def write(self, times: NDArray[np.float64], columns: Sequence[NDArray[Any]]) -> None:
+        """Append one row per time.
+
+        Args:
+            times: simulation times in s; at least one.
+            columns: an array of the same length for each of `Recording.columns`, with the dtype of its type (`object`
+                for String and Binary). The arrays are overwritten after the call; copy what is needed later.
+        """
+        ...
+
+    def flush(self) -> None:
+        """Give all rows to the operating system, so that others can read them and they survive the process."""
+        ...
+
+    def close(self) -> None:
+        """Write what is left and close the file. Without a row, what was at the path stays as it was."""
+        ...
+
+
+def result_format(path: str | Path) -> ResultFormat | None:
+    """The format of a result file of this name, or None if no installed package writes it.
+
+    A name without an ending is that of a CSV.
+
+    Raises:
+        ConfigurationError: two packages write this format, or the package cannot be imported.
+    """
+    ending = Path(path).suffix.removeprefix(".").lower()
+    if ending in _PLAIN or ending.isdecimal():
+        ending = _DEFAULT
+    return cast("ResultFormat | None", plugin(_GROUP, ending))
+
+
+def result_endings() -> list[str]:
+    """The endings that result files can have, such as `.csv`, ours first."""
+    return [f".{name}" for name in plugin_names(_GROUP)]

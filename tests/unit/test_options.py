@@ -1,0 +1,97 @@
+"""Options of a run: flags, help and configuration keys follow from one list."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from fmu_mesh.cli.arguments import add_options, read_options
+from fmu_mesh.cli.main import command_parser
+from fmu_mesh.config.findings import Findings
+from fmu_mesh.config.structure import json_schema
+from fmu_mesh.instances.configuration import installed_config, parse
+from fmu_mesh.run.options import Options, settings, with_options
+
+TEXT = """\
+mesh: one
+simulation: {stop_time: 1, step_size: 0.1}
+instances: {gain: {fmu: Gain.fmu}}
+"""
+GIVEN: dict[str, tuple[str | None, Any]] = {
+    "step_size": ("0.5", 0.5),
+    "stop_time": ("7", 7.0),
+    "window": ("3", 3),
+    "real_time_factor": ("2", 2.0),
+    "update_period": ("0.25", 0.25),
+    "catch_up": ("4", 4.0),
+    "start_values": ("gain.k=1", ("gain.k=1",)),
+    "output": ("r.csv", Path("r.csv")),
+    "listen": ("tcp/127.0.0.1:1", ("tcp/127.0.0.1:1",)),
+    "connect": ("tcp/127.0.0.1:2", ("tcp/127.0.0.1:2",)),
+    "paused": (None, True),
+    "view": (None, True),
+    "video": ("film.gif", Path("film.gif")),
+    "profile": ("p.json", Path("p.json")),
+}
+
+
+@pytest.mark.parametrize("name", settings())
+def test_what_a_flag_is_given_is_the_value_of_its_option(name: str) -> None:
+    parser = argparse.ArgumentParser()
+    add_options(parser, *settings())
+    text, value = GIVEN[name]
+    flag = settings()[name].flag.name
+    assert read_options(parser.parse_args([])) == Options()
+    assert read_options(parser.parse_args([flag] if text is None else [flag, text])) == Options(**{name: value})
+
+
+def test_a_command_reads_the_options_that_it_has() -> None:
+    arguments = command_parser()[0].parse_args(["check", "mesh.yaml", "--window", "auto", "--set", "gain.k=1"])
+    assert read_options(arguments) == Options(window="auto", start_values=("gain.k=1",))
+
+
+def test_the_help_of_a_flag_is_the_description_of_its_key() -> None:
+    definitions = json_schema(installed_config())["$defs"]
+    assert isinstance(definitions, dict)
+    sections = {"simulation": "SimulationConfig", "zenoh": "ZenohConfig", "record": "RecordConfig"}
+    for setting in settings().values():
+        if setting.flag.key is None or setting.flag.text is not None:
+            continue
+        section, _, key = setting.flag.key.partition(".")
+        description = definitions[sections[section]]["properties"][key]["description"]
+        text = setting.help.removesuffix("; repeatable")
+        assert description[1:].startswith(text[1:])
+        assert description[len(text) :].strip(".").partition(":")[0] in ("", "; null")
+
+
+def test_every_option_with_a_key_replaces_it() -> None:
+    loaded = parse(TEXT, Path("one.yaml"))
+    options = Options(**{name: value for name, (_, value) in GIVEN.items()})
+    findings = Findings("one.yaml")
+    changed = with_options(loaded, options, findings)
+    assert not len(findings)
+    simulation, zenoh = changed.config.simulation, changed.config.zenoh
+    assert (simulation.step_size, simulation.stop_time, simulation.window) == (0.5, 7.0, 3)
+    assert (simulation.real_time_factor, simulation.update_period, simulation.catch_up) == (2.0, 0.25, 4.0)
+    assert (zenoh.listen, zenoh.connect) == (["tcp/127.0.0.1:1"], ["tcp/127.0.0.1:2"])
+    assert changed.config.record.file == str(Path("r.csv").absolute())
+    assert changed.overrides["simulation.catch_up"] == "--catch-up 4"
+    assert changed.overrides["zenoh.listen"] == "--listen tcp/127.0.0.1:1"
+    assert changed.overrides.keys() == {setting.flag.key for setting in settings().values()} - {None}
+
+
+def test_options_that_are_not_given_leave_the_configuration_as_it_is() -> None:
+    loaded = parse(TEXT, Path("one.yaml"))
+    assert with_options(loaded, Options()) == loaded
+
+
+def test_a_value_that_its_key_does_not_allow_is_a_finding_that_names_the_flag() -> None:
+    findings = Findings("one.yaml")
+    with_options(parse(TEXT, Path("one.yaml")), Options(update_period=-1.0, catch_up=-2.0), findings)
+    assert [str(finding) for finding in findings] == [
+        "one.yaml: --update-period -1: -1.0; expected a finite number >= 0",
+        "one.yaml: --catch-up -2: -2.0; expected a finite number >= 0 or null",
+    ]
