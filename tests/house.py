@@ -261,10 +261,7 @@ ALLOWED: dict[str, dict[str, str]] = {
         "instances/mujoco/rendering.py: self._viewer.cam.fixedcamid": _MUJOCO,
         "instances/mujoco/rendering.py: self._viewer.cam.type": _MUJOCO,
         "ros/node/entry.py: end.daemon": "a Timer has no parameter for it",
-        "ros/node/fmu_node.py: clock.clock.nanosec": _ROS,
-        "ros/node/fmu_node.py: clock.clock.sec": _ROS,
-        "ros/node/node_topics.py: message.header.stamp.nanosec": _ROS,
-        "ros/node/node_topics.py: message.header.stamp.sec": _ROS,
+        "ros/node/node_topics.py: message.header.stamp": _ROS,
         "ros/node/node_topics.py: setattr(owner)": _ROS,
     },
     "rebound_calls": {
