@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import signal
+import sys
 from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
 from typing import Any
@@ -11,8 +13,17 @@ import pytest
 from hypothesis import settings
 
 from tests.fmus.event_fmus import Version, build_event_fmu
-from tests.fmus.helpers import NO_COMPILER, find_fmu
+from tests.fmus.helpers import NO_COMPILER, find_fmu, session_folder
 from tests.helpers import Place
+
+# Where byte-code must not be written, each process of each mesh compiles all modules again, and each worker all tests.
+sys.dont_write_bytecode = False
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+
+# There are more processes than cores, so none of them needs a thread for each core; starting them takes 0.03 s.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+session_folder()  # before there are workers
 
 # How long an example takes says more about the machine than about the code; a failure must be the same everywhere.
 settings.register_profile("fmu_mesh", deadline=None, derandomize=True, print_blob=True)
@@ -46,13 +57,12 @@ def faulty(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def event_fmu(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
+def event_fmu() -> Callable[..., Path]:
     """Returns an event test FMU by model and FMI version; without a C compiler the test is skipped."""
-    folder = tmp_path_factory.mktemp("event_fmus")
 
     def find(name: str, version: Version, **changes: str) -> Path:
         if NO_COMPILER is not None:
             pytest.skip(NO_COMPILER)
-        return build_event_fmu(name, version, folder, **changes)
+        return build_event_fmu(name, version, session_folder(), **changes)
 
     return find

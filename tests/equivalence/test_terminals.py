@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import signal
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -16,12 +17,12 @@ LONG = "the_left_wheel_of_the_front_axle_with_its_own_long_name"
 MESH = "mesh_of_a_test_with_long_names"
 
 
-def start_long_names(place: Place) -> Path:
-    """A mesh whose names are longer than there is room, running by the wall clock; its configuration."""
+def long_names(place: Place) -> Path:
+    """The configuration of a mesh by the wall clock whose names are longer than there is room."""
     instances = {
         f"{LONG}_{number}": {"fmu": str(FMUS / f"{fmu}.fmu")} for number, fmu in ((1, "DampedPendulum"), (2, "Gain"))
     }
-    config = write_config(
+    return write_config(
         place.folder,
         name=MESH,
         instances=instances,
@@ -29,14 +30,24 @@ def start_long_names(place: Place) -> Path:
         stop_time=3600.0,
         simulation=PACED,
     )
+
+
+def started(place: Place, config: Path) -> Place:
+    """A place where this mesh runs."""
     place.start("launch", config, "--no-progress")
     assert place.run("wait").wait() == 0
-    return config
+    return place
 
 
 def start_pair(place: Place) -> None:
-    place.start("launch", write_config(place.folder, stop_time=3600.0, simulation=PACED), "--no-progress")
-    assert place.run("wait").wait() == 0
+    started(place, write_config(place.folder, stop_time=3600.0, simulation=PACED))
+
+
+@pytest.fixture(scope="module")
+def long_pair() -> Iterator[Place]:
+    """A place with a mesh of long names that is only looked at."""
+    with Place() as place:
+        yield started(place, long_names(place))
 
 
 # --- top
@@ -61,10 +72,8 @@ def test_top_fits_its_terminal_and_has_one_head_line(place: Place, columns: int)
 
 
 @pytest.mark.parametrize("columns", [80, 200])
-def test_top_shortens_long_names_in_the_middle_where_they_do_not_fit(place: Place, columns: int) -> None:
-    start_long_names(place)
-
-    with Terminal(place, "top", columns=columns) as top:
+def test_top_shortens_long_names_in_the_middle_where_they_do_not_fit(long_pair: Place, columns: int) -> None:
+    with Terminal(long_pair, "top", columns=columns) as top:
         shown = top.wait_for("instance")
         rows = [line.split() for line in shown if re.search(r"_[12] ", line)]
 
@@ -151,11 +160,7 @@ def test_without_a_stop_time_the_progress_line_tells_what_is_known(place: Place)
 
 @pytest.mark.parametrize("columns", [60, 80])
 def test_the_progress_line_of_long_names_is_one_line(place: Place, columns: int) -> None:
-    start_long_names(place)
-    config = place.folder / f"{MESH}.yaml"
-    other = place.folder / "other.csv"
-
-    with Terminal(place, "launch", config, "--output", other, "--local", columns=columns) as launch:
+    with Terminal(place, "launch", long_names(place), "--local", columns=columns) as launch:
         launch.wait_for(" % ")
         for _ in range(3):
             before = launch.shown

@@ -15,7 +15,17 @@ from fmu_mesh.instances.fmi import read_description
 from fmus.build import build
 from tests.fmus.helpers import NO_COMPILER
 from tests.fmus.packing import unpacked
-from tests.helpers import DEADLINE_S, FMUS, Launched, Place, row_count, rows_of, wait_until, write_config
+from tests.helpers import (
+    DEADLINE_S,
+    FMUS,
+    Launched,
+    Place,
+    on_a_busy_machine,
+    row_count,
+    rows_of,
+    wait_until,
+    write_config,
+)
 
 
 def start(place: Place, config: Path, role: str, *options: str) -> Launched:
@@ -124,7 +134,7 @@ def test_a_node_with_another_configuration_is_refused_with_the_reason(place: Pla
 
 
 def test_a_master_that_waits_in_vain_says_whom_it_has_refused(place: Place) -> None:
-    config = write_config(place.folder, timeouts={"start": 3.0})
+    config = write_config(place.folder, timeouts={"start": on_a_busy_machine(3.0)})
     master = start(place, config, "master")
     place.note()
 
@@ -200,7 +210,7 @@ def test_the_same_fmu_may_lie_elsewhere_on_the_host_of_a_node(place: Place) -> N
 
 
 def test_a_node_of_another_version_of_ours_is_refused(place: Place) -> None:
-    config = write_config(place.folder, timeouts={"start": 5.0})
+    config = write_config(place.folder, timeouts={"start": on_a_busy_machine(5.0)})
     master = start(place, config, "master")
     place.note()
     program = (

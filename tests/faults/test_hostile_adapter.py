@@ -14,8 +14,7 @@ import pytest
 
 from fmu_mesh import FMIAdapter
 from fmu_mesh.instances.call_guard import floating_point_changed, restore_floating_point
-from fmus.build import build
-from tests.fmus.helpers import NO_COMPILER
+from tests.fmus.helpers import NO_COMPILER, built_once
 from tests.fmus.packing import repacked
 
 Hostile = Callable[[str], Path]
@@ -42,7 +41,7 @@ def hostile(tmp_path_factory: pytest.TempPathFactory) -> Hostile:
     if NO_COMPILER is not None:
         pytest.skip(NO_COMPILER)
     folder = tmp_path_factory.mktemp("hostile")
-    source = build(Path(__file__).parent / "fmus" / "Hostile", folder)
+    source = built_once(Path(__file__).parent / "fmus" / "Hostile")
 
     def named(name: str) -> Path:
         with zipfile.ZipFile(source) as archive:

@@ -9,8 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from fmus.build import build
-from tests.fmus.helpers import NO_COMPILER
+from tests.fmus.helpers import NO_COMPILER, built_once
 from tests.helpers import Place, row_count, rows_of, wait_until, write_config
 
 SHORT = {"call": 2.0, "step": 2.0, "terminate": 2.0, "start": 60.0, "initialize": 60.0}
@@ -28,11 +27,11 @@ STATE_FAULTS = (
 
 
 @pytest.fixture(scope="module")
-def hostile(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def hostile() -> Path:
     """The FMU that does what its instance name says."""
     if NO_COMPILER is not None:
         pytest.skip(NO_COMPILER)
-    return build(Path(__file__).parent / "fmus" / "Hostile", tmp_path_factory.mktemp("hostile"))
+    return built_once(Path(__file__).parent / "fmus" / "Hostile")
 
 
 def mesh_of(place: Place, hostile: Path, names: Sequence[str], *, group: str | None = None, **more: object) -> Path:

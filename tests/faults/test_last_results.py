@@ -11,8 +11,7 @@ from typing import Any
 import psutil
 import pytest
 
-from fmus.build import build
-from tests.fmus.helpers import NO_COMPILER, find_fmu
+from tests.fmus.helpers import NO_COMPILER, built_once, find_fmu
 from tests.helpers import Launched, Place, row_count, rows_of, wait_until, write_config
 
 MODES = pytest.mark.parametrize("options", [(), ("--local",)], ids=["distributed", "local"])
@@ -21,11 +20,11 @@ FOREVER = {"call": 300.0, "start": 300.0, "initialize": 300.0}
 
 
 @pytest.fixture(scope="module")
-def hostile(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def hostile() -> Path:
     """The FMU that does what its instance name says."""
     if NO_COMPILER is not None:
         pytest.skip(NO_COMPILER)
-    return build(Path(__file__).parent / "fmus" / "Hostile", tmp_path_factory.mktemp("hostile"))
+    return built_once(Path(__file__).parent / "fmus" / "Hostile")
 
 
 def kept_bytes(file: Path) -> bytes | None:

@@ -8,6 +8,7 @@ them proves the calling sequence. Nothing of the mesh is involved here.
 from __future__ import annotations
 
 import hashlib
+import os
 import subprocess
 import tempfile
 import zipfile
@@ -138,7 +139,7 @@ def build_event_fmu(name: str, version: Version, folder: Path, **changes: str) -
     guid = f"{{{hashlib.sha256(f'{name}{version}{label}'.encode()).hexdigest()[:32]}}}"
     description = {1: _fmi1, 2: _fmi2, 3: _fmi3}[version](name, model, guid, changes)
     platform = "x86_64-linux" if version == 3 else "linux64"
-    with zipfile.ZipFile(folder / f"{built.name}.tmp", "w", zipfile.ZIP_DEFLATED) as archive:
+    with zipfile.ZipFile(folder / f"{built.name}.{os.getpid()}.tmp", "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("modelDescription.xml", description)
         archive.writestr(f"binaries/{platform}/{name}.so", _compiled(name, model, version, guid))
     Path(archive.filename or "").replace(built)

@@ -6,6 +6,10 @@ the repository. Without a C compiler, a test that needs one of them is skipped w
 
 from __future__ import annotations
 
+import atexit
+import os
+import shutil
+import tempfile
 from pathlib import Path
 
 import fmpy
@@ -13,10 +17,22 @@ import pytest
 
 from fmus.build import BuildError, build, find_compiler
 
-__all__ = ["FMUS", "KEPT_FMUS", "NO_COMPILER", "TEST_FMUS", "build_test_fmu", "extracted_fmu", "find_fmu"]
+__all__ = [
+    "FMUS",
+    "KEPT_FMUS",
+    "NO_COMPILER",
+    "TEST_FMUS",
+    "build_test_fmu",
+    "built_once",
+    "extracted_fmu",
+    "find_fmu",
+    "session_folder",
+]
 
 FMUS = Path(__file__).resolve().parents[2] / "fmus"
 SOURCES = Path(__file__).resolve().parent / "src"
+
+_SESSION = "FMU_MESH_TEST_SESSION"
 
 KEPT_FMUS = tuple(sorted(path.stem for path in FMUS.glob("*.fmu")))
 TEST_FMUS = tuple(
@@ -25,8 +41,18 @@ TEST_FMUS = tuple(
 """The test-only FMUs made of the skeleton, which is of FMI 2.0."""
 
 
+def built_once(model: Path) -> Path:
+    """The FMU of the model in this folder, which all workers of a test session share: it must not be changed.
+
+    Raises:
+        BuildError: there is no C compiler, or the sources do not compile.
+    """
+    built = session_folder() / f"{model.name}.fmu"
+    return built if built.is_file() else build(model, built.parent)
+
+
 def build_test_fmu(name: str, folder: Path) -> Path:
-    """Build a test-only FMU into ``folder`` and return its path; a file that is already there is used again.
+    """Put a test-only FMU into ``folder`` and return its path; a file that is already there is used again.
 
     Args:
         name: a folder of ``tests/fmus/src``.
@@ -35,8 +61,19 @@ def build_test_fmu(name: str, folder: Path) -> Path:
     Raises:
         BuildError: there is no C compiler, or the sources do not compile.
     """
-    built = folder / f"{name}.fmu"
-    return built if built.is_file() else build(SOURCES / name, folder)
+    own = folder / f"{name}.fmu"
+    if not own.is_file():
+        folder.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(built_once(SOURCES / name), own)
+    return own
+
+
+def session_folder() -> Path:
+    """A folder that all workers of this test session share; who asks first makes it, and removes it at its end."""
+    if _SESSION not in os.environ:
+        os.environ[_SESSION] = folder = tempfile.mkdtemp(prefix="fmu_mesh_tests-")
+        atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return Path(os.environ[_SESSION])
 
 
 def find_fmu(name: str, folder: Path) -> Path:

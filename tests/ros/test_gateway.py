@@ -110,7 +110,9 @@ def test_every_sample_from_the_first_point_to_the_last_arrives_and_the_clock_tel
     mesh = place.run("launch", config, "--no-progress")
 
     rows = rows_of(place.folder / "lab.csv")
-    assert (mesh.wait(), mesh.errors.count("\n")) == (0, 1), mesh.errors
+    # Whoever takes longer than 3 s to start is told, rightly, that a router is there and no bridge.
+    said = [line for line in mesh.errors.splitlines() if "no bridge to DDS is there" not in line]
+    assert (mesh.wait(), len(said)) == (0, 1), mesh.errors
     assert len(rows) == 301
     ros.wait_for(rows)
     assert ros.floats("angle") == [row[1] for row in rows]

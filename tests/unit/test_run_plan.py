@@ -20,7 +20,7 @@ CONFIGS = FMUS.parent / "configs"
 
 @pytest.fixture
 def run() -> RunPlan:
-    return plan_run(CONFIGS / "pendulum_delay.yaml", Options(window=64, output=Path("/tmp/other.csv")))  # noqa: S108
+    return plan_run(CONFIGS / "pendulum_delay.yaml", Options(window=64, output=Path("/tmp/other.csv")))  # noqa: S108 nothing is written there
 
 
 def test_what_is_read_is_what_was_written(run: RunPlan, tmp_path: Path) -> None:
