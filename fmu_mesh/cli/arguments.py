@@ -16,7 +16,7 @@ from .. import files
 from ..config.base import ENDPOINT_PATTERN, Endpoint
 from ..config.mesh import MAX_WINDOW
 from ..errors import ConfigurationError, LoadFailed
-from ..run.options import Options, settings
+from ..run.options import Options, option_fields
 from ..text import listed, nearest, nearest_file
 
 __all__ = [
@@ -105,7 +105,7 @@ def add_options(
         metavars: by field, the name of the value in the help, if it differs from that in `Options`.
     """
     for name in names:
-        setting = settings()[name]
+        setting = option_fields()[name]
         flag, kind = setting.flag, setting.type
         default = (defaults or {}).get(name)
         text = setting.help + (f"; default: {default}" if default is not None else "")
@@ -124,7 +124,7 @@ def add_options(
 def read_options(arguments: argparse.Namespace) -> Options:
     """The options from the arguments of a command."""
     given: dict[str, Any] = {}
-    for name, setting in settings().items():
+    for name, setting in option_fields().items():
         if hasattr(arguments, name):
             value = getattr(arguments, name)
             given[name] = tuple(value) if setting.repeatable else value

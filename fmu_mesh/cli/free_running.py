@@ -14,15 +14,16 @@ import msgspec
 from msgspec.structs import replace
 
 from ..config.base import NAME_PATTERN
+from ..config.instance_sections import KIND
 from ..errors import ConfigurationError, LoadFailed
 from ..instances.configuration import parse
-from ..instances.fmi import read_description
+from ..instances.registry import KINDS, describe
 from ..run.launcher import Launcher
 from ..run.options import Options
 from ..run.preparing import planned
 from ..variables.model_description import ModelDescription
 from .arguments import add_command, add_options, no_fmu, read_options
-from .output.display import Display, warn
+from .output.display import Display, say, warn
 from .running import finish, run_launcher
 
 __all__ = ["add_commands"]
@@ -65,7 +66,8 @@ def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.Arg
 
 def _run(arguments: argparse.Namespace) -> int:
     try:
-        description = read_description(arguments.fmu)
+        section = msgspec.convert({KIND: "fmu", "fmu": str(arguments.fmu)}, KINDS.section("fmu"))
+        description = describe(arguments.fmu, section, tell=say)
     except LoadFailed as error:
         raise no_fmu(arguments.fmu, error) from error
     name = arguments.name if arguments.name is not None else description.model_identifier
@@ -78,7 +80,7 @@ def _run(arguments: argparse.Namespace) -> int:
     loaded = parse(text, arguments.fmu, options.start_values)
     named = {place: text.replace(f"--set {name}.", "--set ", 1) for place, text in loaded.overrides.items()}
     loaded = replace(loaded, lines={}, overrides=named)  # nobody has written a file, so findings have no lines
-    run = planned(loaded, loaded.findings(), options)
+    run = planned(loaded, loaded.findings(), options, known={name: description})
     warn(run.plan)
     with Display(run.plan, show_progress=not arguments.no_progress) as display:
         outcome = run_launcher(Launcher(run, display.event, display.output))

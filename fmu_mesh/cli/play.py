@@ -8,8 +8,8 @@ from typing import Any
 
 from ..errors import ConfigurationError
 from ..instances.configuration import load
+from ..ros.bags.bag import Bag, chosen_topics
 from ..ros.bags.playing import grid_of, play, schedule
-from ..ros.bags.reading import Bag, chosen_topics
 from ..wire.client.reaching import Meshes
 from .arguments import add_command, number
 from .looking import reaching

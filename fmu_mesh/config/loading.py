@@ -12,7 +12,7 @@ from collections.abc import Set as AbstractSet
 from pathlib import Path
 
 import msgspec
-from msgspec import inspect
+from msgspec import inspect, structs
 
 from fmu_mesh.config.findings import Findings, locate
 from fmu_mesh.config.instance_sections import KIND, InstanceSection, Kinds, keys_of
@@ -137,7 +137,8 @@ def _examine(text: str, path: Path, overrides: Sequence[str], kinds: Kinds) -> t
     if config is None:
         findings.raise_any()
     assert config is not None  # without a finding there is a configuration
-    return LoadedConfig(config, path, lines, replaced), findings
+    # The kinds have done their part: from here on, a configuration is a plain `Config`, in every process.
+    return LoadedConfig(Config(**structs.asdict(config)), path, lines, replaced), findings
 
 
 def _text(path: Path, findings: Findings) -> str:

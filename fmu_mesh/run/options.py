@@ -21,7 +21,7 @@ from ..config.mesh import RecordConfig, SimulationConfig, ZenohConfig
 from ..config.structure import check
 from ..instances.contract import Showing
 
-__all__ = ["Flag", "Options", "Setting", "settings", "with_options"]
+__all__ = ["Flag", "OptionField", "Options", "option_fields", "with_options"]
 
 _SECTIONS: dict[str, type[Base]] = {"simulation": SimulationConfig, "record": RecordConfig, "zenoh": ZenohConfig}
 
@@ -90,7 +90,7 @@ class Options(msgspec.Struct, frozen=True):
         return Showing(view=self.view, video=self.video.absolute() if self.video is not None else None)
 
 
-class Setting(NamedTuple):
+class OptionField(NamedTuple):
     """One option.
 
     Attributes:
@@ -109,7 +109,7 @@ class Setting(NamedTuple):
 
 
 @cache
-def settings() -> dict[str, Setting]:
+def option_fields() -> dict[str, OptionField]:
     """All options by the names of their fields."""
     found = {}
     for name, hint in get_type_hints(Options, include_extras=True).items():
@@ -117,7 +117,7 @@ def settings() -> dict[str, Setting]:
         repeatable = getattr(kind, "__origin__", None) is tuple
         value = kind.__args__[0] if repeatable else next((a for a in _alternatives(kind) if a is not type(None)), kind)
         text = flag.text or _description(flag.key)
-        found[name] = Setting(name, value, repeatable, flag, f"{text}; repeatable" if repeatable else text)
+        found[name] = OptionField(name, value, repeatable, flag, f"{text}; repeatable" if repeatable else text)
     return found
 
 
@@ -130,7 +130,7 @@ def with_options(loaded: LoadedConfig, options: Options, findings: Findings | No
         findings: collects what is wrong with the values of options; None where they were checked before.
     """
     config, overrides = loaded.config, dict(loaded.overrides)
-    for setting in settings().values():
+    for setting in option_fields().values():
         value, flag = getattr(options, setting.name), setting.flag
         if flag.key is None or value in (None, ()):
             continue

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from pathlib import Path
+from types import MappingProxyType
 
 import msgspec
 
@@ -56,9 +57,20 @@ def plan_run(
 
 
 def planned(
-    loaded: LoadedConfig, findings: Findings, options: Options, tell: Callable[[str], None] = lambda _text: None
+    loaded: LoadedConfig,
+    findings: Findings,
+    options: Options,
+    tell: Callable[[str], None] = lambda _text: None,
+    known: Mapping[str, ModelDescription] = MappingProxyType({}),
 ) -> RunPlan:
-    """Check and plan a configuration whose structure was examined; ``findings`` are those of its structure.
+    """Check and plan a configuration whose structure was examined.
+
+    Args:
+        loaded: the configuration.
+        findings: those of its structure.
+        options: what the command line changes.
+        tell: called before something that takes long, such as compiling an FMU.
+        known: model descriptions that were read before, by instance name.
 
     Raises:
         ConfigurationError: the configuration or an FMU is wrong; carries all findings.
@@ -66,7 +78,7 @@ def planned(
     loaded = with_options(loaded, options, findings)
     if not len(findings):  # otherwise the world may be what is wrong
         check_showing(loaded.config.instances, options.showing)
-    descriptions, unreadable = _descriptions(loaded, findings.places, tell)
+    descriptions, unreadable = _descriptions(loaded, findings.places, tell, known)
     findings.merge(unreadable)
     resolve_ros(loaded, descriptions, findings)
     system = build(loaded, descriptions, tuple(findings))
@@ -78,7 +90,10 @@ def planned(
 
 
 def _descriptions(
-    loaded: LoadedConfig, known_places: AbstractSet[str], tell: Callable[[str], None]
+    loaded: LoadedConfig,
+    known_places: AbstractSet[str],
+    tell: Callable[[str], None],
+    known: Mapping[str, ModelDescription],
 ) -> tuple[dict[str, ModelDescription], Sequence[Finding]]:
     """The description of every instance whose model can be read, and a finding for every other.
 
@@ -91,17 +106,17 @@ def _descriptions(
         key = key_of(section)
         place = f"instances.{name}.{key}"
         if getattr(section, key) == "":
-            if not any(f"{known}.".startswith(f"instances.{name}.") for known in known_places):
+            if not any(f"{other}.".startswith(f"instances.{name}.") for other in known_places):
                 findings.append(loaded.finding(place, "an empty path", expected_model(section)))
             continue
         path, own = loaded.resolve(section.path) if section.path else Path(), placed(section)
-        known = (path, msgspec.json.encode(own))
-        if known not in cache:
+        model = (path, msgspec.json.encode(own))
+        if model not in cache:
             try:
-                cache[known] = describe(path, own, loaded.config.limits, tell)
+                cache[model] = known[name] if name in known else describe(path, own, loaded.config.limits, tell)
             except LoadFailed as error:
-                cache[known] = error
-        found = cache[known]
+                cache[model] = error
+        found = cache[model]
         if isinstance(found, LoadFailed):
             text = found.message.rstrip(".") + (f" ({found.hint.rstrip('.')})" if found.hint else "")
             findings.append(loaded.finding(place, text, _expected(section, path), _similar(path)))

@@ -45,7 +45,7 @@ class Interruption:
 
     def __init__(self) -> None:
         self.reason: str | None = None
-        self._end: Callable[[str], None] = lambda _reason: None
+        self._ends: list[Callable[[str], None]] = []
 
     @property
     def signal(self) -> str | None:
@@ -56,11 +56,12 @@ class Interruption:
         """From any thread: ask for the end."""
         if self.reason is None:
             self.reason = reason
-        self._end(reason)
+        for end in self._ends:
+            end(reason)
 
     def goes_to(self, end: Callable[[str], None]) -> None:
         """Call ``end`` with the reason of each request from now on, and at once if there was one."""
-        self._end = end
+        self._ends.append(end)
         if self.reason is not None:
             end(self.reason)
 

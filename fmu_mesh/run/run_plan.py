@@ -22,7 +22,7 @@ from ..text import listed, nearest
 from ..variables.model_description import ModelDescription
 from .options import Options
 
-__all__ = ["MANUAL", "Model", "NodeRun", "RunPlan", "read_node", "read_run"]
+__all__ = ["MANUAL", "NodeRun", "PlannedModel", "RunPlan", "read_node", "read_run"]
 
 MANUAL = "hand"
 """Name of a run whose processes are started manually."""
@@ -35,7 +35,7 @@ _ELSEWHERE = ModelDescription("", "", "", "co_simulation", "", ())
 T = TypeVar("T")
 
 
-class Model(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class PlannedModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The model of one instance as it was when the run was planned.
 
     Attributes:
@@ -64,7 +64,7 @@ class NodeRun(msgspec.Struct, frozen=True):
     zenoh: ZenohConfig
     showing: Showing
     plan: NodePlan
-    models: Mapping[str, Model]
+    models: Mapping[str, PlannedModel]
 
 
 class RunPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -142,8 +142,8 @@ class RunPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         file.write_bytes(_encoded(parts))
         return file
 
-    def _model(self, instance: str) -> Model:
-        return Model(self.plan.system.instances[instance].description, self.contents[instance])
+    def _model(self, instance: str) -> PlannedModel:
+        return PlannedModel(self.plan.system.instances[instance].description, self.contents[instance])
 
 
 class _Parts(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -175,7 +175,7 @@ def read_node(file: Path, name: str) -> NodeRun:
         zenoh=parts.zenoh,
         showing=parts.showing,
         plan=replace(plan, restarts=parts.restarts),
-        models={item.name: _decoded(file, parts.models[item.name], Model) for item in plan.instances},
+        models={item.name: _decoded(file, parts.models[item.name], PlannedModel) for item in plan.instances},
     )
 
 
@@ -187,7 +187,7 @@ def read_run(file: Path) -> RunPlan:
     """
     parts = _read(file)
     run = _decoded(file, parts.rest, RunPlan)
-    models = {name: _decoded(file, raw, Model) for name, raw in parts.models.items()}
+    models = {name: _decoded(file, raw, PlannedModel) for name, raw in parts.models.items()}
     system = run.plan.system
     instances = {name: replace(own, description=models[name].description) for name, own in system.instances.items()}
     nodes = {name: _decoded(file, raw, NodePlan) for name, raw in parts.nodes.items()}

@@ -68,7 +68,6 @@ class Inbox:
     def __init__(self, shared: SharedInbox | None = None) -> None:
         self._posted: deque[Callable[[], None]] = deque()
         self._source: _Source = _Unopened()
-        self._take = self._source.take
         self._shared = shared
         self.offer: Offer | None = shared.offer if shared is not None else None
         self.refusals = Refusals()
@@ -92,14 +91,12 @@ class Inbox:
             capacity: messages that fit; at least as many as the senders have credit for.
         """
         self._source = _ZenohSource(session, keys, name, senders, capacity, self.refusals)
-        self._take = self._source.take
         self._source.wake()  # for what was posted meanwhile
 
     def share(self) -> None:
         """From now on everything comes through shared memory; call it before the first message."""
         assert self._shared is not None
         zenoh_source, self._source = self._source, self._shared
-        self._take = self._source.take
         zenoh_source.close()
         self._source.wake()  # for what was posted meanwhile
 
@@ -116,7 +113,7 @@ class Inbox:
         """The next message if one is there; runs posted actions on the way."""
         if self._posted:
             self._run_posted()
-        while (arrived := self._take()) is not None:
+        while (arrived := self._source.take()) is not None:
             if (message := self._decoded(*arrived)) is not None:
                 return message
         return None

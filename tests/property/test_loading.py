@@ -182,7 +182,8 @@ def test_any_value_of_an_option_is_taken_or_told_with_the_option(value: object) 
 @relaxed
 @given(CONFIGS)
 def test_a_valid_configuration_survives_the_way_through_a_file(config: Config) -> None:
-    assert parse(as_json(msgspec.to_builtins(config)), FILE).config == config
+    plain = Config(**msgspec.structs.asdict(config))  # without the union of the kinds, by which a file is read
+    assert parse(as_json(msgspec.to_builtins(config)), FILE).config == plain
 
 
 @relaxed

@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 from fmu_mesh.cli.main import main
+from fmu_mesh.ros.bags.bag import Sample
 from fmu_mesh.ros.bags.playing import schedule
-from fmu_mesh.ros.bags.reading import Sample
 from fmu_mesh.simtime import TimeGrid
 from tests.fmus.helpers import find_fmu
 from tests.helpers import Launched, Place, rows_of, wait_until, write_config

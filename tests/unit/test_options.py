@@ -13,7 +13,7 @@ from fmu_mesh.cli.main import command_parser
 from fmu_mesh.config.findings import Findings
 from fmu_mesh.config.structure import json_schema
 from fmu_mesh.instances.configuration import installed_config, parse
-from fmu_mesh.run.options import Options, settings, with_options
+from fmu_mesh.run.options import Options, option_fields, with_options
 
 TEXT = """\
 mesh: one
@@ -38,12 +38,12 @@ GIVEN: dict[str, tuple[str | None, Any]] = {
 }
 
 
-@pytest.mark.parametrize("name", settings())
+@pytest.mark.parametrize("name", option_fields())
 def test_what_a_flag_is_given_is_the_value_of_its_option(name: str) -> None:
     parser = argparse.ArgumentParser()
-    add_options(parser, *settings())
+    add_options(parser, *option_fields())
     text, value = GIVEN[name]
-    flag = settings()[name].flag.name
+    flag = option_fields()[name].flag.name
     assert read_options(parser.parse_args([])) == Options()
     assert read_options(parser.parse_args([flag] if text is None else [flag, text])) == Options(**{name: value})
 
@@ -57,7 +57,7 @@ def test_the_help_of_a_flag_is_the_description_of_its_key() -> None:
     definitions = json_schema(installed_config())["$defs"]
     assert isinstance(definitions, dict)
     sections = {"simulation": "SimulationConfig", "zenoh": "ZenohConfig", "record": "RecordConfig"}
-    for setting in settings().values():
+    for setting in option_fields().values():
         if setting.flag.key is None or setting.flag.text is not None:
             continue
         section, _, key = setting.flag.key.partition(".")
@@ -80,7 +80,7 @@ def test_every_option_with_a_key_replaces_it() -> None:
     assert changed.config.record.file == str(Path("r.csv").absolute())
     assert changed.overrides["simulation.catch_up"] == "--catch-up 4"
     assert changed.overrides["zenoh.listen"] == "--listen tcp/127.0.0.1:1"
-    assert changed.overrides.keys() == {setting.flag.key for setting in settings().values()} - {None}
+    assert changed.overrides.keys() == {setting.flag.key for setting in option_fields().values()} - {None}
 
 
 def test_options_that_are_not_given_leave_the_configuration_as_it_is() -> None:

@@ -14,7 +14,7 @@ from fmu_mesh import plugins
 from fmu_mesh.cli.main import main
 from fmu_mesh.errors import ConfigurationError
 from fmu_mesh.recorder.csv_file import CsvFile
-from fmu_mesh.ros.bags.recording import McapFile
+from fmu_mesh.ros.bags.mcap_file import McapFile
 from fmu_mesh.run.results import rows_left
 from fmu_mesh.system.recording import ResultFile, ResultFormat, result_endings, result_format
 from tests.helpers import write_config

@@ -17,7 +17,7 @@ import msgspec
 
 from ...errors import LoadFailed
 
-__all__ = ["Model", "SdfWorld", "read_world"]
+__all__ = ["GazeboModel", "SdfWorld", "read_world"]
 
 _WITH_VARIABLES = ("revolute", "prismatic")
 _WITHOUT_VARIABLES = ("ball", "universal", "screw", "revolute2", "gearbox")
@@ -39,7 +39,7 @@ _GROUND = """
 """Has the same effect on the motion as Gazebo's own model of this name."""
 
 
-class Model(msgspec.Struct, frozen=True):
+class GazeboModel(msgspec.Struct, frozen=True):
     """A model, also one in another model.
 
     Attributes:
@@ -66,7 +66,7 @@ class SdfWorld(msgspec.Struct, frozen=True):
     text: bytes
     source: bytes
     element: ET.Element
-    models: tuple[Model, ...]
+    models: tuple[GazeboModel, ...]
     notes: tuple[str, ...]
 
 
@@ -99,10 +99,10 @@ def read_world(path: Path) -> SdfWorld:
     return SdfWorld(ET.tostring(root) if changed else source, source, world, models, tuple(notes))
 
 
-def _models(parent: ET.Element, scope: str) -> Iterator[Model]:
+def _models(parent: ET.Element, scope: str) -> Iterator[GazeboModel]:
     for element in parent.findall("model"):
         scoped = f"{scope}{element.get('name')}"
-        yield Model(scoped, element, element.findtext("static", "false").strip() not in {"true", "1"})
+        yield GazeboModel(scoped, element, element.findtext("static", "false").strip() not in {"true", "1"})
         yield from _models(element, f"{scoped}::")
 
 
@@ -136,7 +136,7 @@ def _refuse_includes(world: ET.Element, path: Path) -> None:
         )
 
 
-def _refuse_what_gazebo_leaves_out(world: ET.Element, models: tuple[Model, ...], path: Path) -> None:
+def _refuse_what_gazebo_leaves_out(world: ET.Element, models: tuple[GazeboModel, ...], path: Path) -> None:
     """Parts that Gazebo ignores although they change the motion; and names with spaces.
 
     A space ends a name in the protocol of Gazebo's process.
@@ -162,7 +162,7 @@ def _make_revolute(joint: ET.Element) -> None:
             limit.remove(end)
 
 
-def _notes(world: ET.Element, models: tuple[Model, ...]) -> Iterator[str]:
+def _notes(world: ET.Element, models: tuple[GazeboModel, ...]) -> Iterator[str]:
     for model in models:
         for joint in model.element.findall("joint"):
             name, kind = f"{model.scoped}::{joint.get('name')}", joint.get("type")

@@ -22,7 +22,7 @@ import msgspec
 from ...errors import LoadFailed
 from ...variables.model_description import Causality, DefaultExperiment, ModelDescription, Variable
 from .gazebo_kind import GazeboClassicConfig
-from .gazebo_sdf import Model, read_world
+from .gazebo_sdf import GazeboModel, read_world
 
 __all__ = ["GazeboJoint", "GazeboLink", "GazeboPlace", "GazeboWorld", "describe_gazebo_world", "load_gazebo_world"]
 
@@ -123,7 +123,7 @@ def load_gazebo_world(path: Path, config: GazeboClassicConfig) -> GazeboWorld:
     return GazeboWorld(sdf.text, step_size, joints, links, description, places)
 
 
-def _joints(models: Sequence[Model], free: set[str], path: Path) -> tuple[GazeboJoint, ...]:
+def _joints(models: Sequence[GazeboModel], free: set[str], path: Path) -> tuple[GazeboJoint, ...]:
     found = [
         (f"{model.scoped}::{joint.get('name')}", joint)
         for model in models
@@ -143,7 +143,7 @@ def _joints(models: Sequence[Model], free: set[str], path: Path) -> tuple[Gazebo
     )
 
 
-def _links(models: Sequence[Model]) -> tuple[GazeboLink, ...]:
+def _links(models: Sequence[GazeboModel]) -> tuple[GazeboLink, ...]:
     scoped = [f"{model.scoped}::{link.get('name')}" for model in models for link in model.element.findall("link")]
     return tuple(GazeboLink(*names) for names in zip(scoped, _names(scoped), strict=True))
 

@@ -21,7 +21,7 @@ from ...wire.client.readings import Target
 from ...wire.values import encode_value
 from ...wire.views import Command, MeshInfo
 from ..messages.stamp import nanoseconds
-from .reading import Sample
+from .bag import Sample
 
 __all__ = ["Moment", "grid_of", "play", "schedule"]
 
