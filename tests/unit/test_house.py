@@ -269,7 +269,4 @@ LEFT: dict[str, set[str]] = {
         "node/stepping.py: runner.step_seconds",
         "node/time_measurement.py: self._profiler.sent_s",
     },
-    "private_names_of_others": {
-        "ros/node/variable_parameters.py: overrides = node._parameter_overrides",
-    },
 }
