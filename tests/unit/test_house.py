@@ -135,6 +135,14 @@ def headings(page: Path) -> set[str]:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_every_module_that_a_page_names_exists(page: Path) -> None:
+    named = sorted(set(re.findall(r"`(\w+/[\w/]+\.py)`", page.read_text(encoding="utf-8"))))
+
+    folders = (ROOT, ROOT / "fmu_mesh", ROOT / "tests", page.parent)
+    assert [name for name in named if not any((folder / name).exists() for folder in folders)] == []
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_every_command_of_a_page_is_one_that_there_is(page: Path, capsys: pytest.CaptureFixture[str]) -> None:
     lines = re.findall(r"^(?:    \$ |\.venv/bin/)?(fmu-mesh [ -~]*)$", page.read_text(encoding="utf-8"), re.MULTILINE)
     wrong = []
