@@ -17,7 +17,7 @@ from msgspec import inspect, structs
 from fmu_mesh.config.findings import Findings, locate
 from fmu_mesh.config.instance_sections import KIND, InstanceSection, Kinds, keys_of
 from fmu_mesh.config.mesh import Config, config_type
-from fmu_mesh.config.salvage import salvage
+from fmu_mesh.config.partial import partial_configuration
 from fmu_mesh.config.structure import check
 from fmu_mesh.config.yaml_text import Plain, read
 from fmu_mesh.errors import Finding
@@ -133,7 +133,7 @@ def _examine(text: str, path: Path, overrides: Sequence[str], kinds: Kinds) -> t
         data = _with_kinds(_with_overrides(data, overrides, replaced, findings), sections, kinds, findings)
     type_ = config_type(tuple(sections.values()))
     check(data, inspect.type_info(type_), "", findings)
-    config = salvage(data, findings.places, sections) if len(findings) else msgspec.convert(data, type_)
+    config = partial_configuration(data, findings.places, sections) if len(findings) else msgspec.convert(data, type_)
     if config is None:
         findings.raise_any()
     assert config is not None  # without a finding there is a configuration

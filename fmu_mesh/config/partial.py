@@ -17,7 +17,7 @@ from fmu_mesh.config.instance_sections import KIND, InstanceSection
 from fmu_mesh.config.mesh import Config, config_type
 from fmu_mesh.config.yaml_text import Plain
 
-__all__ = ["salvage"]
+__all__ = ["partial_configuration"]
 
 _CONTAINERS = re.compile(
     r"|simulation|connections|initialization|record|zenoh|timeouts|limits|instances(\.[^.]+(\.start_values)?)?"
@@ -25,8 +25,10 @@ _CONTAINERS = re.compile(
 _TIMES = ("start_time", "stop_time", "step_size")
 
 
-def salvage(data: Plain, wrong: AbstractSet[str], sections: Mapping[str, type[InstanceSection]]) -> Config | None:
-    """The configuration without what stands at the paths ``wrong``; None if too little is left.
+def partial_configuration(
+    data: Plain, wrong: AbstractSet[str], sections: Mapping[str, type[InstanceSection]]
+) -> Config | None:
+    """The configuration without the values at the paths ``wrong``; None if too little is valid.
 
     A missing or wrong time is NaN, a missing model an empty path, a wrong connection has two empty ends.
 
