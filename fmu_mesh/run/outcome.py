@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Literal, Self
+from typing import Literal
 
 import msgspec
 
-from ..errors import ErrorReport, from_report
+from ..errors import ErrorReport
 from ..wire.time_profile import MeshProfile
-from .results import what_is_kept
 
 __all__ = ["Outcome"]
 
@@ -39,18 +38,3 @@ class Outcome(msgspec.Struct, frozen=True, tag="end"):
     ended_by: ErrorReport | None = None
     profile: MeshProfile | None = None
     signal: str | None = None
-
-    @property
-    def kept(self) -> str | None:
-        """A sentence about the rows that a failed run has left; None if there are none."""
-        return what_is_kept(self.file, self.rows)
-
-    def checked(self) -> Self:
-        """Return this outcome if the run went well.
-
-        Raises:
-            FmuMeshError: the run failed; the error says why, and what was recorded.
-        """
-        if self.error is not None:
-            raise from_report(self.error).with_hint(self.kept)
-        return self
