@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from fmu_mesh.instances.mujoco.mujoco_instance import MujocoInstance
-from fmu_mesh.instances.mujoco.mujoco_kind import MujocoConfig
+from fmu_mesh.instances.mujoco.mujoco_section import MujocoConfig
 from fmu_mesh.instances.mujoco.rendering import Picture
 from fmu_mesh.rings.ring import Ring
 from fmu_mesh.simtime import TimeGrid

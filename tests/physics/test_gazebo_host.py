@@ -18,7 +18,7 @@ from fmu_mesh.config.instance_sections import ActuatorConfig
 from fmu_mesh.errors import FmuError, InitializationFailed, LoadFailed, StepFailed
 from fmu_mesh.instances.gazebo import gazebo_process
 from fmu_mesh.instances.gazebo.gazebo_classic import GazeboClassicInstance
-from fmu_mesh.instances.gazebo.gazebo_kind import GazeboClassicConfig
+from fmu_mesh.instances.gazebo.gazebo_section import GazeboClassicConfig
 from fmu_mesh.instances.gazebo.gazebo_world import describe_gazebo_world, load_gazebo_world
 from fmu_mesh.rings.ring import Ring
 from fmu_mesh.run.local import LocalMesh

@@ -16,7 +16,7 @@ import pytest
 
 from fmu_mesh.config.instance_sections import ActuatorConfig
 from fmu_mesh.errors import LoadFailed, StepFailed
-from fmu_mesh.instances.mujoco.mujoco_kind import MujocoConfig
+from fmu_mesh.instances.mujoco.mujoco_section import MujocoConfig
 from fmu_mesh.instances.mujoco.mujoco_world import describe_world
 from tests.physics.mujoco_worlds import Driven, body, slider, write_world
 

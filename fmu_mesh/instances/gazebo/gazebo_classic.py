@@ -28,8 +28,8 @@ from ...rings.ring import Ring
 from ...simtime import TimeGrid, steps_between
 from ...variables.model_description import ModelDescription, Value
 from ..body_axes import relative_velocity, to_body
-from .gazebo_kind import GazeboClassicConfig
 from .gazebo_process import PROGRAM_VARIABLE, GazeboGone, GazeboProcess, check_program
+from .gazebo_section import GazeboClassicConfig
 from .gazebo_world import JOINT_STATE, LINK_STATE, GazeboPlace, load_gazebo_world
 
 __all__ = ["GazeboClassicInstance", "check_gazebo_classic"]

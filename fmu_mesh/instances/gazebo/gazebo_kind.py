@@ -4,48 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
-
-from msgspec import Meta
 
 from ... import files
-from ...config.base import Base
-from ...config.instance_sections import (
-    KIND,
-    Actuators,
-    Controllers,
-    FluidDynamics,
-    Group,
-    Host,
-    PhysicsSection,
-    StartValues,
-    StepSize,
-)
 from ...config.mesh import LimitsConfig
 from ...variables.model_description import ModelDescription
 from ..contract import Instance, Kind, Opening
+from .gazebo_section import GazeboClassicConfig
 
-__all__ = ["KIND_OF_GAZEBO_CLASSIC", "GazeboClassicConfig"]
-
-
-class GazeboClassicConfig(Base, PhysicsSection, frozen=True, kw_only=True, tag_field=KIND, tag="gazebo_classic"):
-    """A world that the simulator Gazebo classic 11 computes: its joints and links are variables."""
-
-    gazebo_classic: Annotated[str, Meta(description="Path of the SDF world, relative to this file.")]
-    physics_steps: Annotated[
-        Annotated[int, Meta(ge=1)] | None,
-        Meta(
-            description="Steps of the engine per own step; default: as few as make none longer than the world's "
-            "max_step_size.",
-        ),
-    ] = None
-    controllers: Controllers = []
-    actuators: Actuators = []
-    fluid_dynamics: FluidDynamics = []
-    start_values: StartValues = {}
-    step_size: StepSize = None
-    group: Group = None
-    host: Host = None
+__all__ = ["KIND_OF_GAZEBO_CLASSIC"]
 
 
 class GazeboClassicKind(Kind[GazeboClassicConfig]):

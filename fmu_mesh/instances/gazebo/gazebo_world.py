@@ -21,8 +21,8 @@ import msgspec
 
 from ...errors import LoadFailed
 from ...variables.model_description import Causality, DefaultExperiment, ModelDescription, Variable
-from .gazebo_kind import GazeboClassicConfig
 from .gazebo_sdf import GazeboModel, read_world
+from .gazebo_section import GazeboClassicConfig
 
 __all__ = ["GazeboJoint", "GazeboLink", "GazeboPlace", "GazeboWorld", "describe_gazebo_world", "load_gazebo_world"]
 

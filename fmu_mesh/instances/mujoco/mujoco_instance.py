@@ -29,7 +29,7 @@ from ...rings.ring import Ring
 from ...simtime import TimeGrid, steps_between
 from ...variables.model_description import ModelDescription, Value
 from ..body_axes import relative_velocity, to_body, wrench_at_center
-from .mujoco_kind import MujocoConfig
+from .mujoco_section import MujocoConfig
 from .mujoco_world import MujocoVariable, engine, load_world, warnings
 from .rendering import Picture
 

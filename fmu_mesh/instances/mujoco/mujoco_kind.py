@@ -4,48 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
 
-from msgspec import Meta
-
-from ...config.base import Base
-from ...config.instance_sections import (
-    KIND,
-    Actuators,
-    Controllers,
-    FluidDynamics,
-    Group,
-    Host,
-    PhysicsSection,
-    StartValues,
-    StepSize,
-)
 from ...config.mesh import LimitsConfig
 from ...variables.model_description import ModelDescription
 from ..contract import Instance, Kind, LogMessage, Opening, Showing
+from .mujoco_section import MujocoConfig
 
-__all__ = ["KIND_OF_MUJOCO", "MujocoConfig"]
-
-
-class MujocoConfig(Base, PhysicsSection, frozen=True, kw_only=True, tag_field=KIND, tag="mujoco"):
-    """A world that the physics engine MuJoCo computes: its joints and bodies are variables."""
-
-    mujoco: Annotated[str, Meta(description="Path of the model (MJCF or URDF), relative to this file.")]
-    physics_steps: Annotated[
-        Annotated[int, Meta(ge=1)] | None,
-        Meta(
-            description="Steps of the engine per own step; default: as few as make none longer than the model's "
-            "timestep.",
-        ),
-    ] = None
-    keyframe: Annotated[str | None, Meta(description="The model's keyframe to start from.")] = None
-    controllers: Controllers = []
-    actuators: Actuators = []
-    fluid_dynamics: FluidDynamics = []
-    start_values: StartValues = {}
-    step_size: StepSize = None
-    group: Group = None
-    host: Host = None
+__all__ = ["KIND_OF_MUJOCO"]
 
 
 class MujocoKind(Kind[MujocoConfig]):

@@ -36,7 +36,7 @@ import msgspec
 from ...errors import LoadFailed
 from ...text import listed, nearest
 from ...variables.model_description import Causality, DefaultExperiment, ModelDescription, Variable
-from .mujoco_kind import MujocoConfig
+from .mujoco_section import MujocoConfig
 
 __all__ = ["MujocoVariable", "Where", "World", "describe_world", "engine", "load_world", "warnings"]
 

@@ -1,0 +1,42 @@
+"""The section of a Gazebo classic world in a configuration."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from msgspec import Meta
+
+from ...config.base import Base
+from ...config.instance_sections import (
+    KIND,
+    Actuators,
+    Controllers,
+    FluidDynamics,
+    Group,
+    Host,
+    PhysicsSection,
+    StartValues,
+    StepSize,
+)
+
+__all__ = ["GazeboClassicConfig"]
+
+
+class GazeboClassicConfig(Base, PhysicsSection, frozen=True, kw_only=True, tag_field=KIND, tag="gazebo_classic"):
+    """A world that the simulator Gazebo classic 11 computes: its joints and links are variables."""
+
+    gazebo_classic: Annotated[str, Meta(description="Path of the SDF world, relative to this file.")]
+    physics_steps: Annotated[
+        Annotated[int, Meta(ge=1)] | None,
+        Meta(
+            description="Steps of the engine per own step; default: as few as make none longer than the world's "
+            "max_step_size.",
+        ),
+    ] = None
+    controllers: Controllers = []
+    actuators: Actuators = []
+    fluid_dynamics: FluidDynamics = []
+    start_values: StartValues = {}
+    step_size: StepSize = None
+    group: Group = None
+    host: Host = None
