@@ -47,10 +47,9 @@ def configured(place: Place, name: str, fmu: str) -> Path:
 
 @contextmanager
 def launched(place: Place, config: Path) -> Iterator[None]:
-    """A run of a mesh, from when its first points are there."""
+    """A mesh that is running."""
     mesh = place.start("launch", config, "--no-progress")
-    place.note()
-    assert place.run("get", "unit.*").wait() == 0
+    assert place.run("wait", config.stem).wait() == 0
     try:
         yield
     finally:
