@@ -6,7 +6,7 @@ import sys
 def main() -> int:
     """Import the command, which takes memory and half a second, and run it; returns the exit code."""
     try:
-        from .cli.limits import FEWEST_MIB, address_space_problem  # noqa: PLC0415 an interrupt must find us here
+        from .run.limits import FEWEST_MIB, address_space_problem  # noqa: PLC0415 an interrupt must find us here
         from .wire.last_exit import LastExit  # noqa: PLC0415 as above
 
         last_exit = LastExit()

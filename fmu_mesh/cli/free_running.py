@@ -83,7 +83,7 @@ def _run(arguments: argparse.Namespace) -> int:
     run = planned(loaded, loaded.findings(), options, known={name: description})
     warn(run.plan)
     with Display(run.plan, show_progress=not arguments.no_progress) as display:
-        outcome = run_launcher(Launcher(run, display.event, display.output))
+        outcome = run_launcher(Launcher(run, display.event))
     finish(run.plan, outcome, arguments)
     return 0
 

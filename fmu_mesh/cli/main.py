@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 import argparse
-import logging
-import os
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 
 from .. import __version__
-from ..errors import ConfigurationError, FmuMeshError, Interrupted
+from ..errors import ConfigurationError
+from ..run.limits import needed_mib
+from ..run.program import exit_code_of
 from ..text import nearest
 from . import checking, free_running, inspecting, looking, play, plotting, running, top
 from .arguments import CommandParser
-from .limits import address_space_problem, needed_mib, out_of_memory
 
 __all__ = ["command_parser", "main"]
-
-Command = Callable[[argparse.Namespace], int]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -31,49 +29,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.command is None:
         parser.print_help()
         return ConfigurationError.exit_code
-    try:
-        return _run(options)
-    except FmuMeshError as error:
-        if options.debug:
-            raise
-        if not error.reported:
-            print(f"fmu-mesh: {error}", file=sys.stderr)
-        return error.exit_code
-    except KeyboardInterrupt:
-        print("fmu-mesh: interrupted", file=sys.stderr)
-        return Interrupted.exit_code
-    except BrokenPipeError:
-        # The reader of our output is gone, as in `fmu-mesh watch … | head`.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
-
-
-def _run(options: argparse.Namespace) -> int:
-    """Run the command. A lack of memory is a problem of this host and not an internal error."""
-    _start_logging(os.environ.get("FMU_MESH_LOG") or "WARNING")
-    if (lack := address_space_problem(needed_mib(options.command, local=getattr(options, "local", False)))) is not None:
-        raise lack
-    run: Command = options.run_command
-    try:
-        return run(options)
-    except (MemoryError, OSError, RuntimeError, ImportError) as error:
-        problem = out_of_memory(error)
-        if problem is None:
-            raise
-        raise problem from error
-
-
-def _start_logging(level: str) -> None:
-    """Log messages of this level and above go to standard error."""
-    names = logging.getLevelNamesMapping()
-    if level.upper() not in names:
-        raise ConfigurationError(
-            f"FMU_MESH_LOG is '{level}', which is no level.", hint="There are DEBUG, INFO, WARNING, ERROR and CRITICAL."
-        )
-    logging.basicConfig(level=names[level.upper()], format="%(name)s: %(levelname)s: %(message)s")
-    logging.getLogger("matplotlib").setLevel(
-        logging.ERROR
-    )  # its warning about a missing folder of its own does not concern the user
+    needed = needed_mib(options.command, local=getattr(options, "local", False))
+    return exit_code_of(partial(options.run_command, options), needed, debug=options.debug)
 
 
 def _parsed(

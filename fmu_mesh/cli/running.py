@@ -12,16 +12,17 @@ from typing import Any
 
 from msgspec.structs import replace
 
-from ..errors import ConfigurationError, FmuError, FmuMeshError, MeshLost
-from ..run.events import Event, EventWriter, Reachable
+from ..errors import ConfigurationError, MeshLost
+from ..run.events import Event, Reachable
 from ..run.gateway_role import run_gateway
-from ..run.launcher import PLANNED, Launcher
+from ..run.in_process import InProcessRun
+from ..run.launcher import Launcher
 from ..run.options import Options
 from ..run.outcome import Outcome
 from ..run.preparing import plan_run
 from ..run.process import ended_by_signals
-from ..run.roles import run_local, run_master, run_node
-from ..run.run_plan import RunPlan, read_node, read_run
+from ..run.roles import run_master, run_node
+from ..run.run_plan import RunPlan
 from ..system.plan import Plan
 from ..wire.session import run_router
 from .arguments import add_command, add_options, count, endpoint, read_options
@@ -51,19 +52,16 @@ def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.Arg
     node = add_command(commands, "node", "start one node manually", [common])
     _add_config(node, "view", "video")
     node.add_argument("node", metavar="INSTANCE", help="name of the instance, or of its group")
-    node.add_argument(PLANNED, action="store_true", help=argparse.SUPPRESS)
     node.set_defaults(run_command=_node)
 
     master = add_command(commands, "master", "start the master and the recorder manually", [common])
     _add_config(master, "paused", "profile")
     master.add_argument("--plot", type=Path, metavar="FILE.png", help="plot the result at the end")
     master.add_argument("--no-progress", action="store_true", help="no progress line")
-    master.add_argument(PLANNED, action="store_true", help=argparse.SUPPRESS)
     master.set_defaults(run_command=_master)
 
     gateway = add_command(commands, "gateway", "start the gateway to ROS manually", [common])
     _add_config(gateway)
-    gateway.add_argument(PLANNED, action="store_true", help=argparse.SUPPRESS)
     gateway.set_defaults(run_command=_gateway)
 
     router = add_command(commands, "router", "run a Zenoh router", [common])
@@ -128,7 +126,7 @@ def _run_processes(run: RunPlan, most_restarts: int, display: Display) -> Outcom
     """Run the mesh; if a process of it is lost, run it again from its first point, as often as `--restarts` allows."""
     while True:
         try:
-            return run_launcher(Launcher(run, display.event, display.output))
+            return run_launcher(Launcher(run, display.event))
         except MeshLost as error:
             if run.restarts == most_restarts or type(error) is not MeshLost:
                 raise
@@ -137,7 +135,7 @@ def _run_processes(run: RunPlan, most_restarts: int, display: Display) -> Outcom
             say(str(error.instead_of_hint(again)))
 
 
-def run_launcher(launcher: Launcher) -> Outcome:
+def run_launcher(launcher: Launcher | InProcessRun) -> Outcome:
     """Run it; Ctrl-C and SIGTERM end the run instead of this process."""
 
     def interrupt(_number: int, _frame: FrameType | None) -> None:
@@ -152,12 +150,8 @@ def run_launcher(launcher: Launcher) -> Outcome:
 
 
 def _run_local(run: RunPlan, display: Display) -> Outcome:
-    def show_hang(error: FmuError) -> None:
-        display.flush(str(error))
-        print(f"fmu-mesh: {error}", file=sys.stderr, flush=True)
-
     with stdout_as_stderr():
-        outcome = run_local(run, display.log, display.progress, show_hang)
+        outcome = run_launcher(InProcessRun(run, display.event))
     display.event(outcome)
     return outcome
 
@@ -176,20 +170,11 @@ def finish(plan: Plan, outcome: Outcome, arguments: argparse.Namespace) -> None:
 
 
 def _node(arguments: argparse.Namespace) -> int:
-    if arguments.planned:
-        run_node(read_node(arguments.config, arguments.node))
-    else:
-        run_node(plan_run(arguments.config, _options(arguments)).node(arguments.node))
+    run_node(plan_run(arguments.config, _options(arguments)).node(arguments.node))
     return 0
 
 
 def _master(arguments: argparse.Namespace) -> int:
-    if arguments.planned:
-        try:
-            run_master(read_run(arguments.config), EventWriter())
-        except FmuMeshError as error:
-            raise error.already_reported()  # noqa: B904 the launcher has the event and shows it
-        return 0
     run = _planned(arguments, _options(arguments))
     with (
         plotted_where_it_ends(run.plan, arguments.plot),
@@ -205,10 +190,7 @@ def _gateway(arguments: argparse.Namespace) -> int:
         if isinstance(event, Reachable):
             print(f"topics of ROS at {', '.join(event.endpoints)}", flush=True)
 
-    if arguments.planned:
-        run_gateway(read_run(arguments.config), EventWriter())
-    else:
-        run_gateway(plan_run(arguments.config, _options(arguments)), show)
+    run_gateway(plan_run(arguments.config, _options(arguments)), show)
     return 0
 
 

@@ -5,7 +5,7 @@ Owns how a path in the file (`connections[2].to`) becomes a line number. Does no
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 from fmu_mesh.errors import ConfigurationError, Finding
 
@@ -25,16 +25,21 @@ class Findings:
         file: the file as the user named it.
         lines: line numbers, counted from 1, by path in the file.
         replaced: the options that replace a value of the file, by path in the file.
+        first: findings that there are already.
     """
 
     def __init__(
-        self, file: str, lines: Mapping[str, int] | None = None, replaced: Mapping[str, str] | None = None
+        self,
+        file: str,
+        lines: Mapping[str, int] | None = None,
+        replaced: Mapping[str, str] | None = None,
+        first: Sequence[Finding] = (),
     ) -> None:
         self._file = file
         self._lines = lines if lines is not None else {}
         self._replaced = replaced if replaced is not None else {}
-        self._items: list[Finding] = []
-        self._places: set[str] = set()
+        self._items: list[Finding] = [*first]
+        self._places: set[str] = {finding.path for finding in first}
         self._settled: frozenset[str] = frozenset()
 
     def add(self, path: str, found: str, expected: str, suggestion: str | None = None) -> None:

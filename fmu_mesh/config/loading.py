@@ -10,6 +10,7 @@ import re
 from collections.abc import Sequence
 from collections.abc import Set as AbstractSet
 from pathlib import Path
+from typing import NamedTuple
 
 import msgspec
 from msgspec import inspect, structs
@@ -23,7 +24,17 @@ from fmu_mesh.config.yaml_text import Plain, read
 from fmu_mesh.errors import Finding
 from fmu_mesh.text import listed, nearest, nearest_file, shown
 
-__all__ = ["MAXIMUM_BYTES", "LoadedConfig", "examine", "load", "parse"]
+__all__ = [
+    "MAXIMUM_BYTES",
+    "LoadedConfig",
+    "PlainConfig",
+    "examine",
+    "examine_data",
+    "load",
+    "parse",
+    "read_file",
+    "read_text",
+]
 
 MAXIMUM_BYTES = 4 * 1024 * 1024
 _ARCHIVE = b"PK\x03\x04"
@@ -31,6 +42,22 @@ _ARCHIVE = b"PK\x03\x04"
 _ARROW = "->"
 _OTHER_ARROW = re.compile(r"\s*(?:-+>|=+>|→|⟶|~>|>)\s*")
 _SHORT_FORM = "'instance.output -> instance.input', or {from: instance.output, to: instance.input}"
+
+
+class PlainConfig(NamedTuple):
+    """The values of a configuration, not yet checked.
+
+    Attributes:
+        data: mappings, lists, texts and numbers, as in the file.
+        file: relative paths and findings refer to it; a configuration that a program has made has no such file.
+        lines: line numbers, counted from 1, by path in the file; empty without a file.
+        findings: what is wrong with the text, such as a key that stands there twice.
+    """
+
+    data: Plain
+    file: Path
+    lines: dict[str, int] = {}
+    findings: tuple[Finding, ...] = ()
 
 
 class LoadedConfig(msgspec.Struct, frozen=True):
@@ -97,10 +124,7 @@ def examine(path: Path, overrides: Sequence[str], kinds: Kinds) -> tuple[LoadedC
     Raises:
         ConfigurationError: the file cannot be read, or too little of it is valid.
     """
-    findings = Findings(str(path))
-    text = _text(path, findings)
-    findings.raise_any()
-    return _examine(text, path, overrides, kinds)
+    return examine_data(read_file(path), overrides, kinds)
 
 
 def parse(text: str, path: Path, overrides: Sequence[str], kinds: Kinds) -> LoadedConfig:
@@ -109,24 +133,43 @@ def parse(text: str, path: Path, overrides: Sequence[str], kinds: Kinds) -> Load
     Raises:
         ConfigurationError: the structure is wrong; has all findings.
     """
-    loaded, findings = _examine(text, path, overrides, kinds)
+    loaded, findings = examine_data(read_text(text, path), overrides, kinds)
     return _right(loaded, findings)
 
 
-def _right(loaded: LoadedConfig, findings: Findings) -> LoadedConfig:
+def read_file(path: Path) -> PlainConfig:
+    """Read the values of a configuration file; what they mean is not checked yet.
+
+    Raises:
+        ConfigurationError: the file cannot be read, or is no YAML.
+    """
+    findings = Findings(str(path))
+    text = _text(path, findings)
     findings.raise_any()
-    return loaded
+    return read_text(text, path)
 
 
-def _examine(text: str, path: Path, overrides: Sequence[str], kinds: Kinds) -> tuple[LoadedConfig, Findings]:
+def read_text(text: str, path: Path) -> PlainConfig:
+    """As `read_file`, with the text of the file as an argument.
+
+    Raises:
+        ConfigurationError: it is no YAML; the findings refer to ``path``.
+    """
     lines: dict[str, int] = {}
-    replaced: dict[str, str] = {}
-    findings = Findings(str(path), lines, replaced)
+    findings = Findings(str(path), lines)
     data = read(text, findings, lines)
+    if data is None and not len(findings):
+        findings.add("", "nothing (null)", "a mapping with mesh, simulation and instances")
     if data is None:
-        if not len(findings):
-            findings.add("", "nothing (null)", "a mapping with mesh, simulation and instances")
         findings.raise_any()
+    return PlainConfig(data, path, lines, tuple(findings))
+
+
+def examine_data(plain: PlainConfig, overrides: Sequence[str], kinds: Kinds) -> tuple[LoadedConfig, Findings]:
+    """As `examine`, for values that were read before, or that a program has made."""
+    data, path, lines, first = plain
+    replaced: dict[str, str] = {}
+    findings = Findings(str(path), lines, replaced, first)
     sections = kinds.own()
     if isinstance(data, dict):
         data = _with_long_connections(data, findings)
@@ -139,6 +182,11 @@ def _examine(text: str, path: Path, overrides: Sequence[str], kinds: Kinds) -> t
     assert config is not None  # without a finding there is a configuration
     # The kinds have done their part: from here on, a configuration is a plain `Config`, in every process.
     return LoadedConfig(Config(**structs.asdict(config)), path, lines, replaced), findings
+
+
+def _right(loaded: LoadedConfig, findings: Findings) -> LoadedConfig:
+    findings.raise_any()
+    return loaded
 
 
 def _text(path: Path, findings: Findings) -> str:

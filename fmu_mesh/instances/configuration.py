@@ -7,11 +7,11 @@ from pathlib import Path
 
 from ..config import loading
 from ..config.findings import Findings
-from ..config.loading import LoadedConfig
+from ..config.loading import LoadedConfig, PlainConfig
 from ..config.mesh import Config, config_type
 from .registry import KINDS
 
-__all__ = ["examine", "installed_config", "load", "parse"]
+__all__ = ["examine", "examine_data", "installed_config", "load", "parse"]
 
 
 def load(path: Path, overrides: Sequence[str] = ()) -> LoadedConfig:
@@ -22,6 +22,11 @@ def load(path: Path, overrides: Sequence[str] = ()) -> LoadedConfig:
 def examine(path: Path, overrides: Sequence[str] = ()) -> tuple[LoadedConfig, Findings]:
     """As `load`, but go on where the structure is wrong; see `fmu_mesh.config.loading.examine`."""
     return loading.examine(path, overrides, KINDS)
+
+
+def examine_data(plain: PlainConfig, overrides: Sequence[str] = ()) -> tuple[LoadedConfig, Findings]:
+    """As `examine`, for values that were read before; see `fmu_mesh.config.loading.examine_data`."""
+    return loading.examine_data(plain, overrides, KINDS)
 
 
 def parse(text: str, path: Path, overrides: Sequence[str] = ()) -> LoadedConfig:

@@ -25,12 +25,12 @@ _LINE_BYTES = 1000
 
 
 def own_command(*arguments: str) -> list[str]:
-    """The command ``fmu-mesh`` with these arguments as a process of this Python.
+    """The program of the processes of a run (`fmu_mesh.run.__main__`) with these arguments, in this Python.
 
     With -P, Python does not look for modules in the current folder. Otherwise a `random.py` of the user would be
     imported instead of that of the standard library.
     """
-    return [sys.executable, "-Pm", "fmu_mesh", *arguments]
+    return [sys.executable, "-Pm", "fmu_mesh.run", *arguments]
 
 
 class Child:

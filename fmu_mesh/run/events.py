@@ -1,4 +1,7 @@
-"""The events that the process of the master sends to its launcher: one JSON line each on standard output."""
+"""The events of a run, and how the process of the master sends them to its launcher: one JSON line each.
+
+`Mesh.run` and `Mesh.start` give them to `on_event`.
+"""
 
 from __future__ import annotations
 
@@ -9,10 +12,11 @@ from collections import deque
 
 import msgspec
 
+from ..errors import ErrorReport
 from ..wire.views import LogLine, MeshStatus
 from .outcome import Outcome
 
-__all__ = ["Event", "EventWriter", "Log", "Reachable", "Status", "decode_event"]
+__all__ = ["Event", "EventWriter", "Log", "Output", "Reachable", "Restarted", "Status", "decode_event"]
 
 
 _MOST_WAITING = 10_000
@@ -36,7 +40,21 @@ class Log(msgspec.Struct, frozen=True, tag="log"):
     line: LogLine
 
 
-Event = Reachable | Status | Log | Outcome
+class Output(msgspec.Struct, frozen=True, tag="output"):
+    """A line that a process of the run has written to its standard output or error; the launcher makes this event."""
+
+    process: str
+    text: str
+
+
+class Restarted(msgspec.Struct, frozen=True, tag="restarted"):
+    """The run starts again from its first point, for the ``number``-th time, because of an error."""
+
+    error: ErrorReport
+    number: int
+
+
+Event = Reachable | Status | Log | Output | Restarted | Outcome
 
 _decoder: msgspec.json.Decoder[Event] = msgspec.json.Decoder(Event)
 

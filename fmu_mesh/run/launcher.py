@@ -19,19 +19,26 @@ from msgspec.structs import replace
 
 from ..errors import DeadlineExceeded, FmuError, FmuMeshError, Interrupted, MeshLost, from_report
 from ..system.plan import RECORDER
-from ..wire.runtime import MeshNote, remove_run_folder, remove_stale_folders, run_folder, runtime_folder, write_note
+from ..wire.runtime import (
+    MeshNote,
+    is_alive,
+    launcher_of,
+    remove_run_folder,
+    remove_stale_folders,
+    run_folder,
+    run_name,
+    runtime_folder,
+    write_note,
+)
 from ..wire.session import LEASE_MS
 from ..wire.views import GOING_ON
 from .child import Child, StopWatch, how_it_ended, own_command
-from .events import Event, Reachable, Status, decode_event
+from .events import Event, Output, Reachable, Status, decode_event
 from .outcome import Outcome
 from .results import rows_left, what_is_kept
 from .run_plan import RunPlan
 
-__all__ = ["PLANNED", "Launcher", "Output"]
-
-PLANNED = "--planned"
-"""Option of the commands `node`, `master` and `gateway`: their file is a run plan, and a launcher watches them."""
+__all__ = ["Launcher"]
 
 _MASTER = "the master"
 _GATEWAY = "the gateway to ROS"
@@ -47,25 +54,24 @@ _SILENCE_S = 10.0
 
 _TURN_S = 0.25
 
-Output = Callable[[str, str], None]
-"""Called with the name of a process and a line that it has written to its standard output or error."""
-
 
 class Launcher:
     """Runs a plan as processes of this host.
 
     Args:
         run: the plan of the run.
-        on_event: called with every event of the master, on the thread that calls `run`.
-        on_output: called with every line that a process writes, likewise.
+        on_event: called with every event, on the thread that calls `run`.
+
+    Attributes:
+        outcome: how the run ended, also where `run` raises an error; None before.
     """
 
-    def __init__(self, run: RunPlan, on_event: Callable[[Event], None], on_output: Output) -> None:
-        self._run = replace(run, run=str(os.getpid()))
+    def __init__(self, run: RunPlan, on_event: Callable[[Event], None]) -> None:
+        self.outcome: Outcome | None = None
+        self._run = replace(run, run=run_name())
         self._plan = run.plan
         self._timeouts = run.loaded.config.timeouts
         self._on_event = on_event
-        self._on_output = on_output
         self._happened: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._processes: dict[str, Child] = {}
         self._lost: list[tuple[str, int, float]] = []
@@ -127,7 +133,7 @@ class Launcher:
     def _spawn(
         self, name: str, arguments: Sequence[str], on_line: Callable[[bytes], None], *, limited: bool = False
     ) -> None:
-        process = Child(name, own_command(*arguments, PLANNED), self._happened.put)
+        process = Child(name, own_command(*arguments), self._happened.put)
         self._processes[name] = process
         process.start(on_line, self._take_output, self._take_exit, limited=limited)
 
@@ -185,7 +191,7 @@ class Launcher:
         self._spawn_nodes()
 
     def _take_output(self, name: str, line: bytes) -> None:
-        self._on_output(name, line.decode(errors="replace").rstrip())
+        self._on_event(Output(name, line.decode(errors="replace").rstrip()))
 
     def _take_exit(self, name: str, code: int) -> None:
         if not self._signalled:  # afterwards the signal is the reason
@@ -261,6 +267,7 @@ class Launcher:
         if outcome is None or gateway_lost:
             error = self._own_account()
         elif outcome.error is None:
+            self.outcome = outcome
             return outcome
         else:
             error = self._with_cause(from_report(outcome.error), outcome)
@@ -268,6 +275,8 @@ class Launcher:
                 error = DeadlineExceeded(f"{_GATEWAY} was not ready within {self._timeouts.start:g} s")
         if type(error) in (Interrupted, MeshLost) and rows > (error.point or 0):
             error.at(rows - 1, self._plan.grid.time(rows - 1))  # the last progress is older than the last row
+        point, seconds = error.point or 0, outcome.seconds if outcome is not None else 0.0
+        self.outcome = Outcome("failed", point, self._plan.grid.time(point), seconds, rows, file, error.report())
         raise error.with_hint(what_is_kept(file, rows))
 
     def _own_account(self) -> FmuMeshError:
@@ -307,11 +316,6 @@ class Launcher:
 def _remove_folders_without_note() -> None:
     """Remove the folders of launchers that were killed before they wrote the note of their mesh."""
     for folder in runtime_folder().glob("*.*"):
-        pid = folder.suffix.removeprefix(".")
-        if pid.isdigit() and not (folder / "mesh.json").exists():
-            try:
-                os.kill(int(pid), 0)
-            except ProcessLookupError:
-                remove_run_folder(folder)
-            except PermissionError:
-                continue
+        pid = launcher_of(folder)
+        if pid is not None and not (folder / "mesh.json").exists() and not is_alive(pid):
+            remove_run_folder(folder)

@@ -66,6 +66,7 @@ class LocalMesh:
 
     Attributes:
         point: the last point reached.
+        rows: rows in the result file, once the run is over.
     """
 
     def __init__(  # noqa: PLR0913, PLR0917  what a caller may want to hear of
@@ -83,7 +84,7 @@ class LocalMesh:
         self._seconds = 0.0
         self._ended_by: TerminationRequested | None = None
         self._buffer: RowBuffer | None = None
-        self._rows = 0
+        self.rows = 0
         self._plan = plan
         self._log = log
         self._progress = progress
@@ -127,13 +128,13 @@ class LocalMesh:
             point=self.point,
             time=self._plan.grid.time(self.point),
             seconds=self._seconds,
-            rows=self._rows,
+            rows=self.rows,
             file=self._plan.system.result_file,
             ended_by=ended_by,
         )
 
     def _kept(self) -> str | None:
-        return what_is_kept(self._plan.system.result_file, self._rows)
+        return what_is_kept(self._plan.system.result_file, self.rows)
 
     def _check_one_process(self) -> None:
         """Refuse two instances of an FMU that allows one per process; groups do not matter here.
@@ -302,7 +303,7 @@ class LocalMesh:
         try:
             rows.close()
         finally:
-            self._rows = rows.count
+            self.rows = rows.count
 
 
 class _Member:

@@ -1,4 +1,4 @@
-"""The roles that a process of a run can have: a node, the master with the recorder, or all of it in one process.
+"""The roles that a process of a run can have: a node, or the master with the recorder.
 
 The same functions serve the processes that `launch` starts and those that a person starts manually.
 """
@@ -20,18 +20,17 @@ from ..node.node import Node
 from ..recorder.recorder import Recorder
 from ..system.plan import RECORDER
 from ..wire.keys import MASTER
-from ..wire.runtime import MeshNote, enter_run_folder, fmu_folder, remove_stale_folders, write_note
+from ..wire.runtime import MeshNote, fmu_folder, write_note
 from ..wire.session import RouterLink, close_session, open_session, own_endpoints
 from ..wire.views import LogLine, MeshStatus
 from .events import Event, Log, Reachable, Status
-from .local import LocalMesh
 from .outcome import Outcome
 from .process import RunProcess
 from .results import open_result
 from .run_plan import NodeRun, RunPlan
 from .wiring import is_socket, wiring
 
-__all__ = ["run_local", "run_master", "run_node"]
+__all__ = ["run_master", "run_node"]
 
 log = logging.getLogger(__name__)
 
@@ -210,47 +209,3 @@ class _Emitter:
 
     def log(self, line: LogLine) -> None:
         self._emit(Log(line))
-
-
-def run_local(
-    run: RunPlan,
-    log: Callable[[LogLine], None],
-    progress: Callable[[int], None],
-    on_hang: Callable[[FmuError], None],
-) -> Outcome:
-    """Run a whole mesh in this process.
-
-    Args:
-        run: the plan of the run.
-        log: called with every log message of an FMU.
-        progress: called with the point now and then.
-        on_hang: called on another thread if an FMU does not return in time, before the process ends.
-
-    Raises:
-        FmuMeshError: the run ended early, and why.
-    """
-    remove_stale_folders()
-    with RunProcess(run.mesh, run.run) as process:
-        enter_run_folder(process.folder, f"local {os.getpid()}")
-        fmus = fmu_folder(process.folder)
-        fmus.mkdir(parents=True, exist_ok=True)
-
-        def show(message: LogMessage) -> None:
-            log(LogLine(message.instance, message.status, message.category, message.message, mesh.point))
-
-        def end(error: FmuError) -> None:
-            on_hang(error)
-            process.end_now(error.exit_code)
-
-        mesh = LocalMesh(
-            run.plan,
-            show,
-            progress,
-            on_hang=end,
-            parent=fmus,
-            showing=run.options.showing,
-            loaded=run.loaded,
-        )
-        process.cleans_up(mesh.clean_up)
-        process.interruption.goes_to(mesh.interrupt)
-        return mesh.run()

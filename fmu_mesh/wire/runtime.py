@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import fcntl
 import hashlib
+import itertools
 import os
 import shutil
 import stat
@@ -26,12 +27,14 @@ __all__ = [
     "enter_run_folder",
     "fmu_folder",
     "is_alive",
+    "launcher_of",
     "leave_run_folder",
     "meshes",
     "process_state",
     "remove_run_folder",
     "remove_stale_folders",
     "run_folder",
+    "run_name",
     "runtime_folder",
     "socket_endpoint",
     "tidy_run_folder",
@@ -41,6 +44,8 @@ __all__ = [
 _SOCKET_PATH_LIMIT = 100
 _NAME_LIMIT = 40
 """Characters of a mesh's name in that of its folder; of a longer one the beginning, and a hash to tell it by."""
+
+_runs = itertools.count(1)
 
 _held: dict[Path, TextIO] = {}
 """The open notes of this process by the folder of their run; they hold their locks."""
@@ -78,7 +83,7 @@ def runtime_folder() -> Path:
 
 
 def run_folder(mesh: str, run: str) -> Path:
-    """The folder of one run of a mesh; ``run`` is the launcher's process id, or `hand` for those by hand.
+    """The folder of one run of a mesh; ``run`` is its name, see `run_name`, or `hand` for those by hand.
 
     Raises:
         ConfigurationError: it cannot be made, or others can get into it.
@@ -89,6 +94,18 @@ def run_folder(mesh: str, run: str) -> Path:
     folder = _private(runtime_folder() / f"{name}.{run}")
     (folder / "fmus").mkdir(exist_ok=True)
     return folder
+
+
+def run_name() -> str:
+    """A name for a run of this process: its process id; from the second run on with the number of the run."""
+    number = next(_runs)
+    return f"{os.getpid()}" if number == 1 else f"{os.getpid()}-{number}"
+
+
+def launcher_of(folder: Path) -> int | None:
+    """The process id of the launcher of the run that a folder belongs to; None without a launcher."""
+    pid = folder.suffix.removeprefix(".").partition("-")[0]
+    return int(pid) if pid.isdigit() else None
 
 
 def _private(folder: Path) -> Path:
@@ -175,7 +192,7 @@ def leave_run_folder(folder: Path) -> None:
     elif note is not None and not is_alive(note.pid):
         remove_run_folder(folder)  # the launcher was killed
         return
-    elif note is None and folder.suffix[1:].isdigit() and is_alive(int(folder.suffix[1:])):
+    elif note is None and (launcher := launcher_of(folder)) is not None and is_alive(launcher):
         return  # a run is over before its launcher has come to write the note; it removes the folder, too
     for empty in (folder / "fmus", folder):
         try:

@@ -12,7 +12,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from fmu_mesh.config.findings import locate
-from fmu_mesh.config.loading import LoadedConfig, _examine
+from fmu_mesh.config.loading import LoadedConfig, examine_data, read_text
 from fmu_mesh.config.mesh import MAX_WINDOW, Config, ConnectionConfig, SimulationConfig
 from fmu_mesh.config.yaml_text import resolve
 from fmu_mesh.errors import ConfigurationError, Finding
@@ -166,7 +166,7 @@ def test_what_is_wrong_in_the_structure_is_never_lost_on_the_way_to_a_system(sec
     found = findings_of(text)
     assume(found)
     with contextlib.suppress(ConfigurationError):
-        loaded, findings = _examine(text, FILE, (), KINDS)
+        loaded, findings = examine_data(read_text(text, FILE), (), KINDS)
         with pytest.raises(ConfigurationError) as caught:
             build(loaded, dict.fromkeys(loaded.config.instances, GAIN), findings)
         assert set(found) <= set(caught.value.findings)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from fmu_mesh.cli.limits import FEWEST_MIB, needed_mib, out_of_memory
+from fmu_mesh.run.limits import FEWEST_MIB, needed_mib, out_of_memory
 from tests.helpers import DEADLINE_S
 
 CONFIG = Path(__file__).parents[2] / "configs" / "pendulum_delay.yaml"

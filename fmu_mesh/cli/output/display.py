@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from ...errors import ErrorReport, FmuMeshError, from_report
-from ...run.events import Event, Log, Reachable, Status
+from ...run.events import Event, Log, Output, Reachable, Restarted, Status
 from ...run.outcome import Outcome
 from ...run.wiring import is_socket, leaves_host
 from ...system.plan import Plan
@@ -80,6 +80,11 @@ class Display:
                 self._status(status)
             case Log(line):
                 self.log(line)
+            case Output(process, text):
+                self._output(process, text)
+            case Restarted(error, number):
+                again = f"The run starts again from its first point (restart {number})."
+                say(str(from_report(error).instead_of_hint(again)))
             case Outcome(ended_by=ErrorReport() as report):
                 self.ended(from_report(report))
             case Outcome():
@@ -101,11 +106,6 @@ class Display:
     def ended(self, early: FmuMeshError) -> None:
         """Show why a run ended before its last point without a failure."""
         self._console.print(escape(str(early)))
-
-    def progress(self, point: int) -> None:
-        """Show the point of a run in this process."""
-        self._progress.point(point)
-        self._release(lambda line: point > line.point)
 
     def log(self, line: LogLine) -> None:
         """Show one log message of an FMU. After five times, the same text is only counted.
@@ -144,7 +144,7 @@ class Display:
         where = f"{line.instance} at point {line.point}"
         self._console.print(f"[{style}]{escape(where)}: {escape(line.message)}[/]")
 
-    def output(self, name: str, text: str) -> None:
+    def _output(self, name: str, text: str) -> None:
         """Show a line of the output of a process."""
         if text:
             shown = "".join(c if c.isprintable() or c == "\t" else "\N{REPLACEMENT CHARACTER}" for c in text)

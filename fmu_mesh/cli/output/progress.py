@@ -5,7 +5,6 @@ Owns which parts are left out on a narrow terminal. It never wraps: a wrapped li
 
 from __future__ import annotations
 
-import time
 from typing import Final
 
 from rich.console import Console, ConsoleOptions, RenderResult
@@ -58,16 +57,6 @@ class ProgressLine:
     def status(self, status: MeshStatus) -> None:
         """Show this status of the mesh."""
         self._status = status
-
-    def point(self, point: int) -> None:
-        """Show this point of a run in this process; the speed is measured from the first call on."""
-        now = time.monotonic()
-        self._started = now if self._started is None else self._started
-        elapsed = now - self._started
-        rate = point / elapsed if elapsed > 0.0 else 0.0
-        grid = self._grid
-        last, at = grid.last_point, grid.time(point)
-        self._status = MeshStatus(self._name, "running", point, last, at, rate, rate * grid.step_size, {})
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         """The line; Rich calls this ten times a second."""

@@ -11,7 +11,7 @@ import resource
 
 from ..errors import ConfigurationError
 
-__all__ = ["FEWEST_MIB", "address_space_problem", "needed_mib", "out_of_memory"]
+__all__ = ["FEWEST_MIB", "RUN_MIB", "address_space_problem", "needed_mib", "out_of_memory"]
 
 FEWEST_MIB = 300
 """Need of any command in MiB. Measured on two processors: `check` 200, `plot` 270."""
@@ -19,7 +19,7 @@ _SESSION_MIB = 1024
 """Need of a Zenoh session, mostly for the stacks of its threads. Measured: `top` 790."""
 _LOCAL_MIB = 660
 """Need of a run in one process. Measured: 630."""
-_RUN_MIB = 1700
+RUN_MIB = 1700
 """Need of a master, a node, and of what starts them. Measured: 1540, of which about a tenth is used."""
 _WITHOUT_SESSION = ("check", "schema", "inspect", "plot")
 _RUNS = ("launch", "run", "node", "master", "gateway")
@@ -32,7 +32,7 @@ def needed_mib(command: str, *, local: bool) -> int:
     if command in _WITHOUT_SESSION:
         return FEWEST_MIB
     if command in _RUNS:
-        return _LOCAL_MIB if local else _RUN_MIB
+        return _LOCAL_MIB if local else RUN_MIB
     return _SESSION_MIB
 
 

@@ -1,0 +1,55 @@
+"""The program of one process of a run: `python -Pm fmu_mesh.run node PLAN NODE`, or `master PLAN`, or `gateway PLAN`.
+
+`fmu_mesh.run.launcher` starts it. PLAN is the file of a run plan. The process ends with the process that started it.
+"""
+
+import sys
+
+
+def main() -> int:
+    """Be the process that the arguments name; returns the exit code."""
+    from ..errors import Interrupted  # noqa: PLC0415 an interrupt must find us here
+
+    try:
+        from ..wire.last_exit import LastExit  # noqa: PLC0415 as above
+
+        last_exit = LastExit()
+        from .limits import RUN_MIB  # noqa: PLC0415 as above
+        from .program import exit_code_of  # noqa: PLC0415 as above
+
+        role, file, *node = sys.argv[1:]
+        return last_exit.with_code(exit_code_of(lambda: _run(role, file, *node), RUN_MIB))
+    except KeyboardInterrupt:
+        return Interrupted.exit_code
+
+
+def _run(role: str, plan: str, node: str = "") -> int:
+    """Take a role in the run."""
+    from pathlib import Path  # noqa: PLC0415 as above
+
+    from ..errors import FmuMeshError  # noqa: PLC0415 as above
+    from .events import EventWriter  # noqa: PLC0415 as above
+    from .run_plan import read_node, read_run  # noqa: PLC0415 as above
+
+    file = Path(plan)
+    match role:
+        case "node":
+            from .roles import run_node  # noqa: PLC0415 only what the role needs
+
+            run_node(read_node(file, node))
+        case "master":
+            from .roles import run_master  # noqa: PLC0415 as above
+
+            try:
+                run_master(read_run(file), EventWriter())
+            except FmuMeshError as error:
+                raise error.already_reported()  # noqa: B904 the launcher has the event and shows it
+        case _:
+            from .gateway_role import run_gateway  # noqa: PLC0415 as above
+
+            run_gateway(read_run(file), EventWriter())
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

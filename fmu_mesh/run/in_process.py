@@ -1,0 +1,131 @@
+"""A whole run in this process, on a thread of its own: `launch --local`, and `Mesh.run(processes=False)`.
+
+Neither signal handlers nor the process as a whole are touched, so a program can have several such runs. A call into an
+FMU that does not return cannot be ended from within a process: then the run is over for whoever waits for it, what was
+recorded is kept, and the thread is left.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+
+from ..errors import FmuError, FmuMeshError, Interrupted
+from ..instances.contract import LogMessage
+from ..wire.runtime import remove_run_folder, remove_stale_folders, run_folder, run_name
+from ..wire.views import LogLine, MeshStatus
+from .events import Event, Log, Status
+from .local import LocalMesh
+from .outcome import Outcome
+from .run_plan import RunPlan
+
+__all__ = ["InProcessRun"]
+
+_STATUS_S = 0.1
+_GRACE_S = 1.0
+"""How long an interrupted run may take to come to its next point."""
+
+
+class InProcessRun:
+    """Runs a plan in this process; it has the interface of `Launcher`.
+
+    Args:
+        run: the plan of the run.
+        on_event: called with every event, on the thread of the run.
+
+    Attributes:
+        outcome: how the run ended, also where `run` raises an error; None before.
+    """
+
+    def __init__(self, run: RunPlan, on_event: Callable[[Event], None]) -> None:
+        self.outcome: Outcome | None = None
+        self._run = run
+        self._on_event = on_event
+        self._started: float | None = None
+        self._told = 0.0
+        self._error: BaseException | None = None
+        self._over = threading.Event()
+        self._mesh: LocalMesh | None = None
+        self._interrupted = False
+
+    def run(self) -> Outcome:
+        """Run from the first to the last point.
+
+        Raises:
+            FmuMeshError: the run ended early, and why.
+        """
+        threading.Thread(target=self._work, name=f"run of {self._run.mesh}", daemon=True).start()
+        self._over.wait()
+        if self._error is not None:
+            if isinstance(self._error, FmuMeshError):
+                self.outcome = self._failed(self._error)
+            raise self._error
+        assert self.outcome is not None
+        return self.outcome
+
+    def interrupt(self) -> None:
+        """From any thread: end the run at its next point; if it does not come there in time, without it."""
+        self._interrupted = True
+        if self._mesh is not None:
+            self._mesh.interrupt("interrupted")
+        threading.Thread(target=self._give_up, name="grace", daemon=True).start()
+
+    def _work(self) -> None:
+        remove_stale_folders()
+        folder = run_folder(self._run.mesh, run_name())
+        try:
+            self._mesh = mesh = LocalMesh(
+                self._run.plan,
+                self._log,
+                self._progress,
+                on_hang=self._end,
+                parent=folder / "fmus",
+                showing=self._run.options.showing,
+                loaded=self._run.loaded,
+            )
+            if self._interrupted:
+                mesh.interrupt("interrupted")
+            self.outcome = mesh.run()
+        except BaseException as error:  # noqa: BLE001 `run` raises it on the thread of the caller
+            self._error = self._error or error
+        finally:
+            remove_run_folder(folder)
+            self._over.set()
+
+    def _give_up(self) -> None:
+        if not self._over.wait(_GRACE_S) and self._mesh is not None:
+            point = self._mesh.point
+            self._end(Interrupted("interrupted", point=point, time=self._run.plan.grid.time(point)))
+
+    def _end(self, error: FmuError | Interrupted) -> None:
+        """From another thread: the thread of the run does not return from an FMU."""
+        assert self._mesh is not None
+        self._mesh.clean_up()
+        self._error = error
+        self._over.set()
+
+    def _failed(self, error: FmuMeshError) -> Outcome:
+        plan, mesh = self._run.plan, self._mesh
+        point, rows = (mesh.point, mesh.rows) if mesh is not None else (0, 0)
+        file = plan.system.result_file
+        return Outcome("failed", point, plan.grid.time(point), 0.0, rows, file, error.report())
+
+    def _log(self, message: LogMessage) -> None:
+        point = self._mesh.point if self._mesh is not None else 0
+        self._on_event(Log(LogLine(message.instance, message.status, message.category, message.message, point)))
+
+    def _progress(self, point: int) -> None:
+        now = time.monotonic()
+        self._started = now if self._started is None else self._started
+        if now - self._told < _STATUS_S:
+            return
+        self._told = now
+        plan, elapsed = self._run.plan, now - self._started
+        rate = point / elapsed if elapsed > 0.0 else 0.0
+        progress = dict.fromkeys(plan.nodes, point)
+        grid = plan.grid
+        status = MeshStatus(
+            self._run.mesh, "running", point, grid.last_point, grid.time(point), rate, rate * grid.step_size, progress
+        )
+        self._on_event(Status(status))

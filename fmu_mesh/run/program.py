@@ -1,0 +1,64 @@
+"""What all programs of fmu_mesh share: logging, exit codes, and errors as one paragraph."""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+from collections.abc import Callable
+
+from ..errors import ConfigurationError, FmuMeshError, Interrupted
+from .limits import address_space_problem, out_of_memory
+
+__all__ = ["exit_code_of"]
+
+
+def exit_code_of(command: Callable[[], int], needed_mib: int, *, debug: bool = False) -> int:
+    """Run a command and return its exit code (design, section 7); an error goes to standard error.
+
+    Args:
+        command: does the work.
+        needed_mib: the address space that the command needs, in MiB.
+        debug: raise an error instead of writing it.
+    """
+    try:
+        return _run(command, needed_mib)
+    except FmuMeshError as error:
+        if debug:
+            raise
+        if not error.reported:
+            sys.stderr.write(f"fmu-mesh: {error}\n")
+        return error.exit_code
+    except KeyboardInterrupt:
+        sys.stderr.write("fmu-mesh: interrupted\n")
+        return Interrupted.exit_code
+    except BrokenPipeError:
+        # The reader of our output is gone, as in `fmu-mesh watch … | head`.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+
+
+def _run(command: Callable[[], int], needed_mib: int) -> int:
+    """Run the command. A lack of memory is a problem of this host and not an internal error."""
+    _start_logging(os.environ.get("FMU_MESH_LOG") or "WARNING")
+    if (lack := address_space_problem(needed_mib)) is not None:
+        raise lack
+    try:
+        return command()
+    except (MemoryError, OSError, RuntimeError, ImportError) as error:
+        problem = out_of_memory(error)
+        if problem is None:
+            raise
+        raise problem from error
+
+
+def _start_logging(level: str) -> None:
+    """Log messages of this level and above go to standard error."""
+    names = logging.getLevelNamesMapping()
+    if level.upper() not in names:
+        raise ConfigurationError(
+            f"FMU_MESH_LOG is '{level}', which is no level.", hint="There are DEBUG, INFO, WARNING, ERROR and CRITICAL."
+        )
+    logging.basicConfig(level=names[level.upper()], format="%(name)s: %(levelname)s: %(message)s")
+    # The warning of matplotlib about a missing folder of its own does not concern the user.
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)
