@@ -345,7 +345,10 @@ class Mesh:
             raise
 
     def _planned(self, options: Options) -> RunPlan:
-        loaded, findings = examine_data(self._plain, options.start_values)
+        file = self._plain.file
+        if file.is_relative_to(here := Path.cwd()):  # findings name it; the folder of the program says nothing new
+            file = file.relative_to(here)
+        loaded, findings = examine_data(self._plain._replace(file=file), options.start_values)
         return planned(loaded, findings, options, log.info)
 
     @property

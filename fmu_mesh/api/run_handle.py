@@ -5,9 +5,11 @@ from __future__ import annotations
 import asyncio
 import threading
 import time
-from collections.abc import Iterator
+import weakref
+from collections.abc import Iterator, Mapping
 from concurrent.futures import Future
 from concurrent.futures import TimeoutError as NotYet
+from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
 from typing import Any, NamedTuple, Self
@@ -26,7 +28,7 @@ from ..errors import (
 from ..variables.value_conversion import from_plain
 from ..wire.client.mesh_client import MeshClient
 from ..wire.client.reaching import Meshes
-from ..wire.client.readings import Reading
+from ..wire.client.readings import Reading, Target
 from ..wire.client.waiting import rest
 from ..wire.views import (
     Command,
@@ -42,11 +44,12 @@ from .notebook_progress import NotebookProgress
 from .result import Result
 from .run_thread import RunThread
 
-__all__ = ["Run", "Sample", "attach"]
+__all__ = ["Run", "Sample", "Watch", "attach"]
 
 _TIMEOUT_S = 5.0
 _LOOK_S = 0.2
 _FOREVER_S = 1e9
+_START_S = 120.0
 
 
 class Sample(NamedTuple):
@@ -65,6 +68,40 @@ class Sample(NamedTuple):
     point: int
     time: float
     unit: str | None
+
+
+class Watch(Iterator[Sample]):
+    """The values of variables as they come, from when it was made until the mesh ends, or until it is closed.
+
+    Args:
+        client: the way into the mesh.
+        targets: the variables by their keys.
+    """
+
+    def __init__(self, client: MeshClient, targets: Mapping[str, Target]) -> None:
+        self._targets = targets
+        self._stack = ExitStack()
+        self._readings = self._stack.enter_context(client.watch(list(targets.values())))
+        weakref.finalize(self, self._stack.close)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def __next__(self) -> Sample:
+        reading = next(self._readings, None)
+        if reading is None:
+            self.close()
+            raise StopIteration
+        return _sample(reading, self._targets[reading.key].variable)
+
+    def close(self) -> None:
+        """End it; may be called twice."""
+        self._stack.close()
 
 
 class Run:
@@ -96,6 +133,7 @@ class Run:
         self._found = meshes.one(None) if meshes is not None else None
         self._opening = threading.RLock()
         self._closed = False
+        self._begun = False
         self._ended: Future[Result] | None = own.future if own is not None else None
 
     def __enter__(self) -> Self:
@@ -136,7 +174,7 @@ class Run:
     @property
     def variables(self) -> dict[str, VariableView]:
         """All variables of the mesh by `instance.variable`."""
-        client = self._client()
+        client = self._running()
         return {f"{target.instance}.{target.variable.name}": target.variable for target in client.targets("*.*")}
 
     # --- values
@@ -154,7 +192,7 @@ class Run:
 
     def samples(self, *names: str) -> list[Sample]:
         """The current values of several variables, each with its point; `*` in a name stands for any characters."""
-        client = self._client()
+        client = self._running()
         targets = {target.key: target for name in names for target in _targets(client, name)}
         return [_sample(reading, targets[reading.key].variable) for reading in client.get(list(targets.values()))]
 
@@ -172,36 +210,43 @@ class Run:
         Raises:
             CallRefused: the variable cannot be set, or takes no such value; says why.
         """
-        client = self._client()
+        client = self._running()
         try:
             return client.set(_targets(client, name)[0], value, at)
         except ConfigurationError as error:
             raise CallRefused(error.message, hint=error.hint) from error
 
-    def watch(self, *names: str) -> Iterator[Sample]:
+    def watch(self, *names: str) -> Watch:
         """Every value of variables from now on, until the mesh ends; `*` in a name stands for any characters.
 
         A reader that falls far behind loses the newest values; the points tell which.
+
+        Example:
+            >>> import fmu_mesh
+            >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
+            >>> with mesh.start(record="memory", stop_time=0.01, paused=True) as run:
+            ...     samples = run.watch("delay.y")
+            ...     answer = run.resume()
+            ...     [sample.point for sample in samples]
+            [1, 2, 3, 4, 5]
         """
-        client = self._client()
+        client = self._running()
         targets = {target.key: target for name in names for target in _targets(client, name)}
-        with client.watch(list(targets.values())) as readings:
-            for reading in readings:
-                yield _sample(reading, targets[reading.key].variable)
+        return Watch(client, targets)
 
     # --- steering
 
     def pause(self) -> CommandAnswer:
         """Pause the mesh; returns when all instances have reached the point of the answer."""
-        return rest(self._client(), Command("pause"))
+        return rest(self._running(), Command("pause"))
 
     def step(self, points: int = 1) -> CommandAnswer:
         """Run some points and pause again; returns when the mesh has paused."""
-        return rest(self._client(), Command("step", points))
+        return rest(self._running(), Command("step", points))
 
     def resume(self) -> CommandAnswer:
         """Go on after a pause."""
-        return self._client().command(Command("resume"))
+        return self._running().command(Command("resume"))
 
     def stop(self) -> None:
         """End the run; what was recorded is kept. `wait` then returns the result of a run that was started here."""
@@ -322,6 +367,19 @@ class Run:
                 raise MeshLost(f"the run of mesh '{self.name}' has ended")
             return self._found
 
+    def _running(self) -> MeshClient:
+        """As `_client`, when the mesh has come to its first point.
+
+        Raises:
+            DeadlineExceeded: it has not, in time.
+        """
+        client = self._client()
+        with self._opening:
+            if not self._begun:
+                _wait_until_it_runs(client)
+                self._begun = True
+        return client
+
     def _reach(self) -> MeshClient:
         own = self._own
         assert own is not None
@@ -351,10 +409,12 @@ def attach(name: str | None = None, *, connect: str | tuple[str, ...] = (), time
     Example:
         >>> import fmu_mesh
         >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
-        >>> with mesh.start(real_time_factor=1.0, record="memory"), fmu_mesh.attach("pendulum_delay") as run:
-        ...     for sample in run.watch("delay.y"):
-        ...         break
-        ...     sample.name, sample.value
+        >>> with mesh.start(real_time_factor=1.0, record="memory") as started_elsewhere:
+        ...     state = started_elsewhere.status.state
+        ...     with fmu_mesh.attach("pendulum_delay") as run:
+        ...         for sample in run.watch("delay.y"):
+        ...             break
+        >>> sample.name, sample.value
         ('delay.y', 0.0)
 
     Args:
@@ -377,7 +437,19 @@ def attach(name: str | None = None, *, connect: str | tuple[str, ...] = (), time
         raise
 
 
-def _targets(client: MeshClient, name: str) -> list[Any]:
+def _wait_until_it_runs(client: MeshClient) -> None:
+    """Wait until the mesh is past its initialization.
+
+    Raises:
+        DeadlineExceeded: it is not, in time.
+    """
+    with client.statuses(_START_S) as statuses:
+        for status in statuses:
+            if status.state not in ("starting", "initializing"):
+                return
+
+
+def _targets(client: MeshClient, name: str) -> list[Target]:
     try:
         return client.targets(name)
     except ConfigurationError as error:
