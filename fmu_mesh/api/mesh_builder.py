@@ -275,10 +275,10 @@ class Mesh:
         Example:
             >>> import fmu_mesh
             >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
-            >>> mesh.connect("pendulum.b", "delay.x")
+            >>> mesh.add("gain", fmu="../fmus/Gian.fmu")
             >>> for finding in mesh.check().findings:
-            ...     print(finding.path, finding.suggestion)
-            connections[1].from pendulum.a
+            ...     print(finding.path, finding.suggestion[-8:])
+            instances.gain.fmu Gain.fmu
         """
         try:
             run = self._planned(_options_of(options))
