@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from .adapter import FMIAdapter
-    from .api.mesh_builder import Check, Mesh, load
-    from .api.models import inspect
+    from .api.functions import attach, inspect, load, meshes
+    from .api.mesh_builder import Check, Mesh
     from .api.result import Result
-    from .api.run_handle import Run, attach, meshes
+    from .api.run_handle import Run
     from .api.samples import Sample
     from .errors import (
         CallRefused,
@@ -70,13 +70,13 @@ _PLACES = {
     "FMIAdapter": "adapter",
     "Check": "api.mesh_builder",
     "Mesh": "api.mesh_builder",
-    "load": "api.mesh_builder",
+    "load": "api.functions",
     "Result": "api.result",
     "Run": "api.run_handle",
     "Sample": "api.samples",
-    "attach": "api.run_handle",
-    "inspect": "api.models",
-    "meshes": "api.run_handle",
+    "attach": "api.functions",
+    "inspect": "api.functions",
+    "meshes": "api.functions",
 }
 """The modules of the public names; all others are exceptions."""
 

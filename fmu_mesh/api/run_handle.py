@@ -39,9 +39,11 @@ from .result import Result
 from .run_thread import RunThread
 from .samples import Sample, Watch, sample_of, targets_of
 
-__all__ = ["Run", "attach", "meshes"]
+__all__ = ["TIMEOUT_S", "Run"]
 
-_TIMEOUT_S = 5.0
+TIMEOUT_S = 5.0
+"""Default deadline of a question in s."""
+
 _LOOK_S = 0.2
 _FOREVER_S = 1e9
 _START_S = 120.0
@@ -334,7 +336,7 @@ class Run:
             raise DeadlineExceeded(f"mesh '{self.name}' cannot be reached within {timeout:g} s")
         if not own.endpoints:
             raise MeshLost(f"the run of mesh '{self.name}' has ended")
-        meshes = Meshes(own.endpoints[:1], _TIMEOUT_S)
+        meshes = Meshes(own.endpoints[:1], TIMEOUT_S)
         self._meshes = meshes.__enter__()
         with meshes.changes() as wait:
             end = time.monotonic() + timeout
@@ -344,64 +346,6 @@ class Run:
                 wait(_LOOK_S)
                 meshes.look()
         return client
-
-
-def attach(name: str | None = None, *, connect: str | tuple[str, ...] = (), timeout: float = _TIMEOUT_S) -> Run:
-    """Find a running mesh that somebody else has started, such as `fmu-mesh launch` in another terminal.
-
-    Example:
-        >>> import fmu_mesh
-        >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
-        >>> with mesh.start(real_time_factor=1.0, record="memory") as started_elsewhere:
-        ...     state = started_elsewhere.status.state
-        ...     with fmu_mesh.attach("pendulum_delay") as run:
-        ...         for sample in run.watch("delay.y"):
-        ...             break
-        >>> sample.name, sample.value
-        ('delay.y', 1.3)
-
-    Args:
-        name: name or key of the mesh; None for the only one that runs.
-        connect: Zenoh endpoints of the mesh or of a router; default: the meshes of this user on this host.
-        timeout: deadline of every question in s.
-
-    Raises:
-        ConfigurationError: no such mesh is running, or there are several.
-        DeadlineExceeded: it does not answer.
-    """
-    endpoints = (connect,) if isinstance(connect, str) else tuple(connect)
-    meshes = Meshes(endpoints, timeout)
-    meshes.__enter__()
-    try:
-        client = meshes.one(None) if name is None else meshes.named(name)
-        return Run(client.keys.mesh, meshes=meshes)
-    except BaseException:
-        meshes.__exit__(None, None, None)
-        raise
-
-
-def meshes(*, connect: str | tuple[str, ...] = (), timeout: float = _TIMEOUT_S) -> list[MeshStatus]:
-    """The status of every mesh that runs; none where no mesh runs or answers.
-
-    Example:
-        >>> import fmu_mesh
-        >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
-        >>> with mesh.start(paused=True, record="memory") as run:
-        ...     point = run.status.point
-        ...     [status.mesh for status in fmu_mesh.meshes()]
-        ['pendulum_delay']
-
-    Args:
-        connect: as in `attach`.
-        timeout: as in `attach`.
-
-    Raises:
-        DeadlineExceeded: an endpoint of ``connect`` does not answer.
-    """
-    with Meshes((connect,) if isinstance(connect, str) else connect, timeout) as found:
-        if found.absence is not None:
-            return []
-        return [status for _, status in found.answers(found.all(), MeshClient.status)]
 
 
 def _wait_until_it_runs(client: MeshClient) -> None:
