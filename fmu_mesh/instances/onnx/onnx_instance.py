@@ -49,7 +49,7 @@ class OnnxInstance:
             (self._variables[name], self._own(name), tensor.reshape(-1)) for name, tensor in self._tensors.items()
         ]
         self._stores = [(tensor.variable, self._own(tensor.variable.name)) for tensor in model.outputs]
-        self._failure: type[FmuError] = InitializationFailed
+        self._is_initialized = False
         self._is_computed = False
 
     @property
@@ -73,7 +73,7 @@ class OnnxInstance:
             InitializationFailed: for the reasons of `do_step`.
         """
         self._follow()
-        self._failure = StepFailed
+        self._is_initialized = True
 
     def set_values(self, values: Mapping[str, Value]) -> None:
         """Set inputs by name."""
@@ -160,7 +160,7 @@ class OnnxInstance:
 
     def _follow(self) -> None:
         """Compute the outputs if the inputs were changed in Initialization Mode."""
-        if self._failure is InitializationFailed and not self._is_computed:
+        if not (self._is_initialized or self._is_computed):
             self._compute()
             self._is_computed = True
 
@@ -173,11 +173,11 @@ class OnnxInstance:
         try:
             outputs = self._model.compute(self._tensors)
         except Exception as error:
-            raise self._failure(f"onnxruntime cannot compute it: {reason_of(error)}", instance=self.name) from error
+            raise self._failed(f"onnxruntime cannot compute it: {reason_of(error)}") from error
         for (variable, values), output in zip(self._stores, outputs, strict=True):
             if output.size != values.size:
                 text = f"the output has {output.size} elements now and had {values.size} for inputs of 0"
-                raise self._failure(text, instance=self.name, variable=variable.name)
+                raise self._failed(text, variable.name)
             values[:] = output.reshape(-1)
             self._check(variable, values)
 
@@ -189,7 +189,11 @@ class OnnxInstance:
         """
         if is_float(variable.type) and (missing := np.isnan(values)).any():
             name = variable.elements[int(missing.argmax())]
-            raise self._failure(f"the {variable.causality} is not a number (NaN)", instance=self.name, variable=name)
+            raise self._failed(f"the {variable.causality} is not a number (NaN)", name)
+
+    def _failed(self, text: str, variable: str | None = None) -> FmuError:
+        failure = StepFailed if self._is_initialized else InitializationFailed
+        return failure(text, instance=self.name, variable=variable)
 
     def _write(self, step: int) -> None:
         for own, rows, columns, mask in self._gives:

@@ -12,6 +12,7 @@ from __future__ import annotations
 import hashlib
 import itertools
 import math
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from types import ModuleType
@@ -171,6 +172,8 @@ def _read(path: Path, limits: LimitsConfig) -> bytes:
 
 
 def _engine() -> ModuleType:
+    # Some releases send usage data to their vendor, with threads and files of their own. Who wants that says so.
+    os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
     try:
         import onnxruntime  # noqa: PLC0415  an extra, and slow to import
     except ImportError as error:
@@ -221,7 +224,7 @@ def _sizes(node: Any) -> tuple[Any, ...]:  # noqa: ANN401  onnxruntime has no ty
     return tuple(1 if place == 0 and not isinstance(size, int) else size for place, size in enumerate(node.shape))
 
 
-def _tensor(number: int, node: Any, sizes: Sizes, inputs: Sequence[Tensor] | None = None) -> Tensor:  # noqa: ANN401
+def _tensor(number: int, node: Any, sizes: Sizes, inputs: Sequence[Tensor] | None = None) -> Tensor:  # noqa: ANN401  as above
     """An output that depends on all ``inputs``, or an input if there are none."""
     dtype, type_ = _TYPES[node.type]
     if inputs is None and is_float(type_):
