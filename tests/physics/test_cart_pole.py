@@ -1,0 +1,86 @@
+"""`examples/cart_pole/`: a trained network keeps the pole up, which nobody else does."""
+
+from __future__ import annotations
+
+import csv
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from fmu_mesh.run.local import LocalMesh
+from fmu_mesh.run.options import Options
+from fmu_mesh.run.preparing import prepare
+from tests.helpers import Place
+
+FOLDER = Path(__file__).resolve().parents[2] / "examples" / "cart_pole"
+
+FALLEN = 0.21
+"""rad: 12 degrees, from which the pole counts as fallen in the usual form of this problem."""
+
+
+def columns(file: Path) -> dict[str, list[float]]:
+    rows = [*csv.DictReader(file.read_text(encoding="utf-8").splitlines())]
+    return {name: [float(row[name]) for row in rows] for name in rows[0]}
+
+
+def run(folder: Path, start: dict[str, float], *, pushed: bool) -> dict[str, list[float]]:
+    """The columns of a run from these start values, with the network or with no force at all."""
+    content = yaml.safe_load((FOLDER / "balance.yaml").read_text(encoding="utf-8"))
+    content["instances"]["cart"] = {"fmu": str(FOLDER / "../../fmus/CartPole.fmu"), "start_values": start}
+    content["instances"]["policy"]["onnx"] = str(FOLDER / "policy.onnx")
+    if not pushed:
+        content["connections"].remove("policy.force -> cart.force")
+    config, output = folder / "balance.yaml", folder / "result.csv"
+    config.write_text(yaml.safe_dump(content), encoding="utf-8")
+    LocalMesh(prepare(config, Options(output=output))).run()
+    return columns(output)
+
+
+def test_the_network_keeps_the_pole_up_for_ten_seconds(place: Place) -> None:
+    file, local = place.folder / "distributed.csv", place.folder / "local.csv"
+    for output, options in ((file, []), (local, ["--local"])):
+        done = place.run("launch", FOLDER / "balance.yaml", "--no-progress", "--output", output, *options)
+        assert done.wait() == 0, done.errors
+
+    result = columns(file)
+    assert file.read_bytes() == local.read_bytes()
+    assert result["time"][-1] == 10.0
+    assert max(map(abs, result["cart.theta"])) < FALLEN
+    # In the last second it stands: within a hundredth of where it began, and of where the cart may be.
+    assert max(map(abs, result["cart.theta"][-50:])) < 0.0015
+    assert max(map(abs, result["cart.x"][-50:])) < 0.024
+
+
+def test_without_a_force_the_pole_falls_within_two_seconds(tmp_path: Path) -> None:
+    angles = run(tmp_path, {"theta": 0.15}, pushed=False)["cart.theta"]
+
+    assert max(map(abs, angles[:101])) > FALLEN
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_from_random_starts_the_network_brings_the_pole_up(seed: int, tmp_path: Path) -> None:
+    # The starts of the training, and others than it had: up to 0.5 m, 0.5 m/s, 0.2 rad, 0.5 rad/s.
+    values = np.array([0.5, 0.5, 0.2, 0.5]) * np.random.default_rng(1000 + seed).uniform(-1.0, 1.0, 4)
+    start = dict(zip(("x", "der(x)", "theta", "der(theta)"), values.tolist(), strict=True))
+
+    balanced, falling = run(tmp_path, start, pushed=True), run(tmp_path, start, pushed=False)
+
+    assert max(map(abs, falling["cart.theta"][:101])) > FALLEN
+    assert max(map(abs, balanced["cart.theta"][-50:])) < 0.002
+    assert max(map(abs, balanced["cart.x"])) < 2.4  # the usual end of the track
+
+
+def test_the_training_writes_a_network_of_the_same_form(tmp_path: Path) -> None:
+    output = tmp_path / "policy.onnx"
+
+    subprocess.run(
+        [sys.executable, FOLDER / "train.py", "--generations", "2", "--output", output], check=True, timeout=120
+    )
+
+    kept = FOLDER / "policy.onnx"
+    assert kept.stat().st_size == output.stat().st_size < 20_000
+    assert kept.read_bytes() != output.read_bytes()
