@@ -12,6 +12,7 @@ memory, so the values of its inputs and outputs are the whole state.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -22,7 +23,7 @@ from ...errors import FmuError, InitializationFailed, StepFailed
 from ...rings.ring import Ring
 from ...simtime import TimeGrid
 from ...system.layout import Layout
-from ...variables.model_description import ModelDescription, Value, Variable
+from ...variables.model_description import ModelDescription, Value
 from ...variables.value_conversion import to_value
 from ...variables.value_types import is_float
 from .onnx_model import Array, OnnxModel, reason_of
@@ -44,11 +45,11 @@ class OnnxInstance:
         self._variables = {variable.name: variable for variable in model.description.variables}
         self._values = Ring(Layout.of(model.description.variables), 1)
         self._tensors: dict[str, Array] = {t.variable.name: np.empty(t.sizes, t.dtype) for t in model.inputs}
-        # The values of every variable, and for an input the elements of its tensor: views of the same memory.
-        self._loads = [
-            (self._variables[name], self._own(name), tensor.reshape(-1)) for name, tensor in self._tensors.items()
-        ]
+        # Views of the same memory: the values of an input and its tensor, of an output, and of all of one type.
+        self._loads = [(self._own(name), tensor.reshape(-1)) for name, tensor in self._tensors.items()]
         self._stores = [(tensor.variable, self._own(tensor.variable.name)) for tensor in model.outputs]
+        parts = zip(self._values.layout.parts, self._values.parts, strict=True)
+        self._numbers = [rows[0] for part, rows in parts if is_float(part.type)]
         self._is_initialized = False
         self._is_computed = False
 
@@ -165,31 +166,38 @@ class OnnxInstance:
             self._is_computed = True
 
     def _compute(self) -> None:
-        """Compute the outputs from the inputs."""
-        with np.errstate(over="ignore"):  # what is beyond the range of a Float32 becomes infinite, as in C
-            for variable, values, tensor in self._loads:
-                self._check(variable, values)
-                tensor[:] = values
-        try:
-            outputs = self._model.compute(self._tensors)
-        except Exception as error:
-            raise self._failed(f"onnxruntime cannot compute it: {reason_of(error)}") from error
-        for (variable, values), output in zip(self._stores, outputs, strict=True):
-            if output.size != values.size:
-                text = f"the output has {output.size} elements now and had {values.size} for inputs of 0"
-                raise self._failed(text, variable.name)
-            values[:] = output.reshape(-1)
-            self._check(variable, values)
+        """Compute the outputs from the inputs.
 
-    def _check(self, variable: Variable, values: Array) -> None:
-        """Check that no value is NaN: most functions of a network hide it, and an FMU passes it on.
-
-        Raises:
-            FmuError: names the first element that is.
+        NaN is an error: most functions of a network hide it, so a policy would go on with a number that means nothing.
         """
-        if is_float(variable.type) and (missing := np.isnan(values)).any():
-            name = variable.elements[int(missing.argmax())]
-            raise self._failed(f"the {variable.causality} is not a number (NaN)", name)
+        with np.errstate(over="ignore"):  # what is beyond the range of a Float32 becomes infinite, as in C
+            for values, tensor in self._loads:
+                tensor[:] = values
+            try:
+                outputs = self._model.compute(self._tensors)
+            except Exception as error:
+                raise self._failed(f"onnxruntime cannot compute it: {reason_of(error)}") from error
+            for (variable, values), output in zip(self._stores, outputs, strict=True):
+                if output.size != values.size:
+                    text = f"the output has {output.size} elements now and had {values.size} for inputs of 0"
+                    raise self._failed(text, variable.name)
+                values[:] = output.ravel()
+            if any(
+                math.isnan(numbers.dot(numbers)) for numbers in self._numbers
+            ):  # only NaN makes a sum of squares NaN
+                raise self._not_a_number()
+
+    def _not_a_number(self) -> FmuError:
+        """The error that names the first element that is NaN; inputs come before outputs."""
+        elements = (
+            (variable, name)
+            for variable in self._variables.values()
+            if is_float(variable.type)
+            for name, value in zip(variable.elements, self._own(variable.name), strict=True)
+            if np.isnan(value)
+        )
+        variable, name = next(elements)
+        return self._failed(f"the {variable.causality} is not a number (NaN)", name)
 
     def _failed(self, text: str, variable: str | None = None) -> FmuError:
         failure = StepFailed if self._is_initialized else InitializationFailed
