@@ -348,14 +348,14 @@ class System:
         if instance not in instances:
             near = nearest(instance, instances)
             hint = f"Did you mean '{near}'?" if near else f"There are {listed(list(instances))}."
-            raise CallRefused(f"there is no instance '{instance}' for '{name}'.", hint=hint)
+            raise CallRefused(f"there is no instance '{instance}', which '{name}' names.", hint=hint)
         description = instances[instance].description
         variable = description.variable_of(rest) if elements else description.variable(rest)
         if variable is None or (rest != variable.name and rest not in variable.elements):
             names = [one.name for one in description.variables]
             near = nearest(rest, names)
             hint = f"Did you mean '{instance}.{near}'?" if near else f"There are {listed(names)}."
-            raise CallRefused(f"'{instance}' has no variable '{rest}'.", instance=instance, hint=hint)
+            raise CallRefused(f"there is no variable '{rest}'.", instance=instance, hint=hint)
         return instance, variable
 
     def _free_lost(self) -> None:
