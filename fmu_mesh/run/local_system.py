@@ -51,7 +51,7 @@ class LocalSystem:
         self._grid = plan.grid
         self._members: dict[str, _Member] = {}
         self._steps: tuple[tuple[str, Callable[[int], None]], ...] = ()
-        self._kept: list[SavedSystem] = []
+        self._kept: dict[int, SavedSystem] = {}
 
     def start(self, open_instance: Callable[[str], Guarded]) -> None:
         """Open all instances and initialize them; then they are at point 0.
@@ -109,7 +109,7 @@ class LocalSystem:
             self._free(SavedSystem(self.point, states))
             raise
         saved = SavedSystem(self.point, states)
-        self._kept.append(saved)
+        self._kept[id(saved)] = saved
         return saved
 
     def restore(self, saved: SavedSystem) -> None:
@@ -122,16 +122,15 @@ class LocalSystem:
 
     def free(self, saved: SavedSystem) -> None:
         """Free a state; nothing happens if it is freed already."""
-        if any(saved is one for one in self._kept):
-            self._kept = [one for one in self._kept if one is not saved]
+        if self._kept.pop(id(saved), None) is not None:
             self._free(saved)
 
     def close(self) -> None:
         """Free all states and close all instances. Never raises; may be called twice."""
-        for saved in self._kept:
+        for saved in self._kept.values():
             with suppress(FmuError):  # it has failed before, and now its memory goes anyway
                 self._free(saved)
-        self._kept = []
+        self._kept.clear()
         for member in self._members.values():
             member.instance.close()
 

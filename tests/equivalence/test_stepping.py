@@ -20,6 +20,7 @@ from tests.equivalence import test_equivalence as meshes
 from tests.equivalence import test_events as events
 from tests.equivalence import test_initialization as loops
 from tests.equivalence import test_types as types
+from tests.equivalence.reference import read_csv
 from tests.fmus.event_fmus import Version
 from tests.fmus.helpers import NO_COMPILER
 from tests.helpers import Place
@@ -33,7 +34,7 @@ def opened(config: Path, *start_values: str) -> System:
 
 
 def rows_stepped(system: System, columns: list[str], sizes: tuple[int, ...] = (1,)) -> Rows:
-    """The time and the values of all points from this one on; each `step` takes the next of ``sizes``, over and over."""
+    """The time and the values of all points from this one on; each `step` takes the next of ``sizes``, in turn."""
     rows = []
     while True:
         rows.append([system.time, *(system.get(name) for name in columns)])
@@ -278,5 +279,5 @@ def test_an_fmu_that_asks_to_end_leaves_the_system_at_the_last_point_of_all(
     assert ended is not None
     assert (ended.instance, ended.point) == ("stairs", 93)
     assert first == second
-    assert [list(row) for row in meshes.read_csv(local)[1]] == first[:-1]
+    assert [list(row) for row in read_csv(local)[1]] == first[:-1]
     assert first[-1] == first[-2]
