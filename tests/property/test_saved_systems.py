@@ -70,7 +70,7 @@ def systems(
 
 actions = st.lists(
     st.one_of(
-        st.tuples(st.just("step"), st.integers(1, 7)),
+        st.tuples(st.just("step"), st.integers(1, 20)),
         st.tuples(st.just("save"), st.none()),
         st.tuples(st.just("restore"), st.integers(0, 5)),
         st.tuples(st.just("close"), st.integers(0, 5)),
@@ -87,7 +87,7 @@ def row(system: System) -> Row:
 
 
 @given(actions)
-@settings(max_examples=120, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_a_system_that_went_back_equals_one_that_did_not(
     systems: tuple[System, System], drawn: list[tuple[str, Any]]
 ) -> None:

@@ -15,13 +15,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 from msgspec.structs import replace
 
 from fmu_mesh.api.open_system import System, SystemState
 from fmu_mesh.errors import CallRefused, ConfigurationError, InitializationFailed, StepFailed
 from fmu_mesh.run.preparing import plan_run
 from tests.fmus.helpers import NO_COMPILER, build_test_fmu
-from tests.helpers import DEADLINE_S, write_config
+from tests.helpers import DEADLINE_S, wait_until, write_config
 
 EventFmu = Callable[..., Path]
 
@@ -205,6 +206,25 @@ def test_a_state_holds_what_was_set(system: System) -> None:
         assert system.get("free.y") == 3.0
 
 
+def test_what_follows_from_a_value_that_was_set_is_back_with_the_state(tmp_path: Path) -> None:
+    controller = {"controller": "position_pid", "start_values": {"p": 2.0}}
+    config = write_config(tmp_path, **PENDULUM_AND_GAIN)
+    content = yaml.safe_load(config.read_text(encoding="utf-8"))
+    content |= {"instances": {"pid": controller}, "connections": []}
+    config.write_text(yaml.safe_dump(content), encoding="utf-8")
+    with System(plan_run(config)) as system:
+        system.set("pid.target", 1.0)
+        state = system.save()
+        assert system.get("pid.effort") == 2.0
+        system.step()
+        system.set("pid.target", 5.0)
+        assert system.get("pid.effort") == 10.0
+
+        system.restore(state)
+
+        assert system.get("pid.effort") == 2.0
+
+
 def test_a_state_can_be_restored_ahead(system: System) -> None:
     early = system.save()
     system.step(500)
@@ -376,8 +396,7 @@ def test_ctrl_c_ends_a_step_and_the_system_can_go_back_to_a_state(tmp_path: Path
         later = system.get("pendulum.a")
 
         def interrupt() -> None:
-            while system.point < 500:
-                pass
+            wait_until(lambda: system.point >= 500, "some steps")
             signal.raise_signal(signal.SIGINT)
 
         thread = threading.Thread(target=interrupt)
