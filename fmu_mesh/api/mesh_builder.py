@@ -21,6 +21,7 @@ from ..run.preparing import planned
 from ..run.run_plan import RunPlan
 from ..text import listed, shown
 from ..wire.views import MeshStatus
+from .open_system import System
 from .result import Result
 from .run_handle import Run
 from .run_thread import MEMORY_LIMIT, RunThread, Settings, memory_file
@@ -343,6 +344,25 @@ class Mesh:
             if memory is not None:
                 memory.parent.rmdir()
             raise
+
+    def open(self, *, start_values: Mapping[str, Any] | None = None) -> System:
+        """Open the mesh to step it in this process and on this thread.
+
+        Example:
+            >>> import fmu_mesh
+            >>> with fmu_mesh.load("configs/pendulum_delay.yaml").open(start_values={"pendulum.a": 0.5}) as system:
+            ...     system.step(500)
+            ...     system.time
+            1.0
+
+        Args:
+            start_values: over those of the mesh, by `instance.variable`.
+
+        Raises:
+            ConfigurationError: the configuration, a model or a start value is wrong; carries all findings.
+            FmuError: an FMU cannot be opened or initialized.
+        """
+        return System(self._planned(_options_of({"start_values": dict(start_values or {})})))
 
     def _planned(self, options: Options) -> RunPlan:
         loaded, findings = examine_data(self._plain, options.start_values)
