@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import math
 import os
 import subprocess
@@ -396,6 +397,24 @@ def test_check_shows_the_model_and_its_connections(tmp_path: Path, capsys: pytes
     assert "policy.onnx (onnxruntime " in page
     assert "gain.y -> policy.observation[1]" in page
     assert "policy.action  Float32" in page
+
+
+def test_inspect_shows_a_model_and_says_why_it_cannot(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = write_network(tmp_path / "policy.onnx")
+    broken = tmp_path / "broken.ONNX"
+    broken.write_bytes(b"hello")
+
+    assert main(["inspect", str(path)]) == 0
+    page = " ".join(capsys.readouterr().out.split())
+    assert main(["inspect", str(path), "--json"]) == 0
+    description = json.loads(capsys.readouterr().out)["description"]
+    assert main(["inspect", str(broken)]) == 2
+
+    assert "Kind onnx model" in page
+    assert "Inputs (1) observation Float64[4] continuous" in page
+    assert "Platforms" not in page
+    assert [variable["name"] for variable in description["variables"]] == ["observation", "action"]
+    assert "protobuf parsing failed" in capsys.readouterr().err
 
 
 def test_without_onnxruntime_the_finding_says_what_to_install(

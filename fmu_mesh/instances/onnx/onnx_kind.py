@@ -37,6 +37,7 @@ class OnnxKind(Kind[OnnxConfig]):
 
     section = OnnxConfig
     expected = "an ONNX model"
+    endings = (".onnx",)
 
     def describe(
         self,

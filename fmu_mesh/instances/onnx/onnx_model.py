@@ -106,14 +106,15 @@ class OnnxModel:
             _tensor(number, node, sizes, self.inputs)
             for number, (node, sizes) in enumerate(zip(outputs, self._sizes_of_outputs(path), strict=True), len(inputs))
         )
+        said = self._session.get_modelmeta()
         self.description = ModelDescription(
-            model_name=self._session.get_modelmeta().graph_name or "onnx",
+            model_name=said.graph_name or "onnx",
             model_identifier="onnx",
             fmi_version="",
             kind="onnx_model",
             guid=sha256[:32],
             variables=tuple(tensor.variable for tensor in (*self.inputs, *self.outputs)),
-            description=self._session.get_modelmeta().description or None,
+            description=said.description or said.graph_description or None,
             generation_tool=f"onnxruntime {engine.__version__}",
             can_handle_variable_step_size=True,
             can_get_and_set_state=True,
