@@ -1,15 +1,21 @@
-"""`examples/cart_pole/`: a trained network keeps the pole up, which nobody else does."""
+"""`examples/cart_pole/`: a trained network keeps the pole up, in a run of a mesh and in the Gymnasium environment."""
 
 from __future__ import annotations
 
 import csv
+import importlib.util
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
+import gymnasium
 import numpy as np
+import onnxruntime
 import pytest
 import yaml
+from gymnasium.utils.env_checker import check_env
 
 from fmu_mesh.run.local import LocalMesh
 from fmu_mesh.run.options import Options
@@ -84,3 +90,59 @@ def test_the_training_writes_a_network_of_the_same_form(tmp_path: Path) -> None:
     kept = FOLDER / "policy.onnx"
     assert kept.stat().st_size == output.stat().st_size < 20_000
     assert kept.read_bytes() != output.read_bytes()
+
+
+@pytest.fixture
+def environment() -> Iterator[Any]:
+    """The environment of the example."""
+    spec = importlib.util.spec_from_file_location("cart_pole_environment", FOLDER / "environment.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    environment = module.CartPole()
+    yield environment
+    environment.close()
+
+
+def test_the_environment_is_what_gymnasium_asks_of_one(environment: Any) -> None:  # noqa: ANN401  of a file
+    check_env(environment, skip_render_check=True)
+
+
+def test_an_episode_has_the_floats_of_a_run(environment: Any, tmp_path: Path) -> None:  # noqa: ANN401  as above
+    start = {"x": 0.1, "der(x)": -0.3, "theta": 0.02, "der(theta)": 0.0}
+    seen = [environment.reset(seed=1, options=start)[0]]
+    terminated = False
+    while not terminated:
+        observation, _, terminated, truncated, _ = environment.step(np.zeros(1, dtype=np.float32))
+        seen.append(observation)
+        assert not truncated
+
+    result = run(tmp_path, start, pushed=False)
+    expected = np.array([result[f"cart.{name}"] for name in start], dtype=np.float32).T
+    assert np.array(seen).tolist() == expected[: len(seen)].tolist()
+    assert len(seen) > 50
+
+
+def test_an_episode_begins_anew_by_its_seed(environment: Any) -> None:  # noqa: ANN401  as above
+    first = environment.reset(seed=5)[0].tolist()
+    environment.step(np.ones(1, dtype=np.float32))
+
+    assert environment.reset(seed=5)[0].tolist() == first
+    assert environment.reset()[0].tolist() != first
+    environment.close()
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        environment.step(np.ones(1, dtype=np.float32))
+
+
+def test_the_network_keeps_the_pole_up_in_the_environment(environment: Any) -> None:  # noqa: ANN401  as above
+    policy = onnxruntime.InferenceSession(FOLDER / "policy.onnx", providers=["CPUExecutionProvider"])
+    observation, _ = environment.reset(seed=3)
+    total, truncated = 0.0, False
+    while not truncated:
+        [force] = policy.run(None, {"observation": observation[None]})
+        observation, reward, terminated, truncated, _ = environment.step(force[0] / 10.0)
+        total += reward
+        assert not terminated
+
+    assert total > 0.98 * 500  # of 1 for each of the 500 steps; it has to come from its random start first
