@@ -17,6 +17,7 @@ import pytest
 import yaml
 from gymnasium.utils.env_checker import check_env
 
+import fmu_mesh
 from fmu_mesh.run.local import LocalMesh
 from fmu_mesh.run.options import Options
 from fmu_mesh.run.preparing import prepare
@@ -90,6 +91,23 @@ def test_the_training_writes_a_network_of_the_same_form(tmp_path: Path) -> None:
     kept = FOLDER / "policy.onnx"
     assert kept.stat().st_size == output.stat().st_size < 20_000
     assert kept.read_bytes() != output.read_bytes()
+
+
+def test_a_stepped_mesh_goes_back_with_its_network(tmp_path: Path) -> None:
+    result = run(tmp_path, {"theta": 0.15}, pushed=True)
+    names = ("cart.theta", "policy.force")
+
+    with fmu_mesh.load(FOLDER / "balance.yaml").open() as system:
+        system.step(100)
+        state = system.save()
+        ends = []
+        for _ in range(2):
+            system.restore(state)
+            first = [system.get(name) for name in names]
+            system.step(100)
+            ends.append([first, [system.get(name) for name in names]])
+
+    assert ends == [[[result[name][point] for name in names] for point in (100, 200)]] * 2
 
 
 @pytest.fixture

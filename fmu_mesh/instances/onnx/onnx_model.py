@@ -51,6 +51,7 @@ _TYPES: dict[str, tuple[Any, VariableType]] = {
 """By the type of a tensor, the type of its elements, and the type of an output that holds all their values."""
 
 _NO_FOLDER = "/dev/null"
+"""Where onnxruntime looks for weights that are not in the file; its message names it."""
 
 
 class Tensor(msgspec.Struct, frozen=True):
@@ -196,7 +197,7 @@ def _load(engine: ModuleType, data: bytes, path: Path) -> Any:  # noqa: ANN401  
     try:
         return engine.InferenceSession(data, options, providers=["CPUExecutionProvider"])
     except Exception as error:
-        if "external data" in str(error).lower():
+        if _NO_FOLDER in str(error):
             hint = f"Write one file: `onnx.save(onnx.load('{path.name}'), '{path.name}')`."
             raise LoadFailed(f"'{path}' has its weights in another file", hint=hint) from error
         raise LoadFailed(f"onnxruntime cannot load '{path}': {reason_of(error)}") from error
