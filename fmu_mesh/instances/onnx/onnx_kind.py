@@ -16,6 +16,7 @@ from ... import files
 from ...config.base import Base
 from ...config.instance_sections import KIND, Group, Host, InstanceSection, StartValues, StepSize
 from ...config.mesh import LimitsConfig
+from ...errors import LoadFailed
 from ...variables.model_description import ModelDescription
 from ..contract import Instance, Kind, Opening
 
@@ -60,7 +61,11 @@ class OnnxKind(Kind[OnnxConfig]):
         from .onnx_instance import OnnxInstance  # noqa: PLC0415  as above
         from .onnx_model import OnnxModel  # noqa: PLC0415  as above
 
-        return OnnxInstance(opening.name, OnnxModel(opening.path, opening.limits, opening.content))
+        try:
+            model = OnnxModel(opening.path, opening.limits, opening.content)
+        except LoadFailed as error:
+            raise LoadFailed(error.message, instance=opening.name, hint=error.hint) from error
+        return OnnxInstance(opening.name, model)
 
 
 KIND_OF_ONNX_MODELS = OnnxKind()
