@@ -13,9 +13,11 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from .adapter import FMIAdapter
     from .api.mesh_builder import Check, Mesh, load
+    from .api.models import inspect
     from .api.open_system import System, SystemState
     from .api.result import Result
-    from .api.run_handle import Run, Sample, attach
+    from .api.run_handle import Run, attach, meshes
+    from .api.samples import Sample
     from .errors import (
         CallRefused,
         ConfigurationError,
@@ -62,7 +64,9 @@ __all__ = [
     "UnknownName",
     "__version__",
     "attach",
+    "inspect",
     "load",
+    "meshes",
 ]
 
 _PLACES = {
@@ -74,8 +78,10 @@ _PLACES = {
     "SystemState": "api.open_system",
     "Result": "api.result",
     "Run": "api.run_handle",
-    "Sample": "api.run_handle",
+    "Sample": "api.samples",
     "attach": "api.run_handle",
+    "inspect": "api.models",
+    "meshes": "api.run_handle",
 }
 """The modules of the public names; all others are exceptions."""
 

@@ -271,6 +271,8 @@ ALLOWED: dict[str, dict[str, str]] = {
         "ros/node/node_topics.py: setattr(owner)": _ROS,
     },
     "private_names_of_others": {
+        'api/mesh_builder.py: mesh._take(read_text(text, Path(folder).absolute() / "<text>"))': "its own class",
+        "api/mesh_builder.py: mesh._take(read_file(Path(path)))": "its own class",
         "ros/node/variable_parameters.py: overrides = node._parameter_overrides": "rclpy has no public way to read it",
     },
     "rebound_calls": {

@@ -276,10 +276,10 @@ class Mesh:
         Example:
             >>> import fmu_mesh
             >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
-            >>> mesh.connect("pendulum.b", "delay.x")
+            >>> mesh.add("gain", fmu="../fmus/Gian.fmu")
             >>> for finding in mesh.check().findings:
-            ...     print(finding.path, finding.suggestion)
-            connections[1].from pendulum.a
+            ...     print(finding.path, finding.suggestion[-8:])
+            instances.gain.fmu Gain.fmu
         """
         try:
             run = self._planned(_options_of(options))
@@ -365,7 +365,10 @@ class Mesh:
         return System(self._planned(_options_of({"start_values": dict(start_values or {})})))
 
     def _planned(self, options: Options) -> RunPlan:
-        loaded, findings = examine_data(self._plain, options.start_values)
+        file = self._plain.file
+        if file.is_relative_to(here := Path.cwd()):  # findings name it; the folder of the program says nothing new
+            file = file.relative_to(here)
+        loaded, findings = examine_data(self._plain._replace(file=file), options.start_values)
         return planned(loaded, findings, options, log.info)
 
     @property

@@ -5,12 +5,11 @@ from __future__ import annotations
 import asyncio
 import threading
 import time
-from collections.abc import Iterator
 from concurrent.futures import Future
 from concurrent.futures import TimeoutError as NotYet
 from pathlib import Path
 from types import TracebackType
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
 from ..errors import (
     CallRefused,
@@ -20,13 +19,10 @@ from ..errors import (
     Interrupted,
     KeyboardInterrupted,
     MeshLost,
-    UnknownName,
     from_report,
 )
-from ..variables.value_conversion import from_plain
 from ..wire.client.mesh_client import MeshClient
 from ..wire.client.reaching import Meshes
-from ..wire.client.readings import Reading
 from ..wire.client.waiting import rest
 from ..wire.views import (
     Command,
@@ -41,30 +37,14 @@ from ..wire.views import (
 from .notebook_progress import NotebookProgress
 from .result import Result
 from .run_thread import RunThread
+from .samples import Sample, Watch, sample_of, targets_of
 
-__all__ = ["Run", "Sample", "attach"]
+__all__ = ["Run", "attach", "meshes"]
 
 _TIMEOUT_S = 5.0
 _LOOK_S = 0.2
 _FOREVER_S = 1e9
-
-
-class Sample(NamedTuple):
-    """One value of a variable.
-
-    Attributes:
-        name: `instance.variable`.
-        value: a number, truth value, text or bytes; an array as a numpy array.
-        point: the communication point of the value.
-        time: the simulation time of this point in s.
-        unit: the unit, as FMI writes it; None without one.
-    """
-
-    name: str
-    value: Any
-    point: int
-    time: float
-    unit: str | None
+_START_S = 120.0
 
 
 class Run:
@@ -96,6 +76,7 @@ class Run:
         self._found = meshes.one(None) if meshes is not None else None
         self._opening = threading.RLock()
         self._closed = False
+        self._begun = False
         self._ended: Future[Result] | None = own.future if own is not None else None
 
     def __enter__(self) -> Self:
@@ -136,7 +117,7 @@ class Run:
     @property
     def variables(self) -> dict[str, VariableView]:
         """All variables of the mesh by `instance.variable`."""
-        client = self._client()
+        client = self._running()
         return {f"{target.instance}.{target.variable.name}": target.variable for target in client.targets("*.*")}
 
     # --- values
@@ -154,9 +135,9 @@ class Run:
 
     def samples(self, *names: str) -> list[Sample]:
         """The current values of several variables, each with its point; `*` in a name stands for any characters."""
-        client = self._client()
-        targets = {target.key: target for name in names for target in _targets(client, name)}
-        return [_sample(reading, targets[reading.key].variable) for reading in client.get(list(targets.values()))]
+        client = self._running()
+        targets = {target.key: target for name in names for target in targets_of(client, name)}
+        return [sample_of(reading, targets[reading.key].variable) for reading in client.get(list(targets.values()))]
 
     def set(self, name: str, value: object, *, at: float | None = None) -> SetAnswer:
         """Give an unconnected input or a tunable parameter a value.
@@ -172,36 +153,43 @@ class Run:
         Raises:
             CallRefused: the variable cannot be set, or takes no such value; says why.
         """
-        client = self._client()
+        client = self._running()
         try:
-            return client.set(_targets(client, name)[0], value, at)
+            return client.set(targets_of(client, name)[0], value, at)
         except ConfigurationError as error:
             raise CallRefused(error.message, hint=error.hint) from error
 
-    def watch(self, *names: str) -> Iterator[Sample]:
+    def watch(self, *names: str) -> Watch:
         """Every value of variables from now on, until the mesh ends; `*` in a name stands for any characters.
 
         A reader that falls far behind loses the newest values; the points tell which.
+
+        Example:
+            >>> import fmu_mesh
+            >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
+            >>> with mesh.start(record="memory", stop_time=0.01, paused=True) as run:
+            ...     samples = run.watch("delay.y")
+            ...     answer = run.resume()
+            ...     [sample.point for sample in samples][-1]
+            5
         """
-        client = self._client()
-        targets = {target.key: target for name in names for target in _targets(client, name)}
-        with client.watch(list(targets.values())) as readings:
-            for reading in readings:
-                yield _sample(reading, targets[reading.key].variable)
+        client = self._running()
+        targets = {target.key: target for name in names for target in targets_of(client, name)}
+        return Watch(client, targets)
 
     # --- steering
 
     def pause(self) -> CommandAnswer:
         """Pause the mesh; returns when all instances have reached the point of the answer."""
-        return rest(self._client(), Command("pause"))
+        return rest(self._running(), Command("pause"))
 
     def step(self, points: int = 1) -> CommandAnswer:
         """Run some points and pause again; returns when the mesh has paused."""
-        return rest(self._client(), Command("step", points))
+        return rest(self._running(), Command("step", points))
 
     def resume(self) -> CommandAnswer:
         """Go on after a pause."""
-        return self._client().command(Command("resume"))
+        return self._running().command(Command("resume"))
 
     def stop(self) -> None:
         """End the run; what was recorded is kept. `wait` then returns the result of a run that was started here."""
@@ -322,6 +310,19 @@ class Run:
                 raise MeshLost(f"the run of mesh '{self.name}' has ended")
             return self._found
 
+    def _running(self) -> MeshClient:
+        """As `_client`, when the mesh has come to its first point.
+
+        Raises:
+            DeadlineExceeded: it has not, in time.
+        """
+        client = self._client()
+        with self._opening:
+            if not self._begun:
+                _wait_until_it_runs(client)
+                self._begun = True
+        return client
+
     def _reach(self) -> MeshClient:
         own = self._own
         assert own is not None
@@ -351,11 +352,13 @@ def attach(name: str | None = None, *, connect: str | tuple[str, ...] = (), time
     Example:
         >>> import fmu_mesh
         >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
-        >>> with mesh.start(real_time_factor=1.0, record="memory"), fmu_mesh.attach("pendulum_delay") as run:
-        ...     for sample in run.watch("delay.y"):
-        ...         break
-        ...     sample.name, sample.value
-        ('delay.y', 0.0)
+        >>> with mesh.start(real_time_factor=1.0, record="memory") as started_elsewhere:
+        ...     state = started_elsewhere.status.state
+        ...     with fmu_mesh.attach("pendulum_delay") as run:
+        ...         for sample in run.watch("delay.y"):
+        ...             break
+        >>> sample.name, sample.value
+        ('delay.y', 1.3)
 
     Args:
         name: name or key of the mesh; None for the only one that runs.
@@ -377,16 +380,40 @@ def attach(name: str | None = None, *, connect: str | tuple[str, ...] = (), time
         raise
 
 
-def _targets(client: MeshClient, name: str) -> list[Any]:
-    try:
-        return client.targets(name)
-    except ConfigurationError as error:
-        raise UnknownName(error.message, hint=error.hint) from error
+def meshes(*, connect: str | tuple[str, ...] = (), timeout: float = _TIMEOUT_S) -> list[MeshStatus]:
+    """The status of every mesh that runs; none where no mesh runs or answers.
+
+    Example:
+        >>> import fmu_mesh
+        >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
+        >>> with mesh.start(paused=True, record="memory") as run:
+        ...     point = run.status.point
+        ...     [status.mesh for status in fmu_mesh.meshes()]
+        ['pendulum_delay']
+
+    Args:
+        connect: as in `attach`.
+        timeout: as in `attach`.
+
+    Raises:
+        DeadlineExceeded: an endpoint of ``connect`` does not answer.
+    """
+    with Meshes((connect,) if isinstance(connect, str) else connect, timeout) as found:
+        if found.absence is not None:
+            return []
+        return [status for _, status in found.answers(found.all(), MeshClient.status)]
 
 
-def _sample(reading: Reading, view: VariableView) -> Sample:
-    value = from_plain(reading.value, view.type, view.shape)
-    return Sample(f"{reading.instance}.{reading.variable}", value, reading.point, reading.time, reading.unit)
+def _wait_until_it_runs(client: MeshClient) -> None:
+    """Wait until the mesh is past its initialization.
+
+    Raises:
+        DeadlineExceeded: it is not, in time.
+    """
+    with client.statuses(_START_S) as statuses:
+        for status in statuses:
+            if status.state not in ("starting", "initializing"):
+                return
 
 
 def _by_keyboard(error: Interrupted) -> KeyboardInterrupted:

@@ -13,9 +13,10 @@ from typing import Any, Final
 
 import msgspec
 
+from ..api.models import inspect
 from ..errors import ConfigurationError, LoadFailed
 from ..instances.fmi import read_description, sha256_of
-from ..instances.registry import describe_file
+from ..instances.registry import KINDS
 from ..text import fits, nearest, short_number, shown
 from ..variables.model_description import Causality, Kind, ModelDescription, Variable
 from .arguments import add_command, no_fmu
@@ -85,16 +86,15 @@ def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.Arg
 
 
 def inspect_fmu(path: Path) -> Inspection:
-    """Read all properties of an FMU without loading it, or of a file that another kind of instance knows.
+    """Read all properties of an FMU without loading it, or of a file whose ending is another kind of instance.
 
     Raises:
         ConfigurationError: it cannot be read; says why.
     """
     reasons: tuple[str, ...] = ()
     try:
-        other = describe_file(path) if path.is_file() and path.suffix.lower() != ".fmu" else None
-        if other is not None:
-            size = path.stat().st_size
+        if path.is_file() and path.suffix != ".fmu" and path.suffix[1:] in KINDS.names():
+            size, other = path.stat().st_size, inspect(path)
             return Inspection(str(path), sha256_of(path), size, runs_here=True, problems=(), description=other)
         try:
             description = read_description(path)

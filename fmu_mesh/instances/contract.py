@@ -98,13 +98,11 @@ class Kind(ABC, Generic[Section]):
     Attributes:
         section: the Struct of the section; its tag is the key of the kind.
         expected: in words, what the file of a model is: "a CSV file with a column `time`".
-        endings: the endings of files, such as ".onnx", that belong to this kind alone and need no other keys.
         can_be_shown: whether `--view` and `--video` can show its instances.
     """
 
     section: type[Section]
     expected: str = "a file of this kind"
-    endings: tuple[str, ...] = ()
     can_be_shown: bool = False
 
     @abstractmethod

@@ -32,7 +32,6 @@ __all__ = [
     "content",
     "decode_section",
     "describe",
-    "describe_file",
     "expected_model",
     "open_instance",
 ]
@@ -100,19 +99,6 @@ def describe(
         LoadFailed: the model cannot be read.
     """
     return _kind_of(section).describe(path, section, limits, tell)
-
-
-def describe_file(path: Path) -> ModelDescription | None:
-    """The model description of a file whose ending belongs to one kind; None if there is no such kind.
-
-    Raises:
-        LoadFailed: the model cannot be read.
-    """
-    for key in _names():
-        kind = _kind(key)
-        if path.suffix.lower() in kind.endings:
-            return describe(path, msgspec.convert({KIND: key, key: str(path)}, kind.section))
-    return None
 
 
 def content(path: Path, section: InstanceSection) -> str:

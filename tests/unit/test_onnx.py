@@ -401,7 +401,7 @@ def test_check_shows_the_model_and_its_connections(tmp_path: Path, capsys: pytes
 
 def test_inspect_shows_a_model_and_says_why_it_cannot(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = write_network(tmp_path / "policy.onnx")
-    broken = tmp_path / "broken.ONNX"
+    broken = tmp_path / "broken.onnx"
     broken.write_bytes(b"hello")
 
     assert main(["inspect", str(path)]) == 0

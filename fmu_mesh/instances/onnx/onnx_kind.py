@@ -38,7 +38,6 @@ class OnnxKind(Kind[OnnxConfig]):
 
     section = OnnxConfig
     expected = "an ONNX model"
-    endings = (".onnx",)
 
     def describe(
         self,
