@@ -63,8 +63,8 @@ class System:
         ...     system.step(100)
         ...     later = system.get("pendulum.a")
         ...     system.restore(state)
-        ...     system.time, system.get("pendulum.a") < later
-        (1.0, True)
+        ...     system.time, system.get("pendulum.a") == later
+        (1.0, False)
 
     Args:
         run: the plan of the run.
@@ -302,8 +302,8 @@ class System:
         ended = self._ended_by
         who = ended.instance if ended is not None else None
         reason, hint = {
-            "ended": (f"the FMU of '{who}' has asked to end the simulation", _BACK),
-            "failed": ("an FMU has failed before", "Only close() is allowed now."),
+            "ended": (f"'{who}' has asked to end the simulation", _BACK),
+            "failed": ("an instance has failed before", "Only close() is allowed now."),
             "interrupted": ("the last call was interrupted in the middle", _BACK),
             "closed": ("the system is closed", None),
         }[self._mode]
@@ -383,7 +383,6 @@ class SystemState:
     def __init__(self, point: int, release: Callable[[], None]) -> None:
         self.point = point
         self._release = weakref.finalize(self, release)
-        self._release.atexit = False
 
     def __enter__(self) -> Self:
         return self

@@ -352,7 +352,9 @@ def test_a_failed_step_has_instance_point_and_time_and_only_close_is_allowed(
         assert (failed.value.instance, failed.value.point, failed.value.time) == ("faulty", 500, 0.5)
         assert (system.point, angle != 0.0) == (500, True)
         for name, call in CALLS.items():
-            with pytest.raises(CallRefused, match=rf"^{name} is not possible, because an FMU has failed before\. Only"):
+            with pytest.raises(
+                CallRefused, match=rf"^{name} is not possible, because an instance has failed before\. Only"
+            ):
                 call(system, None)  # type: ignore[arg-type]  # it is not looked at
     assert not list(temporary.iterdir())
 
@@ -378,9 +380,7 @@ def test_an_fmu_that_asks_to_end_ends_the_steps_but_not_the_looking(tmp_path: Pa
         assert (system.ended_by.instance, system.point) == ("stairs", 375)
         assert system.get("stairs.counter") == 3
         for name in ("step", "set", "save"):
-            with pytest.raises(
-                CallRefused, match=f"{name} is not possible, because the FMU of 'stairs' has asked to end"
-            ):
+            with pytest.raises(CallRefused, match=f"{name} is not possible, because 'stairs' has asked to end"):
                 CALLS[name](system, state)
         system.restore(state)
         assert system.ended_by is None
