@@ -41,8 +41,8 @@ def temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return folder
 
 
-def opened(folder: Path, *, stop_time: float | None = 1.0, **sections: Any) -> System:  # noqa: ANN401 as in a file
-    return System(plan_run(write_config(folder, stop_time=stop_time, **{**PENDULUM_AND_GAIN, **sections})))  # type: ignore[arg-type]
+def opened(folder: Path, **changes: Any) -> System:  # noqa: ANN401 arguments of `write_config`
+    return System(plan_run(write_config(folder, **(PENDULUM_AND_GAIN | changes))))
 
 
 @pytest.fixture
