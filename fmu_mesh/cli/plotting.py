@@ -18,7 +18,7 @@ from ..errors import ConfigurationError, FmuMeshError
 from ..recorder.csv_file import CsvFile
 from ..system.plan import Plan
 from ..system.recording import result_format
-from ..system.system import System
+from ..system.system import ResolvedSystem
 from ..text import listed, nearest, nearest_file
 from ..variables.model_description import Variable
 from ..variables.value_types import is_float
@@ -123,7 +123,7 @@ def _state_of(result: str | None) -> tuple[int, int, int] | None:
     return status.st_ino, status.st_size, status.st_mtime_ns
 
 
-def _curve(system: System, instance: str, variable: Variable) -> Curve:
+def _curve(system: ResolvedSystem, instance: str, variable: Variable) -> Curve:
     """On which axes a variable is drawn: one for each unit."""
     if variable.type == "Boolean":
         return Curve(FLAGS)
@@ -135,7 +135,7 @@ def _curve(system: System, instance: str, variable: Variable) -> Curve:
     return Curve(f"value in {unit}", note="" if variable.unit else " (no unit)")
 
 
-def _unit_passed_on(system: System, instance: str, variable: Variable) -> str | None:
+def _unit_passed_on(system: ResolvedSystem, instance: str, variable: Variable) -> str | None:
     """The unit of what comes out of an output again that declares none, such as that of a transport delay.
 
     It depends on a single input, which declares no unit either, and on nothing else that could have one.
