@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from .adapter import FMIAdapter
     from .api.mesh_builder import Check, Mesh, load
+    from .api.open_system import System, SystemState
     from .api.result import Result
     from .api.run_handle import Run, Sample, attach
     from .errors import (
@@ -56,6 +57,8 @@ __all__ = [
     "Run",
     "Sample",
     "StepFailed",
+    "System",
+    "SystemState",
     "UnknownName",
     "__version__",
     "attach",
@@ -70,6 +73,8 @@ _PLACES = {
     "Result": "api.result",
     "Run": "api.run_handle",
     "Sample": "api.run_handle",
+    "System": "api.open_system",
+    "SystemState": "api.open_system",
     "attach": "api.run_handle",
 }
 """The modules of the public names; all others are exceptions."""

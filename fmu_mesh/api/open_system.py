@@ -22,7 +22,7 @@ from typing import Any, Literal, Self
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from ..errors import CallRefused, ErrorReport, FmuError, TerminationRequested
+from ..errors import CallRefused, ErrorReport, FmuError, TerminationRequested, UnknownName
 from ..instances.call_guard import Guarded, Unwatched
 from ..instances.contract import LogMessage
 from ..instances.registry import open_instance
@@ -175,7 +175,8 @@ class System:
             numpy array of your own, which later steps do not change.
 
         Raises:
-            CallRefused: there is no such variable; or see `close`.
+            UnknownName: there is no such variable; suggests the nearest one.
+            CallRefused: see `close`.
             FmuError: the FMU failed. Only `close` is allowed now.
         """
         self._demand("get", "ended")
@@ -207,6 +208,7 @@ class System:
                 an array as a numpy array or nested lists of its shape.
 
         Raises:
+            UnknownName: there is no such variable; suggests the nearest one.
             CallRefused: the variable cannot be set, or not to this value; or see `close`.
             FmuError: the FMU refuses the value. Only `close` is allowed now.
         """
@@ -348,14 +350,14 @@ class System:
         if instance not in instances:
             near = nearest(instance, instances)
             hint = f"Did you mean '{near}'?" if near else f"There are {listed(list(instances))}."
-            raise CallRefused(f"there is no instance '{instance}', which '{name}' names.", hint=hint)
+            raise UnknownName(f"there is no instance '{instance}', which '{name}' names.", hint=hint)
         description = instances[instance].description
         variable = description.variable_of(rest) if elements else description.variable(rest)
         if variable is None or (rest != variable.name and rest not in variable.elements):
             names = [one.name for one in description.variables]
             near = nearest(rest, names)
             hint = f"Did you mean '{instance}.{near}'?" if near else f"There are {listed(names)}."
-            raise CallRefused(f"there is no variable '{rest}'.", instance=instance, hint=hint)
+            raise UnknownName(f"there is no variable '{rest}'.", instance=instance, hint=hint)
         return instance, variable
 
     def _free_lost(self) -> None:

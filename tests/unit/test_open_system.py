@@ -19,7 +19,7 @@ import yaml
 from msgspec.structs import replace
 
 from fmu_mesh.api.open_system import System, SystemState
-from fmu_mesh.errors import CallRefused, ConfigurationError, InitializationFailed, StepFailed
+from fmu_mesh.errors import CallRefused, ConfigurationError, InitializationFailed, StepFailed, UnknownName
 from fmu_mesh.run.preparing import plan_run
 from tests.fmus.helpers import NO_COMPILER, build_test_fmu
 from tests.helpers import DEADLINE_S, wait_until, write_config
@@ -149,7 +149,7 @@ def test_what_cannot_be_set_is_refused_with_the_reason(system: System, name: str
 
 @pytest.mark.parametrize("name", ["pendulum", "pendulum.b", "other.a", "", ".", "pendulum.a[1]"])
 def test_a_name_of_nothing_is_refused(system: System, name: str) -> None:
-    with pytest.raises(CallRefused, match="there is no"):
+    with pytest.raises(UnknownName, match="there is no"):
         system.get(name)
 
 
