@@ -18,6 +18,7 @@ import pytest
 import yaml
 from msgspec.structs import replace
 
+import fmu_mesh
 from fmu_mesh.api.open_system import System, SystemState
 from fmu_mesh.errors import CallRefused, ConfigurationError, InitializationFailed, StepFailed, UnknownName
 from fmu_mesh.run.preparing import plan_run
@@ -93,6 +94,16 @@ def test_a_system_without_a_stop_time_has_no_last_point(tmp_path: Path) -> None:
         system.step(5000)
 
         assert (system.point, system.last_point) == (5000, None)
+
+
+def test_a_mesh_opens_with_start_values_of_the_call(tmp_path: Path, temporary: Path) -> None:
+    mesh = fmu_mesh.load(write_config(tmp_path))
+    with mesh.open() as first, mesh.open({"pendulum.a": 0.5}) as second:
+        assert (first.get("pendulum.a"), second.get("pendulum.a")) == (1.5, 0.5)
+
+    with pytest.raises(ConfigurationError, match="unknown variable 'm' of instance 'pendulum'"):
+        mesh.open({"pendulum.m": 1.0})
+    assert not list(temporary.iterdir())
 
 
 # ---- values
@@ -333,6 +344,29 @@ def test_another_thread_is_refused(system: System, call: str) -> None:
 
     assert f"{call} is not possible here, because a system belongs to the thread that made it" in str(refused[0])
     system.step()
+
+
+def test_each_thread_may_have_a_system_of_its_own(tmp_path: Path, temporary: Path) -> None:
+    run = plan_run(write_config(tmp_path))
+    found: list[list[float]] = []
+
+    def step_it() -> None:
+        with System(run) as system:
+            state = system.save()
+            for _ in range(3):
+                system.restore(state)
+                system.step(1000)
+            found.append([system.get("pendulum.a"), system.get("delay.y")])
+
+    threads = [threading.Thread(target=step_it) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+
+    assert len(found) == 4
+    assert all(row == found[0] for row in found)
+    assert not list(temporary.iterdir())
 
 
 def test_a_failed_step_has_instance_point_and_time_and_only_close_is_allowed(
