@@ -345,24 +345,27 @@ class Mesh:
                 memory.parent.rmdir()
             raise
 
-    def open(self, *, start_values: Mapping[str, Any] | None = None) -> System:
-        """Open the mesh to step it in this process and on this thread.
+    def open(self, start_values: Mapping[str, Any] | None = None) -> System:
+        """Open all instances in this process, for a program that steps them itself (docs/stepping.md).
+
+        Nothing is recorded into a file, and no other process is started.
 
         Example:
             >>> import fmu_mesh
-            >>> with fmu_mesh.load("configs/pendulum_delay.yaml").open(start_values={"pendulum.a": 0.5}) as system:
-            ...     system.step(500)
-            ...     system.time
-            1.0
+            >>> with fmu_mesh.load("configs/pendulum_delay.yaml").open({"pendulum.a": 0.5}) as system:
+            ...     system.step(100)
+            ...     system.time, system.get("pendulum.a") < 0.5
+            (0.2, True)
 
         Args:
-            start_values: over those of the mesh, by `instance.variable`.
+            start_values: start values by `instance.variable`; they come before those of the configuration.
 
         Raises:
-            ConfigurationError: the configuration, a model or a start value is wrong; carries all findings.
-            FmuError: an FMU cannot be opened or initialized.
+            ConfigurationError: the configuration, a model or a start value is wrong; carries all findings. Or two
+                instances need a process of their own each.
+            FmuError: an instance cannot be opened or initialized. Nothing is left behind.
         """
-        return System(self._planned(_options_of({"start_values": dict(start_values or {})})))
+        return System(self._planned(_options_of({"start_values": start_values or {}})))
 
     def _planned(self, options: Options) -> RunPlan:
         file = self._plain.file

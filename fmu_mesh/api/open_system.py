@@ -22,7 +22,7 @@ from typing import Any, Literal, Self
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from ..errors import CallRefused, ErrorReport, FmuError, TerminationRequested
+from ..errors import CallRefused, ErrorReport, FmuError, TerminationRequested, UnknownName
 from ..instances.call_guard import Guarded, Unwatched
 from ..instances.contract import LogMessage
 from ..instances.registry import open_instance
@@ -63,8 +63,8 @@ class System:
         ...     system.step(100)
         ...     later = system.get("pendulum.a")
         ...     system.restore(state)
-        ...     system.time, system.get("pendulum.a") < later
-        (1.0, True)
+        ...     system.time, system.get("pendulum.a") == later
+        (1.0, False)
 
     Args:
         run: the plan of the run.
@@ -175,7 +175,8 @@ class System:
             numpy array of your own, which later steps do not change.
 
         Raises:
-            CallRefused: there is no such variable; or see `close`.
+            UnknownName: there is no such variable; suggests the nearest one.
+            CallRefused: see `close`.
             FmuError: the FMU failed. Only `close` is allowed now.
         """
         self._demand("get", "ended")
@@ -207,6 +208,7 @@ class System:
                 an array as a numpy array or nested lists of its shape.
 
         Raises:
+            UnknownName: there is no such variable; suggests the nearest one.
             CallRefused: the variable cannot be set, or not to this value; or see `close`.
             FmuError: the FMU refuses the value. Only `close` is allowed now.
         """
@@ -302,8 +304,8 @@ class System:
         ended = self._ended_by
         who = ended.instance if ended is not None else None
         reason, hint = {
-            "ended": (f"the FMU of '{who}' has asked to end the simulation", _BACK),
-            "failed": ("an FMU has failed before", "Only close() is allowed now."),
+            "ended": (f"'{who}' has asked to end the simulation", _BACK),
+            "failed": ("an instance has failed before", "Only close() is allowed now."),
             "interrupted": ("the last call was interrupted in the middle", _BACK),
             "closed": ("the system is closed", None),
         }[self._mode]
@@ -348,14 +350,14 @@ class System:
         if instance not in instances:
             near = nearest(instance, instances)
             hint = f"Did you mean '{near}'?" if near else f"There are {listed(list(instances))}."
-            raise CallRefused(f"there is no instance '{instance}', which '{name}' names.", hint=hint)
+            raise UnknownName(f"there is no instance '{instance}', which '{name}' names.", hint=hint)
         description = instances[instance].description
         variable = description.variable_of(rest) if elements else description.variable(rest)
         if variable is None or (rest != variable.name and rest not in variable.elements):
             names = [one.name for one in description.variables]
             near = nearest(rest, names)
             hint = f"Did you mean '{instance}.{near}'?" if near else f"There are {listed(names)}."
-            raise CallRefused(f"there is no variable '{rest}'.", instance=instance, hint=hint)
+            raise UnknownName(f"there is no variable '{rest}'.", instance=instance, hint=hint)
         return instance, variable
 
     def _free_lost(self) -> None:
@@ -383,7 +385,6 @@ class SystemState:
     def __init__(self, point: int, release: Callable[[], None]) -> None:
         self.point = point
         self._release = weakref.finalize(self, release)
-        self._release.atexit = False
 
     def __enter__(self) -> Self:
         return self

@@ -18,8 +18,9 @@ import pytest
 import yaml
 from msgspec.structs import replace
 
+import fmu_mesh
 from fmu_mesh.api.open_system import System, SystemState
-from fmu_mesh.errors import CallRefused, ConfigurationError, InitializationFailed, StepFailed
+from fmu_mesh.errors import CallRefused, ConfigurationError, InitializationFailed, StepFailed, UnknownName
 from fmu_mesh.run.preparing import plan_run
 from tests.fmus.helpers import NO_COMPILER, build_test_fmu
 from tests.helpers import DEADLINE_S, wait_until, write_config
@@ -41,8 +42,8 @@ def temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return folder
 
 
-def opened(folder: Path, *, stop_time: float | None = 1.0, **sections: Any) -> System:  # noqa: ANN401 as in a file
-    return System(plan_run(write_config(folder, stop_time=stop_time, **{**PENDULUM_AND_GAIN, **sections})))  # type: ignore[arg-type]
+def opened(folder: Path, **changes: Any) -> System:  # noqa: ANN401 arguments of `write_config`
+    return System(plan_run(write_config(folder, **(PENDULUM_AND_GAIN | changes))))
 
 
 @pytest.fixture
@@ -93,6 +94,16 @@ def test_a_system_without_a_stop_time_has_no_last_point(tmp_path: Path) -> None:
         system.step(5000)
 
         assert (system.point, system.last_point) == (5000, None)
+
+
+def test_a_mesh_opens_with_start_values_of_the_call(tmp_path: Path, temporary: Path) -> None:
+    mesh = fmu_mesh.load(write_config(tmp_path))
+    with mesh.open() as first, mesh.open({"pendulum.a": 0.5}) as second:
+        assert (first.get("pendulum.a"), second.get("pendulum.a")) == (1.5, 0.5)
+
+    with pytest.raises(ConfigurationError, match="unknown variable 'm' of instance 'pendulum'"):
+        mesh.open({"pendulum.m": 1.0})
+    assert not list(temporary.iterdir())
 
 
 # ---- values
@@ -149,7 +160,7 @@ def test_what_cannot_be_set_is_refused_with_the_reason(system: System, name: str
 
 @pytest.mark.parametrize("name", ["pendulum", "pendulum.b", "other.a", "", ".", "pendulum.a[1]"])
 def test_a_name_of_nothing_is_refused(system: System, name: str) -> None:
-    with pytest.raises(CallRefused, match="there is no"):
+    with pytest.raises(UnknownName, match="there is no"):
         system.get(name)
 
 
@@ -335,6 +346,29 @@ def test_another_thread_is_refused(system: System, call: str) -> None:
     system.step()
 
 
+def test_each_thread_may_have_a_system_of_its_own(tmp_path: Path, temporary: Path) -> None:
+    run = plan_run(write_config(tmp_path))
+    found: list[list[float]] = []
+
+    def step_it() -> None:
+        with System(run) as system:
+            state = system.save()
+            for _ in range(3):
+                system.restore(state)
+                system.step(1000)
+            found.append([system.get("pendulum.a"), system.get("delay.y")])
+
+    threads = [threading.Thread(target=step_it) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+
+    assert len(found) == 4
+    assert all(row == found[0] for row in found)
+    assert not list(temporary.iterdir())
+
+
 def test_a_failed_step_has_instance_point_and_time_and_only_close_is_allowed(
     tmp_path: Path, faulty: Path, temporary: Path
 ) -> None:
@@ -352,7 +386,9 @@ def test_a_failed_step_has_instance_point_and_time_and_only_close_is_allowed(
         assert (failed.value.instance, failed.value.point, failed.value.time) == ("faulty", 500, 0.5)
         assert (system.point, angle != 0.0) == (500, True)
         for name, call in CALLS.items():
-            with pytest.raises(CallRefused, match=rf"^{name} is not possible, because an FMU has failed before\. Only"):
+            with pytest.raises(
+                CallRefused, match=rf"^{name} is not possible, because an instance has failed before\. Only"
+            ):
                 call(system, None)  # type: ignore[arg-type]  # it is not looked at
     assert not list(temporary.iterdir())
 
@@ -378,9 +414,7 @@ def test_an_fmu_that_asks_to_end_ends_the_steps_but_not_the_looking(tmp_path: Pa
         assert (system.ended_by.instance, system.point) == ("stairs", 375)
         assert system.get("stairs.counter") == 3
         for name in ("step", "set", "save"):
-            with pytest.raises(
-                CallRefused, match=f"{name} is not possible, because the FMU of 'stairs' has asked to end"
-            ):
+            with pytest.raises(CallRefused, match=f"{name} is not possible, because 'stairs' has asked to end"):
                 CALLS[name](system, state)
         system.restore(state)
         assert system.ended_by is None
