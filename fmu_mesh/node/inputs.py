@@ -1,7 +1,7 @@
 """Unconnected inputs and tunable parameters over time: values that came with a time, as any program sends them.
 
 Owns how such a value becomes what a step uses (the node-based use of ROS's `fmi_adapter`). Which settings are allowed
-at all is `fmu_mesh.node.settings`.
+at all is `fmu_mesh.system.settable`.
 """
 
 from __future__ import annotations
