@@ -13,7 +13,7 @@ from typing import Any, Final
 
 import msgspec
 
-from ..api.models import inspect
+from ..api.functions import inspect
 from ..errors import ConfigurationError, LoadFailed
 from ..instances.fmi import read_description, sha256_of
 from ..instances.registry import KINDS
