@@ -76,14 +76,20 @@ class FmuMeshError(Exception):
     Attributes:
         reported: True if another process has already shown this error.
 
-    The layer that catches an error often knows more than the one that raised it. It adds what it knows and raises the
-    same error again:
+    Example:
+        Every exception says in its message what to do next, and the command would end with its exit code:
 
-    ```python
-    except StepFailed as error:
-        error.at(point, grid.time(point))
-        raise
-    ```
+        >>> from fmu_mesh import FMIAdapter
+        >>> try:
+        ...     FMIAdapter("fmus/Gain.fmu", step_size=0.0)
+        ... except FmuMeshError as error:
+        ...     print(type(error).__name__, error.exit_code, error.instance)
+        ...     print(error)
+        CallRefused 2 Gain@...
+        instance Gain@...: the step size is 0.0 s; expected one above 0.
+
+    The layer that catches an error often knows more than the one that raised it. It adds what it knows (`at`,
+    `with_hint`) and raises the same error again.
     """
 
     exit_code: ClassVar[int] = 1
