@@ -105,13 +105,13 @@ class FmuMeshError(Exception):
         hint: str | None = None,
     ) -> None:
         super().__init__(message)
-        self.message = message
+        self.message: str = message
         self.instance = instance
         self.variable = variable
         self.point = point
         self.time = time
         self.hint = hint
-        self.reported = False
+        self.reported: bool = False
 
     def __str__(self) -> str:
         where = []

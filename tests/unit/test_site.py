@@ -1,4 +1,4 @@
-"""The site has all pages, and its reference all public names. `make docs` builds it and finds links that lead nowhere."""
+"""The site has all pages, and its reference all public names; `make docs` finds links that lead nowhere."""
 
 from __future__ import annotations
 
