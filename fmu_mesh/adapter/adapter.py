@@ -222,12 +222,6 @@ class FMIAdapter:
             CallRefused: it was called before, or ``time`` is no finite number, or of another kind than those of inputs
                 that were set before.
             InitializationFailed: the FMU refuses a start value, or does not start.
-
-        Example:
-            >>> with fmu_mesh.FMIAdapter("fmus/DampedPendulum.fmu") as pendulum:
-            ...     pendulum.exit_initialization_mode(1000.0)  # 1000 s on our clock is 0 s on that of the FMU
-            ...     pendulum.simulation_time
-            1000.0
         """
         self._demand("initialization", "exit_initialization_mode")
         self._clock = clock_from(self._arguments.time(time))
@@ -256,7 +250,6 @@ class FMIAdapter:
 
         Example:
             >>> with fmu_mesh.FMIAdapter("fmus/Gain.fmu", step_size=1.0) as gain:
-            ...     gain.set_initial_value("k", 1.0)
             ...     gain.exit_initialization_mode(0.0)
             ...     gain.set_input_value("u", 0.0, 10.0)
             ...     gain.set_input_value("u", 2.0, 20.0)  # in between it is linear
@@ -283,14 +276,6 @@ class FMIAdapter:
         Raises:
             CallRefused: the mode, the name or the type is wrong, or the parameter is not tunable.
             StepFailed: the FMU refuses it; only `close` is allowed now.
-
-        Example:
-            >>> with fmu_mesh.FMIAdapter("fmus/Gain.fmu", step_size=1.0) as gain:
-            ...     gain.set_initial_value("u", 3.0)
-            ...     gain.exit_initialization_mode(0.0)
-            ...     gain.set_parameter_value("k", 2.5)
-            ...     print(gain.do_step(), gain.get_output_value("y"))
-            1.0 7.5
         """
         self._demand("stepping", "set_parameter_value")
         converted = self._arguments.value(self._arguments.tunable(name), value)
@@ -303,12 +288,6 @@ class FMIAdapter:
         Raises:
             CallRefused: the mode is wrong, or the step size is not above 0, or not one that this FMU takes.
             StepFailed: the FMU failed; only `close` is allowed now.
-
-        Example:
-            >>> with fmu_mesh.FMIAdapter("fmus/DampedPendulum.fmu", step_size=0.02) as pendulum:
-            ...     pendulum.exit_initialization_mode(0.0)
-            ...     pendulum.do_step(), pendulum.do_step(0.01)
-            (0.02, 0.03)
         """
         self._demand("stepping", "do_step")
         default = self._step_size
@@ -355,13 +334,6 @@ class FMIAdapter:
         Raises:
             CallRefused: the adapter is closed, or there is no such output.
             FmuError: the FMU refuses it; only `close` is allowed now.
-
-        Example:
-            >>> with fmu_mesh.FMIAdapter("fmus/TransportDelay.fmu") as delay:
-            ...     delay.set_initial_value("x", 0.5)
-            ...     delay.exit_initialization_mode(0.0)
-            ...     delay.get_output_value("y")
-            0.5
         """
         self._arguments.output(name)
         return self.get_value(name)
@@ -372,11 +344,6 @@ class FMIAdapter:
         Raises:
             CallRefused: the adapter is closed, or there is no such variable.
             FmuError: the FMU refuses it; only `close` is allowed now.
-
-        Example:
-            >>> with fmu_mesh.FMIAdapter("fmus/DampedPendulum.fmu") as pendulum:
-            ...     pendulum.get_value("g")  # m/s2
-            9.81
         """
         self._demand(None, "get_value")
         self._arguments.any(name)
