@@ -253,7 +253,11 @@ NOT_RUN = [
         "it takes 15 minutes; .ci/long runs it",
     ),
     ("docs/installation.md", "pipx install '.[plot]'", "it installs into your home; .ci/run installs the same wheel"),
-    ("docs/installation.md", "uv tool install '.[plot]'", "it installs into your home; .ci/run installs the same wheel"),
+    (
+        "docs/installation.md",
+        "uv tool install '.[plot]'",
+        "it installs into your home; .ci/run installs the same wheel",
+    ),
     ("docs/installation.md", "python3 -m venv .my-venv", "it downloads 150 MB; .ci/run installs the same wheel"),
     ("docs/performance.md", "make bench", "it takes 20 minutes, and figures of a busy machine mean nothing"),
     (
