@@ -87,7 +87,7 @@ class FmuMeshError(Exception):
         >>> import fmu_mesh
         >>> try:
         ...     fmu_mesh.FMIAdapter("fmus/Gain.fmu", step_size=0.0)
-        ... except FmuMeshError as error:
+        ... except fmu_mesh.FmuMeshError as error:
         ...     print(type(error).__name__, error.exit_code, error.instance)
         ...     print(error)
         CallRefused 2 Gain@...
@@ -179,6 +179,10 @@ class FmuMeshError(Exception):
 
 class Finding(msgspec.Struct, frozen=True):
     """One error in a configuration.
+
+    Example:
+        >>> print(Finding("mesh.yaml", "simulation.algorithm", "'jacob'", "jacobi or gauss_seidel", "jacobi", line=3))
+        mesh.yaml:3: simulation.algorithm: 'jacob'; expected jacobi or gauss_seidel. Did you mean 'jacobi'?
 
     Attributes:
         file: the file that has the error.

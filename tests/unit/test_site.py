@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import importlib.util
 import re
 from collections import Counter
@@ -46,8 +47,8 @@ def described() -> Counter[str]:
     names: Counter[str] = Counter()
     for page in (ROOT / REFERENCE).glob("*.md"):
         for name, options in DIRECTIVE.findall(page.read_text(encoding="utf-8")):
-            members = (yaml.safe_load(options) or {}).get("options", {}).get("members", ())
-            names.update([name.rpartition(".")[2], *members])
+            whole = (yaml.safe_load(options) or {}).get("options", {}).get("members") is True
+            names.update(importlib.import_module(name).__all__ if whole else [name.rpartition(".")[2]])
     return names
 
 
