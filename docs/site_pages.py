@@ -17,7 +17,7 @@ __all__ = ["site_pages"]
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDERS = ("bridges", "docs", "examples")
-COPIED = {".css", ".png", ".svg"}
+COPIED = {".css", ".onnx", ".png", ".svg"}
 LANGUAGES = {".cc": "cpp", ".json": "json", ".py": "python", ".toml": "toml", ".yaml": "yaml"}
 
 _FENCE = re.compile(r"^```.*?^```", re.MULTILINE | re.DOTALL)
@@ -25,10 +25,11 @@ _LINK = re.compile(r"(\]\()(?![a-z]+:|#)([^)#\s]+)((?:#[^)\s]*)?\))")
 
 
 def main(folder: Path) -> None:
-    """Write all pages with their images and styles into ``folder``; what was there is removed."""
+    """Write all pages, and what is shown or linked to as it is, into ``folder``; what was there is removed."""
     shutil.rmtree(folder, ignore_errors=True)
     files = {name: text.encode() for name, text in site_pages().items()}
-    files |= {_name(path): path.read_bytes() for path in ROOT.glob("docs/**/*") if path.suffix in COPIED}
+    copied = (path for part in FOLDERS for path in (ROOT / part).rglob("*") if path.suffix in COPIED)
+    files |= {_name(path): path.read_bytes() for path in copied}
     for name, content in files.items():
         file = folder / name
         file.parent.mkdir(parents=True, exist_ok=True)
