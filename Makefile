@@ -40,10 +40,11 @@ check: $(VENV)/.installed-check $(VENV)/.installed-test ## lint, format, types, 
 	if [ -n "$$failed" ]; then printf "\nmake check failed:$$failed\n" >&2; exit 1; fi; \
 	echo "make check: all clean"
 
-# A link that leads nowhere, or a name that the reference cannot find, ends the build.
+# A link that leads nowhere, a name that the reference cannot find, or a warning about a docstring ends the build.
 docs: $(VENV)/.installed-docs ## the site, with the reference of the library: build/site/index.html
 	@$(BIN)/python docs/site_pages.py build/pages
-	@PATH="$(BIN):$$PATH" $(BIN)/zensical build --strict --clean
+	@PATH="$(BIN):$$PATH" $(BIN)/zensical build --strict --clean >build/site.log 2>&1; code=$$?; cat build/site.log; \
+	if [ $$code -ne 0 ] || grep -q '^griffe: ' build/site.log; then exit 1; fi
 
 bench: $(VENV)/.installed-test ## us and the peers on this machine: one table (about 20 minutes)
 	@$(BIN)/python -m benchmarks
