@@ -10,7 +10,7 @@ from array import array
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TextIO
+from typing import TextIO
 
 import numpy as np
 
@@ -22,10 +22,10 @@ from ..system.system import System
 from ..text import listed, nearest, nearest_file
 from ..variables.model_description import Variable
 from ..variables.value_types import is_float
-from .arguments import add_command
+from .arguments import CommandParser, Parsers, add_quiet
 from .output.drawing import FLAGS, VALUE, Curve, Results, draw
 
-__all__ = ["add_commands", "check_plot", "plot_results", "plotted_where_it_ends", "read_results"]
+__all__ = ["PARSERS", "check_plot", "plot_results", "plotted_where_it_ends", "read_results"]
 
 _TIME = "time"
 _WORDS = {"true": 1.0, "false": 0.0, "": float("nan"), '""': float("nan")}
@@ -34,17 +34,16 @@ _DIMENSIONLESS = ("1", "-")
 """Units that mean no unit."""
 
 
-def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.ArgumentParser) -> None:
-    """Add the command of this module."""
-    plot = add_command(commands, "plot", "plot a result file", [common])
-    plot.add_argument("results", type=Path, metavar="RESULTS.csv", help="the result file")
-    plot.add_argument(
+def _add_plot(parser: CommandParser) -> None:
+    parser.add_argument("results", type=Path, metavar="RESULTS.csv", help="the result file")
+    parser.add_argument(
         "--output", type=Path, metavar="FILE.png", help="file of the picture; default: beside the result file"
     )
-    plot.add_argument(
+    parser.add_argument(
         "--variables", nargs="+", metavar="INSTANCE.VARIABLE", help="plot only these; default: all of the file"
     )
-    plot.set_defaults(run_command=_plot)
+    add_quiet(parser)
+    parser.set_defaults(run_command=_plot)
 
 
 def _plot(arguments: argparse.Namespace) -> int:
@@ -231,3 +230,6 @@ def _meant(text: str, names: Sequence[str]) -> list[str]:
 
 def _either(names: Sequence[str]) -> str:
     return " or ".join(filter(None, [listed([repr(name) for name in names[:-1]], nothing=""), repr(names[-1])]))
+
+
+PARSERS: Parsers = {"plot": _add_plot}

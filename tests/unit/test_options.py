@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from fmu_mesh.cli.arguments import add_options, read_options
 from fmu_mesh.cli.main import command_parser
+from fmu_mesh.cli.run_options import add_options, read_options
 from fmu_mesh.config.findings import Findings
 from fmu_mesh.config.structure import json_schema
 from fmu_mesh.instances.configuration import installed_config, parse
@@ -21,6 +21,7 @@ simulation: {stop_time: 1, step_size: 0.1}
 instances: {gain: {fmu: Gain.fmu}}
 """
 GIVEN: dict[str, tuple[str | None, Any]] = {
+    "algorithm": ("jacobi", "jacobi"),
     "step_size": ("0.5", 0.5),
     "stop_time": ("7", 7.0),
     "window": ("3", 3),
@@ -28,6 +29,7 @@ GIVEN: dict[str, tuple[str | None, Any]] = {
     "update_period": ("0.25", 0.25),
     "catch_up": ("4", 4.0),
     "start_values": ("gain.k=1", ("gain.k=1",)),
+    "config_values": ("zenoh.mode=client", ("zenoh.mode=client",)),
     "output": ("r.csv", Path("r.csv")),
     "listen": ("tcp/127.0.0.1:1", ("tcp/127.0.0.1:1",)),
     "connect": ("tcp/127.0.0.1:2", ("tcp/127.0.0.1:2",)),

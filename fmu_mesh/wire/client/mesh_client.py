@@ -122,15 +122,16 @@ class MeshClient:
 
     def instance_in(self, reference: str) -> str | None:
         """The instance that a reference names; None if it names the mesh as a whole."""
-        name = reference.removeprefix(self.keys.root).strip("/")
+        name = self._within(reference).removeprefix(self.keys.root).strip("/")
         name = name.removesuffix("/info").removesuffix("/status")
         return None if name in ("", "mesh") or reference == self.keys.mesh else name
 
     def targets(self, reference: str) -> list[Target]:
-        """The variables that a reference means: `instance.variable` or a key, either of them with wildcards.
+        """The variables that a reference means: `instance.variable`, `mesh/instance.variable`, or a key.
 
-        In the short form `*` stands for any characters; in a key the wildcards are those of Zenoh.
+        In the short forms `*` stands for any characters; in a key the wildcards are those of Zenoh.
         """
+        reference = self._within(reference)
         if not is_key(reference, self.keys):
             return self._targets_by_name(reference)
         asked = key_expression(reference)
@@ -217,6 +218,11 @@ class MeshClient:
             yield follower.to_the_last() if follower.there.wait(self._timeout_s) else iter(())
 
     # --- names
+
+    def _within(self, reference: str) -> str:
+        """A reference without the name of this mesh in front; a key stays as it is."""
+        whole_key = reference.startswith(f"{self.keys.prefix}/")
+        return reference if whole_key else reference.removeprefix(f"{self.keys.mesh}/")
 
     def _targets_by_name(self, reference: str) -> list[Target]:
         instance, _, name = reference.partition(".")
