@@ -59,7 +59,7 @@ class Keys(msgspec.Struct, frozen=True):
         return f"{self.root}/{instance}/{kind}/{escape(variable)}"
 
     def mesh_key(self, what: Literal["info", "status", "plan", "command", "log", "ros"]) -> str:
-        """A queryable of the master; `status` and `log` are also published, and `ros` begins the keys of the gateways."""
+        """A queryable of the master; `ros` begins the keys of the gateways to ROS."""
         return f"{self.root}/mesh/{what}"
 
     @property
