@@ -149,7 +149,7 @@ def with_config_values(plain: PlainConfig, config_values: Sequence[str]) -> Plai
         option, (path, equals, written) = f"--set-config {text}", text.partition("=")
         keys = path.split(".")
         value = read(written, wrong := Findings(option), {})
-        if not equals or not all(keys):
+        if not (equals and written and all(keys)):
             findings.add(option, "no value of a key", "KEY=VALUE, such as simulation.window=16")
         elif "[" in path:
             findings.add(option, "a key inside a list", f"the whole list, as in {path.partition('[')[0]}=[...]")
