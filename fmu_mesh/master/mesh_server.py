@@ -77,7 +77,8 @@ class MasterServer:
         self._status_published = 0.0
         self._entities: list[zenoh.Queryable[None] | zenoh.Subscriber[None]] = []
         self._log_lines = 0
-        self._kept_log: deque[msgspec.Raw] = deque(maxlen=_KEPT_LINES)
+        self._kept_log: deque[msgspec.Raw] = deque()
+        self._kept_bytes = 0
         self._log_publisher = session.declare_publisher(
             self._keys.mesh_key("log"), encoding=json_encoding, congestion_control=zenoh.CongestionControl.DROP
         )
@@ -132,11 +133,15 @@ class MasterServer:
                 raise MessageRefused("it is not the log of an instance of this mesh")
             self._events.log(line)
             self._log_lines += 1
-            data = msgspec.json.encode(replace(line, number=self._log_lines))
-            self._log_publisher.put(data)
-            self._kept_log.append(msgspec.Raw(data))
-            while sum(map(len, self._kept_log)) > _KEPT_BYTES:
-                self._kept_log.popleft()
+            self._keep(msgspec.json.encode(replace(line, number=self._log_lines)))
+
+    def _keep(self, line: bytes) -> None:
+        """Publish a line of the log of all instances, and keep it; forget the oldest ones beyond the limits."""
+        self._log_publisher.put(line)
+        self._kept_log.append(msgspec.Raw(line))
+        self._kept_bytes += len(line)
+        while len(self._kept_log) > _KEPT_LINES or self._kept_bytes > _KEPT_BYTES:
+            self._kept_bytes -= len(self._kept_log.popleft())
 
     def publish_status(self, *, at_once: bool = False) -> None:
         """Publish the status if it is time to, or ``at_once``."""

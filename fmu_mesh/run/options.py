@@ -53,7 +53,10 @@ class Options(msgspec.Struct, frozen=True):
     Each field is an option, and its annotation says how the command line spells it.
 
     Example:
-        >>> prepare(Path("mesh.yaml"), Options(window=1, start_values=("gain.k=2.5",)))
+        >>> from fmu_mesh.run.preparing import prepare
+        >>> options = Options(step_size=0.004, start_values=("pendulum.l=2",))
+        >>> prepare(Path("configs/pendulum_delay.yaml"), options).grid.last_point
+        10000
     """
 
     algorithm: Annotated[str | None, Flag("--algorithm", "NAME", "simulation.algorithm")] = None

@@ -278,6 +278,19 @@ def test_log_messages_from_before_are_shown_and_chosen_by_instance_and_level(
     assert "Did you mean 'gain'?" in call("logs", "--instance", "gian")[2]
 
 
+def test_of_a_long_log_the_newest_messages_are_kept(call: Call, session: zenoh.Session) -> None:
+    published = Samples(session, f"{ROOT}/mesh/log")
+    for _ in range(1100):
+        session.put(f"{ROOT}/gain/in/u", "1")
+    first = json.loads(published.until(lambda _: True).payload.to_bytes())["number"]
+    published.until(lambda sample: json.loads(sample.payload.to_bytes())["number"] >= first + 1099)
+
+    numbers = [json.loads(line)["number"] for line in call("logs", "--json")[1].splitlines()]
+
+    assert numbers == [*range(numbers[-1] - 999, numbers[-1] + 1)]
+    assert numbers[-1] >= first + 1099
+
+
 def test_set_takes_effect_at_the_point_that_it_answers(call: Call) -> None:
     for name, value in (("free.u", "0.75"), ("gain.k", "-3")):
         code, out, _ = call("set", name, value, "--json")
