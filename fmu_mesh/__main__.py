@@ -4,7 +4,7 @@ import sys
 
 
 def main() -> int:
-    """Import the command, which takes memory and half a second, and run it; returns the exit code."""
+    """Import the command and run it; returns the exit code."""
     try:
         from .run.limits import FEWEST_MIB, address_space_problem  # noqa: PLC0415 an interrupt must find us here
         from .wire.last_exit import LastExit  # noqa: PLC0415 as above
@@ -14,12 +14,13 @@ def main() -> int:
             print(f"fmu-mesh: {problem}", file=sys.stderr)
             return problem.exit_code
         from .cli.main import main as command  # noqa: PLC0415 as above
+
+        return last_exit.with_code(command())  # it imports the module of the command
     except KeyboardInterrupt:
         from .errors import Interrupted  # noqa: PLC0415 as above
 
         print("fmu-mesh: interrupted", file=sys.stderr)
         return Interrupted.exit_code
-    return last_exit.with_code(command())
 
 
 if __name__ == "__main__":

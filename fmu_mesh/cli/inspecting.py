@@ -9,20 +9,22 @@ import textwrap
 from base64 import b64encode
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import msgspec
 
+from .. import files
 from ..api.functions import inspect
 from ..errors import ConfigurationError, LoadFailed
 from ..instances.fmi import read_description, sha256_of
 from ..instances.registry import KINDS
-from ..text import fits, nearest, short_number, shown
+from ..text import fits, nearest, nearest_file, short_number, shown
 from ..variables.model_description import Causality, Kind, ModelDescription, Variable
-from .arguments import add_command, no_fmu
+from .arguments import CommandParser, Parsers, add_json
+from .output.json_output import print_failure
 from .output.tables import pairs
 
-__all__ = ["Inspection", "add_commands", "inspect_fmu", "inspection_page"]
+__all__ = ["PARSERS", "Inspection", "inspect_fmu", "inspection_page", "no_fmu"]
 
 _SHOWN_VARIABLES: Final = 20
 """Variables of one causality on a page without `--all`."""
@@ -68,21 +70,19 @@ class Inspection(msgspec.Struct, frozen=True, omit_defaults=False):
     description: ModelDescription
 
 
-def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.ArgumentParser) -> None:
-    """Add the commands of this module."""
-    inspect = add_command(commands, "inspect", "show the properties of an FMU, without running it", [common])
-    inspect.add_argument("fmu", type=Path, metavar="MODEL.fmu", help="the FMU, or the folder of an unpacked one")
-    inspect.add_argument(
+def _add_inspect(parser: CommandParser) -> None:
+    parser.add_argument("fmu", type=Path, metavar="MODEL.fmu", help="the FMU, or the folder of an unpacked one")
+    parser.add_argument(
         "variables",
         nargs="*",
         metavar="VARIABLE",
         help="show only these variables; * stands for any characters",
     )
-    inspect.add_argument(
+    parser.add_argument(
         "--all", action="store_true", help=f"show all variables instead of {_SHOWN_VARIABLES} of each causality"
     )
-    inspect.add_argument("--json", action="store_true", help="print everything as JSON")
-    inspect.set_defaults(run_command=_inspect)
+    add_json(parser, "print everything as one JSON object")
+    parser.set_defaults(run_command=_inspect)
 
 
 def inspect_fmu(path: Path) -> Inspection:
@@ -115,6 +115,17 @@ def inspect_fmu(path: Path) -> Inspection:
     )
 
 
+def no_fmu(path: Path, error: LoadFailed) -> ConfigurationError:
+    """The error for a path that should be an FMU and is something else, or nothing."""
+    hint = error.hint
+    if not files.exists(path):
+        near = nearest_file(path)
+        hint = f"Did you mean '{near}'?" if near is not None else hint
+    elif path.suffix in (".yaml", ".yml"):
+        hint = f"A configuration is run by `fmu-mesh launch {path}`."
+    return ConfigurationError(error.message, hint=hint)
+
+
 def inspection_page(
     inspection: Inspection, width: int, patterns: Sequence[str] = (), *, everything: bool = False
 ) -> list[str]:
@@ -141,7 +152,12 @@ def inspection_page(
 
 
 def _inspect(arguments: argparse.Namespace) -> int:
-    inspection = inspect_fmu(arguments.fmu)
+    try:
+        inspection = inspect_fmu(arguments.fmu)
+    except ConfigurationError as error:
+        if arguments.json:
+            print_failure(error)
+        raise
     if arguments.json:
         sys.stdout.buffer.write(msgspec.json.format(msgspec.json.encode(inspection)) + b"\n")
         return 0
@@ -265,3 +281,6 @@ def _start(variable: Variable) -> str:
             item = next((item for item, value in variable.items if value == start), None)
             text = f"{item} ({start})" if item is not None else shown(start)
     return f"= {text} {unit}".rstrip()
+
+
+PARSERS: Parsers = {"inspect": _add_inspect}

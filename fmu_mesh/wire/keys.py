@@ -58,7 +58,7 @@ class Keys(msgspec.Struct, frozen=True):
         """Value of one variable."""
         return f"{self.root}/{instance}/{kind}/{escape(variable)}"
 
-    def mesh_key(self, what: Literal["info", "status", "plan", "command", "ros"]) -> str:
+    def mesh_key(self, what: Literal["info", "status", "plan", "command", "log", "ros"]) -> str:
         """A queryable of the master; `ros` begins the keys of the gateways to ROS."""
         return f"{self.root}/mesh/{what}"
 

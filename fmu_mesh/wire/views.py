@@ -105,13 +105,14 @@ class InstanceStatus(msgspec.Struct, frozen=True):
 
 
 class LogLine(msgspec.Struct, frozen=True):
-    """One line of `…/<instance>/log`."""
+    """One line of `…/<instance>/log`, and of `…/mesh/log`, where ``number`` counts the lines of all from 1."""
 
     instance: str
     status: str
     category: str
     message: str
     point: int
+    number: int = 0
 
 
 class SetAnswer(msgspec.Struct, frozen=True):

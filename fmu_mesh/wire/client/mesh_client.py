@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from itertools import chain
 from typing import Any, TypeVar, cast
 
 import msgspec
@@ -28,6 +29,7 @@ from ..views import (
     CommandAnswer,
     InstanceInfo,
     InstanceStatus,
+    LogLine,
     MeshInfo,
     MeshStatus,
     RosView,
@@ -124,15 +126,16 @@ class MeshClient:
 
     def instance_in(self, reference: str) -> str | None:
         """The instance that a reference names; None if it names the mesh as a whole."""
-        name = reference.removeprefix(self.keys.root).strip("/")
+        name = self._within(reference).removeprefix(self.keys.root).strip("/")
         name = name.removesuffix("/info").removesuffix("/status")
         return None if name in ("", "mesh") or reference == self.keys.mesh else name
 
     def targets(self, reference: str) -> list[Target]:
-        """The variables that a reference means: `instance.variable` or a key, either of them with wildcards.
+        """The variables that a reference means: `instance.variable`, `mesh/instance.variable`, or a key.
 
-        In the short form `*` stands for any characters; in a key the wildcards are those of Zenoh.
+        In the short forms `*` stands for any characters; in a key the wildcards are those of Zenoh.
         """
+        reference = self._within(reference)
         if not is_key(reference, self.keys):
             return self._targets_by_name(reference)
         asked = key_expression(reference)
@@ -218,7 +221,31 @@ class MeshClient:
                 follower.subscribe(target.key, Keeper(target, follower.arrived).keep)
             yield follower.to_the_last() if follower.there.wait(self._timeout_s) else iter(())
 
+    @contextmanager
+    def logs(self, *, follow: bool) -> Iterator[Iterator[LogLine]]:
+        """The log messages that the mesh has kept, the oldest first; then all new ones until it ends, if ``follow``."""
+        with Follower[LogLine](self._session, self.keys) as follower:
+
+            def take(sample: zenoh.Sample) -> None:
+                with suppress(MessageRefused):
+                    follower.arrived.put(decode_json(sample.payload.to_bytes(), LogLine))
+
+            if follow:  # from before the question, so that no message is missing between the two
+                follower.subscribe(self.keys.mesh_key("log"), take)
+            kept = self._view(self.keys.mesh_key("log"), list[LogLine], f"mesh '{self.keys.mesh}'")
+            last = kept[-1].number if kept else 0
+            there = follow and follower.there.wait(self._timeout_s)
+            new = follower.to_the_last() if there else iter(())
+            yield chain(kept, (line for line in new if line.number > last))
+
     # --- names
+
+    def _within(self, reference: str) -> str:
+        """A reference without the name of this mesh in front; of `mesh/instance/out/y` the whole key."""
+        short = reference.removeprefix(f"{self.keys.mesh}/")
+        if short == reference or reference.startswith(f"{self.keys.prefix}/"):
+            return reference
+        return f"{self.keys.root}/{short}" if "/" in short.partition(".")[0] else short
 
     def _targets_by_name(self, reference: str) -> list[Target]:
         instance, _, name = reference.partition(".")

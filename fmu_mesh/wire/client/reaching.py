@@ -106,7 +106,7 @@ class Meshes:
             DeadlineExceeded: it does not answer.
         """
         if mesh is None:
-            return self.one(None) if self._found else None
+            return self.named(None) if self._found else None
         return self.named(mesh) if any(found.is_called(mesh) for found in self._found) else None
 
     def all(self) -> list[MeshClient]:
@@ -168,25 +168,29 @@ class Meshes:
             raise _same_name(running, listed([found.keys.mesh for found in running]))
         raise ConfigurationError(
             f"{len(running)} meshes are running: {listed([found.keys.mesh for found in running])}.",
-            hint=f"Say which one by a full key, such as '{running[0].keys.root}/INSTANCE/out/VARIABLE'.",
+            hint=f"Say which one, as in '{running[0].keys.mesh}/INSTANCE.VARIABLE'.",
         )
 
-    def named(self, mesh: str) -> MeshClient:
-        """The mesh with this name, or with this key.
+    def named(self, mesh: str | None) -> MeshClient:
+        """The mesh with this name, or with this key; None for the only one.
 
         Raises:
             ConfigurationError: there is none, or more than one.
             DeadlineExceeded: it does not answer.
         """
         running = self._running()
-        named = [found for found in running if found.is_called(mesh)]
+        named = [found for found in running if mesh is None or found.is_called(mesh)]
         if len(named) == 1:
             return self._client(named[0])
         if named:
             roots = listed([found.keys.root for found in named])
             if len({found.keys.root for found in named}) < len(named):
                 raise _same_name(named, roots)
+            if mesh is None:
+                names = listed([found.keys.mesh for found in named])
+                raise ConfigurationError(f"{len(named)} meshes are running: {names}.", hint="Give the name of one.")
             raise ConfigurationError(f"{len(named)} meshes are named '{mesh}': {roots}.", hint="Give the key.")
+        assert mesh is not None  # otherwise all that are running would be meant, at least one
         raise _not_running(mesh, running)
 
     def _running(self) -> list[_Found]:
@@ -316,7 +320,9 @@ class _Found(NamedTuple):
 
 def _means(keys: Keys, reference: str) -> bool:
     """Whether a reference says that it is about this mesh."""
-    if reference in (keys.mesh, keys.root):
+    if reference in (keys.mesh, keys.root) or (
+        reference.startswith(f"{keys.mesh}/") and not reference.startswith(f"{keys.prefix}/")
+    ):
         return True
     return is_key(reference, keys) and key_expression(reference).intersects(zenoh.KeyExpr(f"{keys.root}/**"))
 
@@ -331,6 +337,9 @@ def _same_name(found: Sequence[_Found], names: str) -> ConfigurationError:
 
 def _not_running(reference: str, running: Sequence[_Found]) -> ConfigurationError:
     names = [name for found in running for name in (found.keys.mesh, found.keys.root)]
+    first = reference.partition("/")[0]
+    if "/" in reference and not any(reference.startswith(f"{found.keys.prefix}/") for found in running):
+        names = [found.keys.mesh + reference.removeprefix(first) for found in running]
     suggestion = nearest(reference, names)
     hint = (
         f"Did you mean '{suggestion}'?"
