@@ -1,4 +1,4 @@
-"""What may be set from outside while a node runs: unconnected inputs and tunable parameters; all else with a reason."""
+"""Which variables may be set from outside during a run: unconnected inputs and tunable parameters, no others."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ __all__ = ["Setting", "checked_setting"]
 
 
 class Setting(msgspec.Struct, frozen=True):
-    """A value for a variable; ``time`` (s) is from when on, of an input; None: from the next point on."""
+    """A value for a variable. ``time`` (s): from when on it holds, for an input; None: from the next point on."""
 
     variable: str
     value: Value
