@@ -303,7 +303,7 @@ class Recorder:
             self._put_progress(HEADER.pack(PROGRESS, 0, 0, complete))
 
     def _report(self, error: FmuMeshError | None) -> None:
-        """Report to the master how recording ended; a master that ends accepts no reports, and waits for this thread."""
+        """Report to the master how recording ended. A master that ends accepts no reports; it waits for this thread."""
         report = NodeReport(RECORDER, max(self._written - 1, 0), error.report() if error is not None else None)
         patience_s, left = self._plan.timeouts.stop, self._leaving.is_set
         try:
