@@ -1,8 +1,8 @@
 """Messages between processes of one host through shared memory: bounded buffers, and a semaphore to wait for.
 
 A receiver owns anonymous memory with one buffer for each of its senders. An `Offer` contains its process id and file
-descriptor, with which processes of the same user can open it; a random token proves that it is the same host. There is no
-file, so nothing is left behind if a process is killed.
+descriptor, with which processes of the same user can open it; a random token proves that it is the same host. There is
+no file, so nothing is left behind if a process is killed.
 
 Each buffer is Dijkstra's bounded buffer: the semaphore ``items`` counts messages that are written, ``spaces`` messages
 that are read. These semaphores determine the order of all memory accesses between processes, on every processor. The
