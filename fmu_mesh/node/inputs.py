@@ -1,4 +1,4 @@
-"""Unconnected inputs over time: values that a program sends together with the time from which on they hold.
+"""Unconnected inputs and tunable parameters over time: values that a program sends with a time from which on they hold.
 
 Owns how a step gets its value from them, as `fmi_adapter` does for a ROS node. `fmu_mesh.node.settings` decides which
 settings are allowed.
@@ -73,7 +73,7 @@ class TimedInputs(AroundInstance[Instance]):
         self._step = step + 1
 
     def add(self, name: str, value: Value, time: float | None) -> int:
-        """Give an input a value from ``time`` (s; None: now) on; return the first own step that uses it.
+        """Give a variable a value from ``time`` (s; None: now) on; return the first own step that uses it.
 
         Raises:
             ValueRefused: too many values wait for their time, or this one is too late.
@@ -88,7 +88,8 @@ class TimedInputs(AroundInstance[Instance]):
             raise ValueRefused(f"the time {when:g} s is later than any run ends")
         if name not in self._trajectories:
             variable = self.description.variable(name)
-            linear = self._linear and variable is not None and is_float(variable.type)
+            is_input = variable is not None and variable.causality == "input"
+            linear = self._linear and variable is not None and is_input and is_float(variable.type)
             trajectory = Trajectory(Samples(linear))
             if when > now:
                 trajectory.add(now, self._instance.get_values([name])[0])
@@ -97,6 +98,11 @@ class TimedInputs(AroundInstance[Instance]):
             raise ValueRefused(f"{_WAITING} values of '{name}' wait for their time already")
         self._trajectories[name].add(when, value)
         return math.ceil(max(steps, self._step))
+
+    def follows(self, name: str) -> bool:
+        """Whether a variable gets its values over time: every input does, and a parameter that got one with a time."""
+        variable = self.description.variable(name)
+        return name in self._trajectories or (variable is not None and variable.causality == "input")
 
     def get_state(self) -> object:
         """See `KeepsState`; values with a later time are part of the state."""
@@ -159,12 +165,10 @@ def set_input(runner: Runner, name: str, value: Value, time: float | None) -> in
         FmuError: the FMU refused it.
         ValueRefused: too many values wait for their time, or this one is too late.
     """
-    variable = runner.instance.description.variable(name)
-    is_input = variable is not None and variable.causality == "input"
-    if is_input and time is not None and not isinstance(runner.instance, TimedInputs):
+    if time is not None and not isinstance(runner.instance, TimedInputs):
         timed = runner.wrap(lambda instance: TimedInputs(instance, "hold"))
         timed.start(runner.grid, runner.plan.step_points, runner.step)
-    if is_input and isinstance(runner.instance, TimedInputs):
+    if isinstance(runner.instance, TimedInputs) and (time is not None or runner.instance.follows(name)):
         return runner.instance.add(name, value, time)
     runner.instance.set_values({name: value})
     return runner.step

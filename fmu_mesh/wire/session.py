@@ -251,6 +251,7 @@ class Question(msgspec.Struct, frozen=True):
         whom: the receiver, for the error.
         deadline_s: how long to wait for an answer, in s.
         payload: JSON of the query, if there is any.
+        attachment: JSON of the attachment, if there is any.
         answer_s: how long an existing queryable may take to answer, in s, if that is longer.
         priority: the query overtakes messages of lower priority, and follows earlier ones of the same priority.
     """
@@ -259,6 +260,7 @@ class Question(msgspec.Struct, frozen=True):
     whom: str
     deadline_s: float
     payload: bytes | None = None
+    attachment: bytes | None = None
     answer_s: float | None = None
     priority: zenoh.Priority = zenoh.Priority.DEFAULT
 
@@ -299,7 +301,7 @@ def answers(
                     # Zenoh does not report that the process of the queryable is gone: it would wait for the timeout.
                     replies: queue.SimpleQueue[zenoh.Reply | None] = queue.SimpleQueue()
                     handler = Callback(replies.put, partial(replies.put, None))
-                    querier.get(handler, payload=question.payload, encoding=encoding)
+                    querier.get(handler, payload=question.payload, encoding=encoding, attachment=question.attachment)
                     if samples := _collected(replies, over, every=every):
                         return samples
                 if over():
