@@ -28,14 +28,14 @@ _WAITING = 1 << 16
 
 
 class TimedInputs(AroundInstance[Instance]):
-    """An `Instance` whose unconnected inputs follow trajectories; all other calls go to the inner instance.
+    """An `Instance` whose inputs and parameters may follow trajectories; all other calls go to the inner instance.
 
-    The step from t sets each of these inputs to its value at t. A value without a time holds from the next step on. So
-    does a value with a past time, unless a value with a later time is already used. All kinds of instances can be used.
+    The step from t sets each of these variables to its value at t. A value without a time holds from the next step on.
+    So does a value with a past time, unless a value with a later time is already used. All kinds of instances can be used.
 
     Args:
         instance: the inner instance.
-        interpolation: linear between two times for Reals, or constant from each time on.
+        interpolation: linear between two times for inputs of type Real, or constant from each time on.
     """
 
     def __init__(self, instance: Instance, interpolation: Literal["hold", "linear"]) -> None:

@@ -14,7 +14,7 @@ __all__ = ["Setting", "checked_setting"]
 
 
 class Setting(msgspec.Struct, frozen=True):
-    """A value for a variable. ``time`` (s): from when on it holds, for an input; None: from the next point on."""
+    """A value for a variable; ``time`` (s): from when on it holds; None: from the next point on."""
 
     variable: str
     value: Value
