@@ -31,7 +31,7 @@ class TimedInputs(AroundInstance[Instance]):
     """An `Instance` whose inputs and parameters may follow trajectories; all other calls go to the inner instance.
 
     The step from t sets each of these variables to its value at t. A value without a time holds from the next step on.
-    So does a value with a past time, unless a value with a later time is already used. All kinds of instances can be used.
+    So does a value with a past time, unless a value with a later time is already used. The instance may be of any kind.
 
     Args:
         instance: the inner instance.
