@@ -150,7 +150,7 @@ class Master:
         if others:
             self._token.undeclare()
             raise ConfigurationError(
-                f"mesh '{self._keys.mesh}' runs already where this one connects to",
+                f"mesh '{self._keys.mesh}' is already running where this master connects",
                 hint="Stop it first, or give this mesh another name or another `zenoh.key_prefix`.",
             )
         self._declare()
@@ -333,7 +333,7 @@ class Master:
     def _take_progress(self, node: str, kind: int, _link: int, _count: int, point: int, _data: bytes) -> bool:
         """Store the progress of a node; return whether it has increased."""
         if kind != PROGRESS:
-            self._inbox.refusals.add(spoken(node), f"a message of kind {kind} is nothing that the master takes")
+            self._inbox.refusals.add(spoken(node), f"a message of kind {kind} is not one that the master accepts")
             return False
         if not self._may_be_at(node, point):
             self._fail(self._broken(node, f"is at point {point}"))
@@ -367,7 +367,7 @@ class Master:
         node = RunKeys.node_in(str(query.key_expr))
         report = decode_json(payload_of(query), NodeReport)
         if report.node != node or not self._members.is_admitted(node):
-            raise MessageRefused("it is from no node that has registered")
+            raise MessageRefused("its sender has not registered")
         error = from_report(report.error) if report.error is not None else None
         if isinstance(error, TerminationRequested):
             # Its node continues with its other instances, and reports this again at the end.
@@ -394,7 +394,7 @@ class Master:
         return ProtocolBroken(
             f"{spoken(node)} says that it {what}, and the master has granted point {self._grant}",
             instance=self._instances_of(node),
-            hint="Does somebody else send in its name?",
+            hint="Does another process send messages with its name?",
         )
 
     def _instances_of(self, node: str) -> str | None:

@@ -124,7 +124,7 @@ class Members:
         node = RunKeys.node_in(str(query.key_expr))
         data = payload_of(query)
         if node not in self._admitted or node in self._ready:
-            raise MessageRefused("it is from no node that has registered")
+            raise MessageRefused("its sender has not registered")
         ready = decode_json(data, NodeReady)
         outlet = SharedOutlet.open(ready.offer, MASTER, spoken(node), self._inbox.stash, self._timeouts.step)
         if outlet is not None and self._inbox.offer is not None:
@@ -239,10 +239,10 @@ class Followers:
     def wait(self, timeout_s: float) -> None:
         """Wait until all followers have their last sample, for at most ``timeout_s`` seconds."""
         if self._lost:
-            log.warning("a gateway was gone before the last point; ROS has nothing of what came after it")
+            log.warning("a gateway was lost before the last point; ROS did not get the samples after it")
         deadline = time.monotonic() + timeout_s
         while self._there:
             if (left := deadline - time.monotonic()) <= 0:
-                log.warning("a gateway did not take its last samples within %g s", timeout_s)
+                log.warning("a gateway did not receive its last samples within %g s", timeout_s)
                 return
             self._inbox.wait(left)

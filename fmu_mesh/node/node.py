@@ -317,7 +317,7 @@ class Node:
         elif kind == INITIAL:
             self._initialization.take(receiver.link, point, data)
         else:
-            raise MessageRefused(f"a message of kind {kind} is nothing that a node sends")
+            raise MessageRefused(f"a message of kind {kind} is not one that a node sends")
 
     def _take_from_master(self, message: Message) -> None:
         _, kind, _, _, point, data = message
@@ -326,7 +326,7 @@ class Node:
             if point > most:
                 raise ProtocolBroken(
                     f"the master grants point {point} to node '{self._plan.node}', which may be granted {most} at most",
-                    hint="Does somebody else send in its name?",
+                    hint="Does another process send messages with its name?",
                 )
             self._heard = time.monotonic()
             self._grant = max(self._grant, min(point, self._plan.grid.last_point))
@@ -335,7 +335,7 @@ class Node:
         elif kind == ABORT:
             raise _Aborted(from_report(decode_abort(data)))
         else:
-            raise MessageRefused(f"a message of kind {kind} is nothing that the master sends")
+            raise MessageRefused(f"a message of kind {kind} is not one that the master sends")
 
     def _covered(self) -> int:
         return min(runner.covered for runner in self._runners.values())

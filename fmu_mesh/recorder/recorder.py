@@ -193,7 +193,7 @@ class Recorder:
                     self._write_complete_rows()
                     self._tell_progress()
             elif time.monotonic() - heard > self._plan.timeouts.step:
-                raise DeadlineExceeded("the recorder heard nothing from the master")
+                raise DeadlineExceeded("the recorder received nothing from the master")
         while self._leaving.is_set() and (message := self._inbox.poll()) is not None:
             self._take(message)  # messages that arrived before the end, above all its reason
 
@@ -226,7 +226,7 @@ class Recorder:
         elif kind == LAST:
             source.end()
         elif kind != INITIAL:
-            raise MessageRefused(f"a message of kind {kind} is nothing that a node sends")
+            raise MessageRefused(f"a message of kind {kind} is not one that a node sends")
 
     def _take_from_master(self, message: Message) -> None:
         _, kind, _, _, _, data = message
@@ -237,7 +237,7 @@ class Recorder:
             self._take_last_rows(cause)
             raise _Ended(cause)
         elif kind != GRANT:
-            raise MessageRefused(f"a message of kind {kind} is nothing that the master sends")
+            raise MessageRefused(f"a message of kind {kind} is not one that the master sends")
 
     def _fits(self, link: Link, end: int) -> bool:
         """Whether rows of a source before its own step ``end`` overwrite no rows that are not written yet."""

@@ -51,15 +51,14 @@ class FrameReceiver:
         """
         rows = decode_rows(data, count, self._parts)
         if first < 0:
-            raise MessageRefused(f"a frame from point {first} on holds none of the run")
+            raise MessageRefused(f"a frame from point {first} on has no point of this run")
         if count > self.kept.rows or (first <= self.received < first + count and not self._fits(first + count)):
             last = (first + count - 1) * self.link.step_points
             raise ProtocolBroken(
-                f"'{self.link.source}' sends its values up to point {last} to {self._target}, which has no room for "
-                "them: more than was granted",
+                f"'{self.link.source}' sends its values up to point {last} to {self._target}, more than was granted",
                 instance=self.link.source,
                 point=first * self.link.step_points,
-                hint="Does somebody else send in its name?",
+                hint="Does another process send messages with its name?",
             )
         if first > self.received:
             missing, last = self.received * self.link.step_points, first * self.link.step_points - 1

@@ -225,7 +225,7 @@ class _ZenohSource:
         key = str(sample.key_expr)
         sender = self._senders.get(key)
         if sender is None:
-            self._refusals.add(key, "nobody of this run sends on this key")
+            self._refusals.add(key, "no participant of this run sends with this key")
             return _NOBODY, b""
         return sender, sample.payload.to_bytes()
 

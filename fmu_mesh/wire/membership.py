@@ -185,7 +185,7 @@ class Membership:
             MeshLost: the master refused this node; the message says why.
         """
         if not self._answered.wait(patience_s):
-            raise DeadlineExceeded(f"nobody answered for the master within {patience_s:g} s")
+            raise DeadlineExceeded(f"the master did not answer within {patience_s:g} s")
         if self._refusal is not None:
             raise self._refusal
         assert self._keys is not None
@@ -306,7 +306,7 @@ class Membership:
         with self._inbox.refusals.guard(str(query.key_expr), query):
             hello = decode_json(payload_of(query), Hello)
             if hello.node not in {link.target_node for link in self._plan.links_out}:
-                raise MessageRefused("it is from no node that this one sends to")
+                raise MessageRefused("its sender receives nothing from this node")
             outlet = self._outlet(hello.offer, hello.node, f"node '{hello.node}'")
             query.reply(query.key_expr, _SHARED if outlet is not None else b"")
             query.drop()

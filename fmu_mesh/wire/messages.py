@@ -78,7 +78,7 @@ def decode_json(data: bytes, type_: type[T], most: int = MAX_MESSAGE_SIZE) -> T:
         MessageRefused: it is not JSON of that type, or larger.
     """
     if len(data) > most:
-        raise MessageRefused(f"it has {len(data)} bytes, and {most} are the most")
+        raise MessageRefused(f"it has {len(data)} bytes; the limit is {most}")
     try:
         return msgspec.json.decode(data, type=type_)
     # msgspec does not catch exceptions of Python itself, such as UnicodeDecodeError.

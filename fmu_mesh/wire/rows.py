@@ -48,7 +48,7 @@ def encode_frames(kind: int, link: int, first: int, rows: Rows) -> Iterator[byte
         return
     half = len(rows[0]) // 2
     if not half:
-        text = f"the values of one point take {len(message)} bytes, and {MAX_MESSAGE_SIZE} are the most"
+        text = f"the values of one point take {len(message)} bytes; the limit is {MAX_MESSAGE_SIZE}"
         raise FmuMeshError(text, hint="Connect and record fewer or smaller variables.")
     yield from encode_frames(kind, link, first, tuple(part[:half] for part in rows))
     yield from encode_frames(kind, link, first + half, tuple(part[half:] for part in rows))
@@ -61,7 +61,7 @@ def decode_rows(data: bytes, count: int, parts: Sequence[Part]) -> Rows:
         MessageRefused: it does not contain exactly these rows.
     """
     if len(data) > MAX_MESSAGE_SIZE:
-        raise _refused(data, count, f"{MAX_MESSAGE_SIZE} are the most")
+        raise _refused(data, count, f"at most {MAX_MESSAGE_SIZE} are allowed")
     place = HEADER.size
     rows: list[NDArray[Any]] = []
     for type_, _, width in parts:

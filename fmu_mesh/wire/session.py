@@ -165,7 +165,7 @@ def own_endpoints(session: zenoh.Session, deadline_s: float = 5.0) -> tuple[str,
     Raises:
         DeadlineExceeded: they are not known within ``deadline_s`` seconds.
     """
-    answer = ask(session, Question(f"@/{session.zid()}/*", "the session's own endpoints", deadline_s))
+    answer = ask(session, Question(f"@/{session.zid()}/*", "this Zenoh session", deadline_s))
     return tuple(str(locator) for locator in json.loads(answer).get("locators", ()))
 
 
@@ -305,11 +305,11 @@ def answers(
                     if samples := _collected(replies, over, every=every):
                         return samples
                 if over():
-                    raise MeshLost(f"{question.whom} has not answered yet, and the asker gave up")
+                    raise MeshLost(f"{question.whom} has not answered yet, and this process does not wait any more")
                 changed.wait(min(left, _LOOK_S))
         finally:
             listener.undeclare()
-    raise DeadlineExceeded(f"nobody answered for {question.whom} within {question.deadline_s:g} s")
+    raise DeadlineExceeded(f"{question.whom} did not answer within {question.deadline_s:g} s")
 
 
 def answer_of(reply: zenoh.Reply) -> zenoh.Sample | None:

@@ -77,7 +77,7 @@ class Follower(Generic[Item]):
         try:
             return self.arrived.get(timeout=max(0.0, deadline - time.monotonic()))
         except queue.Empty:
-            raise DeadlineExceeded(f"mesh '{self._keys.mesh}' says nothing more in time") from None
+            raise DeadlineExceeded(f"mesh '{self._keys.mesh}' did not end in time") from None
 
     def _token_changed(self, sample: zenoh.Sample) -> None:
         if sample.kind == zenoh.SampleKind.PUT and not self._over:
