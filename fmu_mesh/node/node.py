@@ -8,7 +8,7 @@ One step of a node, in pseudocode::
             send the frames that are full, or whose burst is over
         handle the messages that arrived: frames go into the input rings, a higher grant is stored
         if nothing was stepped:
-            send all frames, tell the master the progress, wait for the next message
+            send all frames, send the progress to the master, wait for the next message
 
 Owns the life of the process between `ready` and `done`. The FMUs are only called here, on the main thread; queries are
 served by `fmu_mesh.node.node_server` from snapshots.
@@ -85,7 +85,7 @@ class Node:
         open_instance: opens an instance of the plan by name; the caller closes the instances too.
         on_hang: called on another thread if a step does not return in time.
         router: the link to the router that connects this node to the others, if there is one.
-        launch: the launcher that started this process; None where it was started by hand.
+        launch: the launcher that started this process; None if it was started manually.
 
     Attributes:
         failure_is_known: whether others know what ended the run: the master knows it, or is gone.

@@ -246,7 +246,7 @@ def remove_stale_folders() -> None:
     for folder in runtime_folder().glob("*.hand"):
         tidy_run_folder(folder)
         for empty in (folder / "fmus", folder):
-            with suppress(OSError):  # somebody uses it
+            with suppress(OSError):  # a process still uses it
                 empty.rmdir()
 
 
