@@ -12,9 +12,11 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from .adapter import FMIAdapter
-    from .api.mesh_builder import Check, Mesh, load
+    from .api.functions import attach, inspect, load, meshes
+    from .api.mesh_builder import Check, Mesh
     from .api.result import Result
-    from .api.run_handle import Run, Sample, attach
+    from .api.run_handle import Run
+    from .api.samples import Sample
     from .errors import (
         CallRefused,
         ConfigurationError,
@@ -59,18 +61,22 @@ __all__ = [
     "UnknownName",
     "__version__",
     "attach",
+    "inspect",
     "load",
+    "meshes",
 ]
 
 _PLACES = {
     "FMIAdapter": "adapter",
     "Check": "api.mesh_builder",
     "Mesh": "api.mesh_builder",
-    "load": "api.mesh_builder",
+    "load": "api.functions",
     "Result": "api.result",
     "Run": "api.run_handle",
-    "Sample": "api.run_handle",
-    "attach": "api.run_handle",
+    "Sample": "api.samples",
+    "attach": "api.functions",
+    "inspect": "api.functions",
+    "meshes": "api.functions",
 }
 """The modules of the public names; all others are exceptions."""
 

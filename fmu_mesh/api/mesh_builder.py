@@ -25,7 +25,7 @@ from .result import Result
 from .run_handle import Run
 from .run_thread import MEMORY_LIMIT, RunThread, Settings, memory_file
 
-__all__ = ["Check", "Mesh", "RunOptions", "load"]
+__all__ = ["Check", "Mesh", "RunOptions"]
 
 log = logging.getLogger("fmu_mesh.run")
 
@@ -275,10 +275,10 @@ class Mesh:
         Example:
             >>> import fmu_mesh
             >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
-            >>> mesh.connect("pendulum.b", "delay.x")
+            >>> mesh.add("gain", fmu="../fmus/Gian.fmu")
             >>> for finding in mesh.check().findings:
-            ...     print(finding.path, finding.suggestion)
-            connections[1].from pendulum.a
+            ...     print(finding.path, finding.suggestion[-8:])
+            instances.gain.fmu Gain.fmu
         """
         try:
             run = self._planned(_options_of(options))
@@ -363,21 +363,6 @@ class Mesh:
         if not isinstance(section, dict):
             raise ConfigurationError(f"'{key}' of '{self._plain.file}' is {shown(section)}, where a mapping should be")
         return section
-
-
-def load(path: str | Path) -> Mesh:
-    """Read a configuration file.
-
-    Example:
-        >>> import fmu_mesh
-        >>> fmu_mesh.load("configs/pendulum_delay.yaml").instances
-        ['pendulum', 'delay']
-
-    Raises:
-        ConfigurationError: the file cannot be read, or is no YAML. What it means is checked by `Mesh.check`, and before
-            a run.
-    """
-    return Mesh.from_file(path)
 
 
 def _options_of(given: RunOptions, memory: Path | None = None) -> Options:

@@ -29,6 +29,7 @@ from .instance_wrapper import AroundInstance
 
 __all__ = [
     "DEFAULT_MODE",
+    "ENDED",
     "CallWatch",
     "Guarded",
     "call_named",
@@ -57,6 +58,9 @@ _ENVIRONMENT_BYTES: Final = 512
 """More than the size of `fenv_t` on any platform."""
 _ACTION_BYTES: Final = 512
 """More than the size of `struct sigaction` on any platform."""
+ENDED: Final = "; its process is ended"
+"""What an error about a call that does not return ends with, where that is so."""
+
 _DEFAULT_ENVIRONMENT: Final = ctypes.c_void_p(-1)
 """`FE_DFL_ENV` of the C libraries on x86 and ARM."""
 
@@ -209,7 +213,7 @@ class CallWatch:
     def _overrun(self, call: _Call, now: float) -> FmuError:
         function = current_function(self._caller) or ("doStep" if call.kind is StepFailed else "a call")
         return call.kind(
-            f"the FMU has not returned for {now - call.started:.1f} s from {function}; its process is ended",
+            f"the FMU has not returned for {now - call.started:.1f} s from {function}{ENDED}",
             instance=call.instance,
             hint=f"If it needs that long, raise `timeouts.{call.setting}` in the configuration.",
         )
