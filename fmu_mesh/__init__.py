@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from .adapter import FMIAdapter
     from .api.functions import attach, inspect, load, meshes
     from .api.mesh_builder import Check, Mesh
+    from .api.open_system import System, SystemState
     from .api.result import Result
     from .api.run_handle import Run
     from .api.samples import Sample
@@ -58,6 +59,8 @@ __all__ = [
     "Run",
     "Sample",
     "StepFailed",
+    "System",
+    "SystemState",
     "UnknownName",
     "__version__",
     "attach",
@@ -74,6 +77,8 @@ _PLACES = {
     "Result": "api.result",
     "Run": "api.run_handle",
     "Sample": "api.samples",
+    "System": "api.open_system",
+    "SystemState": "api.open_system",
     "attach": "api.functions",
     "inspect": "api.functions",
     "meshes": "api.functions",

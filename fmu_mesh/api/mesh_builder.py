@@ -21,6 +21,7 @@ from ..run.preparing import planned
 from ..run.run_plan import RunPlan
 from ..text import listed, shown
 from ..wire.views import MeshStatus
+from .open_system import System
 from .result import Result
 from .run_handle import Run
 from .run_thread import MEMORY_LIMIT, RunThread, Settings, memory_file
@@ -343,6 +344,28 @@ class Mesh:
             if memory is not None:
                 memory.parent.rmdir()
             raise
+
+    def open(self, start_values: Mapping[str, Any] | None = None) -> System:
+        """Open all instances in this process, for a program that steps them itself (docs/stepping.md).
+
+        Nothing is recorded into a file, and no other process is started.
+
+        Example:
+            >>> import fmu_mesh
+            >>> with fmu_mesh.load("configs/pendulum_delay.yaml").open({"pendulum.a": 0.5}) as system:
+            ...     system.step(100)
+            ...     system.time, system.get("pendulum.a") < 0.5
+            (0.2, True)
+
+        Args:
+            start_values: start values by `instance.variable`; they come before those of the configuration.
+
+        Raises:
+            ConfigurationError: the configuration, a model or a start value is wrong; carries all findings. Or two
+                instances need a process of their own each.
+            FmuError: an instance cannot be opened or initialized. Nothing is left behind.
+        """
+        return System(self._planned(_options_of({"start_values": start_values or {}})))
 
     def _planned(self, options: Options) -> RunPlan:
         file = self._plain.file

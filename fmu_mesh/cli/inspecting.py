@@ -13,8 +13,10 @@ from typing import Any, Final
 
 import msgspec
 
+from ..api.functions import inspect
 from ..errors import ConfigurationError, LoadFailed
 from ..instances.fmi import read_description, sha256_of
+from ..instances.registry import KINDS
 from ..text import fits, nearest, short_number, shown
 from ..variables.model_description import Causality, Kind, ModelDescription, Variable
 from .arguments import add_command, no_fmu
@@ -84,13 +86,16 @@ def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.Arg
 
 
 def inspect_fmu(path: Path) -> Inspection:
-    """Read all properties of an FMU without loading it.
+    """Read all properties of an FMU without loading it, or of a file whose ending is another kind of instance.
 
     Raises:
         ConfigurationError: it cannot be read; says why.
     """
     reasons: tuple[str, ...] = ()
     try:
+        if path.is_file() and path.suffix != ".fmu" and path.suffix[1:] in KINDS.names():
+            size, other = path.stat().st_size, inspect(path)
+            return Inspection(str(path), sha256_of(path), size, runs_here=True, problems=(), description=other)
         try:
             description = read_description(path)
         except LoadFailed as error:
@@ -175,17 +180,19 @@ def _facts(inspection: Inspection, width: int) -> list[str]:
     if indicators := description.event_indicators:
         states.append(f"{indicators} event indicator{'s' if indicators > 1 else ''}")
     times += [f"tolerance {short_number(experiment.tolerance)}"] if experiment.tolerance is not None else []
+    kinds = " or ".join(_KIND_WORDS[kind] for kind in description.kinds)
+    platforms = ", ".join(_PLATFORM_WORDS.get(name, name) for name in description.platforms)
     size = f" ({inspection.bytes} bytes)" if inspection.bytes is not None else " (a folder)"
     facts = [
         ("File", f"{inspection.file}{size}"),
         ("SHA-256", inspection.sha256 or ""),
         ("Model", description.model_name),
         ("Description", description.description or ""),
-        ("Kind", f"FMI {description.fmi_version} {' or '.join(_KIND_WORDS[kind] for kind in description.kinds)}"),
+        ("Kind", f"FMI {description.fmi_version} {kinds}" if kinds else description.kind.replace("_", " ")),
         ("Identifier", description.model_identifier),
         ("GUID", description.guid),
         ("Made by", description.generation_tool or ""),
-        ("Platforms", ", ".join(_PLATFORM_WORDS.get(name, name) for name in description.platforms) or "none"),
+        ("Platforms", platforms or ("none" if kinds else "")),
         ("Runs here", "yes" if inspection.runs_here else "no, see Problems"),
         ("Can", ", ".join(can)),
         ("Needs", ", ".join(needs)),

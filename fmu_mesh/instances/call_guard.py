@@ -32,6 +32,7 @@ __all__ = [
     "ENDED",
     "CallWatch",
     "Guarded",
+    "Unwatched",
     "call_named",
     "current_function",
     "floating_point_changed",
@@ -219,6 +220,26 @@ class CallWatch:
         )
 
 
+class Unwatched:
+    """Takes the place of a `CallWatch` in a program that is not ours to end: no call has a deadline.
+
+    Between two steps this restores only the floating-point mode: the rest takes longer than a step.
+    """
+
+    @contextmanager
+    def calling(self, _instance: str, kind: type[FmuError], _setting: str, _limit_s: float) -> Iterator[None]:
+        """Around one call of an FMU."""
+        if kind is not StepFailed:
+            with kept_state():
+                yield
+            return
+        try:
+            yield
+        finally:
+            if floating_point_changed():
+                restore_floating_point()
+
+
 def current_function(thread: int) -> str | None:
     """The FMI function that a thread is in; None if it is in none, or in one of the compiled calls of a step."""
     return _functions.get(thread)
@@ -240,14 +261,16 @@ class Guarded(AroundInstance[Instance]):
     Args:
         name: instance name.
         open_: makes the instance; a call with a deadline like the others.
-        watch: watches the deadlines.
+        watch: watches the deadlines, or does not.
         timeouts: the deadlines.
 
     Attributes:
         do_step: that of the inner instance: `CallWatch.stepping` watches the steps.
     """
 
-    def __init__(self, name: str, open_: Callable[[], Instance], watch: CallWatch, timeouts: TimeoutsConfig) -> None:
+    def __init__(
+        self, name: str, open_: Callable[[], Instance], watch: CallWatch | Unwatched, timeouts: TimeoutsConfig
+    ) -> None:
         self._name = name
         self._watch = watch
         self._timeouts = timeouts

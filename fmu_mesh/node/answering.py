@@ -14,15 +14,15 @@ import msgspec
 import zenoh
 
 from ..system.plan import NodePlan
+from ..system.settable import check_settable
 from ..variables.model_description import Value, Variable
 from ..wire.inbox import Inbox
-from ..wire.keys import Keys
-from ..wire.values import ValueRefused, attachment, encode_value, json_encoding
+from ..wire.keys import Keys, unescape
+from ..wire.values import ValueRefused, attachment, decode_time, decode_value, encode_value, json_encoding
 from ..wire.views import LogLine, SetAnswer
 from .activity import Activity
 from .info import instance_info
 from .inputs import set_input
-from .settings import checked_setting
 from .stepping import Runner
 from .streams import kind_of
 
@@ -161,7 +161,7 @@ class Answers:
 
     def _take_put(self, runner: Runner, key: str, data: bytes, attachment: bytes | None) -> None:
         try:
-            new = checked_setting(runner, self._keys.instance(runner.name), key, data, attachment)
+            new = _checked_setting(runner, self._keys.instance(runner.name), key, data, attachment)
         except ValueRefused as refused:
             self._log(LogLine(runner.name, "warning", "set", str(refused), runner.point))
             return
@@ -185,7 +185,7 @@ class Answers:
         data = query.payload.to_bytes() if query.payload else b""
         attachment = query.attachment.to_bytes() if query.attachment is not None else None
         try:
-            new = checked_setting(runner, self._keys.instance(runner.name), key, data, attachment)
+            new = _checked_setting(runner, self._keys.instance(runner.name), key, data, attachment)
         except ValueRefused as refused:
             query.reply_err(str(refused))
             query.drop()
@@ -222,3 +222,42 @@ class _Pending:
     def refuse(self, reason: str) -> None:
         self.query.reply_err(reason)
         self.query.drop()
+
+
+class _Setting(msgspec.Struct, frozen=True):
+    """A value for a variable; ``time`` (s) is from when on, of an input; None: from the next point on."""
+
+    variable: str
+    value: Value
+    time: float | None = None
+
+
+def _checked_setting(runner: Runner, root: str, key: str, data: bytes, attachment: bytes | None) -> _Setting:
+    """The variable, value and time of a setting that arrived for an instance.
+
+    Args:
+        runner: the instance.
+        root: what its keys start with.
+        key: the key that the value was sent to.
+        data: the value as JSON.
+        attachment: the time of the value as JSON, if there is one.
+
+    Raises:
+        ValueRefused: with the reason.
+    """
+    parts = key.removeprefix(root + "/").split("/")
+    if len(parts) != 2 or "*" in key:
+        raise ValueRefused(f"'{key}' is not the key of one variable")
+    kind, name = parts[0], unescape(parts[1])
+    variable = runner.instance.description.variable(name)
+    if variable is None or kind_of(variable) != kind:
+        raise ValueRefused(f"'{runner.name}' has no variable '{name}' under '{kind}'")
+    try:
+        check_settable(runner.plan, variable)
+    except ValueRefused as refused:
+        raise ValueRefused(f"'{runner.name}.{name}' {refused}") from refused
+    try:
+        time = decode_time(attachment) if attachment is not None else None
+        return _Setting(name, decode_value(data, variable), time)
+    except ValueRefused as refused:
+        raise ValueRefused(f"'{runner.name}.{name}': {refused}") from refused

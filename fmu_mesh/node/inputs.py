@@ -1,7 +1,7 @@
 """Unconnected inputs and tunable parameters over time: values that a program sends with a time from which on they hold.
 
-Owns how a step gets its value from them, as `fmi_adapter` does for a ROS node. `fmu_mesh.node.settings` decides which
-settings are allowed.
+Owns how a step gets its value from them, as `fmi_adapter` does for a ROS node. `fmu_mesh.system.settable` says which
+variables may be set.
 """
 
 from __future__ import annotations

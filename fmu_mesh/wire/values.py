@@ -11,7 +11,7 @@ import zenoh
 from ..errors import MessageRefused
 from ..simtime import ENDLESS
 from ..variables.model_description import Value, Variable
-from ..variables.value_conversion import MAX_TEXT_SIZE, ValueRefused, to_plain, to_value
+from ..variables.value_conversion import MAX_TEXT_SIZE, ValueRefused, checked_value, to_plain
 from .messages import decode_json
 
 __all__ = [
@@ -93,10 +93,4 @@ def decode_value(data: bytes, variable: Variable) -> Value:
         value: Any = decode_json(data, object)
     except MessageRefused as error:
         raise ValueRefused(f"it is no JSON value ({error})") from error
-    try:
-        return to_value(value, variable)
-    except ValueRefused as refused:
-        what = "is out of its range" if refused.out_of_range else f"is no {variable.type_name} value for it"
-        near = f" (did you mean '{refused.suggestion}'?)" if refused.suggestion else ""
-        text = f"{data[:80].decode(errors='replace')} {what}; expected {refused.expected}{near}"
-        raise ValueRefused(text) from refused
+    return checked_value(value, variable, data[:80].decode(errors="replace"))
