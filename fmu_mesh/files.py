@@ -110,8 +110,10 @@ def replaced(path: Path) -> Iterator[Path]:
     After an error in the block an older file stays unchanged. A device or a pipe is written directly.
 
     Example:
-        >>> with replaced(Path("plot.png")) as draft:
-        ...     draft.write_bytes(picture)
+        >>> with replaced(Path("angles.svg")) as draft:
+        ...     _ = draft.write_text("<svg/>")
+        >>> Path("angles.svg").read_text()
+        '<svg/>'
     """
     target = Path(os.path.realpath(path))
     if target.exists() and not target.is_file():

@@ -64,6 +64,14 @@ class FMIAdapter:
     Raises:
         CallRefused: ``step_size`` is not above 0, or missing here and in the FMU.
         LoadFailed: the FMU cannot be read, extracted or instantiated. Nothing is left behind.
+
+    Example:
+        >>> with fmu_mesh.FMIAdapter("fmus/Gain.fmu", step_size=0.5) as gain:
+        ...     gain.set_initial_value("k", 2.0)
+        ...     gain.exit_initialization_mode(0.0)
+        ...     gain.set_input_value("u", 0.0, 21.0)
+        ...     print(gain.do_steps_until(1.0), gain.get_output_value("y"))
+        1.0 42.0
     """
 
     def __init__(
@@ -179,6 +187,14 @@ class FMIAdapter:
         Raises:
             CallRefused: the mode, the name or the type is wrong, or the variable cannot be set before the start.
             InitializationFailed: the FMU refuses it, here or in `exit_initialization_mode`.
+
+        Example:
+            >>> with fmu_mesh.FMIAdapter("fmus/DampedPendulum.fmu") as pendulum:
+            ...     pendulum.set_initial_value("a", 1.3)  # rad
+            ...     pendulum.set_initial_value("l", 2.0)  # m
+            ...     pendulum.exit_initialization_mode(0.0)
+            ...     pendulum.get_output_value("a")
+            1.3
         """
         self._demand("initialization", "set_initial_value")
         variable = self._arguments.settable(name)
@@ -231,6 +247,17 @@ class FMIAdapter:
 
         Raises:
             CallRefused: the adapter is closed, or the name, the type or the time is wrong.
+
+        Example:
+            >>> with fmu_mesh.FMIAdapter("fmus/Gain.fmu", step_size=1.0) as gain:
+            ...     gain.exit_initialization_mode(0.0)
+            ...     gain.set_input_value("u", 0.0, 10.0)
+            ...     gain.set_input_value("u", 2.0, 20.0)  # in between it is linear
+            ...     for _ in range(3):
+            ...         print(gain.do_step(), gain.get_output_value("y"))
+            1.0 10.0
+            2.0 15.0
+            3.0 20.0
         """
         self._demand(None, "set_input_value")
         converted = self._arguments.value(self._arguments.input(name), value)
@@ -280,6 +307,12 @@ class FMIAdapter:
         Raises:
             CallRefused: the mode is wrong, or the FMU is already more than half a step past ``time``.
             StepFailed: the FMU failed; only `close` is allowed now.
+
+        Example:
+            >>> with fmu_mesh.FMIAdapter("fmus/DampedPendulum.fmu", step_size=0.02) as pendulum:
+            ...     pendulum.exit_initialization_mode(0.0)
+            ...     pendulum.do_steps_until(0.055)  # 0.06 is nearer than 0.04
+            0.06
         """
         self._demand("stepping", "do_steps_until")
         if max_steps is not None and max_steps < 1:

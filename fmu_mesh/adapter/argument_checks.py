@@ -30,10 +30,10 @@ class Arguments:
     def __init__(self, instance: str, description: ModelDescription) -> None:
         self.instance = instance
         self._description = description
-        self.all = {variable.name: variable for variable in description.variables}
-        self.inputs = self._having("input")
-        self.outputs = self._having("output")
-        self.parameters = self._having("parameter")
+        self.all: dict[str, Variable] = {variable.name: variable for variable in description.variables}
+        self.inputs: dict[str, Variable] = self._having("input")
+        self.outputs: dict[str, Variable] = self._having("output")
+        self.parameters: dict[str, Variable] = self._having("parameter")
         self._tunable = {v.name: v for v in self.parameters.values() if v.variability == "tunable"}
         self._settable = {v.name: v for v in description.variables if v.settable_before_start}
 

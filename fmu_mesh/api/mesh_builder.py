@@ -80,6 +80,12 @@ class RunOptions(TypedDict, total=False):
 class Check(msgspec.Struct, frozen=True):
     """What `Mesh.check` found.
 
+    Example:
+        >>> import fmu_mesh
+        >>> check = fmu_mesh.load("configs/pendulum_delay.yaml").check()
+        >>> bool(check), check.findings
+        (True, ())
+
     Attributes:
         findings: everything that is wrong, each with its place; empty if the mesh can run.
         warnings: what may be wrong, in words.

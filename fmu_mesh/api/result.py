@@ -128,7 +128,7 @@ class Result(Mapping[str, NDArray[Any]]):
         Example:
             >>> import fmu_mesh
             >>> result = fmu_mesh.load("configs/pendulum_delay.yaml").run(stop_time=1.0, record="memory")
-            >>> result.plot("pendulum.a", "delay.y").savefig("/tmp/angles.png")
+            >>> result.plot("pendulum.a", "delay.y").savefig("angles.png")
 
         Raises:
             ConfigurationError: there is no such variable, or matplotlib is not installed.

@@ -20,6 +20,13 @@ __all__ = ["Sample", "Watch", "sample_of", "targets_of"]
 class Sample(NamedTuple):
     """One value of a variable.
 
+    Example:
+        >>> import fmu_mesh
+        >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
+        >>> with mesh.start(record="memory", paused=True) as run:
+        ...     run.samples("pendulum.a")
+        [Sample(name='pendulum.a', value=1.3, point=0, time=0.0, unit='rad')]
+
     Attributes:
         name: `instance.variable`.
         value: a number, truth value, text or bytes; an array as a numpy array.

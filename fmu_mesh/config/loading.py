@@ -100,7 +100,8 @@ def load(path: Path, overrides: Sequence[str], kinds: Kinds) -> LoadedConfig:
     """Read a configuration file.
 
     Example:
-        >>> load(Path("configs/pendulum_delay.yaml"), ["pendulum.l=2"]).config.mesh
+        >>> from fmu_mesh.instances.registry import KINDS
+        >>> load(Path("configs/pendulum_delay.yaml"), ["pendulum.l=2"], KINDS).config.mesh
         'pendulum_delay'
 
     Args:

@@ -128,9 +128,12 @@ class CallWatch:
     """Watches the calls of one thread; reports a call that misses its deadline on another thread.
 
     Example:
-        >>> with closing(CallWatch(report)) as watch:
-        ...     with watch.calling("pendulum", StepFailed, "step", 30.0):
-        ...         fmu.enterEventMode()  # after 30 s, `report` gets an error that names this function
+        >>> reported = threading.Event()
+        >>> watch = CallWatch(lambda error: reported.set())
+        >>> with watch.calling("pendulum", StepFailed, "step", 0.01):
+        ...     reported.wait(10)  # as long as a call of an FMU that does not return
+        True
+        >>> watch.close()
 
     Args:
         on_overrun: called with the error, which says the instance, the call and the point. The watched thread is still

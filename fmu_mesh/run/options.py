@@ -50,7 +50,8 @@ class Options(msgspec.Struct, frozen=True):
     Each field is an option, and its annotation says how the command line spells it.
 
     Example:
-        >>> prepare(Path("mesh.yaml"), Options(window=1, start_values=("gain.k=2.5",)))
+        >>> Options(window=1, start_values=("gain.k=2.5",)).window
+        1
     """
 
     step_size: Annotated[float | None, Flag("--step-size", "S", "simulation.step_size")] = None
