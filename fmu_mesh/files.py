@@ -99,7 +99,7 @@ def unwritable(path: Path, error: OSError) -> ConfigurationError:
     """The error for a result file that could be opened, but not be written to its end."""
     return ConfigurationError(
         f"the result file '{path}' cannot be written: {error.strerror}",
-        hint="The run has ended there. Make room, or choose another file with --output.",
+        hint="The run has ended there. Free some disk space, or choose another file with --output.",
     )
 
 

@@ -1,6 +1,6 @@
-"""The master's face to the rest of the world: what it answers to queries, its status, and the log of all instances.
+"""What other programs see of the master: answers to queries, its status, and the log of all instances.
 
-Everything that arrives, on foreign threads, is posted to the main thread.
+Queries and samples arrive on threads of Zenoh, and are posted to the main thread.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from ..wire.views import LogLine, MeshInfo, MeshStatus
 __all__ = ["STATUS_S", "Events", "MasterServer", "mesh_info"]
 
 STATUS_S = 0.1
-"""How often the status is published."""
+"""Time in s between two publications of the status."""
 
 _MOST_LOG_BYTES = 1 << 20
 _KEPT_LINES = 1000
@@ -38,7 +38,7 @@ _KEPT_BYTES = 1 << 20
 
 
 class Events(Protocol):
-    """What the master tells whoever started it. Called on the master's main thread."""
+    """What the master reports to the program that started it. Called on the master's main thread."""
 
     def status(self, status: MeshStatus) -> None:
         """The state of the run, about ten times a second."""
@@ -53,7 +53,7 @@ class MasterServer:
     """Serves the queries of one run.
 
     Args:
-        session: the session of this process; stays the caller's.
+        session: the session of this process; the caller closes it.
         inbox: the inbox of the master.
         status: the state of the run right now.
         instances: the names of all instances.
@@ -87,7 +87,7 @@ class MasterServer:
         )
 
     def serve(self, key: str, answer: Callable[[zenoh.Query], None]) -> None:
-        """From now on ``answer`` gets the queries of a key; what it refuses is answered with the reason."""
+        """From now on ``answer`` handles the queries of a key; if it refuses one, the reply is the reason."""
         post, guard = self._inbox.post, self._inbox.refusals.guard
 
         def take(query: zenoh.Query) -> None:
@@ -97,7 +97,7 @@ class MasterServer:
         self._entities.append(self._session.declare_queryable(key, lambda query: post(lambda: take(query))))
 
     def show(self, what: Literal["info", "status", "plan", "log"], view: Callable[[], object]) -> None:
-        """From now on a key of the mesh is answered with a view."""
+        """From now on queries of a key of the mesh are answered with a view."""
         key = self._keys.mesh_key(what)
 
         def reply(query: zenoh.Query) -> None:
@@ -116,7 +116,7 @@ class MasterServer:
         )
 
     def hand_on_logs(self) -> None:
-        """From now on the log of all instances is handed on, kept, and published as one."""
+        """From now on the log messages of all instances go to `Events.log`, are kept, and are published as one log."""
         self.show("log", lambda: [*self._kept_log])
         post = self._inbox.post
         self._entities.append(
@@ -144,7 +144,7 @@ class MasterServer:
             self._kept_bytes -= len(self._kept_log.popleft())
 
     def publish_status(self, *, at_once: bool = False) -> None:
-        """Publish the status if it is time to, or ``at_once``."""
+        """Publish the status if it is due, or ``at_once``."""
         now = time.monotonic()
         if not at_once and now - self._status_published < STATUS_S:
             return
@@ -167,7 +167,7 @@ def mesh_info(plan: Plan, run: str, config_file: str, endpoints: Sequence[str], 
         run: the run's id.
         config_file: name of the configuration file.
         endpoints: where tools can reach this process.
-        shared: who gets all messages through shared memory.
+        shared: the participants that get all messages through shared memory.
     """
     config = plan.system.config
     grid = plan.grid

@@ -1,7 +1,7 @@
-"""Answers to the queries of a node, and the settings that it takes.
+"""Answers to the queries of a node, and the values that others set.
 
-On the server's thread. Values come from rows that were completed, or are read by the main thread at the next point;
-settings are checked here and made by the main thread. A query that waits for a point is refused when that takes long.
+All of it runs on the server thread. Values come from complete rows, or the main thread reads them at the next point.
+Settings are checked here and made by the main thread. A query that waits too long for a point is refused.
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ class Answers:
 
     Args:
         plan: what the node has to do.
-        inbox: the inbox of the node, for what the main thread has to do.
+        inbox: the inbox of the node, to let the main thread do something.
         activity: what the node is doing.
-        post: from any thread: has the server's thread do something.
+        post: lets the server thread do something; may be called from any thread.
         log: publishes a log message; on the server's thread.
     """
 
@@ -62,7 +62,7 @@ class Answers:
         self._pending: list[_Pending] = []
 
     def answer(self, name: str, query: zenoh.Query) -> None:
-        """Answer everything under the instance's key that the query's key expression matches."""
+        """Answer for every key of the instance that the query's key expression matches."""
         root = self._keys.instance(name)
         asked = query.key_expr
         runner = self._activity.runners.get(name)
@@ -97,7 +97,7 @@ class Answers:
             query.drop()
 
     def put_arrived(self, runner: Runner, sample: zenoh.Sample) -> None:
-        """On a foreign thread: take a value that was put; what is wrong with it goes into the log."""
+        """On a thread of Zenoh: accept a value that was put; if it is refused, the reason is logged."""
         attachment = sample.attachment.to_bytes() if sample.attachment is not None else None
         data = sample.payload.to_bytes()
         self._post(partial(self._take_put, runner, str(sample.key_expr), data, attachment))
@@ -120,10 +120,10 @@ class Answers:
         return matching
 
     def _from_rows(self, runner: Runner, wanted: list[tuple[str, Variable]]) -> tuple[list[tuple[str, Value]], int]:
-        """Values that the rows of the newest own step hold, and that step; what only the FMU knows is left out.
+        """The values in the rows of the newest own step, and that step; values that only the FMU has are not included.
 
-        The main thread steps meanwhile. It may come round to this row, which then holds values of a later step: what
-        was read is thrown away, and read again; after a few times it is left to the main thread.
+        The main thread steps meanwhile, and may overwrite this row of the ring with values of a later step. Then the
+        values are read again; after a few attempts the main thread reads them.
         """
         ring = runner.outputs
         names = {*ring.layout.names}
@@ -175,7 +175,7 @@ class Answers:
         self._inbox.post(take)
 
     def _answer_setting(self, name: str, query: zenoh.Query) -> None:
-        """A query with a payload sets a value and is told from which point on it holds, or why it was refused."""
+        """Answer a query that sets a value: from which point on the value holds, or why it was refused."""
         runner = self._activity.runners.get(name)
         key = str(query.key_expr)
         if runner is None:
@@ -212,7 +212,7 @@ class Answers:
 
 
 class _Pending:
-    """A query that waits for its instance to come to a point."""
+    """A query that waits until its instance reaches a point."""
 
     def __init__(self, instance: str, query: zenoh.Query) -> None:
         self.instance = instance
