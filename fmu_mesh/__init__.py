@@ -12,8 +12,10 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from .adapter import FMIAdapter
-    from .api.functions import attach, inspect, load, meshes
-    from .api.mesh_builder import Check, Mesh
+    from .api.functions import attach, load, meshes
+    from .api.inspection import Inspection, inspect
+    from .api.mesh_builder import Mesh
+    from .api.mesh_check import Check
     from .api.open_system import System, SystemState
     from .api.result import Result
     from .api.run_handle import Run
@@ -48,6 +50,7 @@ __all__ = [
     "FmuMeshError",
     "FrameGap",
     "InitializationFailed",
+    "Inspection",
     "Interrupted",
     "KeyboardInterrupted",
     "LoadFailed",
@@ -71,7 +74,7 @@ __all__ = [
 
 _PLACES = {
     "FMIAdapter": "adapter",
-    "Check": "api.mesh_builder",
+    "Check": "api.mesh_check",
     "Mesh": "api.mesh_builder",
     "load": "api.functions",
     "Result": "api.result",
@@ -80,7 +83,8 @@ _PLACES = {
     "System": "api.open_system",
     "SystemState": "api.open_system",
     "attach": "api.functions",
-    "inspect": "api.functions",
+    "Inspection": "api.inspection",
+    "inspect": "api.inspection",
     "meshes": "api.functions",
 }
 """The modules of the public names; all others are exceptions."""

@@ -3,105 +3,34 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Literal, Self, TypedDict, Unpack
+from types import MappingProxyType
+from typing import Any, Self, Unpack, cast
 
 import msgspec
-import numpy as np
 
+from ..config.instance_sections import KIND
 from ..config.loading import PlainConfig, read_file, read_text
 from ..config.yaml_text import written
-from ..errors import CallRefused, ConfigurationError, Finding
+from ..errors import CallRefused, ConfigurationError, LoadFailed
 from ..instances.configuration import examine_data
-from ..instances.registry import KINDS, check_engines
-from ..run.events import Event, Status
-from ..run.options import Options
+from ..instances.registry import KINDS, check_engines, describe
+from ..run.options import with_config_values
 from ..run.preparing import planned
 from ..run.run_plan import RunPlan
 from ..text import listed, shown
-from ..wire.views import MeshStatus
+from ..variables.model_description import ModelDescription
+from .inspection import with_way_out
+from .mesh_check import Check
 from .open_system import System
+from .plan_options import PlanOptions, RunOptions, StartOptions, options_of, plain
 from .result import Result
 from .run_handle import Run
-from .run_thread import MEMORY_LIMIT, RunThread, Settings, memory_file
 
-__all__ = ["Check", "Mesh", "RunOptions"]
+__all__ = ["Mesh"]
 
 log = logging.getLogger("fmu_mesh.run")
-
-
-class RunOptions(TypedDict, total=False):
-    """What `Mesh.run` and `Mesh.start` take; each option of the configuration replaces its key for this run.
-
-    Attributes:
-        processes: False runs everything in this process; the floats are the same.
-        record: "memory" keeps the results as arrays, without a file.
-        memory_limit: the most bytes of such results (1 GiB); a run that needs more is refused, or ends there.
-        output: the result file; its ending chooses the format.
-        start_values: start values by `instance.variable`.
-        step_size: base communication step size in s.
-        stop_time: time of the last communication point in s.
-        window: how many points a node may run ahead of the slowest one, or "auto".
-        real_time_factor: simulation time per wall-clock time; 0: as fast as possible.
-        update_period: with a real-time factor, points that are due are stepped together once per this time in s.
-        catch_up: largest lag behind the wall clock in s.
-        listen: Zenoh endpoints where others can connect.
-        connect: Zenoh endpoints to connect to.
-        paused: stay paused at the first point until `Run.resume` or `Run.step`.
-        restarts: how often a run is started again from its first point if one of its processes is lost.
-        view: show the world of a physics engine in a window.
-        video: film that world into this file.
-        on_progress: called with a `MeshStatus` about ten times per second.
-        on_event: called with every event of `fmu_mesh.run.events`.
-    """
-
-    processes: bool
-    record: Literal["memory"] | None
-    memory_limit: int
-    output: str | Path | None
-    start_values: Mapping[str, Any]
-    step_size: float
-    stop_time: float
-    window: int | Literal["auto"]
-    real_time_factor: float
-    update_period: float
-    catch_up: float
-    listen: Sequence[str]
-    connect: Sequence[str]
-    paused: bool
-    restarts: int
-    view: bool
-    video: str | Path
-    on_progress: Callable[[MeshStatus], object]
-    on_event: Callable[[Event], object]
-
-
-class Check(msgspec.Struct, frozen=True):
-    """What `Mesh.check` found.
-
-    Example:
-        >>> import fmu_mesh
-        >>> check = fmu_mesh.load("configs/pendulum_delay.yaml").check()
-        >>> bool(check), check.findings
-        (True, ())
-
-    Attributes:
-        findings: everything that is wrong, each with its place; empty if the mesh can run.
-        warnings: what may be wrong, in words.
-        run: the plan of the run; None if something is wrong.
-    """
-
-    findings: tuple[Finding, ...] = ()
-    warnings: tuple[str, ...] = ()
-    run: RunPlan | None = None
-
-    def __bool__(self) -> bool:
-        return not self.findings
-
-    def __str__(self) -> str:
-        lines = [*map(str, self.findings), *(f"warning: {warning}" for warning in self.warnings)]
-        return "\n".join(lines) or "OK"
 
 
 class Mesh:
@@ -136,7 +65,7 @@ class Mesh:
         **simulation: Any,  # noqa: ANN401  as the file has it
     ) -> None:
         keys = {"step_size": step_size, "stop_time": stop_time, **simulation}
-        data = {"mesh": name, "simulation": _plain(keys), "instances": {}, "connections": []}
+        data = {"mesh": name, "simulation": plain(keys), "instances": {}, "connections": []}
         self._take(PlainConfig(data, Path.cwd() / f"<mesh {name}>"))
 
     @classmethod
@@ -161,8 +90,61 @@ class Mesh:
         mesh._take(read_file(Path(path)))  # noqa: SLF001  its own method
         return mesh
 
-    def _take(self, plain: PlainConfig) -> None:
-        self._plain = plain
+    @classmethod
+    def from_fmu(
+        cls,
+        path: str | Path,
+        *,
+        name: str | None = None,
+        simulation: Mapping[str, Any] = MappingProxyType({}),
+        on_notice: Callable[[str], None] = log.info,
+        **section: Any,  # noqa: ANN401  as the file has it
+    ) -> Self:
+        """A mesh of one FMU, as `fmu-mesh run` makes it; nothing is recorded, unless an option says so.
+
+        Example:
+            >>> import fmu_mesh
+            >>> mesh = fmu_mesh.Mesh.from_fmu("fmus/DampedPendulum.fmu", simulation={"stop_time": 1.0})
+            >>> mesh.run(record="memory")["DampedPendulum.a"].shape
+            (501,)
+
+        Args:
+            path: the FMU.
+            name: name of the mesh and of its instance; None: the model identifier.
+            simulation: keys of the section `simulation`; by default, the FMU says the step size, and there is no end.
+            on_notice: called with a sentence before something that takes long, such as compiling the FMU.
+            section: other keys of the instance, as in `add`.
+
+        Raises:
+            LoadFailed: it is no FMU that can run here; says why.
+            CallRefused: neither the FMU nor ``simulation`` has a step size.
+        """
+        file = Path(path)
+        own = msgspec.convert({KIND: "fmu", "fmu": str(path)}, KINDS.section("fmu"))
+        try:
+            description = describe(file, own, tell=on_notice)
+        except LoadFailed as error:
+            raise with_way_out(error, file) from error
+        own_name = name if name is not None else description.model_identifier
+        times = {"step_size": description.default_experiment.step_size, "stop_time": None, **simulation}
+        if times["step_size"] is None:
+            raise CallRefused(
+                f"'{path}' has no default step size.", hint='Give one, as `simulation={"step_size": ...}`.'
+            )
+        instance = plain({"fmu": file.absolute(), **section})
+        data = {
+            "mesh": own_name,
+            "simulation": plain(times),
+            "instances": {own_name: instance},
+            "record": {"file": None},
+        }
+        mesh = cls.__new__(cls)
+        mesh._take(PlainConfig(data, file), {own_name: description})  # noqa: SLF001  its own method
+        return mesh
+
+    def _take(self, values: PlainConfig, known: Mapping[str, ModelDescription] = MappingProxyType({})) -> None:
+        self._plain = values
+        self._known = known
 
     # --- building
 
@@ -214,7 +196,7 @@ class Mesh:
             raise CallRefused(
                 f"nothing says what '{name}' is", hint=f"Give it one of the keys {listed(KINDS.names())}."
             )
-        self._section("instances")[name] = _plain(given)
+        self._section("instances")[name] = plain(given)
 
     def connect(self, source: str, target: str, **keys: Any) -> None:  # noqa: ANN401  as the file has it
         """Connect an output to an input, both as `instance.variable`.
@@ -225,7 +207,7 @@ class Mesh:
             keys: any other key of a connection in a configuration file, such as ``factor=2.0``.
         """
         connections = self._data.setdefault("connections", [])
-        connections.append(_plain({"from": source, "to": target, **keys}))
+        connections.append(plain({"from": source, "to": target, **keys}))
 
     def record(self, *variables: str, file: str | Path | None = None) -> None:
         """Choose what is recorded, and into which file.
@@ -235,7 +217,7 @@ class Mesh:
             file: the result file; None leaves the one of the configuration.
         """
         section = self._section("record")
-        section.update(_plain({"variables": list(variables) or None} | ({"file": file} if file is not None else {})))
+        section.update(plain({"variables": list(variables) or None} | ({"file": file} if file is not None else {})))
 
     def configure(self, **sections: Any) -> None:  # noqa: ANN401  as the file has it
         """Set keys of other sections of the configuration, or of the top level.
@@ -250,9 +232,9 @@ class Mesh:
         """
         for key, value in sections.items():
             if isinstance(value, Mapping):
-                self._section(key).update(_plain(dict(value)))
+                self._section(key).update(plain(dict(value)))
             else:
-                self._data[key] = _plain(value)
+                self._data[key] = plain(value)
 
     def to_yaml(self) -> str:
         """The configuration as the text of a file, for the folder that this mesh looks for files in."""
@@ -276,7 +258,7 @@ class Mesh:
 
     # --- running
 
-    def check(self, **options: Unpack[RunOptions]) -> Check:
+    def check(self, **options: Unpack[PlanOptions]) -> Check:
         """Check the configuration, its models, and that this host can run them; nothing is started.
 
         Example:
@@ -287,13 +269,36 @@ class Mesh:
             ...     print(finding.path, finding.suggestion[-8:])
             instances.gain.fmu Gain.fmu
         """
+        run, file = None, self._shown_file
         try:
-            run = self._planned(_options_of(options))
-            check_engines(run.plan.system.config.instances, str(self._plain.file))
+            run = self.plan(**options)
+            check_engines(run.plan.system.config.instances, str(file))
         except ConfigurationError as error:
-            findings = error.findings or (Finding(str(self._plain.file), "", error.message, error.hint or ""),)
-            return Check(findings=findings)
-        return Check(warnings=tuple(map(str, run.plan.system.warnings)), run=run)
+            return Check(str(file), error, run)
+        return Check(str(file), run=run)
+
+    def plan(self, **options: Unpack[PlanOptions]) -> RunPlan:
+        """Read all models and plan a run, which `Run.start` starts; nothing is started here.
+
+        Example:
+            >>> import fmu_mesh
+            >>> plan = fmu_mesh.load("configs/pendulum_delay.yaml").plan(stop_time=1.0, record="memory")
+            >>> plan.plan.grid.last_point
+            500
+            >>> with fmu_mesh.Run.start(plan) as run:
+            ...     len(run.wait().times)
+            501
+
+        Args:
+            options: see `PlanOptions`.
+
+        Raises:
+            ConfigurationError: the configuration, a model or an option is wrong; carries all findings.
+        """
+        chosen = options_of(options)
+        data = with_config_values(self._plain._replace(file=self._shown_file), chosen.config_values)
+        loaded, findings = examine_data(data, chosen.start_values)
+        return planned(loaded, findings, chosen, options.get("on_notice", log.info), self._known)
 
     def run(self, **options: Unpack[RunOptions]) -> Result:
         """Run the mesh to its end, and return what it has recorded.
@@ -331,25 +336,9 @@ class Mesh:
         Raises:
             ConfigurationError: the configuration, a model or an option is wrong; carries all findings.
         """
-        memory = None
-        if options.get("record") == "memory":
-            if options.get("output") is not None:
-                raise CallRefused('`output` and `record="memory"` exclude each other')
-            memory = memory_file()
-        try:
-            plan = self._planned(_options_of(options, memory))
-            settings = Settings(
-                processes=options.get("processes", True),
-                restarts=options.get("restarts", 0),
-                on_event=_listener(options),
-                memory=memory,
-                memory_limit=options.get("memory_limit", MEMORY_LIMIT),
-            )
-            return Run(plan.mesh, own=RunThread(plan, settings))
-        except BaseException:
-            if memory is not None:
-                memory.parent.rmdir()
-            raise
+        how = {name: value for name, value in options.items() if name not in PlanOptions.__annotations__}
+        what = {name: value for name, value in options.items() if name not in how}
+        return Run.start(self.plan(**cast("PlanOptions", what)), **cast("StartOptions", how))
 
     def open(self, start_values: Mapping[str, Any] | None = None) -> System:
         """Open all instances in this process, for a program that steps them itself (docs/stepping.md).
@@ -371,14 +360,13 @@ class Mesh:
                 instances need a process of their own each.
             FmuError: an instance cannot be opened or initialized. Nothing is left behind.
         """
-        return System(self._planned(_options_of({"start_values": start_values or {}})))
+        return System(self.plan(start_values=start_values or {}))
 
-    def _planned(self, options: Options) -> RunPlan:
-        file = self._plain.file
-        if file.is_relative_to(here := Path.cwd()):  # findings name it; the folder of the program says nothing new
-            file = file.relative_to(here)
-        loaded, findings = examine_data(self._plain._replace(file=file), options.start_values)
-        return planned(loaded, findings, options, log.info)
+    @property
+    def _shown_file(self) -> Path:
+        """The file as findings name it; a mesh without a file is named without the working directory."""
+        file, here = self._plain.file, Path.cwd()
+        return file.relative_to(here) if file.name.startswith("<") and file.is_relative_to(here) else file
 
     @property
     def _data(self) -> dict[str, Any]:
@@ -392,62 +380,3 @@ class Mesh:
         if not isinstance(section, dict):
             raise ConfigurationError(f"'{key}' of '{self._plain.file}' is {shown(section)}, where a mapping should be")
         return section
-
-
-def _options_of(given: RunOptions, memory: Path | None = None) -> Options:
-    """The options of a run, as the command line has them."""
-    output = given.get("output")
-    video = given.get("video")
-    return Options(
-        step_size=given.get("step_size"),
-        stop_time=given.get("stop_time"),
-        window=given.get("window"),
-        real_time_factor=given.get("real_time_factor"),
-        update_period=given.get("update_period"),
-        catch_up=given.get("catch_up"),
-        start_values=tuple(_start_value(*item) for item in given.get("start_values", {}).items()),
-        output=memory if memory is not None else Path(output) if output is not None else None,
-        listen=tuple(given.get("listen", ())),
-        connect=tuple(given.get("connect", ())),
-        paused=given.get("paused", False),
-        view=given.get("view", False),
-        video=Path(video) if video is not None else None,
-    )
-
-
-def _start_value(name: str, value: object) -> str:
-    """A start value as the command line has it; JSON is YAML, and its floats are exact."""
-    try:
-        return f"{name}={msgspec.json.encode(_plain(value)).decode()}"
-    except (TypeError, msgspec.MsgspecError) as error:
-        raise CallRefused(f"the start value of '{name}' is {shown(value)}: {error}", variable=name) from error
-
-
-def _listener(options: RunOptions) -> Callable[[Event], None] | None:
-    """What is called with the events of a run; None if nothing is asked for."""
-    on_event, on_progress = options.get("on_event"), options.get("on_progress")
-    if on_event is None and on_progress is None:
-        return None
-
-    def tell(event: Event) -> None:
-        if on_event is not None:
-            on_event(event)
-        if on_progress is not None and isinstance(event, Status):
-            on_progress(event.status)
-
-    return tell
-
-
-def _plain(value: Any) -> Any:  # noqa: ANN401  whatever a program gives
-    """A value as a file has it: paths are text, arrays are nested lists."""
-    match value:
-        case Path():
-            return str(value)
-        case np.ndarray() | np.generic():
-            return value.tolist()
-        case Mapping():
-            return {key: _plain(inner) for key, inner in value.items()}
-        case list() | tuple():
-            return [_plain(inner) for inner in value]
-        case _:
-            return value

@@ -9,7 +9,7 @@ from concurrent.futures import Future
 from concurrent.futures import TimeoutError as NotYet
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self, Unpack
 
 from ..errors import (
     CallRefused,
@@ -35,9 +35,13 @@ from ..wire.views import (
     VariableView,
 )
 from .notebook_progress import NotebookProgress
-from .result import Result
-from .run_thread import RunThread
 from .samples import Sample, Watch, sample_of, targets_of
+
+if TYPE_CHECKING:  # whoever attaches to a mesh needs nothing that plans or starts one
+    from ..run.run_plan import RunPlan
+    from .plan_options import StartOptions
+    from .result import Result
+    from .run_thread import RunThread
 
 __all__ = ["TIMEOUT_S", "Run"]
 
@@ -80,6 +84,21 @@ class Run:
         self._closed = False
         self._begun = False
         self._ended: Future[Result] | None = own.future if own is not None else None
+
+    @classmethod
+    def start(cls, plan: RunPlan, **how: Unpack[StartOptions]) -> Self:
+        """Start a run that `Mesh.plan` has planned; `Mesh.start` does both.
+
+        Args:
+            plan: the plan of the run.
+            how: see `StartOptions`.
+
+        Raises:
+            CallRefused: its results do not fit into memory.
+        """
+        from .run_thread import RunThread, Settings  # noqa: PLC0415  not for those who attach to a mesh
+
+        return cls(plan.mesh, own=RunThread(plan, Settings(**how)))
 
     def __enter__(self) -> Self:
         return self
@@ -193,6 +212,18 @@ class Run:
         """Go on after a pause."""
         return self._running().command(Command("resume"))
 
+    def interrupt(self) -> None:
+        """End a run that was started here, so that `wait` raises `Interrupted`; a second call waits for no process.
+
+        It may be called in a signal handler.
+
+        Raises:
+            CallRefused: the run was started by somebody else.
+        """
+        if self._own is None:
+            raise CallRefused(f"mesh '{self.name}' was started by somebody else", hint="`stop` ends it.")
+        self._own.interrupt()
+
     def stop(self) -> None:
         """End the run; what was recorded is kept. `wait` then returns the result of a run that was started here."""
         if self._own is None:
@@ -291,8 +322,8 @@ class Run:
         """The end of the run; that of a mesh that was found is followed on a thread."""
         with self._opening:
             if self._ended is None:
-                self._ended = future = Future[Result]()
-                client = self._client()
+                future: Future[Result] = Future()
+                self._ended, client = future, self._client()
                 threading.Thread(target=_follow, args=(client, future), name="end", daemon=True).start()
             return self._ended
 
@@ -368,6 +399,8 @@ def _by_keyboard(error: Interrupted) -> KeyboardInterrupted:
 
 def _follow(client: MeshClient, future: Future[Result]) -> None:
     """Follow a mesh that somebody else has started to its end."""
+    from .result import Result  # noqa: PLC0415  see above
+
     try:
         file, last = client.info().result_file, None
         with client.statuses(_FOREVER_S) as statuses:

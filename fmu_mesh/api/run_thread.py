@@ -25,7 +25,7 @@ from ..run.outcome import Outcome
 from ..run.run_plan import RunPlan
 from ..simtime import ENDLESS
 from ..wire.runtime import run_name, runtime_folder
-from ..wire.views import LogLine, MeshStatus
+from ..wire.views import MeshStatus
 from .result import Result, result_of, types_of
 from .result_reading import Columns
 
@@ -38,6 +38,7 @@ MEMORY_LIMIT = 2**30
 
 _WARNED_AT = 0.8
 _JOIN_S = 10.0
+_MEMORY = "memory."
 _LEVELS = {"ok": logging.DEBUG, "warning": logging.WARNING, "discard": logging.WARNING}
 
 
@@ -47,16 +48,16 @@ class Settings(msgspec.Struct, frozen=True):
     Attributes:
         processes: False runs everything in this process.
         restarts: how often a run is started again from its first point if a process of it is lost.
-        on_event: called with every event, on the thread of the run.
-        memory: the file for results that stay in memory; None: results go where the configuration says.
-        memory_limit: the most bytes of such results.
+        memory_limit: the most bytes of results that stay in memory.
+        on_progress: called with every status, on the thread of the run.
+        on_event: called there with every event; without it, the log gets the messages of FMUs.
     """
 
     processes: bool = True
     restarts: int = 0
-    on_event: Callable[[Event], object] | None = None
-    memory: Path | None = None
     memory_limit: int = MEMORY_LIMIT
+    on_progress: Callable[[MeshStatus], object] | None = None
+    on_event: Callable[[Event], object] | None = None
 
 
 class RunThread:
@@ -85,9 +86,11 @@ class RunThread:
         self._stopped = False
         self._failure: BaseException | None = None
         self._warned = False
-        self._changing = threading.Lock()
-        if settings.memory is not None:
+        self._changing = threading.RLock()  # a signal handler may interrupt the handler before it
+        self._memory = _memory_of(plan)
+        if self._memory is not None:
             _check_memory(plan, settings.memory_limit)
+            self._memory.parent.mkdir(mode=0o700)
         _active.add(self)
         self._thread = threading.Thread(target=self._work, name=f"run of {plan.mesh}", daemon=True)
         self._thread.start()
@@ -126,8 +129,8 @@ class RunThread:
             self.future.set_result(result)
         finally:
             self.reached.set()
-            if self._settings.memory is not None:
-                rmtree(self._settings.memory.parent, ignore_errors=True)
+            if self._memory is not None:
+                rmtree(self._memory.parent, ignore_errors=True)
             _active.discard(self)
 
     def _run(self) -> Result:
@@ -136,15 +139,15 @@ class RunThread:
         Raises:
             FmuMeshError: it ended early; has the result.
         """
-        plan = self.plan
+        plan, most = self.plan, self._settings.restarts
         while True:
             try:
                 return self._result(self._run_once(plan))
             except FmuMeshError as error:
-                if type(error) is not MeshLost or plan.restarts == self._settings.restarts or self._failure is not None:
+                if type(error) is not MeshLost or plan.restarts == most or self._failure is not None:
                     return self._ended_early(error)
                 plan = replace(plan, restarts=plan.restarts + 1)
-                self._take(Restarted(error.report(), plan.restarts))
+                self._take(Restarted(error.report(), plan.restarts, most))
 
     def _run_once(self, plan: RunPlan) -> Outcome:
         kind = Launcher if self._settings.processes else InProcessRun
@@ -177,17 +180,16 @@ class RunThread:
             case Status(status):
                 self.status = status
                 self._watch_memory()
-            case Log(line):
-                _log_line(line)
-            case Output(process, text):
-                log.info("%s: %s", process, text)
-            case Restarted(error, number):
-                log.warning("restart %d: %s", number, error.message)
-        if self._settings.on_event is not None:
-            try:
-                self._settings.on_event(event)
-            except BaseException as error:  # noqa: BLE001 whoever waits gets it
-                self._fail(error)
+        on_event, on_progress = self._settings.on_event, self._settings.on_progress
+        if on_event is None:
+            _log(event)
+        try:
+            if on_event is not None:
+                on_event(event)
+            if on_progress is not None and isinstance(event, Status):
+                on_progress(event.status)
+        except BaseException as error:  # noqa: BLE001 whoever waits gets it
+            self._fail(error)
 
     def _fail(self, error: BaseException) -> None:
         """End the run because of something in this program."""
@@ -196,7 +198,7 @@ class RunThread:
             self._runner.interrupt()
 
     def _watch_memory(self) -> None:
-        file, limit = self._settings.memory, self._settings.memory_limit
+        file, limit = self._memory, self._settings.memory_limit
         if file is None or not file.exists():
             return
         size = file.stat().st_size
@@ -207,10 +209,10 @@ class RunThread:
             log.warning("the results of '%s' take %d bytes of memory; the run ends at %d", self.plan.mesh, size, limit)
 
     def _result(self, outcome: Outcome | None) -> Result:
-        if self._settings.memory is None or outcome is None:
+        if self._memory is None or outcome is None:
             return result_of(self.plan, outcome)
         types = types_of(self.plan.plan.system) or {}
-        times, arrays = read_arrays(self._settings.memory, list(types.values()))
+        times, arrays = read_arrays(self._memory, list(types.values()))
         columns = Columns(times, dict(zip(types, arrays, strict=True)))
         return Result(
             self.plan.mesh, outcome=replace(outcome, file=None), system=self.plan.plan.system, columns=columns
@@ -232,13 +234,19 @@ def _end_all() -> None:
 
 
 def memory_file() -> Path:
-    """A file for results that stay in memory, in a folder of its own; whoever runs the mesh removes both.
+    """The file for results that stay in memory; the run makes its folder, and removes it.
 
     If this process is killed, the next run of this user removes them.
     """
-    folder = runtime_folder() / f"memory.{run_name()}"
-    folder.mkdir(mode=0o700)
-    return folder / f"rows{ENDING}"
+    return runtime_folder() / f"{_MEMORY}{run_name()}" / f"rows{ENDING}"
+
+
+def _memory_of(plan: RunPlan) -> Path | None:
+    """The file for results that stay in memory; None if they go where the configuration says."""
+    output = plan.options.output
+    if output is None or output.suffix != ENDING or not output.parent.name.startswith(_MEMORY):
+        return None
+    return output if output.parent.parent == runtime_folder() else None
 
 
 def _check_memory(plan: RunPlan, limit: int) -> None:
@@ -262,6 +270,15 @@ def _too_large(mesh: str, limit: int, size: int | None = None) -> CallRefused:
     )
 
 
-def _log_line(line: LogLine) -> None:
-    level = _LEVELS.get(line.status, logging.ERROR)
-    log.log(level, "%s at point %d: %s", line.instance, line.point, line.message)
+def _log(event: Event) -> None:
+    """Log an event that the program does not ask for."""
+    match event:
+        case Log(line):
+            level = _LEVELS.get(line.status, logging.ERROR)
+            log.log(level, "%s at point %d: %s", line.instance, line.point, line.message)
+        case Output(process, text):
+            log.info("%s: %s", process, text)
+        case Restarted(error, number, _):
+            log.warning("restart %d: %s", number, error.message)
+        case _:
+            pass

@@ -4,31 +4,19 @@ from __future__ import annotations
 
 import argparse
 import sys
-from pathlib import Path
 
 import msgspec
 
+from ..api.functions import load
+from ..api.plan_view import PlanView
 from ..config.structure import schema_text
 from ..errors import FmuMeshError
 from ..instances.configuration import installed_config
-from ..instances.registry import check_engines
-from ..run.preparing import prepare
-from ..system.grouping import automatic_nodes
-from ..system.initialization_plan import Loop
-from ..system.plan import Plan
-from ..system.system import Connection, SystemInstance
-from ..text import listed, short_number, short_path, shown
-from ..variables.model_description import Variable
 from .arguments import CommandParser, Parsers, add_json, add_quiet
-from .output.display import teller
 from .output.json_output import Failure, failure_of, print_json
-from .output.plan_view import PlanView, plan_view
-from .output.tables import pairs, table
-from .run_options import add_configuration, read_options
+from .run_options import add_configuration, given_options
 
-__all__ = ["PARSERS", "CheckReport", "plan_page"]
-
-_PROBLEM_CHARACTERS = 100
+__all__ = ["PARSERS", "CheckReport"]
 
 
 class CheckReport(msgspec.Struct, frozen=True):
@@ -60,205 +48,22 @@ def _add_schema(parser: CommandParser) -> None:
 
 def _check(arguments: argparse.Namespace) -> int:
     try:
-        plan = prepare(arguments.config, read_options(arguments), teller(quiet=arguments.quiet))
-        if not arguments.json:
-            print("\n".join(plan_page(plan)))
-        check_engines(plan.system.config.instances, str(arguments.config))
+        check = load(arguments.config).check(**given_options(arguments))
+        if not arguments.json and check.run is not None:
+            print(check or check.page)
+        check.require()
     except FmuMeshError as error:
         if arguments.json:
             print_json(CheckReport(str(arguments.config), error.exit_code, error=failure_of(error)))
         raise
     if arguments.json:
-        print_json(CheckReport(str(arguments.config), 0, plan_view(plan)))
-    else:
-        print(f"\nOK: {arguments.config} can run.")
+        print_json(CheckReport(str(arguments.config), 0, check.plan))
     return 0
 
 
 def _schema(_arguments: argparse.Namespace) -> int:
     sys.stdout.write(schema_text(installed_config()))
     return 0
-
-
-def plan_page(plan: Plan) -> list[str]:
-    """The plan as lines of text, the same on every terminal and in every pipe."""
-    sections = [
-        ("", _head(plan)),
-        ("Instances", _instances(plan)),
-        ("Connections", _connections(plan)),
-        ("Execution order within one point", _order(plan)),
-        ("Groups", _groups(plan)),
-        ("Inputs that are not connected", _free_inputs(plan)),
-        ("Initialization", _initialization(plan)),
-        ("Recorded", _recorded(plan)),
-        ("Warnings", _warnings(plan)),
-    ]
-    lines: list[str] = []
-    for title, content in sections:
-        if content:
-            lines += ([""] if lines else []) + ([title] if title else []) + content
-    return lines
-
-
-def _head(plan: Plan) -> list[str]:
-    simulation, grid = plan.system.config.simulation, plan.grid
-    factor = simulation.real_time_factor
-    window = f"{plan.window} points" if plan.window > 1 else "1 point: lockstep"
-    end = f"{short_number(grid.stop_time)} s in {grid.last_point}" if grid.stop_time is not None else "an open end in"
-    times = f"{short_number(grid.start_time)} s to {end} steps of"
-    return pairs(
-        [
-            ("Mesh", plan.system.config.mesh),
-            ("Simulation", f"{times} {short_number(grid.step_size)} s"),
-            ("Algorithm", simulation.algorithm),
-            ("Window", window),
-            ("Speed", f"{factor:g} times real time" if factor else "as fast as possible"),
-        ]
-    )
-
-
-def _instances(plan: Plan) -> list[str]:
-    rows = [
-        [
-            instance.name,
-            _model(plan, instance),
-            f"step {short_number(instance.step_points * plan.grid.step_size)} s",
-            "a process of its own" if instance.node == instance.name else f"group {instance.node}",
-            _start_values(instance),
-        ]
-        for instance in plan.system.instances.values()
-    ]
-    return table(rows, indent=2)
-
-
-def _model(plan: Plan, instance: SystemInstance) -> str:
-    """The file of an instance, and what computes it."""
-    summary = plan.system.config.instances[instance.name].summary(instance.description)
-    return f"{Path(instance.fmu).name or instance.description.model_name} ({summary})"
-
-
-def _start_values(instance: SystemInstance) -> str:
-    return ", ".join(
-        f"{name} = {shown(value)}{_unit(instance.description.variable(name))}"
-        for name, value in instance.start_values.items()
-    )
-
-
-def _connections(plan: Plan) -> list[str]:
-    closing_ones = {str(c) for c in plan.closing}
-    rows = []
-    for c in plan.connections:
-        what = "value at the start of the step" if c.delay else "value at the end of the step"
-        closing = "closes a cycle" if str(c) in closing_ones else ""
-        if c.extrapolation == "linear":
-            what = "goes on linearly in the step" if c.delay else "changes linearly in the step"
-        rows.append([str(c), f"delay {c.delay}", what, _arithmetic(c), closing, c.units])
-    return table(rows, indent=2)
-
-
-def _free_inputs(plan: Plan) -> list[str]:
-    """Inputs that keep their start values unless they are set: a forgotten connection is visible here."""
-    connected = {(c.target_instance, c.target.name) for c in plan.connections}
-    lines = []
-    for name, instance in plan.system.instances.items():
-        free = [v for v in instance.description.variables if v.causality == "input" and (name, v.name) not in connected]
-        starts = [(v, instance.start_values.get(v.name, v.start)) for v in free]
-        shown_ = [f"{v.name}{f' = {shown(start)}' if start is not None else ''}{_unit(v)}" for v, start in starts]
-        if shown_:
-            lines.append([name, listed(shown_)])
-    return table(lines, indent=2)
-
-
-def _arithmetic(c: Connection) -> str:
-    """The formula of a connection; empty if it copies the value."""
-    if (c.factor, c.offset) == (1.0, 0.0):
-        return ""
-    product = f"{short_number(c.factor)} * {c.source_name}" if c.factor != 1.0 else c.source_name
-    sign = "-" if c.offset < 0.0 else "+"
-    sum_ = f"{product} {sign} {short_number(abs(c.offset))}" if c.offset else product
-    return f"{c.target_name} = {sum_}"
-
-
-def _order(plan: Plan) -> list[str]:
-    instant = {(c.source_instance, c.target_instance) for c in plan.connections if c.delay == 0}
-    arrow = " -> " if instant else ", "
-    lines = [f"  {arrow.join(plan.order)}" + ("" if instant else "  (at the same time)" if len(plan.order) > 1 else "")]
-    lines += [f"  cycle: {', '.join(cycle)}" for cycle in plan.cycles]
-    return lines
-
-
-def _groups(plan: Plan) -> list[str]:
-    """For each cycle, what `group: auto` does or would do, and why."""
-    config, instances = plan.system.config, plan.system.instances
-    edges = [(c.source_instance, c.target_instance) for c in plan.connections]
-    automatic = automatic_nodes(config, edges, {name: own.description for name, own in instances.items()})
-    lines = []
-    for cycle in plan.cycles:
-        names = ", ".join(sorted(cycle, key=[*instances].index))
-        now = {plan.node_of(name) for name in cycle}
-        would = {automatic.get(name, config.instances[name].group or name) for name in cycle}
-        if len(now) > 1:
-            cost = f"{names} form a cycle over {len(now)} nodes: each point costs a round trip"
-            lines.append(f"  {cost}; {_remedy(len(now), len(would))}")
-        elif config.group == "auto" and any(name in automatic for name in cycle):
-            lines.append(f"  {names} form a cycle: together in '{now.pop()}', each point costs no round trip")
-    return lines
-
-
-def _remedy(nodes: int, automatic: int) -> str:
-    if automatic == 1:
-        return "`group: auto` would put them into one"
-    apart = "groups, hosts, or FMUs that allow one instance per process keep them apart"
-    return apart if automatic >= nodes else f"`group: auto` would put them into {automatic}, since {apart}"
-
-
-def _initialization(plan: Plan) -> list[str]:
-    """The levels in which outputs are computed, and which ones are iterated together."""
-    loops = {loop.first: loop for loop in plan.initialization.loops}
-    levels: dict[int, list[str]] = {}
-    by_order = sorted(plan.initialization.levels.items(), key=lambda item: plan.order.index(item[0][0]))
-    for (name, variable), level in by_order:
-        levels.setdefault(level, []).append(f"{name}.{variable}")
-    lines = []
-    for level, names in sorted(levels.items()):
-        lines.append(f"  level {level}: {', '.join(names)}")
-        if level in loops:
-            last = loops[level].last
-            until = f"levels {level} to {last} are" if last > level else f"level {level} is"
-            lines[-1:-1] = [f"  {until} iterated, beginning with {', '.join(_assumed(plan, loops[level]))}"]
-    return lines
-
-
-def _assumed(plan: Plan, loop: Loop) -> list[str]:
-    """The torn inputs of a loop, each with the value that is assumed at first."""
-    described = {tear: plan.system.instances[tear.target].description.variable_of(tear.input) for tear in loop.tears}
-    return [f"{t.target}.{t.input} = {shown(t.start)}{_unit(variable)}" for t, variable in described.items()]
-
-
-def _recorded(plan: Plan) -> list[str]:
-    if plan.system.result_file is None or not plan.system.recorded:
-        return ["  nothing"]
-    instances = plan.system.instances
-    rows = []
-    for name, variable in plan.system.recorded:
-        described = instances[name].description.variable_of(variable)
-        type_ = described.type_name.partition("[")[0] if described is not None else ""
-        rows.append([f"{name}.{variable}", type_, _unit(described).strip()])
-    return [*table(rows, indent=2), f"  into {short_path(plan.system.result_file)}"]
-
-
-def _warnings(plan: Plan) -> list[str]:
-    lines = [f"  {warning}" for warning in plan.system.warnings]
-    for instance in plan.system.instances.values():
-        for problem in instance.description.problems:
-            text = " ".join(problem.split())
-            short = text if len(text) <= _PROBLEM_CHARACTERS else text[: _PROBLEM_CHARACTERS - 3] + "..."
-            lines.append(f"  {instance.name}: {Path(instance.fmu).name}: {short}")
-    return lines
-
-
-def _unit(variable: Variable | None) -> str:
-    return f" {variable.unit}" if variable is not None and variable.unit else ""
 
 
 PARSERS: Parsers = {"check": _add_check, "schema": _add_schema}

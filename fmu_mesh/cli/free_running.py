@@ -7,30 +7,18 @@ from __future__ import annotations
 
 import argparse
 import re
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
-import msgspec
 from msgspec.structs import replace
 
+from ..api.mesh_builder import Mesh
 from ..config.base import NAME_PATTERN
-from ..config.instance_sections import KIND
-from ..config.loading import PlainConfig
-from ..errors import ConfigurationError, LoadFailed
-from ..instances.configuration import examine_data
-from ..instances.registry import KINDS, describe
-from ..run.launcher import Launcher
-from ..run.options import Options, with_config_values
-from ..run.preparing import planned
-from ..run.run_plan import RunPlan
-from ..variables.model_description import ModelDescription
+from ..errors import CallRefused, ConfigurationError, LoadFailed
 from .arguments import CommandParser, Parsers, add_json
-from .inspecting import no_fmu
-from .output.display import Display, teller, warn
+from .output.display import teller
 from .output.reports import RunReporter
-from .run_options import add_options, read_options
-from .running import add_output, finish, run_launcher
+from .run_options import add_options, given_options
+from .running import add_output, run_mesh
 
 __all__ = ["PARSERS"]
 
@@ -72,52 +60,47 @@ def _add_run(parser: CommandParser) -> None:
 
 def _run(arguments: argparse.Namespace) -> int:
     with RunReporter(wanted=arguments.json) as reporter:
-        run = _planned(arguments, teller(quiet=arguments.quiet))
-        if not arguments.quiet:
-            warn(run.plan)
-        with Display(run.plan, show_progress=not arguments.no_progress, quiet=arguments.quiet) as display:
-            outcome = run_launcher(Launcher(run, display.event), run, reporter)
-        finish(run.plan, outcome, arguments)
+        mesh, options = _mesh(arguments), given_options(arguments)
+        front = f"{mesh.name}."  # the only instance has the name of the mesh
+        options["start_values"] = tuple(f"{front}{change}" for change in options["start_values"])
+        try:
+            run_mesh(mesh, options, arguments, reporter, {})
+        except ConfigurationError as error:
+            raise _as_given(error, front) from error
     return 0
 
 
-def _planned(arguments: argparse.Namespace, tell: Callable[[str], None]) -> RunPlan:
+def _mesh(arguments: argparse.Namespace) -> Mesh:
+    """The mesh of this one FMU."""
+    simulation = {"stop_time": None, **_SIMULATION}
+    if arguments.step_size is not None:
+        simulation["step_size"] = arguments.step_size
     try:
-        section = msgspec.convert({KIND: "fmu", "fmu": str(arguments.fmu)}, KINDS.section("fmu"))
-        description = describe(arguments.fmu, section, tell=tell)
-    except LoadFailed as error:
-        raise no_fmu(arguments.fmu, error) from error
-    name = arguments.name if arguments.name is not None else description.model_identifier
-    if re.search(NAME_PATTERN, name) is None:
+        mesh = Mesh.from_fmu(
+            arguments.fmu,
+            name=arguments.name,
+            simulation=simulation,
+            on_notice=teller(quiet=arguments.quiet),
+            interpolation=arguments.interpolation,
+        )
+    except LoadFailed as error:  # a wrong argument: nothing was going to run
+        raise ConfigurationError(error.message, hint=error.hint) from error
+    except CallRefused as error:
+        raise ConfigurationError(error.message, hint="Give one with --step-size.") from error
+    if re.search(NAME_PATTERN, mesh.name) is None:
         what = "a name of letters, digits, _ and - that starts with a letter or _"
-        raise ConfigurationError(f"'{name}' is not {what}", hint="Give the mesh such a name with --name.")
-    options = read_options(arguments)
-    options = replace(options, start_values=tuple(f"{name}.{change}" for change in options.start_values))
-    plain = PlainConfig(_configuration(arguments, name, options, description), arguments.fmu)
-    loaded, findings = examine_data(with_config_values(plain, options.config_values), options.start_values)
-    findings.raise_any()
-    named = {place: text.replace(f"--set {name}.", "--set ", 1) for place, text in loaded.overrides.items()}
-    loaded = replace(loaded, overrides=named)
-    return planned(loaded, loaded.findings(), options, known={name: description})
+        raise ConfigurationError(f"'{mesh.name}' is not {what}", hint="Give the mesh such a name with --name.")
+    return mesh
 
 
-def _configuration(
-    arguments: argparse.Namespace, name: str, options: Options, description: ModelDescription
-) -> dict[str, Any]:
-    """The configuration of a mesh of one instance as a file would have it, before options replace its keys."""
-    step_size = description.default_experiment.step_size
-    if step_size is None and options.step_size is None:
-        raise ConfigurationError(f"'{arguments.fmu}' has no default step size.", hint="Give one with --step-size.")
-    return {
-        "mesh": name,
-        "simulation": {
-            "stop_time": None,
-            "step_size": step_size if step_size is not None else options.step_size,
-            **_SIMULATION,
-        },
-        "instances": {name: {"fmu": str(arguments.fmu.absolute()), "interpolation": arguments.interpolation}},
-        "record": {"file": None},
-    }
+def _as_given(error: ConfigurationError, front: str) -> ConfigurationError:
+    """The error with start values as they were given: without the name of the only instance."""
+
+    def short(text: str) -> str:
+        return text.replace(f"--set {front}", "--set ", 1)
+
+    findings = tuple(replace(finding, path=short(finding.path)) for finding in error.findings)
+    return ConfigurationError(short(error.message), findings=findings, hint=error.hint)
 
 
 PARSERS: Parsers = {"run": _add_run}

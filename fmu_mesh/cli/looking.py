@@ -15,6 +15,7 @@ from typing import Any
 
 import msgspec
 
+from ..api.tables import table
 from ..errors import ConfigurationError, FmuMeshError, Interrupted
 from ..wire.client.mesh_client import MeshClient
 from ..wire.client.reaching import Meshes
@@ -33,7 +34,6 @@ from .output.pages import (
     seconds,
     variables,
 )
-from .output.tables import table
 
 __all__ = ["PARSERS", "add_question"]
 

@@ -5,14 +5,19 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
+from msgspec.structs import asdict
+
+from ..api.plan_options import PlanOptions
 from ..config.base import Endpoint
 from ..config.mesh import MAX_WINDOW
+from ..errors import ConfigurationError
 from ..run.options import Options, option_fields
 from .arguments import endpoint, number, whole
+from .output.display import teller
 
-__all__ = ["add_configuration", "add_options", "read_options"]
+__all__ = ["add_configuration", "add_options", "given_options", "read_options"]
 
 
 def add_configuration(parser: argparse.ArgumentParser) -> None:
@@ -62,6 +67,19 @@ def add_options(
         if flag.bare is not None:
             details |= {"nargs": "?", "const": flag.bare, "type": _trace_file}
         parser.add_argument(flag.name, **details)
+
+
+def given_options(arguments: argparse.Namespace) -> PlanOptions:
+    """The options from the arguments of a command, as the library takes them.
+
+    Raises:
+        ConfigurationError: two of them cannot be combined.
+    """
+    options = read_options(arguments)
+    if options.view and options.video is not None:
+        raise ConfigurationError("--view and --video do not go together", hint="Leave one of them out.")
+    tell = teller(quiet=getattr(arguments, "quiet", False))
+    return cast("PlanOptions", {**asdict(options), "on_notice": tell})
 
 
 def read_options(arguments: argparse.Namespace) -> Options:

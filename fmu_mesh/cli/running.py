@@ -6,32 +6,33 @@ import argparse
 import signal
 import sys
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
+from functools import partial
 from pathlib import Path
 from types import FrameType
 
-from msgspec.structs import replace
-
-from ..errors import ConfigurationError, MeshLost
+from ..api.functions import load
+from ..api.mesh_builder import Mesh
+from ..api.plan_options import PlanOptions, StartOptions
+from ..api.run_handle import Run
+from ..errors import ConfigurationError
 from ..run.events import Event, Reachable
 from ..run.gateway_role import run_gateway
-from ..run.in_process import InProcessRun
-from ..run.launcher import Launcher
-from ..run.options import Options
 from ..run.outcome import Outcome
-from ..run.preparing import plan_run
 from ..run.process import ended_by_signals
 from ..run.roles import run_master, run_node
 from ..run.run_plan import RunPlan
 from ..system.plan import Plan
 from ..wire.session import run_router
 from .arguments import CommandParser, Parsers, add_json, add_quiet, count, endpoint
-from .output.display import Display, say, stdout_as_stderr, summary, teller, warn
+from .output.display import Display, stdout_as_stderr, summary, warn
 from .output.profile_table import show_profile
 from .output.reports import RunReporter
 from .plotting import check_plot, plot_results, plotted_where_it_ends
-from .run_options import add_configuration, add_options, read_options
+from .run_options import add_configuration, add_options, given_options
 
-__all__ = ["PARSERS", "add_output", "finish", "run_launcher"]
+__all__ = ["PARSERS", "add_output", "run_mesh"]
 
 
 def _add_launch(parser: CommandParser) -> None:
@@ -94,91 +95,82 @@ def add_output(parser: CommandParser) -> None:
     add_quiet(parser)
 
 
-def _options(arguments: argparse.Namespace) -> Options:
-    """The options of a command.
-
-    Raises:
-        ConfigurationError: two of them cannot be combined.
-    """
-    options = read_options(arguments)
-    if options.view and options.video is not None:
-        raise ConfigurationError("--view and --video do not go together", hint="Leave one of them out.")
-    return options
-
-
 def _launch(arguments: argparse.Namespace) -> int:
     with RunReporter(wanted=arguments.json) as reporter:
-        run = _planned(arguments, _launch_options(arguments))
-        with (
-            plotted_where_it_ends(run.plan, arguments.plot),
-            Display(run.plan, show_progress=not arguments.no_progress, quiet=arguments.quiet) as display,
-        ):
-            if arguments.local:
-                outcome = _run_local(run, display, reporter)
-            else:
-                outcome = _run_processes(run, arguments.restarts, display, reporter)
-        finish(run.plan, outcome, arguments)
+        options, how = given_options(arguments), _how(arguments)
+        run_mesh(load(arguments.config), options, arguments, reporter, how)
     return 0
 
 
-def _launch_options(arguments: argparse.Namespace) -> Options:
-    options = _options(arguments)
-    if arguments.local and options.paused:
+def _how(arguments: argparse.Namespace) -> StartOptions:
+    """How a run is started.
+
+    Raises:
+        ConfigurationError: two options cannot be combined.
+    """
+    if arguments.local and arguments.paused:
         raise ConfigurationError("--paused is for a mesh that others can reach, and --local has none of it.")
-    if arguments.local and options.profile:
+    if arguments.local and arguments.profile:
         raise ConfigurationError("--profile measures nodes, and --local has none", hint="Leave one of them out.")
-    if arguments.restarts and (arguments.local or options.paused):
+    if arguments.restarts and (arguments.local or arguments.paused):
         other = "--local" if arguments.local else "--paused"
         raise ConfigurationError(f"--restarts and {other} do not go together", hint="Leave one of them out.")
-    return options
+    return {"processes": not arguments.local, "restarts": arguments.restarts}
 
 
-def _planned(arguments: argparse.Namespace, options: Options) -> RunPlan:
+def run_mesh(
+    mesh: Mesh, options: PlanOptions, arguments: argparse.Namespace, reporter: RunReporter, how: StartOptions
+) -> None:
+    """Run a mesh, show its events, and at the end what the arguments ask for."""
+    plan = _planned(mesh, options, arguments)
+    reporter.planned(plan)
+    with (
+        plotted_where_it_ends(plan.plan, getattr(arguments, "plot", None)),
+        Display(plan.plan, show_progress=not arguments.no_progress, quiet=arguments.quiet) as display,
+        nullcontext() if how.get("processes", True) else stdout_as_stderr(),
+        _ended_by_signals() as runs,
+    ):
+        how["on_event"] = partial(_show, reporter, display)
+        runs.append(Run.start(plan, **how))
+        outcome = runs[0].wait().outcome
+    assert outcome is not None  # it has run
+    _finish(plan.plan, outcome, arguments)
+
+
+def _show(reporter: RunReporter, display: Display, event: Event) -> None:
+    reporter.event(event)
+    display.event(event)
+
+
+def _planned(mesh: Mesh, options: PlanOptions, arguments: argparse.Namespace) -> RunPlan:
     """Plan the run of a command, and check what it shows at the end."""
-    run = plan_run(arguments.config, options, teller(quiet=arguments.quiet))
+    plan = mesh.plan(**options)
     if not arguments.quiet:
-        warn(run.plan)
-    if arguments.plot is not None:
-        check_plot(arguments.plot, run.plan.system.result_file)
-    return run
+        warn(plan.plan)
+    if getattr(arguments, "plot", None) is not None:
+        check_plot(arguments.plot, plan.plan.system.result_file)
+    return plan
 
 
-def _run_processes(run: RunPlan, most_restarts: int, display: Display, reporter: RunReporter) -> Outcome:
-    """Run the mesh; if a process of it is lost, run it again from its first point, as often as `--restarts` allows."""
-    while True:
-        try:
-            return run_launcher(Launcher(run, display.event), run, reporter)
-        except MeshLost as error:
-            if run.restarts == most_restarts or type(error) is not MeshLost:
-                raise
-            run = replace(run, restarts=run.restarts + 1)
-            again = f"The run starts again from its first point (restart {run.restarts} of {most_restarts})."
-            say(str(error.instead_of_hint(again)))
-
-
-def run_launcher(launcher: Launcher | InProcessRun, run: RunPlan, reporter: RunReporter) -> Outcome:
-    """Run it; Ctrl-C and SIGTERM end the run instead of this process."""
-    reporter.started(run, launcher)
+@contextmanager
+def _ended_by_signals() -> Iterator[list[Run]]:
+    """Inside, Ctrl-C and SIGTERM end the run in the list that this yields, instead of this process."""
+    runs: list[Run] = []
 
     def interrupt(_number: int, _frame: FrameType | None) -> None:
-        launcher.interrupt()
+        if not runs:
+            raise KeyboardInterrupt
+        runs[0].interrupt()
 
     before = {number: signal.signal(number, interrupt) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
-        return launcher.run()
+        yield runs
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
 
 
-def _run_local(run: RunPlan, display: Display, reporter: RunReporter) -> Outcome:
-    with stdout_as_stderr():
-        outcome = run_launcher(InProcessRun(run, display.event), run, reporter)
-    display.event(outcome)
-    return outcome
-
-
-def finish(plan: Plan, outcome: Outcome, arguments: argparse.Namespace) -> None:
+def _finish(plan: Plan, outcome: Outcome, arguments: argparse.Namespace) -> None:
     """Show what the options of the command ask for, and print the summary."""
     if outcome.profile is not None:
         show_profile(plan, outcome.profile, outcome.seconds, arguments.profile)
@@ -192,20 +184,20 @@ def finish(plan: Plan, outcome: Outcome, arguments: argparse.Namespace) -> None:
 
 
 def _node(arguments: argparse.Namespace) -> int:
-    run_node(plan_run(arguments.config, _options(arguments)).node(arguments.node))
+    run_node(load(arguments.config).plan(**given_options(arguments)).node(arguments.node))
     return 0
 
 
 def _master(arguments: argparse.Namespace) -> int:
-    run = _planned(arguments, _options(arguments))
+    plan = _planned(load(arguments.config), given_options(arguments), arguments)
     with (
-        plotted_where_it_ends(run.plan, arguments.plot),
+        plotted_where_it_ends(plan.plan, arguments.plot),
         Display(
-            run.plan, show_progress=not arguments.no_progress, quiet=arguments.quiet, waits_for_nodes=False
+            plan.plan, show_progress=not arguments.no_progress, quiet=arguments.quiet, waits_for_nodes=False
         ) as display,
     ):
-        outcome = run_master(run, display.event)
-    finish(run.plan, outcome, arguments)
+        outcome = run_master(plan, display.event)
+    _finish(plan.plan, outcome, arguments)
     return 0
 
 
@@ -214,7 +206,7 @@ def _gateway(arguments: argparse.Namespace) -> int:
         if isinstance(event, Reachable):
             print(f"topics of ROS at {', '.join(event.endpoints)}", flush=True)
 
-    run_gateway(plan_run(arguments.config, _options(arguments)), show)
+    run_gateway(load(arguments.config).plan(**given_options(arguments)), show)
     return 0
 
 

@@ -14,6 +14,7 @@ from typing import Final
 
 import msgspec
 
+from ..api.tables import shortened, table, width_of
 from ..errors import DeadlineExceeded, Interrupted
 from ..wire.client.mesh_client import MeshClient
 from ..wire.client.reaching import Meshes
@@ -21,7 +22,6 @@ from ..wire.views import InstanceStatus, MeshStatus
 from .arguments import CommandParser, Parsers, add_json, add_reaching, positive_seconds
 from .output.pages import progress, seconds
 from .output.screen import Screen
-from .output.tables import shortened, table, width_of
 from .output.terminal import may_draw
 
 __all__ = ["PARSERS", "page"]

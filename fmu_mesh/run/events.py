@@ -48,10 +48,11 @@ class Output(msgspec.Struct, frozen=True, tag="output"):
 
 
 class Restarted(msgspec.Struct, frozen=True, tag="restarted"):
-    """The run starts again from its first point, for the ``number``-th time, because of an error."""
+    """The run starts again from its first point, for the ``number``-th of ``most`` times, because of an error."""
 
     error: ErrorReport
     number: int
+    most: int
 
 
 Event = Reachable | Status | Log | Output | Restarted | Outcome

@@ -65,6 +65,7 @@ class InProcessRun:
                 self.outcome = self._failed(self._error)
             raise self._error
         assert self.outcome is not None
+        self._on_event(self.outcome)
         return self.outcome
 
     def interrupt(self) -> None:

@@ -85,7 +85,7 @@ def test_what_is_right_has_a_plan() -> None:
     check = built().check()
 
     assert check
-    assert str(check) == "OK"
+    assert str(check).endswith("\n\nOK: <mesh pair> can run.")
     assert check.run is not None
     assert check.run.plan.order == ("pendulum", "delay")
 

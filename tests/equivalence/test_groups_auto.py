@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
-from fmu_mesh.cli.checking import plan_page
+from fmu_mesh.api.plan_page import plan_page
 from fmu_mesh.instances.configuration import load
 from fmu_mesh.run.preparing import prepare
 from fmu_mesh.system.grouping import automatic_nodes

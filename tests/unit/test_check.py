@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from msgspec.structs import replace
 
-from fmu_mesh.cli.checking import plan_page
+from fmu_mesh.api.plan_page import plan_page
 from fmu_mesh.cli.main import main
 from fmu_mesh.config.structure import json_schema
 from fmu_mesh.errors import Finding

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from fmu_mesh.cli.checking import plan_page
+from fmu_mesh.api.plan_page import plan_page
 from fmu_mesh.config.findings import Findings
 from fmu_mesh.config.mesh import ConnectionConfig
 from fmu_mesh.instances.configuration import parse

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import yaml
 
-from fmu_mesh.cli.checking import plan_page
+from fmu_mesh.api.plan_page import plan_page
 from fmu_mesh.errors import ConfigurationError
 from fmu_mesh.run.local import LocalMesh
 from fmu_mesh.run.preparing import prepare

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fmu_mesh.cli.checking import plan_page
+from fmu_mesh.api.plan_page import plan_page
 from fmu_mesh.errors import ConfigurationError
 from fmu_mesh.instances.fmi import read_description
 from fmu_mesh.run.preparing import prepare

@@ -86,8 +86,8 @@ class Display:
                 self.log(line)
             case Output(process, text):
                 self._output(process, text)
-            case Restarted(error, number):
-                again = f"The run starts again from its first point (restart {number})."
+            case Restarted(error, number, most):
+                again = f"The run starts again from its first point (restart {number} of {most})."
                 say(str(from_report(error).instead_of_hint(again)))
             case Outcome(ended_by=ErrorReport() as report) if not self._quiet:
                 self.ended(from_report(report))

@@ -6,11 +6,11 @@ from collections.abc import Iterable, Sequence
 
 import msgspec
 
+from ...api.tables import pairs, table
 from ...simtime import ENDLESS
 from ...text import short_number
 from ...wire.client.readings import Reading
 from ...wire.views import InstanceInfo, InstanceStatus, MeshInfo, MeshStatus, RosView, VariableView
-from .tables import pairs, table
 
 __all__ = [
     "cells",

@@ -12,11 +12,11 @@ from typing import Any
 
 import msgspec
 
+from ...api.tables import table
 from ...errors import ConfigurationError
 from ...files import replaced
 from ...system.plan import RECORDER, Plan
 from ...wire.time_profile import GRANT, MeshProfile, NodeProfile
-from .tables import table
 
 __all__ = ["critical_path", "profile_page", "show_profile", "summary_of", "trace"]
 

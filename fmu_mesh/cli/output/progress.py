@@ -13,10 +13,10 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
+from ...api.tables import shortened
 from ...simtime import TimeGrid
 from ...system.plan import Plan
 from ...wire.views import MeshStatus
-from .tables import shortened
 from .terminal import may_draw
 
 __all__ = ["ProgressLine", "progress_parts"]

@@ -12,9 +12,8 @@ from typing import Literal, Self
 
 import msgspec
 
-from ...errors import ErrorReport
-from ...run.in_process import InProcessRun
-from ...run.launcher import Launcher
+from ...errors import ErrorReport, FmuMeshError
+from ...run.events import Event, Restarted
 from ...run.outcome import Outcome
 from ...run.run_plan import RunPlan
 from .display import stdout_as_stderr
@@ -64,7 +63,8 @@ class RunReporter:
         self._wanted = wanted
         self._stack = ExitStack()
         self._run: RunPlan | None = None
-        self._runner: Launcher | InProcessRun | None = None
+        self._outcome: Outcome | None = None
+        self._restarts = 0
 
     def __enter__(self) -> Self:
         if self._wanted:
@@ -79,13 +79,23 @@ class RunReporter:
         if self._wanted:
             print_json(self._report(error))
 
-    def started(self, run: RunPlan, runner: Launcher | InProcessRun) -> None:
-        """Tell what runs, and who knows its outcome; again, if it starts again."""
-        self._run, self._runner = run, runner
+    def planned(self, run: RunPlan) -> None:
+        """Tell what is going to run."""
+        self._run = run
+
+    def event(self, event: Event) -> None:
+        """Take an event of the run."""
+        match event:
+            case Restarted(_, number, _):
+                self._restarts = number
+            case Outcome():
+                self._outcome = event
 
     def _report(self, error: BaseException | None) -> RunReport:
         failure = failure_of(error) if error is not None else None
-        outcome = self._runner.outcome if self._runner is not None else None
+        outcome = self._outcome
+        if isinstance(error, FmuMeshError) and error.result is not None:  # it knows more than the master
+            outcome = error.result.outcome
         outcome = outcome or Outcome("failed", 0, 0.0, 0.0, 0, None)
         return RunReport(
             mesh=self._run.mesh if self._run is not None else None,
@@ -96,7 +106,7 @@ class RunReporter:
             seconds=outcome.seconds,
             rows=outcome.rows,
             file=outcome.file,
-            restarts=self._run.restarts if self._run is not None else 0,
+            restarts=self._restarts,
             error=failure,
             ended_by=outcome.ended_by,
         )

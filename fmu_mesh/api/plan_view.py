@@ -1,14 +1,14 @@
-"""The plan of a mesh as `check --json` prints it: names and plain values, without what only nodes need."""
+"""The plan of a mesh as plain values: names and plain values, without what only nodes need."""
 
 from __future__ import annotations
 
 import msgspec
 
-from ...config.mesh import SimulationConfig
-from ...errors import Finding
-from ...system.plan import Plan
-from ...variables.value_conversion import to_plain
-from ...variables.value_types import PlainValue
+from ..config.mesh import SimulationConfig
+from ..errors import Finding
+from ..system.plan import Plan
+from ..variables.value_conversion import to_plain
+from ..variables.value_types import PlainValue
 
 __all__ = ["PlanView", "plan_view"]
 

@@ -1,0 +1,281 @@
+"""What a file of a model declares, and whether it can run here. Nothing of it is executed."""
+
+from __future__ import annotations
+
+import textwrap
+from base64 import b64encode
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+import msgspec
+
+from .. import files
+from ..config.instance_sections import KIND
+from ..errors import CallRefused, LoadFailed, UnknownName
+from ..instances.fmi import read_description, sha256_of
+from ..instances.registry import KINDS, describe
+from ..text import fits, listed, nearest, nearest_file, short_number, shown
+from ..variables.model_description import Causality, Kind, ModelDescription, Variable
+from .tables import pairs
+
+__all__ = ["SHOWN_VARIABLES", "Inspection", "inspect", "with_way_out"]
+
+SHOWN_VARIABLES: Final = 20
+"""Variables of one causality on a page that does not list all."""
+
+_WIDTH: Final = 120
+_CAUSALITIES: Final[tuple[tuple[Causality, str], ...]] = (
+    ("input", "Inputs"),
+    ("output", "Outputs"),
+    ("structuralParameter", "Structural parameters"),
+    ("parameter", "Parameters"),
+    ("calculatedParameter", "Calculated parameters"),
+    ("independent", "Independent variable"),
+    ("local", "Local variables"),
+)
+_CAPABILITIES: Final = (
+    ("can_handle_variable_step_size", "variable step size"),
+    ("can_reject_steps", "repeat a step"),
+    ("can_get_and_set_state", "get and set its state"),
+    ("can_serialize_state", "serialize its state"),
+    ("can_interpolate_inputs", "interpolate inputs"),
+    ("has_event_mode", "event mode"),
+)
+
+
+class Inspection(msgspec.Struct, frozen=True, omit_defaults=False):
+    """What `inspect` found. As text, it is the page that `fmu-mesh inspect` prints; its fields are those of `--json`.
+
+    Example:
+        >>> import fmu_mesh
+        >>> gain = fmu_mesh.inspect("fmus/Gain.fmu")
+        >>> gain.runs_here, gain.problems
+        (True, ())
+        >>> print(gain.page(variables=["k"]))
+        Parameters (1)
+          k  Real  tunable  = 1.0  gain
+
+    Attributes:
+        file: the path as it was given.
+        sha256: of the archive, as hexadecimal digits; None for a folder.
+        bytes: size of the archive; None for a folder.
+        runs_here: whether it can run on this platform.
+        problems: violations and warnings as text; if it cannot run here, the first one says why.
+        description: the model description.
+    """
+
+    file: str
+    sha256: str | None
+    bytes: int | None
+    runs_here: bool
+    problems: tuple[str, ...]
+    description: ModelDescription
+
+    def page(self, width: int = _WIDTH, variables: Sequence[str] = (), *, everything: bool = False) -> str:
+        """The page in lines of at most ``width`` columns, unless a name is longer.
+
+        Args:
+            width: in columns.
+            variables: names, with `*` for any characters; if given, only these variables are shown.
+            everything: whether all variables are listed.
+
+        Raises:
+            UnknownName: there is no such variable; suggests the nearest one.
+        """
+        names = [variable.name for variable in self.description.variables]
+        for pattern in variables:
+            if not any(fits(pattern, name) for name in names):
+                near = nearest(pattern, names)
+                hint = f"Did you mean '{near}'?" if near else None
+                raise UnknownName(f"'{self.file}' has no variable '{pattern}'", hint=hint)
+        return "\n".join(_page(self, width, variables, everything=everything))
+
+    def __str__(self) -> str:
+        return self.page()
+
+
+def inspect(path: str | Path, *, kind: str | None = None) -> Inspection:
+    """Read what a model declares: its variables, capabilities and default experiment. Nothing of it is run.
+
+    Example:
+        >>> import fmu_mesh
+        >>> pendulum = fmu_mesh.inspect("fmus/DampedPendulum.fmu").description
+        >>> pendulum.fmi_version, pendulum.default_experiment.step_size
+        ('2.0', 0.002)
+        >>> [variable.name for variable in pendulum.with_causality("output")]
+        ['a', 'der(a)', 'der(a,2)']
+        >>> pendulum.variable("l").unit
+        'm'
+
+    Args:
+        path: the file of the model.
+        kind: the kind of instance, as its key in a configuration; default: the kind with the ending of the file,
+            otherwise an FMU.
+
+    Raises:
+        LoadFailed: it is no such model; says why.
+        CallRefused: no installed package offers this kind.
+    """
+    file, names = Path(path), KINDS.names()
+    if kind is not None and kind not in names:
+        raise CallRefused(f"no installed package offers the kind of instance '{kind}'; there are {listed(names)}")
+    key = kind if kind is not None else file.suffix.removeprefix(".") if file.is_file() else names[0]
+    reasons: tuple[str, ...] = ()
+    try:
+        if key in names and key != names[0]:
+            section = msgspec.convert({KIND: key, key: str(path)}, KINDS.section(key))
+            description = describe(file.absolute(), section)
+        else:
+            try:
+                description = read_description(file)
+            except LoadFailed as error:
+                description = read_description(file, to_run=False)  # otherwise this says why
+                reasons = (str(error),)
+    except LoadFailed as error:
+        raise with_way_out(error, file) from error
+    is_archive = not file.is_dir()
+    return Inspection(
+        file=str(path),
+        sha256=sha256_of(file),
+        bytes=file.stat().st_size if is_archive else None,
+        runs_here=not reasons,
+        problems=(*reasons, *description.problems),
+        description=description,
+    )
+
+
+def with_way_out(error: LoadFailed, path: Path) -> LoadFailed:
+    """The error for a path that should be a model and is something else, or nothing."""
+    if not files.exists(path):
+        near = nearest_file(path)
+        return error.instead_of_hint(f"Did you mean '{near}'?") if near is not None else error
+    if path.suffix in (".yaml", ".yml"):
+        return error.instead_of_hint(f"A configuration is run by `fmu-mesh launch {path}`.")
+    return error
+
+
+def _page(inspection: Inspection, width: int, patterns: Sequence[str], *, everything: bool) -> list[str]:
+    description = inspection.description
+    chosen = [v for v in description.variables if not patterns or any(fits(pattern, v.name) for pattern in patterns)]
+    lines = [] if patterns else [*_facts(inspection, width), *_problems(inspection, width)]
+    for causality, title in _CAUSALITIES:
+        members = [variable for variable in chosen if variable.causality == causality]
+        if members:
+            lines += ([""] if lines else []) + [f"{title} ({len(members)})"]
+            limit = None if everything or patterns else SHOWN_VARIABLES
+            lines += _variables(members[:limit], width)
+            if limit is not None and len(members) > limit:
+                lines.append(f"  ... and {len(members) - limit} more: --all lists them, a name such as 'x*' some")
+    return lines
+
+
+def _facts(inspection: Inspection, width: int) -> list[str]:
+    description = inspection.description
+    experiment = description.default_experiment
+    can = [words for field, words in _CAPABILITIES if getattr(description, field)]
+    needs = ["one process for each instance"] if description.only_once_per_process else []
+    needs += ["the tool that made it"] if description.needs_execution_tool else []
+    counts = [
+        f"{count} {title.lower() if count > 1 else title.lower().removesuffix('s')}"
+        for causality, title in _CAUSALITIES
+        if (count := len(description.with_causality(causality)))
+    ]
+    times = [
+        f"{what} {short_number(value)} s"
+        for what, value in (
+            ("start", experiment.start_time),
+            ("stop", experiment.stop_time),
+            ("step", experiment.step_size),
+        )
+        if value is not None
+    ]
+    states = [f"{description.continuous_states} continuous"] if description.continuous_states else []
+    if indicators := description.event_indicators:
+        states.append(f"{indicators} event indicator{'s' if indicators > 1 else ''}")
+    times += [f"tolerance {short_number(experiment.tolerance)}"] if experiment.tolerance is not None else []
+    kinds = " or ".join(_KIND_WORDS[kind] for kind in description.kinds)
+    platforms = ", ".join(_PLATFORM_WORDS.get(name, name) for name in description.platforms)
+    size = f" ({inspection.bytes} bytes)" if inspection.bytes is not None else " (a folder)"
+    facts = [
+        ("File", f"{inspection.file}{size}"),
+        ("SHA-256", inspection.sha256 or ""),
+        ("Model", description.model_name),
+        ("Description", description.description or ""),
+        ("Kind", f"FMI {description.fmi_version} {kinds}" if kinds else description.kind.replace("_", " ")),
+        ("Identifier", description.model_identifier),
+        ("GUID", description.guid),
+        ("Made by", description.generation_tool or ""),
+        ("Platforms", platforms or ("none" if kinds else "")),
+        ("Runs here", "yes" if inspection.runs_here else "no, see Problems"),
+        ("Can", ", ".join(can)),
+        ("Needs", ", ".join(needs)),
+        ("Experiment", ", ".join(times)),
+        ("Variables", ", ".join(counts) or "none"),
+        ("States", ", ".join(states)),
+        ("Clocks", ", ".join(map(str, description.clocks))),
+    ]
+    lines = pairs((name, " ".join(value.split())) for name, value in facts)
+    indent = " " * (2 + max(len(name) for name, value in facts if value))
+    return [part for line in lines for part in _wrapped(line, width, indent)]
+
+
+_KIND_WORDS: Final[dict[Kind, str]] = {"co_simulation": "co-simulation", "model_exchange": "model exchange"}
+_PLATFORM_WORDS: Final = {"c-code": "C sources"}
+
+
+def _problems(inspection: Inspection, width: int) -> list[str]:
+    if not inspection.problems:
+        return []
+    lines = ["", f"Problems ({len(inspection.problems)})"]
+    for problem in inspection.problems:
+        lines += _wrapped("  " + " ".join(problem.split()), width, "    ")
+    return lines
+
+
+def _wrapped(line: str, width: int, indent: str) -> list[str]:
+    """Wrap a line without breaking paths and hashes, so that they can be copied."""
+    return textwrap.wrap(
+        line,
+        width,
+        subsequent_indent=indent,
+        break_long_words=False,
+        break_on_hyphens=False,
+        drop_whitespace=True,
+        replace_whitespace=False,
+    )
+
+
+def _variables(variables: Sequence[Variable], width: int) -> list[str]:
+    """One line each: name, type, variability, start value with unit, and as much of the description as fits."""
+    rows = [[v.name, v.type_name, v.variability, _start(v), " ".join((v.description or "").split())] for v in variables]
+    widest = [max(len(row[column]) for row in rows) for column in range(4)]
+    # A very long name must not move the other columns off the page.
+    widest[0] = min(widest[0], width // 2)
+    lines = []
+    for row in rows:
+        cells = "  ".join(cell.ljust(size) for cell, size in zip(row, widest, strict=False) if size)
+        line = f"  {cells.rstrip()}" if not row[4] else f"  {cells}  {row[4]}"
+        lines.append(line if len(line) <= width or not row[4] else _cut(line, width, 2 + len(cells)))
+    return lines
+
+
+def _cut(line: str, width: int, least: int) -> str:
+    """The line with a shortened description, or without it on a narrow page."""
+    return f"{line[: width - 3].rstrip()}..." if width - 3 > least + 10 else line[:least].rstrip()
+
+
+def _start(variable: Variable) -> str:
+    """The start value with its unit; only the unit if there is none."""
+    unit = variable.unit or ""
+    if variable.start is None:
+        return f"[{unit}]" if unit else ""
+    match variable.start:
+        case list() as rows:
+            text = msgspec.json.encode(rows).decode()
+        case bytes() as data:
+            text = shown(b64encode(data).decode())
+        case start:
+            item = next((item for item, value in variable.items if value == start), None)
+            text = f"{item} ({start})" if item is not None else shown(start)
+    return f"= {text} {unit}".rstrip()

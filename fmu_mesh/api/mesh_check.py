@@ -1,0 +1,79 @@
+"""What a check of a mesh has found: the plan of its run, or everything that is wrong."""
+
+from __future__ import annotations
+
+import msgspec
+
+from ..errors import ConfigurationError, Finding
+from ..run.run_plan import RunPlan
+from .plan_page import plan_page
+from .plan_view import PlanView, plan_view
+
+__all__ = ["Check"]
+
+
+class Check(msgspec.Struct, frozen=True):
+    """What `Mesh.check` found. As text, it is the page that `fmu-mesh check` prints.
+
+    Example:
+        >>> import fmu_mesh
+        >>> check = fmu_mesh.load("configs/pendulum_delay.yaml").check()
+        >>> bool(check), check.findings
+        (True, ())
+        >>> check.plan.order, check.plan.last_point
+        (['pendulum', 'delay'], 20000)
+        >>> print(check)
+        Mesh        pendulum_delay
+        Simulation  0 s to 40 s in 20000 steps of 0.002 s
+        ...
+        OK: configs/pendulum_delay.yaml can run.
+
+    Attributes:
+        file: the configuration, as messages name it.
+        error: why the mesh cannot run; None if it can.
+        run: the plan of the run; None if the configuration is wrong.
+    """
+
+    file: str
+    error: ConfigurationError | None = None
+    run: RunPlan | None = None
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """Everything that is wrong, each with its place; empty if the mesh can run."""
+        if self.error is None:
+            return ()
+        return self.error.findings or (Finding(self.file, "", self.error.message, self.error.hint or ""),)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What may be wrong, in words."""
+        return tuple(map(str, self.run.plan.system.warnings)) if self.run is not None else ()
+
+    @property
+    def plan(self) -> PlanView | None:
+        """What would run, as plain values; None if the configuration is wrong."""
+        return plan_view(self.run.plan) if self.run is not None else None
+
+    @property
+    def page(self) -> str:
+        """What would run, as text; empty if the configuration is wrong."""
+        return "\n".join(plan_page(self.run.plan)) if self.run is not None else ""
+
+    def require(self) -> RunPlan:
+        """The plan of the run.
+
+        Raises:
+            ConfigurationError: the mesh cannot run; carries all findings.
+        """
+        if self.error is not None:
+            raise self.error
+        assert self.run is not None
+        return self.run
+
+    def __bool__(self) -> bool:
+        return self.error is None
+
+    def __str__(self) -> str:
+        verdict = "\n".join(map(str, self.findings)) or f"OK: {self.file} can run."
+        return f"{self.page}\n\n{verdict}" if self.run is not None else verdict

@@ -1,0 +1,137 @@
+"""What a program can choose beside the configuration: for the plan of a run, and for the run itself."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal, TypedDict
+
+import msgspec
+import numpy as np
+
+from ..errors import CallRefused
+from ..run.events import Event
+from ..run.options import Options
+from ..text import shown
+from ..wire.views import MeshStatus
+from .run_thread import memory_file
+
+__all__ = ["PlanOptions", "RunOptions", "StartOptions", "options_of", "plain"]
+
+
+class PlanOptions(TypedDict, total=False):
+    """What `Mesh.plan` and `Mesh.check` take; each option of the configuration replaces its key for this run.
+
+    Attributes:
+        record: "memory" keeps the results as arrays, without a file.
+        output: the result file; its ending chooses the format.
+        start_values: start values by `instance.variable`; or texts as `--set` has them.
+        config_values: values of any keys by their path, such as `{"simulation.window": 16}`; or texts as `--set-config`
+            has them.
+        algorithm: "jacobi" or "gauss_seidel".
+        step_size: base communication step size in s.
+        stop_time: time of the last communication point in s.
+        window: how many points a node may run ahead of the slowest one, or "auto".
+        real_time_factor: simulation time per wall-clock time; 0: as fast as possible.
+        update_period: with a real-time factor, points that are due are stepped together once per this time in s.
+        catch_up: largest lag behind the wall clock in s.
+        listen: Zenoh endpoints where others can connect.
+        connect: Zenoh endpoints to connect to.
+        paused: stay paused at the first point until `Run.resume` or `Run.step`.
+        view: show the world of a physics engine in a window.
+        video: film that world into this file.
+        profile: measure where the time goes; `Result.outcome` has it.
+        on_notice: called with a sentence before something that takes long, such as compiling an FMU; by default, the
+            log gets it.
+    """
+
+    record: Literal["memory"] | None
+    output: str | Path | None
+    start_values: Mapping[str, Any] | Sequence[str]
+    config_values: Mapping[str, Any] | Sequence[str]
+    algorithm: str | None
+    step_size: float | None
+    stop_time: float | None
+    window: int | Literal["auto"] | None
+    real_time_factor: float | None
+    update_period: float | None
+    catch_up: float | None
+    listen: Sequence[str]
+    connect: Sequence[str]
+    paused: bool
+    view: bool
+    video: str | Path | None
+    profile: bool | Path | None
+    on_notice: Callable[[str], None]
+
+
+class StartOptions(TypedDict, total=False):
+    """What `Run.start` takes.
+
+    Attributes:
+        processes: False runs everything in this process; the floats are the same.
+        memory_limit: the most bytes of results in memory (1 GiB); a run that needs more is refused, or ends there.
+        restarts: how often a run is started again from its first point if one of its processes is lost.
+        on_progress: called with a `MeshStatus` about ten times per second.
+        on_event: called with every event of `fmu_mesh.run.events`; without it, the log gets messages of FMUs.
+    """
+
+    processes: bool
+    memory_limit: int
+    restarts: int
+    on_progress: Callable[[MeshStatus], object] | None
+    on_event: Callable[[Event], object] | None
+
+
+class RunOptions(PlanOptions, StartOptions, total=False):
+    """What `Mesh.run` and `Mesh.start` take: what `Mesh.plan` takes, and what `Run.start` takes."""
+
+
+def options_of(given: PlanOptions) -> Options:
+    """The options of a plan, as the command line has them.
+
+    Raises:
+        CallRefused: two of them exclude each other, or a value cannot be written down.
+    """
+    fields: dict[str, Any] = {**given}
+    fields.pop("on_notice", None)
+    if fields.pop("record", None) == "memory":
+        if fields.get("output") is not None:
+            raise CallRefused('`output` and `record="memory"` exclude each other')
+        fields["output"] = memory_file()
+    fields["profile"] = Path() if fields.get("profile") is True else fields.get("profile") or None
+    for name in ("output", "video"):
+        fields[name] = Path(fields[name]) if fields.get(name) is not None else None
+    for name, what in (("start_values", "start value"), ("config_values", "value")):
+        fields[name] = _written(fields.get(name, ()), what)
+    for name in ("listen", "connect"):
+        fields[name] = tuple(fields.get(name, ()))
+    return Options(**fields)
+
+
+def _written(values: Mapping[str, object] | Sequence[str], what: str) -> tuple[str, ...]:
+    """Values as the command line has them; JSON is YAML, and its floats are exact."""
+    if not isinstance(values, Mapping):
+        return tuple(values)
+    texts = []
+    for name, value in values.items():
+        try:
+            texts.append(f"{name}={msgspec.json.encode(plain(value)).decode()}")
+        except (TypeError, msgspec.MsgspecError) as error:
+            raise CallRefused(f"the {what} of '{name}' is {shown(value)}: {error}", variable=name) from error
+    return tuple(texts)
+
+
+def plain(value: Any) -> Any:  # noqa: ANN401  whatever a program gives
+    """A value as a file has it: paths are text, arrays are nested lists."""
+    match value:
+        case Path():
+            return str(value)
+        case np.ndarray() | np.generic():
+            return value.tolist()
+        case Mapping():
+            return {key: plain(inner) for key, inner in value.items()}
+        case list() | tuple():
+            return [plain(inner) for inner in value]
+        case _:
+            return value
