@@ -25,6 +25,7 @@ SHOWN_VARIABLES: Final = 20
 """Variables of one causality on a page that does not list all."""
 
 _WIDTH: Final = 120
+_FMU: Final = "fmu"
 _CAUSALITIES: Final[tuple[tuple[Causality, str], ...]] = (
     ("input", "Inputs"),
     ("output", "Outputs"),
@@ -120,10 +121,10 @@ def inspect(path: str | Path, *, kind: str | None = None) -> Inspection:
     file, names = Path(path), KINDS.names()
     if kind is not None and kind not in names:
         raise CallRefused(f"no installed package offers the kind of instance '{kind}'; there are {listed(names)}")
-    key = kind if kind is not None else file.suffix.removeprefix(".") if file.is_file() else names[0]
+    key = kind if kind is not None else file.suffix.removeprefix(".") if file.is_file() else _FMU
     reasons: tuple[str, ...] = ()
     try:
-        if key in names and key != names[0]:
+        if key in names and key != _FMU:
             section = msgspec.convert({KIND: key, key: str(path)}, KINDS.section(key))
             description = describe(file.absolute(), section)
         else:

@@ -243,6 +243,10 @@ def remove_stale_folders() -> None:
     """Remove the folders of runs whose launcher is gone and whose processes could not remove them."""
     for _ in meshes():
         continue
+    for folder in runtime_folder().glob("*.*"):  # of runs that never wrote a note, such as those in one process
+        pid = launcher_of(folder)
+        if pid is not None and not (folder / "mesh.json").exists() and not is_alive(pid):
+            remove_run_folder(folder)
     for folder in runtime_folder().glob("*.hand"):
         tidy_run_folder(folder)
         for empty in (folder / "fmus", folder):
