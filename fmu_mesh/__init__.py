@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from .adapter import FMIAdapter
-    from .api.functions import attach, load, meshes
+    from .api.attaching import attach, meshes
     from .api.inspection import Inspection, inspect
-    from .api.mesh_builder import Mesh
+    from .api.mesh_builder import Mesh, load
     from .api.mesh_check import Check
     from .api.open_system import System, SystemState
     from .api.result import Result
@@ -76,16 +76,16 @@ _PLACES = {
     "FMIAdapter": "adapter",
     "Check": "api.mesh_check",
     "Mesh": "api.mesh_builder",
-    "load": "api.functions",
+    "load": "api.mesh_builder",
     "Result": "api.result",
     "Run": "api.run_handle",
     "Sample": "api.samples",
     "System": "api.open_system",
     "SystemState": "api.open_system",
-    "attach": "api.functions",
+    "attach": "api.attaching",
     "Inspection": "api.inspection",
     "inspect": "api.inspection",
-    "meshes": "api.functions",
+    "meshes": "api.attaching",
 }
 """The modules of the public names; all others are exceptions."""
 

@@ -6,7 +6,7 @@ import logging
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Self, Unpack, cast
+from typing import TYPE_CHECKING, Any, Self, Unpack, cast
 
 import msgspec
 
@@ -21,14 +21,15 @@ from ..run.preparing import planned
 from ..run.run_plan import RunPlan
 from ..text import listed, shown
 from ..variables.model_description import ModelDescription
-from .inspection import with_way_out
 from .mesh_check import Check
-from .open_system import System
 from .plan_options import PlanOptions, RunOptions, StartOptions, options_of, plain
-from .result import Result
 from .run_handle import Run
 
-__all__ = ["Mesh"]
+if TYPE_CHECKING:
+    from .open_system import System
+    from .result import Result
+
+__all__ = ["Mesh", "load"]
 
 log = logging.getLogger("fmu_mesh.run")
 
@@ -124,6 +125,8 @@ class Mesh:
         try:
             description = describe(file, own, tell=on_notice)
         except LoadFailed as error:
+            from .inspection import with_way_out  # noqa: PLC0415  it imports FMPy
+
             raise with_way_out(error, file) from error
         own_name = name if name is not None else description.model_identifier
         times = {"step_size": description.default_experiment.step_size, "stop_time": None, **simulation}
@@ -360,6 +363,8 @@ class Mesh:
                 instances need a process of their own each.
             FmuError: an instance cannot be opened or initialized. Nothing is left behind.
         """
+        from .open_system import System  # noqa: PLC0415  only this needs it
+
         return System(self.plan(start_values=start_values or {}))
 
     @property
@@ -380,3 +385,18 @@ class Mesh:
         if not isinstance(section, dict):
             raise ConfigurationError(f"'{key}' of '{self._plain.file}' is {shown(section)}, where a mapping should be")
         return section
+
+
+def load(path: str | Path) -> Mesh:
+    """Read a configuration file.
+
+    Example:
+        >>> import fmu_mesh
+        >>> fmu_mesh.load("configs/pendulum_delay.yaml").instances
+        ['pendulum', 'delay']
+
+    Raises:
+        ConfigurationError: the file cannot be read, or is no YAML. What it means is checked by `Mesh.check`, and before
+            a run.
+    """
+    return Mesh.from_file(path)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import asyncio
 import threading
 import time
+from collections.abc import Iterator
 from concurrent.futures import Future
 from concurrent.futures import TimeoutError as NotYet
+from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self, Unpack
@@ -23,13 +24,15 @@ from ..errors import (
 )
 from ..wire.client.mesh_client import MeshClient
 from ..wire.client.reaching import Meshes
-from ..wire.client.waiting import rest
+from ..wire.client.waiting import rest, wait_for
 from ..wire.views import (
     Command,
     CommandAnswer,
     InstanceInfo,
     InstanceStatus,
+    LogLine,
     MeshInfo,
+    MeshState,
     MeshStatus,
     SetAnswer,
     VariableView,
@@ -51,6 +54,7 @@ TIMEOUT_S = 5.0
 _LOOK_S = 0.2
 _FOREVER_S = 1e9
 _START_S = 120.0
+_WAIT_S = 60.0
 
 
 class Run:
@@ -75,11 +79,13 @@ class Run:
         3.0
     """
 
-    def __init__(self, name: str, *, own: RunThread | None = None, meshes: Meshes | None = None) -> None:
+    def __init__(
+        self, name: str, *, own: RunThread | None = None, attached: tuple[MeshClient, ExitStack] | None = None
+    ) -> None:
         self.name = name
         self._own = own
-        self._meshes = meshes
-        self._found = meshes.one(None) if meshes is not None else None
+        self._found: MeshClient | None
+        self._found, self._way = attached if attached is not None else (None, ExitStack())
         self._opening = threading.RLock()
         self._closed = False
         self._begun = False
@@ -198,19 +204,35 @@ class Run:
         targets = {target.key: target for name in names for target in targets_of(client, name)}
         return Watch(client, targets)
 
+    def logs(self, *, follow: bool = False) -> Iterator[LogLine]:
+        """The log messages of FMUs that the mesh has kept, the oldest first.
+
+        Example:
+            >>> import fmu_mesh
+            >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
+            >>> with mesh.start(record="memory", paused=True) as run:
+            ...     [line.message for line in run.logs()]
+            []
+
+        Args:
+            follow: whether all new ones follow, until the mesh ends.
+        """
+        with self._client().logs(follow=follow) as lines:
+            yield from lines
+
     # --- steering
 
     def pause(self) -> CommandAnswer:
         """Pause the mesh; returns when all instances have reached the point of the answer."""
-        return rest(self._running(), Command("pause"))
+        return rest(self._steered(), Command("pause"))
 
     def step(self, points: int = 1) -> CommandAnswer:
         """Run some points and pause again; returns when the mesh has paused."""
-        return rest(self._running(), Command("step", points))
+        return rest(self._steered(), Command("step", points))
 
     def resume(self) -> CommandAnswer:
         """Go on after a pause."""
-        return self._running().command(Command("resume"))
+        return self._steered().command(Command("resume"))
 
     def interrupt(self) -> None:
         """End a run that was started here, so that `wait` raises `Interrupted`; a second call waits for no process.
@@ -224,16 +246,43 @@ class Run:
             raise CallRefused(f"mesh '{self.name}' was started by somebody else", hint="`stop` ends it.")
         self._own.interrupt()
 
-    def stop(self) -> None:
-        """End the run; what was recorded is kept. `wait` then returns the result of a run that was started here."""
+    def stop(self) -> CommandAnswer | None:
+        """End the run; what was recorded is kept. `wait` then returns the result of a run that was started here.
+
+        Returns:
+            The answer of the mesh; None if it has ended, has not begun, or runs in this process.
+        """
         if self._own is None:
-            self._client().command(Command("stop"))
-        elif not self._own.future.done():
-            self._own.expect_stop()
-            try:
-                self._client().command(Command("stop"))
-            except FmuMeshError:
-                self._own.stop()  # it has not begun, or runs in this process
+            return self._client().command(Command("stop"))
+        if self._own.future.done():
+            return None
+        self._own.expect_stop()
+        try:
+            return self._client().command(Command("stop"))
+        except FmuMeshError:
+            self._own.stop()  # it has not begun, or runs in this process
+            return None
+
+    def wait_for(self, state: MeshState, timeout: float = _WAIT_S) -> MeshStatus:
+        """Wait until the mesh is in a state, such as "paused".
+
+        Example:
+            >>> import fmu_mesh
+            >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
+            >>> with mesh.start(record="memory", paused=True) as run:
+            ...     run.wait_for("paused").point
+            0
+
+        Args:
+            state: "starting", "initializing", "running", "paused", "stopping", "done" or "failed".
+            timeout: the longest time to wait in s.
+
+        Raises:
+            DeadlineExceeded: it was not in this state in time.
+            MeshLost: it has ended before.
+            FmuMeshError: it has failed before.
+        """
+        return wait_for(self._client(), state, timeout)
 
     # --- the end
 
@@ -271,6 +320,8 @@ class Run:
             >>> len(asyncio.run(both()).times)
             501
         """
+        import asyncio  # noqa: PLC0415  slow to import for a command
+
         return await asyncio.shield(asyncio.wrap_future(self._end()))
 
     def close(self) -> None:
@@ -282,8 +333,7 @@ class Run:
                 self._own.stop()
                 self._own.join()
             self._closed = True
-            if self._meshes is not None:
-                self._meshes.__exit__(None, None, None)
+            self._way.close()
 
     def _wait(self, future: Future[Result], timeout: float | None) -> Result:
         end = time.monotonic() + timeout if timeout is not None else None
@@ -356,6 +406,10 @@ class Run:
                 self._begun = True
         return client
 
+    def _steered(self) -> MeshClient:
+        """As `_running` for a run that was started here; a mesh that was found takes commands when it takes them."""
+        return self._client() if self._own is None else self._running()
+
     def _reach(self) -> MeshClient:
         own = self._own
         assert own is not None
@@ -367,8 +421,7 @@ class Run:
             raise DeadlineExceeded(f"mesh '{self.name}' cannot be reached within {timeout:g} s")
         if not own.endpoints:
             raise MeshLost(f"the run of mesh '{self.name}' has ended")
-        meshes = Meshes(own.endpoints[:1], TIMEOUT_S)
-        self._meshes = meshes.__enter__()
+        meshes = self._way.enter_context(Meshes(own.endpoints[:1], TIMEOUT_S))
         with meshes.changes() as wait:
             end = time.monotonic() + timeout
             while (client := meshes.appeared(self.name)) is None:

@@ -7,7 +7,7 @@ import sys
 
 import msgspec
 
-from ..api.functions import load
+from ..api.mesh_builder import load
 from ..api.plan_view import PlanView
 from ..config.structure import schema_text
 from ..errors import FmuMeshError

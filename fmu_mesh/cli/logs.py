@@ -7,12 +7,11 @@ import os
 import sys
 from typing import Final
 
+from ..api.attaching import attach
 from ..errors import ConfigurationError, Interrupted
 from ..text import listed, nearest
-from ..wire.client.reaching import Meshes
 from ..wire.views import LogLine
-from .arguments import CommandParser, Parsers
-from .looking import add_question
+from .arguments import CommandParser, Parsers, add_json, add_reaching
 from .output.json_output import print_json
 
 __all__ = ["PARSERS"]
@@ -21,7 +20,9 @@ _LEVELS: Final = ("ok", "warning", "discard", "error", "fatal")
 
 
 def _add_logs(parser: CommandParser) -> None:
-    add_question(parser, _logs)
+    add_reaching(parser)
+    add_json(parser)
+    parser.set_defaults(run_command=_logs)
     parser.add_argument("mesh", nargs="?", metavar="MESH", help="name or key of the mesh; default: the only one")
     parser.add_argument("--instance", metavar="NAME", help="only the messages of this instance")
     parser.add_argument(
@@ -34,15 +35,14 @@ def _add_logs(parser: CommandParser) -> None:
     parser.add_argument("-f", "--follow", action="store_true", help="also show new messages, until the mesh ends")
 
 
-def _logs(arguments: argparse.Namespace, meshes: Meshes) -> int:
-    client = meshes.named(arguments.mesh)
-    if arguments.instance is not None and arguments.instance not in (names := client.info().instances):
-        near = nearest(arguments.instance, names)
-        hint = f"Did you mean '{near}'?" if near is not None else f"There are: {listed(names)}."
-        raise ConfigurationError(f"mesh '{client.keys.mesh}' has no instance '{arguments.instance}'.", hint=hint)
-    with client.logs(follow=arguments.follow) as lines:
+def _logs(arguments: argparse.Namespace) -> int:
+    with attach(arguments.mesh, connect=arguments.connect, timeout=arguments.timeout) as run:
+        if arguments.instance is not None and arguments.instance not in (names := run.info().instances):
+            near = nearest(arguments.instance, names)
+            hint = f"Did you mean '{near}'?" if near is not None else f"There are: {listed(names)}."
+            raise ConfigurationError(f"mesh '{run.name}' has no instance '{arguments.instance}'.", hint=hint)
         try:
-            for line in lines:
+            for line in run.logs(follow=arguments.follow):
                 if arguments.instance in (None, line.instance) and _rank(line.status) >= _rank(arguments.level):
                     _show(line, as_json=arguments.json)
         except KeyboardInterrupt:

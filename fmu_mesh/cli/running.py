@@ -12,8 +12,7 @@ from functools import partial
 from pathlib import Path
 from types import FrameType
 
-from ..api.functions import load
-from ..api.mesh_builder import Mesh
+from ..api.mesh_builder import Mesh, load
 from ..api.plan_options import PlanOptions, StartOptions
 from ..api.run_handle import Run
 from ..errors import ConfigurationError

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import argparse
 import re
-from typing import get_args
+import time
+from typing import Final, get_args
 
+from ..api.attaching import attach
+from ..api.run_handle import Run
 from ..errors import ConfigurationError
-from ..wire.client.reaching import Meshes
-from ..wire.client.waiting import rest, wait_for
-from ..wire.views import Command, MeshState
+from ..wire.views import MeshState
 from .arguments import CommandParser, Parsers, add_json, add_quiet, add_reaching, whole
-from .looking import add_question
 from .output.json_output import print_json
 
 __all__ = ["PARSERS"]
@@ -21,8 +21,10 @@ _WAIT_S = 60.0
 
 
 def _add_command(parser: CommandParser) -> None:
-    add_question(parser, _command)
+    add_reaching(parser)
+    add_json(parser)
     add_quiet(parser)
+    parser.set_defaults(run_command=_command)
     _add_mesh(parser)
 
 
@@ -31,25 +33,26 @@ def _add_step(parser: CommandParser) -> None:
     parser.add_argument("points", nargs="?", metavar="N", help="points (1)")
 
 
-def _command(arguments: argparse.Namespace, meshes: Meshes) -> int:
+def _command(arguments: argparse.Namespace) -> int:
     name, points = arguments.mesh, getattr(arguments, "points", None)
     if arguments.command == "step" and points is None and name is not None and _NUMBER.fullmatch(name):
         name, points = None, name  # `step 10`: no mesh has a number as its name
     number = whole(points) if points is not None else 1
     if number < 1:
         raise ConfigurationError(f"N: '{points}' is not a whole number of 1 or more")
-    command = Command(arguments.command, number)
-    client = meshes.named(name)
-    answer = rest(client, command) if command.command in ("pause", "step") else client.command(command)
+    with attach(name, connect=arguments.connect, timeout=arguments.timeout) as run:
+        answer = run.step(number) if arguments.command == "step" else _COMMANDS[arguments.command](run)
+    assert answer is not None  # that of a mesh that was found
     if arguments.json:
         print_json(answer)
         return 0
     what = "is told to end, and was" if answer.command == "stop" else f"is {answer.state}"
-    print(f"mesh '{client.keys.mesh}' {what} at point {answer.point}")
+    print(f"mesh '{run.name}' {what} at point {answer.point}")
     return 0
 
 
-_NUMBER = re.compile(r"[-+]?[0-9.].*")
+_COMMANDS: Final = {"pause": Run.pause, "resume": Run.resume, "stop": Run.stop}
+_NUMBER: Final = re.compile(r"[-+]?[0-9.].*")
 
 
 def _add_wait(parser: CommandParser) -> None:
@@ -70,8 +73,9 @@ def _add_wait(parser: CommandParser) -> None:
 def _wait(arguments: argparse.Namespace) -> int:
     # A mesh with a note is running or about to end; an endpoint may appear later.
     patience_s = arguments.timeout if arguments.connect else min(arguments.timeout, _TIMEOUT_S)
-    with Meshes(arguments.connect, patience_s) as meshes:
-        status = wait_for(meshes, arguments.mesh, arguments.state, arguments.timeout)
+    end = time.monotonic() + arguments.timeout
+    with attach(arguments.mesh, connect=arguments.connect, timeout=patience_s, wait=arguments.timeout) as run:
+        status = run.wait_for(arguments.state, end - time.monotonic())
     if arguments.json:
         print_json(status)
     else:

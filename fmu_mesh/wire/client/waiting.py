@@ -12,7 +12,7 @@ from ..views import Command, CommandAnswer, MeshState, MeshStatus
 from .mesh_client import MeshClient
 from .reaching import Meshes
 
-__all__ = ["rest", "wait_for"]
+__all__ = ["appearance", "rest", "wait_for"]
 
 _RANKS: Final[dict[MeshState, int]] = {
     "starting": 0,
@@ -52,33 +52,37 @@ def rest(client: MeshClient, command: Command) -> CommandAnswer:
     raise _gone(mesh, what)
 
 
-def wait_for(meshes: Meshes, mesh: str | None, state: MeshState, timeout_s: float) -> MeshStatus:
-    """The first status in which a mesh is in a state.
+def appearance(meshes: Meshes, mesh: str | None, timeout_s: float) -> MeshClient:
+    """Wait until a mesh is there.
 
     Args:
         meshes: the meshes that can be reached.
         mesh: its name or key; None for the only one.
-        state: as in `status`.
         timeout_s: time limit in s.
 
     Raises:
         ConfigurationError: there are several.
-        MeshLost: it did not start, or was not in this state, in time; or it has ended.
-        FmuMeshError: it has failed.
+        DeadlineExceeded: it did not start in time.
     """
     end = time.monotonic() + timeout_s
     with meshes.changes() as wait:
         while (left_s := end - time.monotonic()) > 0:
             meshes.look()
             if (client := meshes.appeared(mesh)) is not None:
-                return _in_state(client, state, end - time.monotonic())
+                return client
             wait(left_s)
     who = f"mesh '{mesh}'" if mesh is not None else "mesh"
     raise DeadlineExceeded(f"there is no {who} after {timeout_s:g} s.", hint="--timeout waits longer.")
 
 
-def _in_state(client: MeshClient, state: MeshState, timeout_s: float) -> MeshStatus:
-    """The first status in which a running mesh is in a state."""
+def wait_for(client: MeshClient, state: MeshState, timeout_s: float) -> MeshStatus:
+    """The first status in which a running mesh is in a state.
+
+    Raises:
+        DeadlineExceeded: it was not in this state in time.
+        MeshLost: it has ended before.
+        FmuMeshError: it has failed.
+    """
     mesh, last = client.keys.mesh, None
     with client.statuses(timeout_s) as statuses:
         try:

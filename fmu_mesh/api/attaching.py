@@ -1,34 +1,26 @@
-"""The functions with which a program begins: `load`, `attach` and `meshes`."""
+"""Meshes that run already: `attach` to one of them, or list all `meshes`."""
 
 from __future__ import annotations
 
-from pathlib import Path
+from collections.abc import Sequence
+from contextlib import ExitStack
 
 from ..wire.client.mesh_client import MeshClient
 from ..wire.client.reaching import Meshes
+from ..wire.client.waiting import appearance
 from ..wire.views import MeshStatus
-from .mesh_builder import Mesh
 from .run_handle import TIMEOUT_S, Run
 
-__all__ = ["attach", "load", "meshes"]
+__all__ = ["attach", "meshes"]
 
 
-def load(path: str | Path) -> Mesh:
-    """Read a configuration file.
-
-    Example:
-        >>> import fmu_mesh
-        >>> fmu_mesh.load("configs/pendulum_delay.yaml").instances
-        ['pendulum', 'delay']
-
-    Raises:
-        ConfigurationError: the file cannot be read, or is no YAML. What it means is checked by `Mesh.check`, and before
-            a run.
-    """
-    return Mesh.from_file(path)
-
-
-def attach(name: str | None = None, *, connect: str | tuple[str, ...] = (), timeout: float = TIMEOUT_S) -> Run:
+def attach(
+    name: str | None = None,
+    *,
+    connect: str | Sequence[str] = (),
+    timeout: float = TIMEOUT_S,
+    wait: float | None = None,
+) -> Run:
     """Find a running mesh that somebody else has started, such as `fmu-mesh launch` in another terminal.
 
     Example:
@@ -46,23 +38,19 @@ def attach(name: str | None = None, *, connect: str | tuple[str, ...] = (), time
         name: name or key of the mesh; None for the only one that runs.
         connect: Zenoh endpoints of the mesh or of a router; default: the meshes of this user on this host.
         timeout: deadline of every question in s.
+        wait: how long to wait in s if it does not run yet; None: it runs already.
 
     Raises:
         ConfigurationError: no such mesh is running, or there are several.
-        DeadlineExceeded: it does not answer.
+        DeadlineExceeded: it does not answer, or has not started in time.
     """
-    endpoints = (connect,) if isinstance(connect, str) else tuple(connect)
-    meshes = Meshes(endpoints, timeout)
-    meshes.__enter__()
-    try:
-        client = meshes.one(None) if name is None else meshes.named(name)
-        return Run(client.keys.mesh, meshes=meshes)
-    except BaseException:
-        meshes.__exit__(None, None, None)
-        raise
+    with ExitStack() as stack:
+        found = stack.enter_context(Meshes(_endpoints(connect), timeout))
+        client = found.named(name) if wait is None else appearance(found, name, wait)
+        return Run(client.keys.mesh, attached=(client, stack.pop_all()))
 
 
-def meshes(*, connect: str | tuple[str, ...] = (), timeout: float = TIMEOUT_S) -> list[MeshStatus]:
+def meshes(*, connect: str | Sequence[str] = (), timeout: float = TIMEOUT_S) -> list[MeshStatus]:
     """The status of every mesh that runs; none where no mesh runs or answers.
 
     Example:
@@ -80,7 +68,11 @@ def meshes(*, connect: str | tuple[str, ...] = (), timeout: float = TIMEOUT_S) -
     Raises:
         DeadlineExceeded: an endpoint of ``connect`` does not answer.
     """
-    with Meshes((connect,) if isinstance(connect, str) else connect, timeout) as found:
+    with Meshes(_endpoints(connect), timeout) as found:
         if found.absence is not None:
             return []
         return [status for _, status in found.answers(found.all(), MeshClient.status)]
+
+
+def _endpoints(connect: str | Sequence[str]) -> tuple[str, ...]:
+    return (connect,) if isinstance(connect, str) else tuple(connect)
