@@ -10,13 +10,17 @@ import msgspec
 import numpy as np
 
 from ..errors import CallRefused
+from ..recorder.arrays_file import ENDING
 from ..run.events import Event
 from ..run.options import Options
+from ..run.run_plan import RunPlan
 from ..text import shown
+from ..wire.runtime import run_name, runtime_folder
 from ..wire.views import MeshStatus
-from .run_thread import memory_file
 
-__all__ = ["PlanOptions", "RunOptions", "StartOptions", "options_of", "plain"]
+__all__ = ["PlanOptions", "RunOptions", "StartOptions", "memory_of", "options_of", "plain"]
+
+_MEMORY = "memory."
 
 
 class PlanOptions(TypedDict, total=False):
@@ -98,7 +102,7 @@ def options_of(given: PlanOptions) -> Options:
     if fields.pop("record", None) == "memory":
         if fields.get("output") is not None:
             raise CallRefused('`output` and `record="memory"` exclude each other')
-        fields["output"] = memory_file()
+        fields["output"] = _memory_file()
     fields["profile"] = Path() if fields.get("profile") is True else fields.get("profile") or None
     for name in ("output", "video"):
         fields[name] = Path(fields[name]) if fields.get(name) is not None else None
@@ -135,3 +139,19 @@ def plain(value: Any) -> Any:  # noqa: ANN401  whatever a program gives
             return [plain(inner) for inner in value]
         case _:
             return value
+
+
+def _memory_file() -> Path:
+    """The file for results that stay in memory; the run makes its folder, and removes it.
+
+    If this process is killed, the next run of this user removes them.
+    """
+    return runtime_folder() / f"{_MEMORY}{run_name()}" / f"rows{ENDING}"
+
+
+def memory_of(plan: RunPlan) -> Path | None:
+    """The file for results that stay in memory; None if they go where the configuration says."""
+    output = plan.options.output
+    if output is None or output.suffix != ENDING or not output.parent.name.startswith(_MEMORY):
+        return None
+    return output if output.parent.parent == runtime_folder() else None

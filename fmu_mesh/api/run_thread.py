@@ -10,26 +10,25 @@ import logging
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future
-from pathlib import Path
 from shutil import rmtree
 
 import msgspec
 from msgspec.structs import replace
 
 from ..errors import CallRefused, FmuMeshError, Interrupted, MeshLost
-from ..recorder.arrays_file import ENDING, bytes_of_a_row, read_arrays
+from ..recorder.arrays_file import bytes_of_a_row, read_arrays
 from ..run.events import Event, Log, Output, Reachable, Restarted, Status
 from ..run.in_process import InProcessRun
 from ..run.launcher import Launcher
 from ..run.outcome import Outcome
 from ..run.run_plan import RunPlan
 from ..simtime import ENDLESS
-from ..wire.runtime import run_name, runtime_folder
 from ..wire.views import MeshStatus
+from .plan_options import memory_of
 from .result import Result, result_of, types_of
 from .result_reading import Columns
 
-__all__ = ["MEMORY_LIMIT", "RunThread", "Settings", "memory_file"]
+__all__ = ["RunThread", "Settings"]
 
 log = logging.getLogger("fmu_mesh.run")
 
@@ -38,7 +37,6 @@ MEMORY_LIMIT = 2**30
 
 _WARNED_AT = 0.8
 _JOIN_S = 10.0
-_MEMORY = "memory."
 _LEVELS = {"ok": logging.DEBUG, "warning": logging.WARNING, "discard": logging.WARNING}
 
 
@@ -87,7 +85,7 @@ class RunThread:
         self._failure: BaseException | None = None
         self._warned = False
         self._changing = threading.RLock()  # a signal handler may interrupt the handler before it
-        self._memory = _memory_of(plan)
+        self._memory = memory_of(plan)
         if self._memory is not None:
             _check_memory(plan, settings.memory_limit)
             self._memory.parent.mkdir(mode=0o700)
@@ -231,22 +229,6 @@ def _end_all() -> None:
         thread.interrupt()
     for thread in threads:
         thread.join()
-
-
-def memory_file() -> Path:
-    """The file for results that stay in memory; the run makes its folder, and removes it.
-
-    If this process is killed, the next run of this user removes them.
-    """
-    return runtime_folder() / f"{_MEMORY}{run_name()}" / f"rows{ENDING}"
-
-
-def _memory_of(plan: RunPlan) -> Path | None:
-    """The file for results that stay in memory; None if they go where the configuration says."""
-    output = plan.options.output
-    if output is None or output.suffix != ENDING or not output.parent.name.startswith(_MEMORY):
-        return None
-    return output if output.parent.parent == runtime_folder() else None
 
 
 def _check_memory(plan: RunPlan, limit: int) -> None:
