@@ -55,7 +55,7 @@ class Inspection(msgspec.Struct, frozen=True, omit_defaults=False):
         (True, ())
         >>> print(gain.page(variables=["k"]))
         Parameters (1)
-          k  Real  tunable  = 1.0  gain
+          k  Real  tunable  = 1.0  Gain
 
     Attributes:
         file: the path as it was given.
@@ -121,7 +121,7 @@ def inspect(path: str | Path, *, kind: str | None = None) -> Inspection:
     file, names = Path(path), KINDS.names()
     if kind is not None and kind not in names:
         raise CallRefused(f"no installed package offers the kind of instance '{kind}'; there are {listed(names)}")
-    key = kind if kind is not None else file.suffix.removeprefix(".") if file.is_file() else _FMU
+    key = kind if kind is not None else file.suffix.removeprefix(".") if files.exists(file) else _FMU
     reasons: tuple[str, ...] = ()
     try:
         if key in names and key != _FMU:

@@ -72,7 +72,7 @@ class Run:
         ...     answer = run.set("gain.u", 3.0)
         ...     run.step(10).point
         ...     run.get("gain.y")
-        ...     run.stop()
+        ...     answer = run.stop()
         ...     float(run.wait()["gain.y"][-1])
         10
         3.0

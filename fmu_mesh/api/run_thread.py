@@ -10,6 +10,7 @@ import logging
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future
+from pathlib import Path
 from shutil import rmtree
 
 import msgspec
@@ -88,7 +89,7 @@ class RunThread:
         self._memory = memory_of(plan)
         if self._memory is not None:
             _check_memory(plan, settings.memory_limit)
-            self._memory.parent.mkdir(mode=0o700)
+            _make_folder(self._memory.parent, plan)
         _active.add(self)
         self._thread = threading.Thread(target=self._work, name=f"run of {plan.mesh}", daemon=True)
         self._thread.start()
@@ -119,17 +120,20 @@ class RunThread:
         self._thread.join(_JOIN_S)
 
     def _work(self) -> None:
+        result: Result | None = None
+        error: BaseException | None = None
         try:
             result = self._run()
-        except BaseException as error:  # noqa: BLE001 whoever waits gets it
-            self.future.set_exception(error)
-        else:
+        except BaseException as caught:  # noqa: BLE001 whoever waits gets it
+            error = caught
+        if self._memory is not None:  # before anybody can start the plan again
+            rmtree(self._memory.parent, ignore_errors=True)
+        if result is not None:
             self.future.set_result(result)
-        finally:
-            self.reached.set()
-            if self._memory is not None:
-                rmtree(self._memory.parent, ignore_errors=True)
-            _active.discard(self)
+        else:
+            self.future.set_exception(error)
+        self.reached.set()
+        _active.discard(self)
 
     def _run(self) -> Result:
         """Run it, and again if it may be restarted.
@@ -229,6 +233,20 @@ def _end_all() -> None:
         thread.interrupt()
     for thread in threads:
         thread.join()
+
+
+def _make_folder(folder: Path, plan: RunPlan) -> None:
+    """Make the folder for results that stay in memory.
+
+    Raises:
+        CallRefused: a run of the same plan has not ended.
+    """
+    try:
+        folder.mkdir(mode=0o700)
+    except FileExistsError as error:
+        raise CallRefused(
+            f"this plan of '{plan.mesh}' runs already", hint="Make another one for another run."
+        ) from error
 
 
 def _check_memory(plan: RunPlan, limit: int) -> None:

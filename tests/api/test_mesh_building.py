@@ -116,3 +116,65 @@ def test_options_are_checked_as_on_the_command_line() -> None:
         built().run(output="a.csv", record="memory")
     with pytest.raises(fmu_mesh.CallRefused, match=r"the start value of 'pendulum\.a' is"):
         built().run(start_values={"pendulum.a": object()})
+
+
+def test_a_plan_is_made_once_and_started_as_often_as_wanted() -> None:
+    plan = built().plan(record="memory", config_values={"simulation.stop_time": 0.5}, algorithm="jacobi")
+
+    assert plan.plan.grid.last_point == 500
+    assert plan.loaded.config.simulation.algorithm == "jacobi"
+    results = []
+    for processes in (True, False):
+        with fmu_mesh.Run.start(plan, processes=processes) as run:
+            results.append(run.wait())
+    assert len(results[0].times) == 501
+    assert same(*results)
+
+
+def test_a_plan_leaves_nothing_where_it_is_not_started(folder: Path) -> None:
+    assert built().check(record="memory")
+
+    assert list((folder / "run").glob("*")) == []
+
+
+def test_a_plan_runs_once_at_a_time() -> None:
+    plan = built(stop_time=None).plan(record="memory")
+
+    with fmu_mesh.Run.start(plan), pytest.raises(fmu_mesh.CallRefused, match="this plan of 'pair' runs already"):
+        fmu_mesh.Run.start(plan)
+
+
+def test_values_of_keys_are_refused_where_they_stand() -> None:
+    check = built().check(config_values={"simulation.stop_tme": 2.0, "instances.delay.start_values": {"d": 1.0}})
+
+    assert [finding.path for finding in check.findings] == [
+        '--set-config instances.delay.start_values={"d":1.0}',
+        "--set-config simulation.stop_tme=2.0",
+    ]
+    assert check.plan is None
+    assert check.page == ""
+    with pytest.raises(fmu_mesh.ConfigurationError, match="stop_tme"):
+        check.require()
+
+
+def test_one_fmu_is_a_mesh() -> None:
+    mesh = fmu_mesh.Mesh.from_fmu(FMUS / "Gain.fmu", name="one", simulation={"step_size": 0.1, "stop_time": 1.0})
+
+    result = mesh.run(record="memory", start_values={"one.k": 2.0, "one.u": 3.0})
+
+    assert result["one.y"].tolist() == [6.0] * 11
+
+
+def test_what_is_no_fmu_makes_no_mesh(folder: Path) -> None:
+    with pytest.raises(fmu_mesh.LoadFailed, match="A configuration is run by"):
+        fmu_mesh.Mesh.from_fmu(write_config(folder))
+    with pytest.raises(fmu_mesh.LoadFailed, match="does not exist"):
+        fmu_mesh.inspect("nothing.fmu")
+
+
+def test_a_profile_is_in_the_outcome() -> None:
+    outcome = built().run(record="memory", profile=True).outcome
+
+    assert outcome is not None
+    assert outcome.profile is not None
+    assert {node.node for node in outcome.profile.nodes} >= {"pendulum", "delay"}

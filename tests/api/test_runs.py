@@ -198,6 +198,35 @@ def test_a_cancelled_wait_leaves_the_run() -> None:
         assert run.get("gain.y") == 0.0
 
 
+def test_one_of_several_meshes_is_found_by_its_name() -> None:
+    other = fmu_mesh.Mesh("other", step_size=0.01, stop_time=1.0)
+    other.add("gain", fmu=FMUS / "Gain.fmu")
+    with steered().start(record="memory", paused=True) as first, other.start(record="memory", paused=True) as second:
+        first.wait_for("paused")
+        second.wait_for("paused")
+        assert {status.mesh for status in fmu_mesh.meshes()} == {first.name, "other"}
+        with fmu_mesh.attach("other", wait=10.0) as found:
+            assert found.info().mesh == "other"
+            assert found.step(5).point == 5
+            assert list(found.logs()) == []
+            with pytest.raises(fmu_mesh.DeadlineExceeded, match="was not done in time"):
+                found.wait_for("done", timeout=0.3)
+            with pytest.raises(fmu_mesh.CallRefused, match="started by somebody else"):
+                found.interrupt()
+            assert found.stop() is not None
+    with pytest.raises(fmu_mesh.DeadlineExceeded, match="there is no mesh 'other' after"):
+        fmu_mesh.attach("other", wait=0.3)
+
+
+def test_an_interrupted_run_raises_and_keeps_its_rows() -> None:
+    with steered(stop_time=None).start(record="memory") as run:
+        run.get("gain.y")
+        run.interrupt()
+        with pytest.raises(fmu_mesh.Interrupted) as caught:
+            run.wait()
+    assert len(caught.value.result.times) > 0
+
+
 def test_events_and_progress_come_while_it_runs() -> None:
     events: list[Event] = []
     statuses: list[MeshStatus] = []
