@@ -24,7 +24,7 @@ from ..errors import (
 )
 from ..wire.client.mesh_client import MeshClient
 from ..wire.client.reaching import Meshes
-from ..wire.client.waiting import rest, wait_for
+from ..wire.client.waiting import rest, wait_for, wait_for_start
 from ..wire.views import (
     Command,
     CommandAnswer,
@@ -53,7 +53,6 @@ TIMEOUT_S = 5.0
 
 _LOOK_S = 0.2
 _FOREVER_S = 1e9
-_START_S = 120.0
 _WAIT_S = 60.0
 
 
@@ -363,7 +362,8 @@ class Run:
                 self._own.interrupt()
                 continue
             except Interrupted as error:
-                return _by_keyboard(error)
+                named = KeyboardInterrupted(error.message, point=error.point, time=error.time, hint=error.hint)
+                return named.with_result(error.result)
             except FmuMeshError as error:
                 return error
             return KeyboardInterrupted("interrupted").with_result(future.result())
@@ -402,7 +402,7 @@ class Run:
         client = self._client()
         with self._opening:
             if not self._begun:
-                _wait_until_it_runs(client)
+                wait_for_start(client)
                 self._begun = True
         return client
 
@@ -430,24 +430,6 @@ class Run:
                 wait(_LOOK_S)
                 meshes.look()
         return client
-
-
-def _wait_until_it_runs(client: MeshClient) -> None:
-    """Wait until the mesh is past its initialization.
-
-    Raises:
-        DeadlineExceeded: it is not, in time.
-    """
-    with client.statuses(_START_S) as statuses:
-        for status in statuses:
-            if status.state not in ("starting", "initializing"):
-                return
-
-
-def _by_keyboard(error: Interrupted) -> KeyboardInterrupted:
-    named = KeyboardInterrupted(error.message, point=error.point, time=error.time, hint=error.hint)
-    named.with_result(error.result)
-    return named
 
 
 def _follow(client: MeshClient, future: Future[Result]) -> None:

@@ -12,7 +12,9 @@ from ..views import Command, CommandAnswer, MeshState, MeshStatus
 from .mesh_client import MeshClient
 from .reaching import Meshes
 
-__all__ = ["appearance", "rest", "wait_for"]
+__all__ = ["appearance", "rest", "wait_for", "wait_for_start"]
+
+_START_S: Final = 120.0
 
 _RANKS: Final[dict[MeshState, int]] = {
     "starting": 0,
@@ -73,6 +75,18 @@ def appearance(meshes: Meshes, mesh: str | None, timeout_s: float) -> MeshClient
             wait(left_s)
     who = f"mesh '{mesh}'" if mesh is not None else "mesh"
     raise DeadlineExceeded(f"there is no {who} after {timeout_s:g} s.", hint="--timeout waits longer.")
+
+
+def wait_for_start(client: MeshClient) -> None:
+    """Wait until a mesh is past its initialization.
+
+    Raises:
+        DeadlineExceeded: it is not, in time.
+    """
+    with client.statuses(_START_S) as statuses:
+        for status in statuses:
+            if status.state not in ("starting", "initializing"):
+                return
 
 
 def wait_for(client: MeshClient, state: MeshState, timeout_s: float) -> MeshStatus:
