@@ -29,7 +29,8 @@ class NotebookProgress:
     @classmethod
     def here(cls, name: str) -> Self:
         """A progress bar if this program is a notebook, and one that shows nothing otherwise."""
-        if "ipykernel" not in sys.modules:
+        shell = sys.modules["IPython"].get_ipython() if "IPython" in sys.modules else None
+        if not hasattr(shell, "kernel"):  # a terminal has none, and a program that imports ipykernel has no shell
             return cls(name, None)
         from IPython.display import display  # noqa: PLC0415  only a notebook has it
 
