@@ -31,6 +31,7 @@ def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.Arg
     check = add_command(commands, "check", "check a configuration and show its plan, without running it", [common])
     check.add_argument("config", type=Path, metavar="CONFIG", help="the configuration file")
     add_options(check.add_argument_group("instead of what CONFIG says"), "window", "start_values")
+    add_options(check, "allow_code")
     check.set_defaults(run_command=_check)
     schema = add_command(commands, "schema", "print the JSON Schema of configurations", [common])
     schema.set_defaults(run_command=_schema)

@@ -36,7 +36,7 @@ __all__ = ["add_commands", "finish", "run_launcher"]
 def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.ArgumentParser) -> None:
     """Add the commands of this module."""
     launch = add_command(commands, "launch", "run a mesh: one process per node, and the master", [common])
-    _add_config(launch, "paused", "view", "video", "profile")
+    _add_config(launch, "paused", "allow_code", "view", "video", "profile")
     launch.add_argument("--local", action="store_true", help="run everything in this one process")
     launch.add_argument("--plot", type=Path, metavar="FILE.png", help="plot the result at the end")
     launch.add_argument(
@@ -50,18 +50,18 @@ def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.Arg
     launch.set_defaults(run_command=_launch)
 
     node = add_command(commands, "node", "start one node manually", [common])
-    _add_config(node, "view", "video")
+    _add_config(node, "allow_code", "view", "video")
     node.add_argument("node", metavar="INSTANCE", help="name of the instance, or of its group")
     node.set_defaults(run_command=_node)
 
     master = add_command(commands, "master", "start the master and the recorder manually", [common])
-    _add_config(master, "paused", "profile")
+    _add_config(master, "paused", "allow_code", "profile")
     master.add_argument("--plot", type=Path, metavar="FILE.png", help="plot the result at the end")
     master.add_argument("--no-progress", action="store_true", help="no progress line")
     master.set_defaults(run_command=_master)
 
     gateway = add_command(commands, "gateway", "start the gateway to ROS manually", [common])
-    _add_config(gateway)
+    _add_config(gateway, "allow_code")
     gateway.set_defaults(run_command=_gateway)
 
     router = add_command(commands, "router", "run a Zenoh router", [common])

@@ -12,7 +12,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Mapping
-from contextlib import closing, suppress
+from contextlib import ExitStack, closing, suppress
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
@@ -34,8 +34,10 @@ from ..system.initialization_plan import Loop, Tear
 from ..system.layout import Layout
 from ..system.plan import Plan
 from ..variables.value_types import Value
+from .child import is_other_python
 from .outcome import Outcome
 from .results import open_result, what_is_kept
+from .threads import one_thread_meanwhile
 
 __all__ = ["LocalMesh"]
 
@@ -137,11 +139,15 @@ class LocalMesh:
         return what_is_kept(self._plan.system.result_file, self.rows)
 
     def _check_one_process(self) -> None:
-        """Refuse two instances of an FMU that allows one per process; groups do not matter here.
+        """Refuse what cannot run in one process; groups do not matter here.
 
         Raises:
-            ConfigurationError: there are two.
+            ConfigurationError: a component needs another Python, or there are two instances of an FMU that allows one.
         """
+        for name, node in self._plan.nodes.items():
+            if node.interpreter is not None and is_other_python(node.interpreter) and self._open_instance is None:
+                text = f"'{name}' needs the Python '{node.interpreter}', and this process is another one"
+                raise ConfigurationError(text, hint="Run it without --local.")
         first_of: dict[str, str] = {}
         for name, instance in self._plan.system.instances.items():
             if instance.description.only_once_per_process and self._open_instance is None:
@@ -158,13 +164,19 @@ class LocalMesh:
         types = [layouts[instance].column(name).type for instance, name in plan.system.recorded]
         members: dict[str, _Member] = {}
         watch = CallWatch(self._take_hang)
-        with tempfile.TemporaryDirectory(prefix="fmu_mesh-", dir=self._parent) as folder, closing(watch):
+        with (
+            ExitStack() as threads,
+            tempfile.TemporaryDirectory(prefix="fmu_mesh-", dir=self._parent) as folder,
+            closing(watch),
+        ):
+            threads.enter_context(one_thread_meanwhile())
             self._folder = Path(folder)
             file = open_result(self._loaded, plan.system) if plan.system.result_file else None
             self._buffer = rows = RowBuffer(file, plan.grid, types)
             try:
                 for name in plan.order:
                     members[name] = _Member(plan, name, self._guarded(name, Path(folder), watch))
+                threads.enter_context(one_thread_meanwhile())  # with the libraries that a component has imported
                 self._initialize(members)
                 started = time.perf_counter()
                 try:

@@ -175,13 +175,14 @@ def warn(plan: Plan) -> None:
 
 @contextmanager
 def stdout_as_stderr() -> Iterator[None]:
-    """In the block, output of an FMU in this process goes to standard error: standard output is for results."""
+    """In the block, output of an instance in this process goes to standard error: standard output is for results."""
     sys.stdout.flush()
     stdout = os.dup(1)
     os.dup2(2, 1)
     try:
         yield
     finally:
+        sys.stdout.flush()  # of a component in Python
         ctypes.CDLL(None).fflush(None)  # output of the FMU may still be in the buffer of the C library
         os.dup2(stdout, 1)
         os.close(stdout)
