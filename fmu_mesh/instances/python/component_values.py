@@ -5,7 +5,7 @@ Owns which Python values an output may have. A value of another type, or of anot
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Container
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ...rings.ring import Ring
 from ...variables.model_description import Variable
 from ...variables.value_conversion import ValueRefused, to_value
-from ...variables.value_types import DTYPES, Value, is_float, is_text, nested
+from ...variables.value_types import DTYPES, INTEGERS, Value, is_float, is_text, nested
 
 __all__ = ["as_attribute", "as_value", "reader", "writer"]
 
@@ -69,9 +69,11 @@ def writer(ring: Ring, variable: Variable) -> Callable[[int, object], None]:
         return write_array
 
     if variable.type != "Float64":
+        kind, allowed = _exact(variable)
 
         def write_scalar(slot: int, attribute: object) -> None:
-            part[slot, first] = _scalar(attribute, variable)
+            exact = attribute.__class__ is kind and attribute in allowed
+            part[slot, first] = attribute if exact else _scalar(attribute, variable)
 
         return write_scalar
 
@@ -83,6 +85,15 @@ def writer(ring: Ring, variable: Variable) -> Callable[[int, object], None]:
     return write_float
 
 
+def _exact(variable: Variable) -> tuple[type, Container[object]]:
+    """A class, and which of its objects are values of a variable as they are."""
+    if variable.type == "Boolean":
+        return bool, (False, True)
+    if variable.type in INTEGERS:
+        return int, [number for _, number in variable.items] or INTEGERS[variable.type]
+    return type(None), ()
+
+
 def _memory(part: Any) -> Any:  # noqa: ANN401 an array, and a view of its memory
     """The numbers of an array one after the other: indexing this takes half the time of indexing numpy."""
     return part.reshape(-1).data
@@ -92,13 +103,12 @@ def _scalar(attribute: object, variable: Variable) -> Value:
     plain = attribute.item() if isinstance(attribute, np.generic) else attribute
     if isinstance(plain, np.ndarray) and not plain.shape:
         plain = plain.item()
-    # In a file, a text can stand for a number, for an item or for bytes; in Python it is a text.
-    if isinstance(plain, list | tuple | np.ndarray) or (isinstance(plain, str) and variable.type != "String"):
-        raise _refused(attribute, variable)
+    # In a file, a text can also stand for a number or for bytes.
+    in_a_file = isinstance(plain, str) and variable.type not in ("String", "Enumeration")
     try:
-        return to_value(plain, variable)
-    except ValueRefused:
-        raise _refused(attribute, variable) from None
+        return to_value(None if in_a_file else plain, variable)
+    except ValueRefused as refused:
+        raise ValueRefused(f"its value is {_shown(attribute)}, expected {refused.expected}") from None
 
 
 def _array(attribute: object, variable: Variable) -> Array:
@@ -138,12 +148,12 @@ def _text_array(attribute: Any, variable: Variable) -> Array:  # noqa: ANN401 wh
 
 
 def _refused(attribute: object, variable: Variable) -> ValueRefused:
+    expected = f"an array of {variable.type} with the shape {variable.shape}"
+    return ValueRefused(f"its value is {_shown(attribute)}, expected {expected}")
+
+
+def _shown(attribute: object) -> str:
     if isinstance(attribute, np.ndarray):
-        found = f"an array of {attribute.dtype} with the shape {attribute.shape}"
-    else:
-        found = " ".join(repr(attribute).split())
-        found = found if len(found) <= _TEXT_CHARACTERS else f"{found[:_TEXT_CHARACTERS]}..."
-    expected = (
-        f"an array of {variable.type} with the shape {variable.shape}" if variable.shape else f"a {variable.type}"
-    )
-    return ValueRefused(f"its value is {found}, expected {expected}")
+        return f"an array of {attribute.dtype} with the shape {attribute.shape}"
+    text = " ".join(repr(attribute).split())
+    return text if len(text) <= _TEXT_CHARACTERS else f"{text[:_TEXT_CHARACTERS]}..."

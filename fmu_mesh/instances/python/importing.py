@@ -188,21 +188,16 @@ def component_section(cls: object) -> tuple[dict[str, str], ModelDescription]:
     module: Any = sys.modules.get(cls.__module__)
     if "." in cls.__qualname__:
         raise _cannot_import(cls, "it is defined within a function or a class", "Define it at the top of its file.")
-    if getattr(module, "__file__", None) is None or vars(module).get(cls.__name__) is not cls:
+    file = Path(getattr(module, "__file__", None) or "<none>").absolute()
+    if not file.is_file() or vars(module).get(cls.__name__) is not cls:
         reason = "no file has it, because a notebook or an interactive session defined it"
         raise _cannot_import(cls, reason, "Write it to a file and import it from there.")
-    file = Path(module.__file__).absolute()
     spec = module.__spec__
     name = spec.name if spec is not None else cls.__module__
     package = name.partition(".")[0]
-    if package != name and package in packages_distributions():
-        place = name
-    else:
-        if not file.is_file():
-            raise _cannot_import(cls, f"there is no file '{file}'", "Write it to a file and import it from there.")
-        place = str(file)
-    data = file.read_bytes() if file.is_file() else b""
-    return {"python": f"{place}:{cls.__name__}"}, description_of(cls, hashlib.sha256(data).hexdigest())
+    place = name if package != name and package in packages_distributions() else str(file)
+    description = description_of(cls, hashlib.sha256(file.read_bytes()).hexdigest())
+    return {"python": f"{place}:{cls.__name__}"}, description
 
 
 def _cannot_import(cls: type, reason: str, hint: str) -> ConfigurationError:

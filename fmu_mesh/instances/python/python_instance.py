@@ -20,7 +20,7 @@ from ...variables.value_conversion import ValueRefused, to_value
 from ...variables.value_types import Value
 from ..call_guard import lines_shown_of
 from ..contract import LogMessage, Opening
-from .component import Component
+from .component import Component, declared_variables
 from .component_values import as_attribute, as_value, reader, writer
 from .importing import ImportedComponent
 from .python_section import PythonConfig, target_of
@@ -68,6 +68,7 @@ class PythonInstance:
         except FmuMeshError:
             self._imported.close()
             raise
+        self._declared = declared_variables(self._imported.cls)
         self._step_component = self._component.step
         self._values: dict[str, Any] = vars(self._component)
 
@@ -105,7 +106,7 @@ class PythonInstance:
             self._initialize()
         values = []
         for name in names:
-            attribute = getattr(self._component, name)
+            attribute = self._values[name] if name in self._values else self._declared[name].start
             try:
                 values.append(as_value(attribute, self._variables[name]))
             except ValueRefused as refused:
