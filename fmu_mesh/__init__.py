@@ -1,4 +1,10 @@
-"""fmu_mesh: a service mesh for co-simulation on Eclipse Zenoh."""
+"""fmu_mesh: a service mesh for co-simulation on Eclipse Zenoh.
+
+>>> import fmu_mesh
+>>> result = fmu_mesh.load("configs/pendulum_delay.yaml").run(stop_time=1.0, record="memory")
+>>> result["delay.y"].shape
+(501,)
+"""
 
 __version__ = "0.1.0"
 
@@ -6,25 +12,92 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from .adapter import FMIAdapter
+    from .api.mesh_builder import Check, Mesh, load
+    from .api.result import Result
+    from .api.run_handle import Run, Sample, attach
+    from .errors import (
+        CallRefused,
+        ConfigurationError,
+        DeadlineExceeded,
+        Finding,
+        FmuError,
+        FmuMeshError,
+        FrameGap,
+        InitializationFailed,
+        Interrupted,
+        KeyboardInterrupted,
+        LoadFailed,
+        LoopNotConverged,
+        MeshLost,
+        ProtocolBroken,
+        StepFailed,
+        UnknownName,
+    )
     from .instances.python.component import Component, component
     from .instances.python.declarations import Input, Output, Parameter
 
-__all__ = ["Component", "FMIAdapter", "Input", "Output", "Parameter", "__version__", "component"]
+__all__ = [
+    "CallRefused",
+    "Check",
+    "Component",
+    "ConfigurationError",
+    "DeadlineExceeded",
+    "FMIAdapter",
+    "Finding",
+    "FmuError",
+    "FmuMeshError",
+    "FrameGap",
+    "InitializationFailed",
+    "Input",
+    "Interrupted",
+    "KeyboardInterrupted",
+    "LoadFailed",
+    "LoopNotConverged",
+    "Mesh",
+    "MeshLost",
+    "Output",
+    "Parameter",
+    "ProtocolBroken",
+    "Result",
+    "Run",
+    "Sample",
+    "StepFailed",
+    "UnknownName",
+    "__version__",
+    "attach",
+    "component",
+    "load",
+]
+
+_PLACES = {
+    "FMIAdapter": "adapter",
+    "Check": "api.mesh_builder",
+    "Component": "instances.python.component",
+    "Input": "instances.python.declarations",
+    "Mesh": "api.mesh_builder",
+    "load": "api.mesh_builder",
+    "Output": "instances.python.declarations",
+    "Parameter": "instances.python.declarations",
+    "Result": "api.result",
+    "Run": "api.run_handle",
+    "Sample": "api.run_handle",
+    "attach": "api.run_handle",
+    "component": "instances.python.component",
+}
+"""The modules of the public names; all others are exceptions."""
 
 
 def __getattr__(name: str) -> object:
-    """Import what is asked for only now, so that a node or a master does not pay for it."""
-    if name == "FMIAdapter":
-        from .adapter import FMIAdapter  # noqa: PLC0415 see above
+    """Import a public name when it is first used, so that a node or a master does not pay for it."""
+    if name not in __all__:
+        msg = f"module '{__name__}' has no attribute '{name}'"
+        raise AttributeError(msg)
+    from importlib import import_module  # noqa: PLC0415 see above
 
-        return FMIAdapter
-    if name in {"Component", "component"}:
-        from .instances.python import component as components  # noqa: PLC0415 see above
+    value = getattr(import_module(f"{__name__}.{_PLACES.get(name, 'errors')}"), name)
+    globals()[name] = value
+    return value
 
-        return getattr(components, name)
-    if name in {"Input", "Output", "Parameter"}:
-        from .instances.python import declarations  # noqa: PLC0415 see above
 
-        return getattr(declarations, name)
-    msg = f"module '{__name__}' has no attribute '{name}'"
-    raise AttributeError(msg)
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

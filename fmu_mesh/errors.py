@@ -4,6 +4,7 @@
 FmuMeshError                     1   an internal error
 ├── ConfigurationError           2   a file, an option or a command is wrong; carries all findings
 ├── CallRefused                  2   a program called the library wrongly; also a ValueError
+│   └── UnknownName                  there is no such name; also a KeyError
 ├── FmuError                     3   an FMU failed
 │   ├── LoadFailed                   it cannot be extracted, loaded or instantiated
 │   ├── InitializationFailed         a call in or around Initialization Mode failed
@@ -15,6 +16,7 @@ FmuMeshError                     1   an internal error
 │   └── ProtocolBroken               a registered peer sent what the protocol forbids, such as a grant beyond the window
 ├── MessageRefused               1   a received message is malformed; it is counted, and the run goes on
 ├── Interrupted                130   a person or the parent process asked to end
+│   └── KeyboardInterrupted          Ctrl-C in a program; also a KeyboardInterrupt
 └── TerminationRequested         0   an FMU asked to end the simulation: an orderly end, no failure
 ```
 
@@ -24,7 +26,7 @@ that raise them.
 
 from __future__ import annotations
 
-from typing import ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import msgspec
 
@@ -39,6 +41,7 @@ __all__ = [
     "FrameGap",
     "InitializationFailed",
     "Interrupted",
+    "KeyboardInterrupted",
     "LoadFailed",
     "LoopNotConverged",
     "MeshLost",
@@ -46,6 +49,7 @@ __all__ = [
     "ProtocolBroken",
     "StepFailed",
     "TerminationRequested",
+    "UnknownName",
 ]
 
 
@@ -75,6 +79,7 @@ class FmuMeshError(Exception):
 
     Attributes:
         reported: True if another process has already shown this error.
+        result: what was recorded before, if this error ended a run of the library: a `fmu_mesh.Result`.
 
     The layer that catches an error often knows more than the one that raised it. It adds what it knows and raises the
     same error again:
@@ -106,6 +111,7 @@ class FmuMeshError(Exception):
         self.time = time
         self.hint = hint
         self.reported = False
+        self.result: Any = None
 
     def __str__(self) -> str:
         where = []
@@ -139,6 +145,11 @@ class FmuMeshError(Exception):
     def instead_of_hint(self, hint: str) -> Self:
         """Replace the hint; returns this error."""
         self.hint = hint
+        return self
+
+    def with_result(self, result: object) -> Self:
+        """Set what was recorded before; returns this error."""
+        self.result = result
         return self
 
     def already_reported(self) -> Self:
@@ -209,6 +220,10 @@ class CallRefused(FmuMeshError, ValueError):
     exit_code = 2
 
 
+class UnknownName(CallRefused, KeyError):
+    """There is no variable, instance or mesh with this name; suggests the nearest one."""
+
+
 class FmuError(FmuMeshError):
     """An FMU failed."""
 
@@ -257,6 +272,10 @@ class Interrupted(FmuMeshError):
     """A person or the parent process asked this process to end."""
 
     exit_code = 130
+
+
+class KeyboardInterrupted(Interrupted, KeyboardInterrupt):
+    """Ctrl-C, or "interrupt kernel" in a notebook, has ended a run; names the last point."""
 
 
 class TerminationRequested(FmuMeshError):

@@ -236,12 +236,23 @@ def _get(arguments: argparse.Namespace, meshes: Meshes) -> int:
 
 def _set(arguments: argparse.Namespace, meshes: Meshes) -> int:
     client = meshes.one(arguments.key)
-    answer = client.set(client.target(arguments.key), arguments.value)
+    target = client.target(arguments.key)
+    answer = client.set(target, _value(target, arguments.value))
     if arguments.json:
         _print_json(answer)
     else:
         print(f"{answer.key} holds from point {answer.point} on (t = {seconds(answer.time)})")
     return 0
+
+
+def _value(target: Target, text: str) -> object:
+    """The value of a text: JSON, or the text itself, so that an item, a String or base64 needs no quotes."""
+    try:
+        value = msgspec.json.decode(text)
+    except msgspec.DecodeError:
+        return text
+    is_text = target.variable.type in ("String", "Binary") and not isinstance(value, str | list)
+    return text if value is None or is_text else value
 
 
 def _watch(arguments: argparse.Namespace, meshes: Meshes) -> int:

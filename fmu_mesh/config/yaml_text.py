@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import re
 from collections.abc import Iterator
+from io import StringIO
 from typing import NoReturn
 
 from ruamel.yaml import YAML
@@ -30,7 +31,7 @@ from fmu_mesh.config.findings import Findings
 from fmu_mesh.config.yaml_errors import in_words
 from fmu_mesh.text import shown
 
-__all__ = ["MAXIMUM_DEPTH", "MAXIMUM_VALUES", "Plain", "read"]
+__all__ = ["MAXIMUM_DEPTH", "MAXIMUM_VALUES", "Plain", "read", "written"]
 
 Plain = None | bool | int | float | str | list["Plain"] | dict[str, "Plain"]
 
@@ -73,6 +74,14 @@ def read(text: str, findings: Findings, lines: dict[str, int]) -> Plain:
     except (ValueError, OverflowError):  # ruamel.yaml does not catch the errors of `chr`
         findings.add("", "an escape sequence that is no character", "YAML 1.2")
     return None
+
+
+def written(value: Plain) -> str:
+    """A value as YAML text that `read` reads back as the same value; short mappings and lists in one line."""
+    text, yaml = StringIO(), YAML()
+    yaml.default_flow_style = None
+    yaml.dump(value, text)
+    return text.getvalue()
 
 
 def resolve(text: str) -> Plain:

@@ -31,6 +31,7 @@ from .instance_wrapper import AroundInstance
 
 __all__ = [
     "DEFAULT_MODE",
+    "ENDED",
     "CallWatch",
     "Guarded",
     "call_named",
@@ -64,6 +65,9 @@ _ENVIRONMENT_BYTES: Final = 512
 """More than the size of `fenv_t` on any platform."""
 _ACTION_BYTES: Final = 512
 """More than the size of `struct sigaction` on any platform."""
+ENDED: Final = "; its process is ended"
+"""What an error about a call that does not return ends with, where that is so."""
+
 _DEFAULT_ENVIRONMENT: Final = ctypes.c_void_p(-1)
 """`FE_DFL_ENV` of the C libraries on x86 and ARM."""
 
@@ -242,9 +246,9 @@ def not_returned(thread: int, seconds: float, otherwise: str) -> str:
         otherwise: the function of an FMU, if it is not known which one.
     """
     if (line := _line_of_user(thread)) is not None:
-        return f"the component has not returned for {seconds:.1f} s from {line}; its process is ended"
+        return f"the component has not returned for {seconds:.1f} s from {line}{ENDED}"
     function = current_function(thread) or otherwise
-    return f"the FMU has not returned for {seconds:.1f} s from {function}; its process is ended"
+    return f"the FMU has not returned for {seconds:.1f} s from {function}{ENDED}"
 
 
 def _line_of_user(thread: int) -> str | None:

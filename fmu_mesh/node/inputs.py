@@ -1,4 +1,4 @@
-"""Unconnected inputs over time: values that came with a time of their own, as any program sends them.
+"""Unconnected inputs and tunable parameters over time: values that came with a time, as any program sends them.
 
 Owns how such a value becomes what a step uses (the node-based use of ROS's `fmi_adapter`). Which settings are allowed
 at all is `fmu_mesh.node.settings`.
@@ -73,7 +73,7 @@ class TimedInputs(AroundInstance[Instance]):
         self._step = step + 1
 
     def add(self, name: str, value: Value, time: float | None) -> int:
-        """A value of an input from ``time`` (s; None: now) on; returns the own step that is the first to use it.
+        """A value of a variable from ``time`` (s; None: now) on; returns the own step that is the first to use it.
 
         Raises:
             ValueRefused: too many values wait for their time, or this one is too late.
@@ -88,7 +88,8 @@ class TimedInputs(AroundInstance[Instance]):
             raise ValueRefused(f"the time {when:g} s is later than any run ends")
         if name not in self._trajectories:
             variable = self.description.variable(name)
-            linear = self._linear and variable is not None and is_float(variable.type)
+            is_input = variable is not None and variable.causality == "input"
+            linear = self._linear and variable is not None and is_input and is_float(variable.type)
             trajectory = Trajectory(Samples(linear))
             if when > now:
                 trajectory.add(now, self._instance.get_values([name])[0])
@@ -97,6 +98,11 @@ class TimedInputs(AroundInstance[Instance]):
             raise ValueRefused(f"{_WAITING} values of '{name}' wait for their time already")
         self._trajectories[name].add(when, value)
         return math.ceil(max(steps, self._step))
+
+    def follows(self, name: str) -> bool:
+        """Whether a variable gets its values over time: every input does, and a parameter that got one with a time."""
+        variable = self.description.variable(name)
+        return name in self._trajectories or (variable is not None and variable.causality == "input")
 
     def get_state(self) -> object:
         """See `KeepsState`; values whose time is to come are part of the state."""
@@ -159,12 +165,10 @@ def set_input(runner: Runner, name: str, value: Value, time: float | None) -> in
         FmuError: the FMU refused it.
         ValueRefused: too many values wait for their time, or this one is too late.
     """
-    variable = runner.instance.description.variable(name)
-    is_input = variable is not None and variable.causality == "input"
-    if is_input and time is not None and not isinstance(runner.instance, TimedInputs):
+    if time is not None and not isinstance(runner.instance, TimedInputs):
         timed = runner.wrap(lambda instance: TimedInputs(instance, "hold"))
         timed.start(runner.grid, runner.plan.step_points, runner.step)
-    if is_input and isinstance(runner.instance, TimedInputs):
+    if isinstance(runner.instance, TimedInputs) and (time is not None or runner.instance.follows(name)):
         return runner.instance.add(name, value, time)
     runner.instance.set_values({name: value})
     return runner.step

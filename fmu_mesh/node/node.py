@@ -161,12 +161,11 @@ class Node:
 
     def report_hang(self, error: FmuError) -> bool:
         """From a watching thread, while an FMU does not return: tell the master; whether it knows now."""
-        if not self._membership.lost_master:
-            if (unit := self._activity.advancing) is not None:
-                unit.meanwhile(self._send_last_rows)  # should the step end now, the main thread waits for this
-            elif self._activity.state == "running":
-                sys.setswitchinterval(_ALONE_S)  # as above; the main thread is in a call of an FMU, not in Python code
-                self._send_last_rows()
+        if (unit := self._activity.advancing) is not None and not self._membership.lost_master:
+            unit.meanwhile(self._send_last_rows)  # should the step end now, the main thread waits for this
+        elif self._activity.state == "running" and not self._membership.lost_master:
+            sys.setswitchinterval(_ALONE_S)  # as above
+            self._send_last_rows()
         return self.server.report_hang(error, self._patience_s())
 
     # --- before the first point

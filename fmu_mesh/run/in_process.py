@@ -10,8 +10,10 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 from ..errors import FmuError, FmuMeshError, Interrupted
+from ..instances.call_guard import ENDED
 from ..instances.contract import LogMessage
 from ..wire.runtime import remove_run_folder, remove_stale_folders, run_folder, run_name
 from ..wire.views import LogLine, MeshStatus
@@ -48,6 +50,7 @@ class InProcessRun:
         self._over = threading.Event()
         self._mesh: LocalMesh | None = None
         self._interrupted = False
+        self._folder: Path | None = None
 
     def run(self) -> Outcome:
         """Run from the first to the last point.
@@ -72,9 +75,9 @@ class InProcessRun:
         threading.Thread(target=self._give_up, name="grace", daemon=True).start()
 
     def _work(self) -> None:
-        remove_stale_folders()
-        folder = run_folder(self._run.mesh, run_name())
         try:
+            remove_stale_folders()
+            self._folder = folder = run_folder(self._run.mesh, run_name())
             self._mesh = mesh = LocalMesh(
                 self._run.plan,
                 self._log,
@@ -90,8 +93,7 @@ class InProcessRun:
         except BaseException as error:  # noqa: BLE001 `run` raises it on the thread of the caller
             self._error = self._error or error
         finally:
-            remove_run_folder(folder)
-            self._over.set()
+            self._leave()
 
     def _give_up(self) -> None:
         if not self._over.wait(_GRACE_S) and self._mesh is not None:
@@ -102,7 +104,12 @@ class InProcessRun:
         """From another thread: the thread of the run does not return from an FMU."""
         assert self._mesh is not None
         self._mesh.clean_up()
-        self._error = error
+        self._error = error.saying(error.message.removesuffix(ENDED))  # here, the process goes on
+        self._leave()
+
+    def _leave(self) -> None:
+        if self._folder is not None:
+            remove_run_folder(self._folder)
         self._over.set()
 
     def _failed(self, error: FmuMeshError) -> Outcome:

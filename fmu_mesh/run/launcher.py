@@ -33,7 +33,7 @@ from ..wire.runtime import (
 from ..wire.session import LEASE_MS
 from ..wire.views import GOING_ON
 from .child import Child, StopWatch, how_it_ended, own_command
-from .events import Event, Output, Reachable, Status, decode_event
+from .events import Event, OutputLine, Reachable, Status, decode_event
 from .outcome import Outcome
 from .results import rows_left, what_is_kept
 from .run_plan import RunPlan
@@ -190,7 +190,7 @@ class Launcher:
         self._spawn_nodes()
 
     def _take_output(self, name: str, line: bytes) -> None:
-        self._on_event(Output(name, line.decode(errors="replace").rstrip()))
+        self._on_event(OutputLine(name, line.decode(errors="replace").rstrip()))
 
     def _take_exit(self, name: str, code: int) -> None:
         if not self._signalled:  # afterwards the signal is the reason

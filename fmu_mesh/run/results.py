@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from ..config.loading import LoadedConfig
 from ..errors import ConfigurationError
 from ..files import Kept, open_alone
+from ..recorder.arrays_file import ENDING
 from ..system.recording import Recording, ResultFile, ResultFormat, result_format
 from ..system.system import System
 
@@ -84,6 +85,8 @@ def what_is_kept(result_file: str | None, rows: int) -> str | None:
     """The sentence for a run that ended early and left rows; None if there are no rows, as on a device."""
     if not rows or result_file is None or not Path(result_file).is_file():
         return None
+    if result_file.endswith(ENDING):
+        return f"What was recorded up to then ({rows} rows) is in the `result` of this error."
     return f"What was recorded up to then ({rows} rows) is in '{result_file}'."
 
 

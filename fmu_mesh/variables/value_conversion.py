@@ -9,15 +9,15 @@ from __future__ import annotations
 import base64
 import binascii
 import math
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
 from ..text import listed, nearest
 from .model_description import Variable
-from .value_types import INTEGERS, PlainValue, Value, nested
+from .value_types import DTYPES, INTEGERS, PlainValue, Value, VariableType, flattened, nested
 
-__all__ = ["MAX_TEXT_SIZE", "ValueRefused", "range_of", "to_plain", "to_value"]
+__all__ = ["MAX_TEXT_SIZE", "ValueRefused", "from_plain", "range_of", "to_plain", "to_value"]
 
 MAX_TEXT_SIZE = 16 * 2**20
 """Largest size of a String or Binary in bytes."""
@@ -70,6 +70,23 @@ def to_plain(value: Value) -> PlainValue:
             return [to_plain(element) for element in value]
         case _:
             return value
+
+
+def from_plain(plain: PlainValue, type_: str, shape: tuple[int, ...] = ()) -> Any:  # noqa: ANN401  the type says which
+    """A plain value of a type as a program wants it: bytes for Binary, a numpy array for an array.
+
+    Example:
+        >>> from_plain([1.0, "NaN"], "Float64", (2,))
+        array([ 1., nan])
+    """
+    if shape:
+        elements = [from_plain(element, type_) for element in flattened(plain, len(shape))]
+        return np.array(elements, DTYPES[cast("VariableType", type_)]).reshape(shape)
+    if type_ == "Binary" and isinstance(plain, str):
+        return base64.b64decode(plain)
+    if type_ in ("Float64", "Float32") and isinstance(plain, str | int):
+        return _NOT_FINITE[plain] if isinstance(plain, str) else float(plain)
+    return plain
 
 
 def range_of(variable: Variable) -> str:

@@ -251,6 +251,7 @@ class Question(msgspec.Struct, frozen=True):
         whom: who is asked, for the error.
         deadline_s: how long to wait for an answer, in s.
         payload: JSON that goes with the query, if anything.
+        attachment: JSON that goes with the payload, if anything.
         answer_s: how long somebody who is there may take to answer, in s, if that is longer.
         priority: the query goes ahead of what has a lower one, and behind what was sent before with its own.
     """
@@ -259,6 +260,7 @@ class Question(msgspec.Struct, frozen=True):
     whom: str
     deadline_s: float
     payload: bytes | None = None
+    attachment: bytes | None = None
     answer_s: float | None = None
     priority: zenoh.Priority = zenoh.Priority.DEFAULT
 
@@ -299,7 +301,7 @@ def answers(
                     # Zenoh does not tell when whoever took the query is gone: it would wait for the timeout.
                     replies: queue.SimpleQueue[zenoh.Reply | None] = queue.SimpleQueue()
                     handler = Callback(replies.put, partial(replies.put, None))
-                    querier.get(handler, payload=question.payload, encoding=encoding)
+                    querier.get(handler, payload=question.payload, encoding=encoding, attachment=question.attachment)
                     if samples := _collected(replies, over, every=every):
                         return samples
                 if over():

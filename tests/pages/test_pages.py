@@ -19,6 +19,7 @@ from collections.abc import Callable, Iterator
 from itertools import pairwise
 from pathlib import Path
 from typing import Self
+from unittest import mock
 
 import pytest
 import yaml
@@ -76,12 +77,14 @@ class PageRun:
             (self._folder / block.detail).write_text(text, encoding="utf-8")
 
     def __enter__(self) -> Self:
-        self._stdout = contextlib.redirect_stdout(self._printed)
-        self._stdout.__enter__()
+        self._here = contextlib.ExitStack()
+        self._here.enter_context(contextlib.redirect_stdout(self._printed))
+        own = {name: self._place.environment[name] for name in ("FMU_MESH_RUNTIME_DIR", "TMPDIR")}
+        self._here.enter_context(mock.patch.dict(os.environ, own))
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *rest: object) -> None:
-        self._stdout.__exit__(None, None, None)
+        self._here.close()
         for session in (value for value in self._names.values() if isinstance(value, zenoh.Session)):
             session.close()
         for process in self._meanwhile:

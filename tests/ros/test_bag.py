@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from fmu_mesh.cli.main import main
-from fmu_mesh.ros.bags.bag import Sample
+from fmu_mesh.ros.bags.bag import BagSample
 from fmu_mesh.ros.bags.playing import schedule
 from fmu_mesh.simtime import TimeGrid
 from tests.fmus.helpers import find_fmu
@@ -218,8 +218,8 @@ def test_a_plot_of_an_mcap_is_refused_with_the_way_out(tmp_path: Path, capsys: p
 GRID = TimeGrid(0.0, 0.01, 100)
 
 
-def at(ms: float, value: float, instance: str = "gain") -> Sample:
-    return Sample(round(ms * MS), instance, "u", value)
+def at(ms: float, value: float, instance: str = "gain") -> BagSample:
+    return BagSample(round(ms * MS), instance, "u", value)
 
 
 @pytest.mark.parametrize(
@@ -235,7 +235,7 @@ def at(ms: float, value: float, instance: str = "gain") -> Sample:
     ids=["on points", "in any order", "a nanosecond off", "between points", "the last of one point", "after the end"],
 )
 def test_a_sample_holds_from_the_first_point_that_is_not_before_its_stamp(
-    samples: list[Sample], points: dict[int, float]
+    samples: list[BagSample], points: dict[int, float]
 ) -> None:
     moments, merged, beyond = schedule(samples, GRID, {"gain": 1}, start=None)
 
@@ -244,7 +244,7 @@ def test_a_sample_holds_from_the_first_point_that_is_not_before_its_stamp(
 
 
 def test_stamps_of_another_clock_are_moved_so_that_the_first_one_is_at_the_start() -> None:
-    samples = [Sample(1_700_000_000_000_000_000 + k * 10 * MS, "gain", "u", float(k)) for k in range(5)]
+    samples = [BagSample(1_700_000_000_000_000_000 + k * 10 * MS, "gain", "u", float(k)) for k in range(5)]
 
     moments, _, _ = schedule(samples, GRID, {"gain": 1}, start=0.02)
 

@@ -14,12 +14,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 from matplotlib import image
+from matplotlib.axes import Axes
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
+from fmu_mesh.api.drawing import figure_of, reduced
+from fmu_mesh.api.result import Result
+from fmu_mesh.api.result_reading import Columns, read_csv
 from fmu_mesh.cli.main import main
-from fmu_mesh.cli.output.drawing import Results, figure_of, reduced
-from fmu_mesh.cli.plotting import plot_results, plotted_where_it_ends, read_results
+from fmu_mesh.cli.plotting import plot_results, plotted_where_it_ends
 from fmu_mesh.errors import ConfigurationError, StepFailed
 from fmu_mesh.run.preparing import prepare
 from fmu_mesh.system.plan import Plan
@@ -46,6 +49,12 @@ def pixels(picture: Path) -> NDArray[np.float64]:
     return np.asarray(image.imread(picture), dtype=np.float64)
 
 
+def legend_of(axes: Axes) -> list[str]:
+    legend = axes.get_legend()
+    assert legend is not None
+    return [text.get_text() for text in legend.get_texts()]
+
+
 @pytest.mark.skipif(shutil.which("prlimit") is None, reason="needs prlimit")
 @pytest.mark.parametrize("format_", ["png", "svg", "pdf"])
 def test_a_plot_for_which_the_disk_has_no_room_leaves_the_last_one(results: Path, format_: str) -> None:
@@ -62,35 +71,39 @@ def test_a_plot_for_which_the_disk_has_no_room_leaves_the_last_one(results: Path
 
 
 def test_a_result_file_is_read_as_it_was_written(results: Path) -> None:
-    read = read_results(results)
+    read = read_csv(results)
 
     assert read.times.tolist() == [0.0, 0.5, 1.0]
-    assert list(read.columns) == ["a.y", "a.der(x,2)", "b.on", "b.count"]
-    assert read.columns["a.y"].tolist() == [1.5, 0.001, 2.5]
-    assert math.isnan(read.columns["a.der(x,2)"][1])
-    assert read.columns["a.der(x,2)"][2] == math.inf
-    assert read.columns["b.on"].tolist() == [1.0, 0.0, 1.0]
-    assert read.flags == {"b.on"}
-    assert read.whole == {"b.count"}
+    assert list(read.values) == ["a.y", "a.der(x,2)", "b.on", "b.count"]
+    assert read.values["a.y"].tolist() == [1.5, 0.001, 2.5]
+    assert math.isnan(read.values["a.der(x,2)"][1])
+    assert read.values["a.der(x,2)"][2] == math.inf
+    assert read.values["b.on"].tolist() == [True, False, True]
+    assert read.values["b.count"].tolist() == [3, -4, 5]
 
 
 @pytest.mark.parametrize("rest", ["1.5", "1.5,0.1", "1.5,0.1,0.2,true,1", ""])
 def test_a_last_row_that_is_cut_off_is_left_out(results: Path, rest: str) -> None:
     results.write_text(RESULTS + rest, encoding="utf-8")
-    assert read_results(results).times.tolist() == [0.0, 0.5, 1.0]
+    assert read_csv(results).times.tolist() == [0.0, 0.5, 1.0]
 
 
-def test_columns_of_text_are_left_out(tmp_path: Path) -> None:
+def test_columns_of_text_are_read_and_not_drawn(tmp_path: Path) -> None:
     path = tmp_path / "a.csv"
     path.write_text('time,a,"s,t",b\n0.0,1.5,"x, ""y""\nz",2\n0.5,2.5,"",3\n1.0,3.5,"cut')
 
-    results = read_results(path)
+    values = read_csv(path).values
 
-    assert {name: column.tolist() for name, column in results.columns.items()} == {"a": [1.5, 2.5], "b": [2.0, 3.0]}
+    assert {name: column.tolist() for name, column in values.items()} == {
+        "a": [1.5, 2.5],
+        "s,t": ['x, "y"\nz', ""],
+        "b": [2, 3],
+    }
+    assert legend_of(Result.read(path).plot().axes[0]) == ["a", "b"]
 
 
 def test_variables_are_chosen_in_the_order_asked_for(results: Path) -> None:
-    assert list(read_results(results, ["b.count", "a.y"]).columns) == ["b.count", "a.y"]
+    assert legend_of(Result.read(results).plot("b.count", "a.y").axes[0]) == ["b.count", "a.y"]
 
 
 @pytest.mark.parametrize(
@@ -99,7 +112,7 @@ def test_variables_are_chosen_in_the_order_asked_for(results: Path) -> None:
         ("", "it is empty, not 'time'"),
         ("mesh: pair\n", "its first column is 'mesh: pair', not 'time'"),
         (RESULTS + "1.5,1\n", "line 5: 2 values where the heading has 5"),
-        (RESULTS + "1.5,x,1.0,true,1\n", "line 5: could not convert string to float: 'x'"),
+        (RESULTS + "1.5,x,1.0,true,1\n", "line 5: 'x' is no value of type Float64"),
         ("time,a\n\0\xff", ""),
     ],
 )
@@ -109,7 +122,7 @@ def test_what_is_no_result_file_is_refused_with_the_place(results: Path, text: s
         results.write_bytes(b"time,a\n\xff\xfe\n")
         message = "codec can't decode"
     with pytest.raises(ConfigurationError, match=r"'.*run\.csv' is no result file: ") as caught:
-        read_results(results)
+        read_csv(results)
     assert message in str(caught.value)
 
 
@@ -246,10 +259,10 @@ def test_a_unit_that_says_that_there_is_none_is_no_label(tmp_path: Path, unit: s
     assert "value in 1" not in drawn
 
 
-def results_of(columns: Mapping[str, Sequence[float]]) -> Results:
+def results_of(columns: Mapping[str, Sequence[float]]) -> Columns:
     """Results at 0, 1, 2 … s."""
     arrays = {name: np.array(values, dtype=np.float64) for name, values in columns.items()}
-    return Results(np.arange(len(next(iter(arrays.values()))), dtype=np.float64), arrays, frozenset(), frozenset())
+    return Columns(np.arange(len(next(iter(arrays.values()))), dtype=np.float64), arrays)
 
 
 def test_78_lines_can_be_told_apart_and_their_legend_covers_nothing() -> None:

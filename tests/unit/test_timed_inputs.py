@@ -122,13 +122,19 @@ def runner_of(instance: Instance) -> Runner:
     return runner
 
 
-def test_a_parameter_is_set_at_once_whatever_its_time(tmp_path: Path) -> None:
-    gain = Steps(tmp_path, "hold").inputs
-    runner = runner_of(gain)
+def test_a_parameter_without_a_time_is_set_at_once_and_with_one_holds_from_it_on(linear: Steps) -> None:
+    runner = runner_of(linear.inputs)
 
-    assert set_input(runner, "k", 2.0, 99.0) == 0
-    assert gain.get_values(["k"]) == [2.0]
-    gain.close()
+    assert set_input(runner, "k", 2.0, None) == 0
+    assert linear.inputs.get_values(["k"]) == [2.0]
+
+    assert set_input(runner, "k", 4.0, 1.3) == 3
+    used = []
+    for step in range(5):
+        runner.instance.do_step(step)
+        runner.step = step + 1
+        used += runner.instance.get_values(["y"])
+    assert used == [10.0, 10.0, 10.0, 20.0, 20.0]  # a parameter does not change in between, as inputs do here
 
 
 def test_an_instance_follows_times_from_the_first_value_with_one_on(tmp_path: Path) -> None:

@@ -14,8 +14,9 @@ from typing import Final, Self
 from rich.console import Console
 from rich.markup import escape
 
+from ...api.result import summary_of
 from ...errors import ErrorReport, FmuMeshError, from_report
-from ...run.events import Event, Log, Output, Reachable, Restarted, Status
+from ...run.events import Event, Log, OutputLine, Reachable, Restarted, Status
 from ...run.outcome import Outcome
 from ...run.wiring import is_socket, leaves_host
 from ...system.plan import Plan
@@ -80,7 +81,7 @@ class Display:
                 self._status(status)
             case Log(line):
                 self.log(line)
-            case Output(process, text):
+            case OutputLine(process, text):
                 self._output(process, text)
             case Restarted(error, number):
                 again = f"The run starts again from its first point (restart {number})."
@@ -193,8 +194,5 @@ def summary(plan: Plan, outcome: Outcome) -> list[str]:
     lines = []
     if outcome.file is not None:
         lines.append(f"result: {short_path(outcome.file)} ({outcome.rows} rows)")
-    point, seconds = outcome.point, outcome.seconds
-    rate = point / seconds if seconds > 0 else 0.0
-    factor = rate * plan.grid.step_size
-    lines.append(f"{point} points in {seconds:.3f} s: {rate:.0f} points/s, real-time factor {factor:.3g}")
+    lines.append(summary_of(outcome, plan.grid.step_size))
     return lines

@@ -21,7 +21,7 @@ from ...errors import FmuMeshError, LoadFailed
 from ...variables.model_description import ModelDescription
 from .component_description import check_arguments
 from .importing import ImportedComponent
-from .python_section import PythonConfig, target_of
+from .python_section import PythonConfig, class_place_of
 
 __all__ = ["answer_to", "ask_description"]
 
@@ -58,7 +58,7 @@ def ask_description(path: Path, section: PythonConfig) -> ModelDescription:
     Raises:
         LoadFailed: it cannot be imported or described, or the interpreter cannot be used; says why.
     """
-    target = target_of(section.python)
+    target = class_place_of(section.python)
     if target.file and not path.is_file():
         raise LoadFailed("a folder" if path.is_dir() else "no such file")
     python = section.interpreter or sys.executable
@@ -80,7 +80,7 @@ def ask_description(path: Path, section: PythonConfig) -> ModelDescription:
 def answer_to(request: str) -> bytes:
     """In the child process: import what is asked for; returns the answer."""
     asked = msgspec.json.decode(request, type=_Request)
-    component = ImportedComponent(Path(asked.path), target_of(asked.python))
+    component = ImportedComponent(Path(asked.path), class_place_of(asked.python))
     try:
         description = component.load()
         check_arguments(component.cls, asked.arguments)

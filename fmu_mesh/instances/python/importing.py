@@ -26,7 +26,7 @@ from ...text import listed, nearest, short_path
 from ...variables.model_description import ModelDescription
 from .component import Component
 from .component_description import description_of
-from .python_section import Target
+from .python_section import ClassPlace
 
 __all__ = ["ImportedComponent", "being_imported", "component_section"]
 
@@ -61,7 +61,7 @@ class ImportedComponent:
         description: its model description.
     """
 
-    def __init__(self, path: Path, target: Target) -> None:
+    def __init__(self, path: Path, target: ClassPlace) -> None:
         self._path = path
         self._target = target
         self._folder = str(path.parent) if target.file else None

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, Final, Literal, NamedTuple
 
 import msgspec
 
@@ -23,9 +23,12 @@ from ..contract import LogMessage, Opening
 from .component import Component, declared_variables
 from .component_values import as_attribute, as_value, reader, writer
 from .importing import ImportedComponent
-from .python_section import PythonConfig, target_of
+from .python_section import PythonConfig, class_place_of
 
 __all__ = ["PythonInstance"]
+
+
+_ERRORS: Final = {"loading": LoadFailed, "initialization": InitializationFailed, "stepping": StepFailed}
 
 
 class _State(NamedTuple):
@@ -53,11 +56,11 @@ class PythonInstance:
         self._variables: dict[str, Variable] = {variable.name: variable for variable in bare}
         self._outputs = [v.name for v in opening.description.variables if v.causality == "output"]
         self._log = opening.log
-        self._kind: type[FmuError] = LoadFailed
+        self._phase: Literal["loading", "initialization", "stepping"] = "loading"
         self._changed = True
         self._fresh: dict[str, Any] | None = None
         self._component: Component | None = None
-        self._imported = ImportedComponent(opening.path, target_of(opening.section.python))
+        self._imported = ImportedComponent(opening.path, class_place_of(opening.section.python))
         try:
             loaded = self._called(self._imported.load)
             if loaded.guid != opening.description.guid:
@@ -84,7 +87,7 @@ class PythonInstance:
         start_values: Mapping[str, Value],
     ) -> None:
         """Set ``start_values``."""
-        self._kind = InitializationFailed
+        self._phase = "initialization"
         self._values["start_time"] = start_time
         self.set_values({name: to_value(value, self._variables[name]) for name, value in start_values.items()})
 
@@ -92,7 +95,7 @@ class PythonInstance:
         """Leave Initialization Mode: `initialize` has been called with the last inputs."""
         self._initialize()
         self._fresh = None
-        self._kind = StepFailed
+        self._phase = "stepping"
 
     def set_values(self, values: Mapping[str, Value]) -> None:
         """Set inputs and parameters by name."""
@@ -102,7 +105,7 @@ class PythonInstance:
 
     def get_values(self, names: Sequence[str]) -> list[Value]:
         """Current values by name; in Initialization Mode, outputs are computed from the inputs as they are now."""
-        if self._kind is InitializationFailed and not set(names).isdisjoint(self._outputs):
+        if self._phase == "initialization" and not set(names).isdisjoint(self._outputs):
             self._initialize()
         values = []
         for name in names:
@@ -110,7 +113,7 @@ class PythonInstance:
             try:
                 values.append(as_value(attribute, self._variables[name]))
             except ValueRefused as refused:
-                raise self._kind(str(refused), instance=self.name, variable=name) from refused
+                raise _ERRORS[self._phase](str(refused), instance=self.name, variable=name) from refused
         return values
 
     def bind(self, inputs: Ring, outputs: Sequence[Ring], grid: TimeGrid, points: int, step: int = 0) -> None:
@@ -167,7 +170,7 @@ class PythonInstance:
         component = self._live()
         self._called(lambda: component.set_state(state.own))
         self._values.update(copy.deepcopy(state.values))
-        self._kind = StepFailed
+        self._phase = "stepping"
 
     def free_state(self, state: object) -> None:
         """Nothing to free: a state is Python objects."""
@@ -250,7 +253,7 @@ class PythonInstance:
         if isinstance(error, TerminationRequested):
             return TerminationRequested(error.message, instance=self.name)
         hint = error.hint if isinstance(error, FmuMeshError) else None
-        return self._kind(self._imported.told(error), instance=self.name, hint=hint)
+        return _ERRORS[self._phase](self._imported.told(error), instance=self.name, hint=hint)
 
     def _never_assigned(self, name: str) -> StepFailed:
         text = "the component has not assigned this output"

@@ -14,10 +14,10 @@ from ...config.instance_sections import KIND, Group, Host, InstanceSection, Star
 from ...variables.model_description import ModelDescription
 from ...variables.value_types import PlainValue
 
-__all__ = ["PythonConfig", "Target", "target_of"]
+__all__ = ["ClassPlace", "PythonConfig", "class_place_of"]
 
 
-class Target(NamedTuple):
+class ClassPlace(NamedTuple):
     """Where a component class is.
 
     Attributes:
@@ -31,18 +31,18 @@ class Target(NamedTuple):
     name: str
 
 
-def target_of(text: str) -> Target:
+def class_place_of(text: str) -> ClassPlace:
     """What `controller.py:Controller` or `package.module:Controller` names.
 
     Example:
-        >>> target_of("controller.py:Controller").file, target_of("package.module:Controller").module
+        >>> class_place_of("controller.py:Controller").file, class_place_of("package.module:Controller").module
         ('controller.py', 'package.module')
     """
     place, _, name = text.rpartition(":")
     if not place:
         place, name = text, ""
     is_file = place.endswith(".py") or "/" in place
-    return Target(place if is_file else "", "" if is_file else place, name)
+    return ClassPlace(place if is_file else "", "" if is_file else place, name)
 
 
 class PythonConfig(Base, InstanceSection, frozen=True, kw_only=True, tag_field=KIND, tag="python"):
@@ -75,11 +75,11 @@ class PythonConfig(Base, InstanceSection, frozen=True, kw_only=True, tag_field=K
     @property
     def path(self) -> str:
         """The file of the class; empty for a module."""
-        return target_of(self.python).file
+        return class_place_of(self.python).file
 
     def agreed(self) -> Self:
         """The section without the file and the interpreter, which may be elsewhere on each host."""
-        target = target_of(self.python)
+        target = class_place_of(self.python)
         return replace(self, python=f"{target.module}:{target.name}", interpreter=None)
 
     def located(self, folder: Path) -> Self:

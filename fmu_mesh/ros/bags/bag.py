@@ -30,14 +30,14 @@ from ..messages.topics import Port, Topic
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
 
-__all__ = ["Bag", "Sample", "chosen_topics"]
+__all__ = ["Bag", "BagSample", "chosen_topics"]
 
 _CHOICE = re.compile(r"(?P<topic>/?[^=:]+)(:(?P<field>[^=]+))?=(?P<variable>.+)")
 
 StampSource = Literal["header", "log"]
 
 
-class Sample(msgspec.Struct, frozen=True):
+class BagSample(msgspec.Struct, frozen=True):
     """One recorded value.
 
     Attributes:
@@ -103,7 +103,7 @@ class Bag:
         for name, definition in self._reader.typestore.fielddefs.items():
             types.store.fielddefs.setdefault(name, definition)
 
-    def samples(self, topics: Sequence[Topic], stamps: StampSource) -> Iterator[Sample]:
+    def samples(self, topics: Sequence[Topic], stamps: StampSource) -> Iterator[BagSample]:
         """The values of ``topics`` in the order in which they were recorded.
 
         Args:
@@ -120,7 +120,7 @@ class Bag:
             stamp = _header_stamp(message) if stamps == "header" else None
             for parts, port in wanted[connection.topic]:
                 value = _value_at(message, parts, port, connection.topic)
-                yield Sample(logged if stamp is None else stamp, port.instance, port.variable.name, value)
+                yield BagSample(logged if stamp is None else stamp, port.instance, port.variable.name, value)
 
 
 def chosen_topics(

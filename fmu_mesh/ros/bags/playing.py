@@ -18,10 +18,9 @@ from ...simtime import ENDLESS, TimeGrid
 from ...variables.model_description import Value
 from ...wire.client.mesh_client import MeshClient
 from ...wire.client.readings import Target
-from ...wire.values import encode_value
 from ...wire.views import Command, MeshInfo
 from ..messages.stamp import nanoseconds
-from .bag import Sample
+from .bag import BagSample
 
 __all__ = ["Moment", "grid_of", "play", "schedule"]
 
@@ -44,7 +43,7 @@ def grid_of(info: MeshInfo) -> TimeGrid:
 
 
 def schedule(
-    samples: Iterable[Sample], grid: TimeGrid, step_points: Mapping[str, int], *, start: float | None
+    samples: Iterable[BagSample], grid: TimeGrid, step_points: Mapping[str, int], *, start: float | None
 ) -> tuple[list[Moment], int, int]:
     """Find the point of every sample.
 
@@ -110,7 +109,7 @@ def play(
             key = (instance, variable)
             if key not in targets:
                 targets[key] = client.target(f"{instance}.{variable}")
-            answer = client.set(targets[key], encode_value(value).decode())
+            answer = client.set(targets[key], value)
             if answer.point != hold:
                 raise MeshLost(f"the value for point {hold} came to '{instance}.{variable}' at point {answer.point}.")
             count += 1

@@ -12,7 +12,6 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-import msgspec
 from msgspec.structs import replace
 
 from ...config.mesh import RosConfig
@@ -208,7 +207,7 @@ class GatewayNode:
             if target is None or self._client is None:
                 continue
             try:
-                self._client.set(target, msgspec.json.encode(parameter.value).decode())
+                self._client.set(target, parameter.value)
             except FmuMeshError as error:
                 return result(successful=False, reason=str(error))
         return result(successful=True)

@@ -11,16 +11,18 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from typing import TypeVar
+from typing import Any, TypeVar, cast
 
 import msgspec
+import numpy as np
 import zenoh
 
 from ...errors import ConfigurationError, DeadlineExceeded, MeshLost, MessageRefused
-from ...text import fits, listed, nearest
+from ...text import fits, listed, nearest, shown
 from ..keys import Keys
 from ..messages import decode_json
 from ..session import Question, answer_of, answers, reason_of
+from ..values import encode_time, encode_value
 from ..views import (
     Command,
     CommandAnswer,
@@ -166,21 +168,21 @@ class MeshClient:
                     readings[target.key] = reading
         return [readings[target.key] for target in targets if target.key in readings]
 
-    def set(self, target: Target, text: str) -> SetAnswer:
+    def set(self, target: Target, value: object, at: float | None = None) -> SetAnswer:
         """Give an unconnected input or a tunable parameter a value; the answer says from which point on it holds.
 
         Args:
             target: the variable.
-            text: the value as JSON; what is no JSON is taken as text, so an item, a String or base64 needs no quotes.
+            value: a Python or numpy value.
+            at: simulation time in s from which on it holds; None: from the next point on.
         """
-        payload = text.encode()
+        plain = value.tolist() if isinstance(value, np.ndarray | np.generic) else value
         try:
-            value = msgspec.json.decode(payload)
-        except msgspec.DecodeError:
-            value = None
-        if value is None or (target.variable.type in ("String", "Binary") and not isinstance(value, str | list)):
-            payload = msgspec.json.encode(text)
-        return self._view(target.key, SetAnswer, f"'{target.instance}.{target.variable.name}'", payload)
+            payload = encode_value(cast("Any", plain))
+        except (TypeError, msgspec.MsgspecError) as error:
+            raise ConfigurationError(f"{shown(value)} is no value of a variable: {error}") from error
+        who = f"'{target.instance}.{target.variable.name}'"
+        return self._view(target.key, SetAnswer, who, payload, encode_time(at) if at is not None else None)
 
     def command(self, command: Command) -> CommandAnswer:
         """Pause, resume, step or stop the mesh; the answer comes before the mesh rests where it is told to."""
@@ -254,16 +256,20 @@ class MeshClient:
 
     # --- questions
 
-    def _view(self, key: str, kind: type[View], who: str, payload: bytes | None = None) -> View:
-        data = self._ask(key, who, payload)[0].payload.to_bytes()
+    def _view(
+        self, key: str, kind: type[View], who: str, payload: bytes | None = None, attachment: bytes | None = None
+    ) -> View:
+        data = self._ask(key, who, payload, attachment)[0].payload.to_bytes()
         try:
             return decode_json(data, kind)
         except MessageRefused as error:
             raise _not_understood(who, error) from error
 
-    def _ask(self, key: str, who: str, payload: bytes | None = None) -> list[zenoh.Sample]:
+    def _ask(
+        self, key: str, who: str, payload: bytes | None = None, attachment: bytes | None = None
+    ) -> list[zenoh.Sample]:
         try:
-            return answers(self._session, Question(key, who, self._timeout_s, payload))
+            return answers(self._session, Question(key, who, self._timeout_s, payload, attachment))
         except DeadlineExceeded:
             text = f"no answer from {who} within {self._timeout_s:g} s."
             raise DeadlineExceeded(text, hint="--timeout waits longer.") from None

@@ -1,11 +1,11 @@
 """Results as a picture: axes by unit, distinguishable lines, and a legend beside them.
 
-Owns how a picture looks. Its values and units come from `fmu_mesh.cli.plotting`. matplotlib is optional, so it is
-imported when something is drawn.
+Owns how a picture looks. matplotlib is optional, so it is imported when something is drawn.
 """
 
 from __future__ import annotations
 
+import importlib.util
 import math
 import warnings
 from collections.abc import Mapping, Sequence
@@ -18,15 +18,16 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from ...errors import ConfigurationError
-from ...files import replaced
+from ..errors import ConfigurationError
+from ..files import replaced
+from .result_reading import Columns
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from matplotlib.legend import Legend
 
-__all__ = ["FLAGS", "VALUE", "Curve", "Results", "draw", "figure_of", "reduced"]
+__all__ = ["FLAGS", "VALUE", "Curve", "draw", "figure_of", "reduced", "require_matplotlib"]
 
 FLAGS = "true (1) or false (0)"
 """Label of the axis of Booleans."""
@@ -64,22 +65,6 @@ _FEW_AXES = 40
 """More axes than this are lower."""
 
 
-class Results(msgspec.Struct, frozen=True):
-    """The columns of a result file.
-
-    Attributes:
-        times: the times in s.
-        columns: the values by variable; true is 1 and false is 0.
-        flags: the variables with only true and false.
-        whole: the variables of type Integer or Enumeration: a Real always has a point or an exponent.
-    """
-
-    times: NDArray[np.float64]
-    columns: dict[str, NDArray[np.float64]]
-    flags: frozenset[str]
-    whole: frozenset[str]
-
-
 class Curve(msgspec.Struct, frozen=True):
     """How one variable is drawn.
 
@@ -92,14 +77,18 @@ class Curve(msgspec.Struct, frozen=True):
     note: str = ""
 
 
-def draw(results: Results, output: Path, *, title: str, curves: Mapping[str, Curve]) -> None:
-    """Draw results into a file; its suffix gives the format.
+def require_matplotlib() -> None:
+    """Check that matplotlib is installed.
 
-    Args:
-        results: the columns.
-        output: the file; its folder is created.
-        title: the title of the picture.
-        curves: by name of a variable, how to draw it if more than its values is known.
+    Raises:
+        ConfigurationError: it is not.
+    """
+    if importlib.util.find_spec("matplotlib") is None:
+        raise ConfigurationError("plots need matplotlib.", hint="Install it with `pip install 'fmu-mesh[plot]'`.")
+
+
+def draw(figure: Figure, output: Path) -> None:
+    """Write a figure into a file; its suffix gives the format.
 
     Raises:
         ConfigurationError: the file cannot be written.
@@ -110,7 +99,7 @@ def draw(results: Results, output: Path, *, title: str, curves: Mapping[str, Cur
         with warnings.catch_warnings():
             # For example a character that is not in the font: it is drawn as a box.
             warnings.simplefilter("ignore")
-            figure_of(results, title, curves).savefig(picture, format=output.suffix.removeprefix(".") or None)
+            figure.savefig(picture, format=output.suffix.removeprefix(".") or None)
         with replaced(output) as draft:
             draft.write_bytes(picture.getvalue())
     except (OSError, ValueError) as error:  # a ValueError names the formats there are
@@ -118,18 +107,37 @@ def draw(results: Results, output: Path, *, title: str, curves: Mapping[str, Cur
         raise ConfigurationError(f"the plot '{output}' cannot be written: {reason}.") from error
 
 
-def figure_of(results: Results, title: str, curves: Mapping[str, Curve]) -> Figure:
-    """The matplotlib figure: one axes below the other, each as high as its legend."""
+def figure_of(results: Columns, title: str, curves: Mapping[str, Curve]) -> Figure:
+    """The matplotlib figure: one axes below the other, each as high as its legend.
+
+    Args:
+        results: the columns; those of texts are left out.
+        title: the title of the picture.
+        curves: by name of a variable, how to draw it if more than its values is known.
+
+    Raises:
+        ConfigurationError: matplotlib is not installed.
+    """
+    require_matplotlib()
+    groups: dict[str, list[str]] = {}
+    for name, values in results.values.items():
+        if values.dtype == object:
+            continue
+        curve = curves.get(name)
+        axis = curve.axis if curve is not None else FLAGS if values.dtype == bool else VALUE
+        groups.setdefault(axis, []).append(name)
+    groups = groups or {VALUE: []}
+    # A character that is not in the font is drawn as a box, without a word.
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return _laid_out(results, title, curves, groups)
+
+
+def _laid_out(results: Columns, title: str, curves: Mapping[str, Curve], groups: Mapping[str, Sequence[str]]) -> Figure:
     # The object interface: no window, no global state of pyplot.
     from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415  matplotlib is an extra, and slow to import
     from matplotlib.figure import Figure  # noqa: PLC0415  matplotlib is an extra, and slow to import
 
-    groups: dict[str, list[str]] = {}
-    for name in results.columns:
-        curve = curves.get(name)
-        axis = curve.axis if curve is not None else FLAGS if name in results.flags else VALUE
-        groups.setdefault(axis, []).append(name)
-    groups = groups or {VALUE: []}
     figure = Figure(dpi=120, layout="constrained")
     FigureCanvasAgg(figure)
     least = _AXES_INCHES[1] * min(1.0, _FEW_AXES / len(groups))
@@ -148,10 +156,10 @@ def figure_of(results: Results, title: str, curves: Mapping[str, Curve]) -> Figu
     return figure
 
 
-def _draw_axes(axes: Axes, results: Results, names: Sequence[str], label: str) -> None:
+def _draw_axes(axes: Axes, results: Columns, names: Sequence[str], label: str) -> None:
     lone = "o" if len(results.times) == 1 else None  # a line of one point is invisible
     for number, (name, below) in enumerate(zip(names, _lines_below(results, names), strict=True)):
-        times, values = reduced(results.times, results.columns[name], _MAX_POINTS)
+        times, values = reduced(results.times, results.values[name].astype(np.float64), _MAX_POINTS)
         values = np.clip(values, -_GREATEST, _GREATEST)
         dashes = _DASHES[number // _COLOURS % len(_DASHES)]
         if below:
@@ -162,21 +170,21 @@ def _draw_axes(axes: Axes, results: Results, names: Sequence[str], label: str) -
             values,
             color=f"C{number % _COLOURS}",
             linestyle=dashes,
-            drawstyle="steps-post" if name in results.flags or name in results.whole else "default",
+            drawstyle="default" if results.values[name].dtype.kind == "f" else "steps-post",
             linewidth=1.8 if below else 1.4,
             marker=lone,
         )
     axes.set_ylabel(_short(label), parse_math=False)
     axes.grid(visible=True, alpha=0.35)
     axes.margins(x=0.01)
-    if names and all(name in results.flags for name in names):
+    if names and all(results.values[name].dtype == bool for name in names):
         axes.set_yticks([0, 1])
         axes.set_ylim(-0.1, 1.1)
     if not len(results.times):
         axes.text(0.5, 0.5, "no points were recorded", ha="center", va="center", transform=axes.transAxes)
 
 
-def _lines_below(results: Results, names: Sequence[str]) -> list[int]:
+def _lines_below(results: Columns, names: Sequence[str]) -> list[int]:
     """For each variable, how many earlier ones look like the same line.
 
     All 0 if the lines differ in their dashes anyway.
@@ -184,7 +192,7 @@ def _lines_below(results: Results, names: Sequence[str]) -> list[int]:
     if not 1 < len(names) <= _COLOURS or len(results.times) < 2:
         return [0] * len(names)
     stride = 1 + len(results.times) // _MAX_POINTS
-    table = np.array([results.columns[name][::stride] for name in names]).clip(-_GREATEST, _GREATEST)
+    table = np.array([results.values[name][::stride].astype(np.float64) for name in names]).clip(-_GREATEST, _GREATEST)
     near = _SAME * float(np.nan_to_num(table).max() - np.nan_to_num(table).min())
     return [
         sum(np.allclose(table[before], row, rtol=0.0, atol=near, equal_nan=True) for before in range(number))

@@ -1,0 +1,235 @@
+"""The result of a run: arrays by name, with times and units."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import ConfigurationError, UnknownName
+from ..run.outcome import Outcome
+from ..run.run_plan import RunPlan
+from ..system.system import System
+from ..text import listed
+from ..variables.model_description import Variable
+from ..variables.value_types import VariableType, is_float
+from .drawing import FLAGS, VALUE, Curve, figure_of
+from .result_reading import Columns, chosen_names, read_csv
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.figure import Figure
+
+__all__ = ["Result", "result_of", "summary_of", "types_of"]
+
+_DIMENSIONLESS = ("1", "-")
+"""Units that mean no unit."""
+
+
+class Result(Mapping[str, NDArray[Any]]):
+    """What a run has recorded, and how it ended.
+
+    A mapping from `instance.variable` to an array with one value per row. Arrays belong to the caller: to change one
+    changes nothing else. They are read from the result file when they are first used.
+
+    Example:
+        >>> import fmu_mesh
+        >>> result = fmu_mesh.load("configs/pendulum_delay.yaml").run(stop_time=1.0, record="memory")
+        >>> list(result)
+        ['pendulum.a', 'delay.y']
+        >>> result["pendulum.a"].shape, float(result.times[-1]), result.units["pendulum.a"]
+        ((501,), 1.0, 'rad')
+
+    Attributes:
+        title: name of the mesh, or of the file.
+        file: the result file; None if the rows are only in memory, or if nothing was recorded.
+        outcome: how the run ended; None for a file that was read.
+        names: the recorded variables, in order.
+        units: the unit of each, as FMI writes it; None without one.
+    """
+
+    def __init__(
+        self,
+        title: str,
+        *,
+        file: Path | None = None,
+        outcome: Outcome | None = None,
+        system: System | None = None,
+        columns: Columns | None = None,
+    ) -> None:
+        self.title = title
+        self.file = file
+        self.outcome = outcome
+        self._system = system
+        self._step_size = system.grid.step_size if system is not None else 0.0
+        self._given = columns
+        self._variables = _recorded(self._system)
+
+    @classmethod
+    def read(cls, path: str | Path) -> Self:
+        """Read a CSV of an earlier run, such as `launch` writes.
+
+        Example:
+            >>> import fmu_mesh
+            >>> run = fmu_mesh.load("configs/pendulum_delay.yaml").run(stop_time=0.1, output="results/short.csv")
+            >>> fmu_mesh.Result.read("results/short.csv")["delay.y"].tolist() == run["delay.y"].tolist()
+            True
+
+        Raises:
+            ConfigurationError: there is no such file, or it is no result file; says in which line.
+        """
+        path = Path(path)
+        return cls(path.stem, file=path, columns=read_csv(path))
+
+    @property
+    def times(self) -> NDArray[np.float64]:
+        """The simulation time of each row in s, shape `(rows,)`."""
+        return self._columns.times
+
+    @property
+    def names(self) -> list[str]:
+        """The recorded variables, in the order of the columns."""
+        return list(self)
+
+    @property
+    def units(self) -> dict[str, str | None]:
+        """The unit of each variable; None without one, or if it is not known, as for a file that was read."""
+        return {name: self._unit(name) for name in self}
+
+    @property
+    def summary(self) -> str:
+        """One line: points, wall-clock time, speed, and why the run ended early if it did."""
+        if self.outcome is None:
+            return f"{len(self.times)} rows of {listed(self.names)}"
+        early = self.outcome.ended_by or self.outcome.error
+        return summary_of(self.outcome, self._step_size) + (f"; {early.message}" if early is not None else "")
+
+    def to_pandas(self) -> pd.DataFrame:
+        """The result as a data frame: one column per variable, with the time in s as the index.
+
+        Raises:
+            ConfigurationError: pandas is not installed.
+        """
+        try:
+            import pandas as pd  # noqa: PLC0415  an extra, and slow to import
+        except ImportError as error:
+            raise ConfigurationError(
+                "pandas is not installed.", hint="Install it with `pip install pandas`."
+            ) from error
+        return pd.DataFrame(dict(self), index=pd.Index(self.times, name="time"))
+
+    def plot(self, *names: str, title: str | None = None) -> Figure:
+        """Draw variables over time, with one axes for each unit; all of them if none is named.
+
+        Example:
+            >>> import fmu_mesh
+            >>> result = fmu_mesh.load("configs/pendulum_delay.yaml").run(stop_time=1.0, record="memory")
+            >>> result.plot("pendulum.a", "delay.y").savefig("results/angles.png")
+
+        Raises:
+            ConfigurationError: there is no such variable, or matplotlib is not installed.
+        """
+        chosen = chosen_names(self.title, self.names, names)
+        columns = Columns(self.times, {name: self[name] for name in chosen})
+        curves = {name: self._curve(*self._variables[name]) for name in chosen if name in self._variables}
+        return figure_of(columns, title if title is not None else self.title, curves)
+
+    def __getitem__(self, name: str) -> NDArray[Any]:
+        """The values of one variable, one per row; elements of arrays are variables of their own, such as `a.y[1,2]`.
+
+        Raises:
+            UnknownName: it was not recorded; suggests the nearest name.
+        """
+        columns = self._columns.values
+        if name not in columns:
+            try:
+                chosen_names(self.title, list(columns), [name])
+            except ConfigurationError as error:
+                raise UnknownName(error.message, hint=error.hint) from None
+        return columns[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._variables or self._columns.values)
+
+    def __len__(self) -> int:
+        return len(self._variables or self._columns.values)
+
+    def __repr__(self) -> str:
+        return f"<Result of '{self.title}': {self.summary}>"
+
+    @cached_property
+    def _columns(self) -> Columns:
+        if self._given is not None:
+            return self._given
+        if self.file is None or (self.outcome is not None and not self.outcome.rows):
+            return Columns(np.zeros(0), {name: np.zeros(0) for name in self._variables})
+        return read_csv(self.file, types_of(self._system))
+
+    def _unit(self, name: str) -> str | None:
+        return self._variables[name][1].unit if name in self._variables else None
+
+    def _curve(self, instance: str, variable: Variable) -> Curve:
+        """On which axes a variable is drawn: one for each unit."""
+        if variable.type == "Boolean":
+            return Curve(FLAGS)
+        if not is_float(variable.type):
+            return Curve("number")
+        assert self._system is not None
+        unit = variable.unit or _unit_passed_on(self._system, instance, variable)
+        if unit is None or unit in _DIMENSIONLESS:
+            return Curve(VALUE)
+        return Curve(f"value in {unit}", note="" if variable.unit else " (no unit)")
+
+
+def summary_of(outcome: Outcome, step_size: float) -> str:
+    """One line about speed, with the step size in s: `20000 points in 1.234 s: 16207 points/s, real-time factor 32`."""
+    point, seconds = outcome.point, outcome.seconds
+    rate = point / seconds if seconds > 0.0 else 0.0
+    factor = rate * step_size
+    return f"{point} points in {seconds:.3f} s: {rate:.0f} points/s, real-time factor {factor:.3g}"
+
+
+def types_of(system: System | None) -> dict[str, VariableType] | None:
+    """The types of the recorded variables by name; None without a system."""
+    return {name: variable.type for name, (_, variable) in _recorded(system).items()} if system is not None else None
+
+
+def _recorded(system: System | None) -> dict[str, tuple[str, Variable]]:
+    """Instance and variable of each recorded column, by its name."""
+    columns: dict[str, tuple[str, Variable]] = {}
+    for instance, name in system.recorded if system is not None else ():
+        variable = system.instances[instance].description.variable_of(name) if system is not None else None
+        assert variable is not None  # the system is valid
+        columns[f"{instance}.{name}"] = instance, variable
+    return columns
+
+
+def _unit_passed_on(system: System, instance: str, variable: Variable) -> str | None:
+    """The unit of what comes out of an output again that declares none, such as that of a transport delay.
+
+    It depends on a single input, which declares no unit either, and on nothing else that could have one.
+    """
+    for _ in system.instances:  # a cycle of such outputs ends here
+        match variable.dependencies:
+            case (name,):
+                ends = [c for c in system.connections if (c.target_instance, c.target.name) == (instance, name)]
+            case _:
+                return None
+        if len(ends) != 1 or ends[0].target.unit or (ends[0].factor, ends[0].offset) != (1.0, 0.0):
+            return None
+        instance, variable = ends[0].source_instance, ends[0].source
+        if variable.unit:
+            return variable.unit
+    return None
+
+
+def result_of(plan: RunPlan, outcome: Outcome | None) -> Result:
+    """The result of a run that wrote a file, or nothing; without an outcome it has not begun."""
+    if outcome is None:
+        return Result(plan.mesh, system=plan.plan.system)
+    file = Path(outcome.file) if outcome.file is not None else None
+    return Result(plan.mesh, file=file, outcome=outcome, system=plan.plan.system)

@@ -1,0 +1,267 @@
+"""A run that this program has started: a thread of its own that starts it, follows it, and has its result.
+
+The kernel ends the children of a run with the thread that started them, so that thread lives as long as they do.
+"""
+
+from __future__ import annotations
+
+import atexit
+import logging
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future
+from pathlib import Path
+from shutil import rmtree
+
+import msgspec
+from msgspec.structs import replace
+
+from ..errors import CallRefused, FmuMeshError, Interrupted, MeshLost
+from ..recorder.arrays_file import ENDING, bytes_of_a_row, read_arrays
+from ..run.events import Event, Log, OutputLine, Reachable, Restarted, Status
+from ..run.in_process import InProcessRun
+from ..run.launcher import Launcher
+from ..run.outcome import Outcome
+from ..run.run_plan import RunPlan
+from ..simtime import ENDLESS
+from ..wire.runtime import run_name, runtime_folder
+from ..wire.views import LogLine, MeshStatus
+from .result import Result, result_of, types_of
+from .result_reading import Columns
+
+__all__ = ["MEMORY_LIMIT", "RunThread", "Settings", "memory_file"]
+
+log = logging.getLogger("fmu_mesh.run")
+
+MEMORY_LIMIT = 2**30
+"""Default of `memory_limit`, in bytes."""
+
+_WARNED_AT = 0.8
+_JOIN_S = 10.0
+_LEVELS = {"ok": logging.DEBUG, "warning": logging.WARNING, "discard": logging.WARNING}
+
+
+class Settings(msgspec.Struct, frozen=True):
+    """How a program wants a run.
+
+    Attributes:
+        processes: False runs everything in this process.
+        restarts: how often a run is started again from its first point if a process of it is lost.
+        on_event: called with every event, on the thread of the run.
+        memory: the file for results that stay in memory; None: results go where the configuration says.
+        memory_limit: the most bytes of such results.
+    """
+
+    processes: bool = True
+    restarts: int = 0
+    on_event: Callable[[Event], object] | None = None
+    memory: Path | None = None
+    memory_limit: int = MEMORY_LIMIT
+
+
+class RunThread:
+    """Runs a plan on a thread of its own, which starts at once.
+
+    Args:
+        plan: the plan of the run.
+        settings: how it runs.
+
+    Attributes:
+        plan: the plan of the run.
+        future: gets the result, or the error with which the run ended.
+        status: the last status; None before the first.
+        reached: set when `endpoints` are known, or the run is over.
+        endpoints: the Zenoh endpoints of the mesh; empty in this process.
+    """
+
+    def __init__(self, plan: RunPlan, settings: Settings) -> None:
+        self.plan = plan
+        self.future: Future[Result] = Future()
+        self.status: MeshStatus | None = None
+        self.reached = threading.Event()
+        self.endpoints: tuple[str, ...] = ()
+        self._settings = settings
+        self._runner: Launcher | InProcessRun | None = None
+        self._stopped = False
+        self._failure: BaseException | None = None
+        self._warned = False
+        self._changing = threading.Lock()
+        if settings.memory is not None:
+            _check_memory(plan, settings.memory_limit)
+        _active.add(self)
+        self._thread = threading.Thread(target=self._work, name=f"run of {plan.mesh}", daemon=True)
+        self._thread.start()
+
+    @property
+    def in_process(self) -> bool:
+        """Whether all of it runs in this process."""
+        return not self._settings.processes
+
+    def stop(self) -> None:
+        """End the run where it is: an orderly end, and `future` gets the result."""
+        self._stopped = True
+        self.interrupt()
+
+    def expect_stop(self) -> None:
+        """The run is about to be stopped by a command of this program: an orderly end."""
+        self._stopped = True
+
+    def interrupt(self) -> None:
+        """End the run; a second call does not wait for its processes."""
+        with self._changing:
+            self._failure = self._failure or Interrupted("interrupted")
+            if self._runner is not None:
+                self._runner.interrupt()
+
+    def join(self) -> None:
+        """Wait until the thread has ended, for some seconds at most."""
+        self._thread.join(_JOIN_S)
+
+    def _work(self) -> None:
+        try:
+            result = self._run()
+        except BaseException as error:  # noqa: BLE001 whoever waits gets it
+            self.future.set_exception(error)
+        else:
+            self.future.set_result(result)
+        finally:
+            self.reached.set()
+            if self._settings.memory is not None:
+                rmtree(self._settings.memory.parent, ignore_errors=True)
+            _active.discard(self)
+
+    def _run(self) -> Result:
+        """Run it, and again if it may be restarted.
+
+        Raises:
+            FmuMeshError: it ended early; has the result.
+        """
+        plan = self.plan
+        while True:
+            try:
+                return self._result(self._run_once(plan))
+            except FmuMeshError as error:
+                if type(error) is not MeshLost or plan.restarts == self._settings.restarts or self._failure is not None:
+                    return self._ended_early(error)
+                plan = replace(plan, restarts=plan.restarts + 1)
+                self._take(Restarted(error.report(), plan.restarts))
+
+    def _run_once(self, plan: RunPlan) -> Outcome:
+        kind = Launcher if self._settings.processes else InProcessRun
+        with self._changing:
+            if self._failure is not None:
+                raise self._failure
+            self._runner = runner = kind(plan, self._take)
+        return runner.run()
+
+    def _ended_early(self, error: FmuMeshError) -> Result:
+        """The result, if this program has stopped the run.
+
+        Raises:
+            BaseException: why the run has ended otherwise; one of ours has the result.
+        """
+        result = self._result(self._last_outcome())
+        cause = error if self._failure is None or isinstance(self._failure, Interrupted) else self._failure
+        if self._stopped and isinstance(cause, Interrupted):
+            return result
+        raise cause.with_result(result) if isinstance(cause, FmuMeshError) else cause
+
+    def _last_outcome(self) -> Outcome | None:
+        return self._runner.outcome if self._runner is not None else None
+
+    def _take(self, event: Event) -> None:
+        match event:
+            case Reachable(endpoints):
+                self.endpoints = endpoints
+                self.reached.set()
+            case Status(status):
+                self.status = status
+                self._watch_memory()
+            case Log(line):
+                _log_line(line)
+            case OutputLine(process, text):
+                log.info("%s: %s", process, text)
+            case Restarted(error, number):
+                log.warning("restart %d: %s", number, error.message)
+        if self._settings.on_event is not None:
+            try:
+                self._settings.on_event(event)
+            except BaseException as error:  # noqa: BLE001 whoever waits gets it
+                self._fail(error)
+
+    def _fail(self, error: BaseException) -> None:
+        """End the run because of something in this program."""
+        self._failure = self._failure or error
+        if self._runner is not None:
+            self._runner.interrupt()
+
+    def _watch_memory(self) -> None:
+        file, limit = self._settings.memory, self._settings.memory_limit
+        if file is None or not file.exists():
+            return
+        size = file.stat().st_size
+        if size >= limit:
+            self._fail(_too_large(self.plan.mesh, limit))
+        elif size >= _WARNED_AT * limit and not self._warned:
+            self._warned = True
+            log.warning("the results of '%s' take %d bytes of memory; the run ends at %d", self.plan.mesh, size, limit)
+
+    def _result(self, outcome: Outcome | None) -> Result:
+        if self._settings.memory is None or outcome is None:
+            return result_of(self.plan, outcome)
+        types = types_of(self.plan.plan.system) or {}
+        times, arrays = read_arrays(self._settings.memory, list(types.values()))
+        columns = Columns(times, dict(zip(types, arrays, strict=True)))
+        return Result(
+            self.plan.mesh, outcome=replace(outcome, file=None), system=self.plan.plan.system, columns=columns
+        )
+
+
+_active: set[RunThread] = set()
+"""The runs of this process that have not ended."""
+
+
+@atexit.register
+def _end_all() -> None:
+    """At the end of the program, end what still runs."""
+    threads = list(_active)
+    for thread in threads:
+        thread.interrupt()
+    for thread in threads:
+        thread.join()
+
+
+def memory_file() -> Path:
+    """A file for results that stay in memory, in a folder of its own; whoever runs the mesh removes both.
+
+    If this process is killed, the next run of this user removes them.
+    """
+    folder = runtime_folder() / f"memory.{run_name()}"
+    folder.mkdir(mode=0o700)
+    return folder / f"rows{ENDING}"
+
+
+def _check_memory(plan: RunPlan, limit: int) -> None:
+    """Check that all rows of a run fit into memory.
+
+    Raises:
+        CallRefused: they do not.
+    """
+    types = types_of(plan.plan.system) or {}
+    last = plan.plan.grid.last_point
+    size = (last + 1) * bytes_of_a_row(list(types.values()))
+    if last < ENDLESS and size > limit:
+        raise _too_large(plan.mesh, limit, size)
+
+
+def _too_large(mesh: str, limit: int, size: int | None = None) -> CallRefused:
+    takes = f"take {size} bytes of memory" if size is not None else "do not fit into memory"
+    return CallRefused(
+        f"the results of '{mesh}' {takes}; the limit is {limit} bytes",
+        hint="Raise `memory_limit`, record fewer variables, or record into a file with `output`.",
+    )
+
+
+def _log_line(line: LogLine) -> None:
+    level = _LEVELS.get(line.status, logging.ERROR)
+    log.log(level, "%s at point %d: %s", line.instance, line.point, line.message)

@@ -1,0 +1,85 @@
+"""A run in a notebook: a real kernel shows its progress, and "interrupt kernel" ends it cleanly."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from tests.helpers import DEADLINE_S, FMUS, Place, wait_until
+
+manager = pytest.importorskip("jupyter_client.manager")
+pytest.importorskip("ipykernel")
+
+MESH = f"""
+import fmu_mesh
+mesh = fmu_mesh.Mesh("cell", step_size=0.01, stop_time=STOP, real_time_factor=1.0)
+mesh.add("gain", fmu={str(FMUS / "Gain.fmu")!r})
+"""
+
+
+class Kernel:
+    """A kernel, and what its cells show."""
+
+    def __init__(self, client: Any, manager: Any) -> None:  # noqa: ANN401  jupyter_client has no types for them
+        self.client = client
+        self.manager = manager
+
+    def messages(self, cell: str) -> Iterator[tuple[str, dict[str, Any]]]:
+        """Run a cell; its messages to the end."""
+        asked = self.client.execute(cell)
+        end = time.monotonic() + DEADLINE_S
+        while time.monotonic() < end:
+            message = self.client.get_iopub_msg(timeout=DEADLINE_S)
+            if message["parent_header"].get("msg_id") != asked:
+                continue
+            yield message["msg_type"], message["content"]
+            if message["msg_type"] == "status" and message["content"]["execution_state"] == "idle":
+                return
+        raise AssertionError("the cell has not ended")
+
+
+@pytest.fixture
+def kernel(place: Place, monkeypatch: pytest.MonkeyPatch) -> Iterator[Kernel]:
+    for name, value in place.environment.items():
+        monkeypatch.setenv(name, value)
+    own, client = manager.start_new_kernel(kernel_name="python3")
+    try:
+        yield Kernel(client, own)
+    finally:
+        client.stop_channels()
+        own.shutdown_kernel(now=True)
+
+
+def test_a_run_shows_a_progress_bar_that_goes_when_it_ends(kernel: Kernel) -> None:
+    shown = [
+        content
+        for kind, content in kernel.messages(
+            MESH.replace("STOP", "2.0") + "print(len(mesh.run(record='memory').times))"
+        )
+        if kind in ("display_data", "update_display_data", "stream", "error")
+    ]
+
+    bars = [content["data"].get("text/html", "") for content in shown if "data" in content]
+    assert "<progress value=" in bars[0]
+    assert "max='200'" in bars[0]
+    assert "cell: running, point " in bars[-2]
+    assert bars[-1] == ""
+    assert shown[-1] == {"name": "stdout", "text": "201\n"}
+
+
+def test_interrupt_kernel_ends_the_run_and_the_kernel_goes_on(kernel: Kernel, place: Place) -> None:
+    told: list[tuple[str, dict[str, Any]]] = []
+    for kind, content in kernel.messages(MESH.replace("STOP", "None") + "mesh.run(record='memory')"):
+        told.append((kind, content))
+        if kind == "update_display_data" and "running" in content["data"].get("text/plain", ""):
+            kernel.manager.interrupt_kernel()
+
+    [error] = [content for kind, content in told if kind == "error"]
+    assert error["ename"] == "KeyboardInterrupted"
+    assert "point " in error["evalue"]
+    wait_until(lambda: not [p for p in place.processes() if "fmu_mesh.run" in p.cmdline()], "the end of all processes")
+    again = "print(len(mesh.run(record='memory', stop_time=0.1).times))"
+    assert ("stream", {"name": "stdout", "text": "11\n"}) in list(kernel.messages(again))
