@@ -207,9 +207,8 @@ class Mesh:
         """
         if name in self.instances:
             raise CallRefused(f"mesh '{self.name}' has an instance '{name}' already")
-        if component is not None:
-            section |= component_section(component)[0]
-        keys = {"fmu": fmu, **section, "start_values": start_values, "step_size": step_size, "group": group}
+        own = component_section(component)[0] if component is not None else {}
+        keys = {"fmu": fmu, **own, **section, "start_values": start_values, "step_size": step_size, "group": group}
         given = {key: value for key, value in keys.items() if value is not None}
         if not given.keys() & {*KINDS.names()}:
             raise CallRefused(

@@ -6,6 +6,7 @@ import csv
 import os
 import subprocess
 import sys
+import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ import pytest
 import yaml
 
 import fmu_mesh
-from tests.helpers import FMUS, Launched, Place, rows_of, wait_until
+from tests.helpers import FMUS, Place, rows_of
 
 PARTS = '''\
 """Components for tests."""
@@ -117,7 +118,7 @@ GAIN, INTEGRATOR, DELAY, PENDULUM = (
 )
 
 
-def part(name: str, **keys: Any) -> dict[str, Any]:
+def part(name: str, **keys: Any) -> dict[str, Any]:  # noqa: ANN401 as the file has it
     return {"python": f"parts.py:{name}", **keys}
 
 
@@ -182,7 +183,11 @@ SYSTEMS: dict[str, tuple[Mapping[str, Any], Sequence[Any]]] = {
 
 
 def written(
-    folder: Path, instances: Mapping[str, Any], connections: Sequence[Any] = (), stop_time: float = 0.3, **more: Any
+    folder: Path,
+    instances: Mapping[str, Any],
+    connections: Sequence[Any] = (),
+    stop_time: float = 0.3,
+    **more: Any,  # noqa: ANN401 as the file has it
 ) -> Path:
     """A configuration `m.yaml` with the components of `parts.py`; ``simulation`` and ``timeouts`` may be more."""
     (folder / "parts.py").write_text(PARTS, encoding="utf-8")
@@ -226,9 +231,8 @@ def test_processes_and_one_process_write_the_same_bytes(place: Place, name: str,
 
 def test_a_window_of_one_point_gives_the_same_bytes(place: Place) -> None:
     instances, connections = SYSTEMS["a_cycle"]
-    results = []
-    for window in (1, 64):
-        results.append(both(place, written(place.folder, instances, connections, simulation={"window": window})))
+    simulations = ({"window": 1}, {"window": 64})
+    results = [both(place, written(place.folder, instances, connections, simulation=own)) for own in simulations]
 
     assert results[0] == results[1]
 
@@ -291,57 +295,55 @@ def test_a_running_component_is_looked_at_and_set_as_an_fmu_is(place: Place) -> 
     assert "Python" in info.output
     assert "component" in info.output
     assert values[0] == 0.002  # the sine of 0, and the time at which the last step started
-    assert launched.wait() == 0, launched.errors
+    assert launched.wait() == 130, launched.errors  # stopped before its end
 
 
-FAULTS = {
-    "class C(fmu_mesh.Component):\n    y = Output()\n    def step(self, time, step_size):\n        self.y = 1 / (time < 0.05)\n": (
-        3,
-        "instance c, point 50, t = 0.05 s: broken.py:7: ZeroDivisionError: division by zero. What was recorded",
+def fault(body: str, output: str = "Output()", code: int = 3) -> tuple[str, int]:
+    """The file of a component that fails in line 9, and the exit code of its run."""
+    head = "import sys, numpy as np, fmu_mesh\nfrom fmu_mesh import Output\n"
+    head += "from fmu_mesh.errors import TerminationRequested\n\n\nclass C(fmu_mesh.Component):\n"
+    return f"{head}    y = {output}\n{textwrap.indent(body, '    ')}\n", code
+
+
+STEP = "def step(self, time, step_size):\n"
+NO_STEP = f"\n{STEP}    pass"
+AT_0 = "instance c.y, point 0, t = 0 s: "
+FAULTS: dict[str, tuple[tuple[str, int], str]] = {
+    "in_a_step": (
+        fault(f"{STEP}    self.y = 1 / (time < 0.05)"),
+        "instance c, point 50, t = 0.05 s: broken.py:9: ZeroDivisionError: division by zero. What was recorded",
     ),
-    "class C(fmu_mesh.Component):\n    y = Output()\n    def initialize(self):\n        self.y = [][1]\n    def step(self, t, h): pass\n": (
-        3,
-        "instance c: broken.py:7: IndexError: list index out of range",
+    "in_initialize": (
+        fault(f"def initialize(self):\n    self.y = [][1]{NO_STEP}"),
+        "instance c: broken.py:9: IndexError: list index out of range",
     ),
-    "class C(fmu_mesh.Component):\n    y = Output()\n    def step(self, t, h):\n        np.linalg.inv(np.zeros((2, 2)))\n": (
-        3,
-        "broken.py:7: LinAlgError: Singular matrix (",
+    "in_a_library": (
+        fault(f"{STEP}    np.linalg.inv(np.zeros((2, 2)))"),
+        "broken.py:9: LinAlgError: Singular matrix (",
     ),
-    "class C(fmu_mesh.Component):\n    y = Output()\n    def step(self, t, h):\n        self.z = 1\n": (
-        3,
-        "instance c.y, point 0, t = 0 s: the component has not assigned this output. Assign `self.y` in `step`",
+    "no_value": (
+        fault(f"{STEP}    self.z = 1"),
+        f"{AT_0}the component has not assigned this output. Assign `self.y` in `step`",
     ),
-    "class C(fmu_mesh.Component):\n    y = Output()\n    def step(self, t, h):\n        self.y = 'warm'\n": (
-        3,
-        "instance c.y, point 0, t = 0 s: its value is 'warm', expected a number",
-    ),
-    "class C(fmu_mesh.Component):\n    y = Output(shape=3)\n    def step(self, t, h):\n        self.y = np.zeros(2)\n": (
-        3,
+    "text_for_a_number": (fault(f"{STEP}    self.y = 'warm'"), f"{AT_0}its value is 'warm', expected a number"),
+    "another_shape": (
+        fault(f"{STEP}    self.y = np.zeros(2)", "Output(shape=3)"),
         "its value is an array of float64 with the shape (2,), expected an array of Float64 with the shape (3,)",
     ),
-    "class C(fmu_mesh.Component):\n    y = Output()\n    def step(self, t, h):\n        sys.exit('over')\n": (
-        3,
-        "broken.py:7: SystemExit: over",
+    "an_exit": (fault(f"{STEP}    sys.exit('over')"), "broken.py:9: SystemExit: over"),
+    "in_the_constructor": (
+        fault(f"def __init__(self):\n    open('/nowhere'){NO_STEP}"),
+        "broken.py:9: FileNotFoundError: ",
     ),
-    "class C(fmu_mesh.Component):\n    y = Output()\n    def __init__(self):\n        open('/nowhere')\n    def step(self, t, h): pass\n": (
-        3,
-        "broken.py:7: FileNotFoundError: ",
-    ),
-    "class C(fmu_mesh.Component):\n    y = Output()\n    def step(self, t, h):\n        raise TerminationRequested('landed')\n": (
-        0,
-        "landed",
-    ),
+    "an_orderly_end": (fault(f"{STEP}    raise TerminationRequested('landed')", "Output(0.0)", 0), "landed"),
 }
 
 
 @pytest.mark.parametrize("options", [(), ("--local",)], ids=["processes", "local"])
-@pytest.mark.parametrize("number", range(len(FAULTS)))
-def test_what_goes_wrong_in_a_component_is_told_with_its_line(
-    place: Place, number: int, options: Sequence[str]
-) -> None:
-    source, (code, message) = list(FAULTS.items())[number]
-    head = "import sys, numpy as np, fmu_mesh\nfrom fmu_mesh import Output\nfrom fmu_mesh.errors import TerminationRequested\n"
-    (place.folder / "broken.py").write_text(head + source, encoding="utf-8")
+@pytest.mark.parametrize("name", FAULTS)
+def test_what_goes_wrong_in_a_component_is_told_with_its_line(place: Place, name: str, options: Sequence[str]) -> None:
+    (source, code), message = FAULTS[name]
+    (place.folder / "broken.py").write_text(source, encoding="utf-8")
     config = written(place.folder, {"c": {"python": "broken.py:C"}, "gain": {"fmu": GAIN}})
 
     launched = place.run("launch", config, "--no-progress", *options)
@@ -354,9 +356,10 @@ def test_what_goes_wrong_in_a_component_is_told_with_its_line(
 @pytest.mark.parametrize("options", [(), ("--local",)], ids=["processes", "local"])
 @pytest.mark.parametrize("where", ["initialize", "step"])
 def test_a_component_that_hangs_is_told_by_its_name_and_line(place: Place, where: str, options: Sequence[str]) -> None:
-    hang = "        while True:\n            pass\n"
-    text = f"import fmu_mesh\nclass C(fmu_mesh.Component):\n    y = fmu_mesh.Output(0.0)\n    def {where}(self, *times):\n{hang}"
-    text += "    def step(self, time, step_size): pass\n" if where != "step" else ""
+    lines = ["import fmu_mesh", "class C(fmu_mesh.Component):", "    y = fmu_mesh.Output(0.0)"]
+    lines += [f"    def {where}(self, *times):", "        while True:", "            pass"]
+    lines += ["    def step(self, time, step_size): pass"] if where != "step" else []
+    text = "\n".join(lines) + "\n"
     (place.folder / "slow.py").write_text(text, encoding="utf-8")
     timeouts = {"step": 1.0, "call": 1.0}
     config = written(place.folder, {"c": {"python": "slow.py:C"}, "gain": {"fmu": GAIN}}, timeouts=timeouts)
@@ -371,8 +374,10 @@ def test_a_component_that_hangs_is_told_by_its_name_and_line(place: Place, where
 
 @pytest.mark.parametrize("options", [(), ("--local",)], ids=["processes", "local"])
 def test_what_a_component_prints_goes_where_the_output_of_an_fmu_goes(place: Place, options: Sequence[str]) -> None:
-    text = "import fmu_mesh\nprint('imported')\nclass C(fmu_mesh.Component):\n    y = fmu_mesh.Output(0.0)\n"
-    text += "    def step(self, time, step_size):\n        if time == 0.0: print('first step')\n    def close(self): print('closed')\n"
+    lines = ["import fmu_mesh", "print('imported')", "class C(fmu_mesh.Component):", "    y = fmu_mesh.Output(0.0)"]
+    lines += ["    def step(self, time, step_size):", "        if time == 0.0: print('first step')"]
+    lines += ["    def close(self): print('closed')"]
+    text = "\n".join(lines) + "\n"
     (place.folder / "loud.py").write_text(text, encoding="utf-8")
 
     launched = place.run("launch", written(place.folder, {"c": {"python": "loud.py:C"}}), "--no-progress", *options)
@@ -387,14 +392,15 @@ def test_a_matrix_product_is_the_same_whatever_the_environment_says_about_thread
     """With two threads, OpenBLAS multiplies these matrices with other last digits."""
     text = "import numpy as np, fmu_mesh\nclass C(fmu_mesh.Component):\n    y = fmu_mesh.Output(0.0)\n"
     text += "    def __init__(self):\n        self.a = np.random.default_rng(0).standard_normal((400, 400))\n"
-    text += "    def step(self, time, step_size):\n        self.a = self.a @ self.a\n        self.a /= np.abs(self.a).max()\n"
+    text += "    def step(self, time, step_size):\n        self.a = self.a @ self.a\n"
+    text += "        self.a /= np.abs(self.a).max()\n"
     text += "        self.y = float(self.a.sum())\n"
     (place.folder / "product.py").write_text(text, encoding="utf-8")
     config = written(place.folder, {"c": {"python": "product.py:C"}}, stop_time=0.005)
     place.environment |= {"OPENBLAS_NUM_THREADS": "2", "OMP_NUM_THREADS": "2", "MKL_NUM_THREADS": "2"}
     both(place, config)
-    program = "from fmu_mesh.run.local import LocalMesh\nfrom fmu_mesh.run.preparing import prepare\nfrom pathlib import Path\n"
-    program += "import numpy\nnumpy.ones((9, 9)) @ numpy.ones((9, 9))\nLocalMesh(prepare(Path('m.yaml'))).run()\n"
+    program = "import numpy, fmu_mesh\nnumpy.ones((9, 9)) @ numpy.ones((9, 9))\n"
+    program += "fmu_mesh.load('m.yaml').run(processes=False)\n"
 
     in_a_program = place.start_command([sys.executable, "-c", program])
 
@@ -529,7 +535,7 @@ class C(fmu_mesh.Component):
 """
 
 
-def elsewhere(place: Place, interpreter: Path | str, **keys: Any) -> Path:
+def elsewhere(place: Place, interpreter: Path | str, **keys: Any) -> Path:  # noqa: ANN401 as the file has it
     (place.folder / "elsewhere.py").write_text(ELSEWHERE, encoding="utf-8")
     own = {"python": "elsewhere.py:C", "interpreter": str(interpreter), **keys}
     record = {"file": "m.csv", "variables": ["c.y", "c.python"]}
@@ -600,8 +606,6 @@ def test_a_python_without_our_version_is_a_finding_that_says_what_to_install(pla
 
 PROGRAM = """\
 import fmu_mesh
-from fmu_mesh.errors import ConfigurationError
-from fmu_mesh.instances.python.importing import being_imported, component_section
 
 
 class C(fmu_mesh.Component):
@@ -611,37 +615,52 @@ class C(fmu_mesh.Component):
         self.y += 1.0
 
 
-def start():  # as the methods of `Mesh` do
-    if (place := being_imported()) is not None:
-        raise ConfigurationError(f"'{place}' starts a run while it is imported", hint="Put it under a guard.")
-    print(component_section(C)[0]["python"])
+def main():
+    mesh = fmu_mesh.Mesh("m", step_size=0.1, stop_time=0.5)
+    mesh.add("c", component=C)
+    print(mesh.run(record="memory")["c.y"])
+
 
 """
+GUARDED = f"{PROGRAM}if __name__ == '__main__':\n    main()\n"
 
 
-@pytest.mark.parametrize("guard", ["if __name__ == '__main__':\n    start()\n", "start()\n"], ids=["guarded", "bare"])
-def test_a_class_of_the_program_that_runs_is_found_in_its_file_and_a_missing_guard_is_found(
-    place: Place, guard: str
-) -> None:
-    program = place.folder / "program.py"
-    program.write_text(PROGRAM + guard, encoding="utf-8")
-    started = place.start_command([sys.executable, program.name])
-    assert started.wait() == 0, started.errors
-    assert started.output == f"{program.resolve()}:C\n"
+def test_a_class_of_the_program_that_runs_is_found_in_its_file(place: Place) -> None:
+    (place.folder / "program.py").write_text(GUARDED, encoding="utf-8")
 
-    launched = place.run("launch", written(place.folder, {"c": {"python": started.output.strip()}}), "--no-progress")
+    done = place.start_command([sys.executable, str(place.folder / "program.py")])
 
-    if "if" in guard:
-        assert launched.wait() == 0, launched.errors
-    else:
-        assert launched.wait() == 2
-        assert "program.py:15: " in launched.errors
-        assert "starts a run while it is imported (Put it under a guard)" in launched.errors
+    assert done.wait() == 0, done.errors
+    assert done.output == "[0. 1. 2. 3. 4. 5.]\n"
+    place.assert_nothing_left(10.0)
+
+
+def test_a_program_that_is_a_module_of_a_folder_with_other_modules_is_found_in_its_file(place: Place) -> None:
+    (place.folder / "package").mkdir()
+    (place.folder / "package" / "__init__.py").touch()
+    (place.folder / "package" / "program.py").write_text(GUARDED, encoding="utf-8")
+
+    done = place.start_command([sys.executable, "-m", "package.program"])
+
+    assert done.wait() == 0, done.errors
+    assert done.output == "[0. 1. 2. 3. 4. 5.]\n"
+
+
+def test_a_program_without_a_guard_is_told_so_and_starts_nothing(place: Place) -> None:
+    (place.folder / "program.py").write_text(f"{PROGRAM}main()\n", encoding="utf-8")
+
+    done = place.start_command([sys.executable, "program.py"])
+
+    assert done.wait() == 1
+    expected = "program.py:14: mesh 'm' would run while "
+    assert expected in done.errors
+    assert 'is imported (Write `if __name__ == "__main__":` before what the program does)' in done.errors
+    place.assert_nothing_left(10.0)
 
 
 @pytest.mark.parametrize("how", ["-c", "-"])
 def test_a_class_without_a_file_is_refused_as_that_of_a_notebook(place: Place, how: str) -> None:
-    program = PROGRAM + "start()\n"
+    program = f"{PROGRAM}main()\n"
     done = subprocess.run(
         [sys.executable, *(["-c", program] if how == "-c" else ["-"])],
         input=program if how == "-" else None,
@@ -653,7 +672,20 @@ def test_a_class_without_a_file_is_refused_as_that_of_a_notebook(place: Place, h
     )
 
     assert done.returncode == 1
-    expected = (
-        "the component 'C': no file has it, because a notebook or an interactive session defined it. Write it to a file"
-    )
+    expected = "the component 'C': no file has it, because a notebook or an interactive session defined it. Write it to"
     assert expected in done.stderr
+
+
+def test_a_class_within_a_function_is_refused(place: Place) -> None:
+    program = GUARDED.replace(
+        "import fmu_mesh\n",
+        "import fmu_mesh\n\ndef make():\n    class C(fmu_mesh.Component):\n"
+        "        def step(self, time, step_size): pass\n    return C\n",
+        1,
+    ).replace("component=C", "component=make()")
+    (place.folder / "program.py").write_text(program, encoding="utf-8")
+
+    done = place.start_command([sys.executable, "program.py"])
+
+    assert done.wait() == 1
+    assert "'make.<locals>.C': it is defined within a function or a class. Define it at the top" in done.errors
