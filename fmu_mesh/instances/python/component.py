@@ -116,7 +116,9 @@ class _FunctionComponent(Component):
             values[self._outputs[0]] = result
             return
         if not isinstance(result, tuple) or len(result) != len(self._outputs):
-            found = f"{len(result)} values" if isinstance(result, tuple) else f"a {type(result).__name__}"
+            found = (
+                f"{len(result)} values" if isinstance(result, tuple) else f"a value of the type {type(result).__name__}"
+            )
             expected = f"one for each of the outputs {', '.join(self._outputs)}"
             raise ValueError(f"the function returned {found}, expected a tuple of {len(self._outputs)}: {expected}")
         values.update(zip(self._outputs, result, strict=True))
