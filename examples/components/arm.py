@@ -27,9 +27,11 @@ class Pid(fmu_mesh.Component):
         self.integral = 0.0
 
     def initialize(self) -> None:
+        """The voltage before the first step."""
         self.voltage = self.limited(self.wanted(self.integral))
 
     def step(self, time: float, step_size: float) -> None:
+        """Integrate the error, and set the voltage."""
         integral = self.integral + (self.target - self.position) * step_size
         wanted = self.wanted(integral)
         self.voltage = self.limited(wanted)
@@ -37,9 +39,11 @@ class Pid(fmu_mesh.Component):
             self.integral = integral
 
     def wanted(self, integral: float) -> float:
+        """The voltage without its limit."""
         return self.p * (self.target - self.position) + self.i * integral - self.d * self.velocity
 
     def limited(self, voltage: float) -> float:
+        """A voltage within the limit."""
         return min(max(voltage, -self.limit), self.limit)
 
 
@@ -54,6 +58,7 @@ class Arm(fmu_mesh.Component):
     velocity = Output(0.0, unit="rad/s")
 
     def step(self, time: float, step_size: float) -> None:
+        """One step of Euler's method, the position with the new velocity."""
         weight = self.mass * 9.81 * self.length * cos(self.position)
         torque = self.torque - weight - self.friction * self.velocity
         self.velocity += torque / (self.mass * self.length**2) * step_size

@@ -438,7 +438,7 @@ def refused(place: Place, config: Path, *options: str) -> str:
         ),
         ({"python": "depends.py:C"}, "'y' depends on 'v', which is no input (The inputs are u)"),
         ({"python": "parts.py:Lag", "start_values": {"t": -1}}, "-1 for 't', which is out of its range"),
-        ({"python": "parts.py:Lag", "intepreter": "x"}, "Did you mean 'interpreter'?"),
+        ({"python": "parts.py:Lag", "interpreters": "x"}, "Did you mean 'interpreter'?"),
         ({"python": "parts.py:Lag", "interpreter": "/no/python"}, "the Python '/no/python' cannot be started"),
     ],
 )
