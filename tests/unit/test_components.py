@@ -10,6 +10,7 @@ from typing import Any, assert_type
 
 import numpy as np
 import pytest
+import threadpoolctl
 from numpy.typing import NDArray
 
 import fmu_mesh
@@ -24,6 +25,7 @@ from fmu_mesh.instances.python.python_kind import KIND_OF_COMPONENTS
 from fmu_mesh.instances.python.python_section import PythonConfig, class_place_of
 from fmu_mesh.instances.python.unit_names import base_unit_of
 from fmu_mesh.rings.ring import Ring
+from fmu_mesh.run.threads import one_thread_meanwhile
 from fmu_mesh.simtime import TimeGrid
 from fmu_mesh.system.layout import Layout
 from fmu_mesh.variables.units import BaseUnit, conversion
@@ -504,6 +506,22 @@ def test_only_the_thread_that_imports_a_component_is_refused_a_run(tmp_path: Pat
     assert being_imported() is None
     assert threading.active_count() >= 1
     instance.close()
+
+
+def test_runs_in_one_process_that_overlap_limit_the_threads_of_libraries_until_the_last_one_ends() -> None:
+    def threads() -> set[int]:
+        return {library["num_threads"] for library in threadpoolctl.threadpool_info()}
+
+    one, other = one_thread_meanwhile(), one_thread_meanwhile()
+    with threadpoolctl.threadpool_limits(2):
+        one.__enter__()
+        other.__enter__()
+        during = threads()
+        one.__exit__(None, None, None)
+        still = threads()
+        other.__exit__(None, None, None)
+
+        assert (during, still, threads()) == ({1}, {1}, {2})
 
 
 def test_the_public_names_are_those_of_components() -> None:
