@@ -11,7 +11,7 @@ RESULT := results/pendulum_delay
 # worksteal, a worker that has finished the short ones takes some of them.
 PYTEST_ARGS ?= --numprocesses 4 --dist worksteal
 
-.PHONY: help demo test coverage check bench fmus clean
+.PHONY: help demo test coverage check docs bench fmus clean
 
 help: ## show this list
 	@sed -n 's/^\([a-z]*\):[^#]*## \(.*\)/  make \1	\2/p' Makefile
@@ -39,6 +39,12 @@ check: $(VENV)/.installed-check $(VENV)/.installed-test ## lint, format, types, 
 	run codespell; \
 	if [ -n "$$failed" ]; then printf "\nmake check failed:$$failed\n" >&2; exit 1; fi; \
 	echo "make check: all clean"
+
+# A link that leads nowhere, a name that the reference cannot find, or a warning about a docstring ends the build.
+docs: $(VENV)/.installed-docs ## the site, with the reference of the library: build/site/index.html
+	@$(BIN)/python docs/site_pages.py build/pages
+	@PATH="$(BIN):$$PATH" $(BIN)/zensical build --strict --clean >build/site.log 2>&1; code=$$?; cat build/site.log; \
+	if [ $$code -ne 0 ] || grep -q '^griffe: ' build/site.log; then exit 1; fi
 
 bench: $(VENV)/.installed-test ## us and the peers on this machine: one table (about 20 minutes)
 	@$(BIN)/python -m benchmarks

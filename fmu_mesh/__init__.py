@@ -12,9 +12,12 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from .adapter import FMIAdapter
-    from .api.mesh_builder import Check, Mesh, load
+    from .api.functions import attach, inspect, load, meshes
+    from .api.mesh_builder import Check, Mesh
+    from .api.open_system import System, SystemState
     from .api.result import Result
-    from .api.run_handle import Run, Sample, attach
+    from .api.run_handle import Run
+    from .api.samples import Sample
     from .errors import (
         CallRefused,
         ConfigurationError,
@@ -62,11 +65,15 @@ __all__ = [
     "Run",
     "Sample",
     "StepFailed",
+    "System",
+    "SystemState",
     "UnknownName",
     "__version__",
     "attach",
     "component",
+    "inspect",
     "load",
+    "meshes",
 ]
 
 _PLACES = {
@@ -75,14 +82,18 @@ _PLACES = {
     "Component": "instances.python.component",
     "Input": "instances.python.declarations",
     "Mesh": "api.mesh_builder",
-    "load": "api.mesh_builder",
+    "load": "api.functions",
     "Output": "instances.python.declarations",
     "Parameter": "instances.python.declarations",
     "Result": "api.result",
     "Run": "api.run_handle",
-    "Sample": "api.run_handle",
-    "attach": "api.run_handle",
+    "Sample": "api.samples",
+    "System": "api.open_system",
+    "SystemState": "api.open_system",
+    "attach": "api.functions",
     "component": "instances.python.component",
+    "inspect": "api.functions",
+    "meshes": "api.functions",
 }
 """The modules of the public names; all others are exceptions."""
 

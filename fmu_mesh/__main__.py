@@ -4,7 +4,7 @@ import sys
 
 
 def main() -> int:
-    """Import the command, which takes memory and half a second, and run it; returns the exit code."""
+    """Import the command and run it; returns the exit code."""
     try:
         from .run.threads import one_thread_from_now_on  # noqa: PLC0415 before numpy is imported
 
@@ -17,12 +17,13 @@ def main() -> int:
             print(f"fmu-mesh: {problem}", file=sys.stderr)
             return problem.exit_code
         from .cli.main import main as command  # noqa: PLC0415 as above
+
+        return last_exit.with_code(command())  # it imports the module of the command
     except KeyboardInterrupt:
         from .errors import Interrupted  # noqa: PLC0415 as above
 
         print("fmu-mesh: interrupted", file=sys.stderr)
         return Interrupted.exit_code
-    return last_exit.with_code(command())
 
 
 if __name__ == "__main__":

@@ -81,14 +81,20 @@ class FmuMeshError(Exception):
         reported: True if another process has already shown this error.
         result: what was recorded before, if this error ended a run of the library: a `fmu_mesh.Result`.
 
-    The layer that catches an error often knows more than the one that raised it. It adds what it knows and raises the
-    same error again:
+    Example:
+        Every exception says in its message what to do next, and the command would end with its exit code:
 
-    ```python
-    except StepFailed as error:
-        error.at(point, grid.time(point))
-        raise
-    ```
+        >>> import fmu_mesh
+        >>> try:
+        ...     fmu_mesh.FMIAdapter("fmus/Gain.fmu", step_size=0.0)
+        ... except fmu_mesh.FmuMeshError as error:
+        ...     print(type(error).__name__, error.exit_code, error.instance)
+        ...     print(error)
+        CallRefused 2 Gain@...
+        instance Gain@...: the step size is 0.0 s; expected one above 0.
+
+    The layer that catches an error often knows more than the one that raised it. It adds what it knows (`at`,
+    `with_hint`) and raises the same error again.
     """
 
     exit_code: ClassVar[int] = 1
@@ -104,13 +110,13 @@ class FmuMeshError(Exception):
         hint: str | None = None,
     ) -> None:
         super().__init__(message)
-        self.message = message
+        self.message: str = message
         self.instance = instance
         self.variable = variable
         self.point = point
         self.time = time
         self.hint = hint
-        self.reported = False
+        self.reported: bool = False
         self.result: Any = None
 
     def __str__(self) -> str:
@@ -173,6 +179,10 @@ class FmuMeshError(Exception):
 
 class Finding(msgspec.Struct, frozen=True):
     """One error in a configuration.
+
+    Example:
+        >>> print(Finding("mesh.yaml", "simulation.algorithm", "'jacob'", "jacobi or gauss_seidel", "jacobi", line=3))
+        mesh.yaml:3: simulation.algorithm: 'jacob'; expected jacobi or gauss_seidel. Did you mean 'jacobi'?
 
     Attributes:
         file: the file that has the error.

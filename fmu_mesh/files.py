@@ -99,7 +99,7 @@ def unwritable(path: Path, error: OSError) -> ConfigurationError:
     """The error for a result file that could be opened, but not be written to its end."""
     return ConfigurationError(
         f"the result file '{path}' cannot be written: {error.strerror}",
-        hint="The run has ended there. Make room, or choose another file with --output.",
+        hint="The run has ended there. Free some disk space, or choose another file with --output.",
     )
 
 
@@ -110,8 +110,10 @@ def replaced(path: Path) -> Iterator[Path]:
     After an error in the block an older file stays unchanged. A device or a pipe is written directly.
 
     Example:
-        >>> with replaced(Path("plot.png")) as draft:
-        ...     draft.write_bytes(picture)
+        >>> with replaced(Path("angles.svg")) as draft:
+        ...     _ = draft.write_text("<svg/>")
+        >>> Path("angles.svg").read_text()
+        '<svg/>'
     """
     target = Path(os.path.realpath(path))
     if target.exists() and not target.is_file():

@@ -23,6 +23,9 @@ os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 # There are more processes than cores, so none of them needs a thread for each core; starting them takes 0.03 s.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+# onnxruntime sends nothing from here either; fmu_mesh itself sets this where it imports it.
+os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
+
 session_folder()  # before there are workers
 
 # How long an example takes says more about the machine than about the code; a failure must be the same everywhere.

@@ -245,6 +245,7 @@ RULES: tuple[Callable[[Package], set[str]], ...] = (
 
 _C_STRUCT = "a field of a C struct, which ctypes has no other way to set"
 _MUJOCO = "an object of MuJoCo, which is told by its fields"
+_ONNX = "an option of onnxruntime, which is told by its fields"
 _ROS = "a field of a ROS message"
 
 ALLOWED: dict[str, dict[str, str]] = {
@@ -261,6 +262,10 @@ ALLOWED: dict[str, dict[str, str]] = {
         "instances/mujoco/mujoco_instance.py: self._model.opt.timestep": _MUJOCO,
         "instances/mujoco/rendering.py: self._viewer.cam.fixedcamid": _MUJOCO,
         "instances/mujoco/rendering.py: self._viewer.cam.type": _MUJOCO,
+        "instances/onnx/onnx_model.py: options.inter_op_num_threads": _ONNX,
+        "instances/onnx/onnx_model.py: options.intra_op_num_threads": _ONNX,
+        "instances/onnx/onnx_model.py: options.log_severity_level": _ONNX,
+        "instances/onnx/onnx_model.py: options.use_deterministic_compute": _ONNX,
         "ros/node/entry.py: end.daemon": "a Timer has no parameter for it",
         "ros/node/node_topics.py: message.header.stamp": _ROS,
         "ros/node/node_topics.py: setattr(owner)": _ROS,

@@ -1,4 +1,4 @@
-"""`FMIAdapter`: one FMU for a program that steps it by itself, with the concepts of the ROS package `fmi_adapter`."""
+"""`FMIAdapter`: one FMU in a user's own program, with the concepts of the ROS package `fmi_adapter`."""
 
 from .adapter import FMIAdapter
 from .times import Nanoseconds

@@ -1,7 +1,7 @@
-"""`FMIAdapter`: one FMU for a program that steps it by itself.
+"""`FMIAdapter`: one FMU in a user's own program, which calls its steps.
 
-Owns the modes, the time reached and the FMU's private folder. Knows nothing of meshes and Zenoh; of ROS it knows only
-its times.
+Owns the modes, the time reached and the FMU's private folder. Knows nothing of meshes and Zenoh, and of ROS only its
+times.
 """
 
 from __future__ import annotations
@@ -45,9 +45,9 @@ class FMIAdapter:
     `do_steps_until` with `set_input_value` and `get_output_value` in between; `close`, or the end of a `with` block, at
     the end. All calls come from one thread.
 
-    Times are those of the caller's clock, whatever its zero is: seconds, or a time of ROS (`rclpy.time.Time`, the stamp
-    of a header, `Nanoseconds`), which is exact to the nanosecond. `exit_initialization_mode` decides which, and all
-    other times are of the same kind. The FMU's own time starts at 0.0. What a step from t to t + h does:
+    Times are those of the caller's clock, which may have any zero: seconds, or a time of ROS (`rclpy.time.Time`, the
+    stamp of a header, `Nanoseconds`), which is exact to the nanosecond. All times must be of the same kind as that of
+    `exit_initialization_mode`. The FMU's own time starts at 0.0. A step from t to t + h does this:
 
         for every input with a trajectory: set its value at t
         fmi2DoStep from t to t + h
@@ -64,6 +64,14 @@ class FMIAdapter:
     Raises:
         CallRefused: ``step_size`` is not above 0, or missing here and in the FMU.
         LoadFailed: the FMU cannot be read, extracted or instantiated. Nothing is left behind.
+
+    Example:
+        >>> with fmu_mesh.FMIAdapter("fmus/Gain.fmu", step_size=0.5) as gain:
+        ...     gain.set_initial_value("k", 2.0)
+        ...     gain.exit_initialization_mode(0.0)
+        ...     gain.set_input_value("u", 0.0, 21.0)
+        ...     print(gain.do_steps_until(1.0), gain.get_output_value("y"))
+        1.0 42.0
     """
 
     def __init__(
@@ -74,7 +82,7 @@ class FMIAdapter:
     ) -> None:
         path = Path(fmu_path)
         self._description = description = read_description(path)
-        # No instance of a configuration can have this name, so both can be in one process.
+        # No instance of a configuration can have this name, so an adapter and a mesh can be in one process.
         name = f"{description.model_identifier}@{next(_instance_numbers)}"
         self._arguments = Arguments(name, description)
         self._step_size = self._arguments.step_size(step_size)
@@ -112,7 +120,7 @@ class FMIAdapter:
 
     @property
     def all_variable_names(self) -> tuple[str, ...]:
-        """Names of all variables, in the order of the model description, as are the three below."""
+        """Names of all variables, in the order of the model description; the next three have the same order."""
         return tuple(self._arguments.all)
 
     @property
@@ -127,17 +135,17 @@ class FMIAdapter:
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
-        """Names of all parameters that can be set; so there is no calculated parameter."""
+        """Names of all parameters that can be set; these are all but calculated parameters."""
         return tuple(self._arguments.parameters)
 
     @property
     def can_handle_variable_communication_step_size(self) -> bool:
-        """Whether the FMU takes steps of different sizes."""
+        """Whether the FMU supports steps of different sizes."""
         return self._description.can_handle_variable_step_size
 
     @property
     def default_experiment_step(self) -> float | None:
-        """The step size in s that the FMU itself proposes, or None."""
+        """The step size in s of the FMU's default experiment, or None."""
         return self._description.default_experiment.step_size
 
     @property
@@ -147,7 +155,7 @@ class FMIAdapter:
 
     @property
     def is_in_initialization_mode(self) -> bool:
-        """Whether `exit_initialization_mode` is still to come."""
+        """Whether `exit_initialization_mode` has not been called yet."""
         return self._mode == "initialization"
 
     @property
@@ -174,11 +182,19 @@ class FMIAdapter:
         """Set a parameter, an input or the initial value of another variable.
 
         A variable that FMI forbids to set, such as an output with initial 'calculated', is set with a warning in the
-        log: some FMUs take it.
+        log: some FMUs accept it.
 
         Raises:
             CallRefused: the mode, the name or the type is wrong, or the variable cannot be set before the start.
             InitializationFailed: the FMU refuses it, here or in `exit_initialization_mode`.
+
+        Example:
+            >>> with fmu_mesh.FMIAdapter("fmus/DampedPendulum.fmu") as pendulum:
+            ...     pendulum.set_initial_value("a", 1.3)  # rad
+            ...     pendulum.set_initial_value("l", 2.0)  # m
+            ...     pendulum.exit_initialization_mode(0.0)
+            ...     pendulum.get_output_value("a")
+            1.3
         """
         self._demand("initialization", "set_initial_value")
         variable = self._arguments.settable(name)
@@ -187,7 +203,7 @@ class FMIAdapter:
         converted = self._arguments.value(variable, value)
         if not self._entered:
             self._start_values[name] = converted
-            if variable.causality == "structuralParameter":  # arrays have other shapes now
+            if variable.causality == "structuralParameter":  # arrays may have other shapes now
                 self._arguments = Arguments(self._arguments.instance, self._description.sized(self._start_values))
             return
         early = variable.causality == "structuralParameter" or variable.initial != "exact"
@@ -203,8 +219,8 @@ class FMIAdapter:
         value.
 
         Raises:
-            CallRefused: it was called before, or ``time`` is no finite number, or of another kind than those of inputs
-                that were set before.
+            CallRefused: it was called before, or ``time`` is not a finite number, or its kind differs from the times of
+                inputs that were set before.
             InitializationFailed: the FMU refuses a start value, or does not start.
         """
         self._demand("initialization", "exit_initialization_mode")
@@ -226,11 +242,22 @@ class FMIAdapter:
     def set_input_value(self, name: str, time: Time, value: Value) -> None:
         """Add a value to the trajectory of an input: it is valid from ``time`` (caller's clock) on.
 
-        Times may come in any order and lie any time ahead. Of several values for one time the last one counts. A time
-        that is past is accepted: its value holds from the next step on, unless that of a later time is already in use.
+        Times may come in any order and lie any time ahead. Of several values for one time the last one counts. A past
+        time is accepted: its value holds from the next step on, unless a value with a later time is already used.
 
         Raises:
             CallRefused: the adapter is closed, or the name, the type or the time is wrong.
+
+        Example:
+            >>> with fmu_mesh.FMIAdapter("fmus/Gain.fmu", step_size=1.0) as gain:
+            ...     gain.exit_initialization_mode(0.0)
+            ...     gain.set_input_value("u", 0.0, 10.0)
+            ...     gain.set_input_value("u", 2.0, 20.0)  # in between it is linear
+            ...     for _ in range(3):
+            ...         print(gain.do_step(), gain.get_output_value("y"))
+            1.0 10.0
+            2.0 15.0
+            3.0 20.0
         """
         self._demand(None, "set_input_value")
         converted = self._arguments.value(self._arguments.input(name), value)
@@ -259,7 +286,7 @@ class FMIAdapter:
         """Advance by one step of ``step_size`` (s; None: the default one) and return the time reached, in s.
 
         Raises:
-            CallRefused: the mode is wrong, or the step size is not above 0, or not one that this FMU takes.
+            CallRefused: the mode is wrong, or the step size is not above 0, or this FMU does not support it.
             StepFailed: the FMU failed; only `close` is allowed now.
         """
         self._demand("stepping", "do_step")
@@ -268,10 +295,10 @@ class FMIAdapter:
         return self.simulation_time
 
     def do_steps_until(self, time: Time, max_steps: int | None = None) -> float:
-        """Take as many default steps as bring the FMU nearest to ``time``, and return the time reached, in s.
+        """Step with the default step size to the time that is nearest to ``time``; return the time reached, in s.
 
-        Of two times equally near the earlier one is taken. So the time reached may be up to half a step past ``time``,
-        and a ``time`` that is past by no more than that is no error.
+        Of two equally near times the earlier one is used. So the time reached may be up to half a step later than
+        ``time``. A ``time`` in the past is no error if it is at most half a step ago.
 
         Args:
             time: on the caller's clock.
@@ -280,6 +307,12 @@ class FMIAdapter:
         Raises:
             CallRefused: the mode is wrong, or the FMU is already more than half a step past ``time``.
             StepFailed: the FMU failed; only `close` is allowed now.
+
+        Example:
+            >>> with fmu_mesh.FMIAdapter("fmus/DampedPendulum.fmu", step_size=0.02) as pendulum:
+            ...     pendulum.exit_initialization_mode(0.0)
+            ...     pendulum.do_steps_until(0.055)  # 0.06 is nearer than 0.04
+            0.06
         """
         self._demand("stepping", "do_steps_until")
         if max_steps is not None and max_steps < 1:
@@ -324,7 +357,7 @@ class FMIAdapter:
         self._release()
 
     def remove_files(self) -> None:
-        """From any thread, when the process is about to be ended while the FMU does not return: remove its files."""
+        """From any thread, before the process is ended because the FMU does not return: remove its files."""
         shutil.rmtree(self._folder, ignore_errors=True)
 
     def _demand(self, mode: Literal["initialization", "stepping"] | None, call: str) -> None:
@@ -353,14 +386,14 @@ class FMIAdapter:
         return when
 
     def _enter(self) -> None:
-        """Let the FMU enter Initialization Mode; as late as possible, because some values can only be set before."""
+        """Enter Initialization Mode, as late as possible, because some values can only be set before."""
         if not self._entered:
             with self._fmu_called():
                 self._instance.enter_initialization(0.0, None, self._start_values)
             self._entered = True
 
     def _begin_trajectory(self, name: str, *, initial: bool) -> Trajectory:
-        """A new trajectory, whose first value is the initial one at 0.0 if ``initial`` is true."""
+        """A new trajectory; if ``initial`` is true, it starts with the initial value at 0.0."""
         linear = self._interpolate_input and is_float(self._arguments.inputs[name].type)
         self._trajectories[name] = trajectory = Trajectory(Samples(linear))
         if initial:
@@ -386,10 +419,10 @@ class FMIAdapter:
     def _fmu_called(self) -> Iterator[None]:
         """Around every call of the FMU: restore the state of the process, and note a failure.
 
-        When stepping, this restores only the floating-point mode, as in a mesh: the rest takes longer than a step.
+        During steps this restores only the floating-point mode, as in a mesh: the rest takes longer than a step.
         """
         stepping = self._mode == "stepping"
-        own_mode = stepping and floating_point_changed()  # that of the caller, which stays as it is
+        own_mode = stepping and floating_point_changed()  # the caller's mode, which must not change
         try:
             if stepping:
                 yield

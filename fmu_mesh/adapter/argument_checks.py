@@ -1,4 +1,4 @@
-"""Checks the arguments of a caller, names, values and times, before they reach the FMU.
+"""Checks names, values and times of the caller before they are given to the FMU.
 
 Owns the texts of `CallRefused` about arguments. Knows nothing of modes and steps.
 """
@@ -30,10 +30,10 @@ class Arguments:
     def __init__(self, instance: str, description: ModelDescription) -> None:
         self.instance = instance
         self._description = description
-        self.all = {variable.name: variable for variable in description.variables}
-        self.inputs = self._having("input")
-        self.outputs = self._having("output")
-        self.parameters = self._having("parameter")
+        self.all: dict[str, Variable] = {variable.name: variable for variable in description.variables}
+        self.inputs: dict[str, Variable] = self._having("input")
+        self.outputs: dict[str, Variable] = self._having("output")
+        self.parameters: dict[str, Variable] = self._having("parameter")
         self._tunable = {v.name: v for v in self.parameters.values() if v.variability == "tunable"}
         self._settable = {v.name: v for v in description.variables if v.settable_before_start}
 
@@ -78,7 +78,7 @@ class Arguments:
         return instant_of(value) if isinstance(value, RosTime | RosStamp) else self.seconds(value, "time")
 
     def seconds(self, value: float | RosTime, what: str) -> float:
-        """``value``, which is called ``what``, as a finite number."""
+        """``value`` as a finite number; ``what`` is its name for messages."""
         number = value.nanoseconds / 1e9 if isinstance(value, RosTime) else _plain(value)
         if isinstance(number, bool) or not isinstance(number, int | float) or not math.isfinite(number):
             raise self.refusal(f"the {what} is {value!r}; expected a finite number of seconds.")
@@ -96,7 +96,7 @@ class Arguments:
         return number
 
     def other_step_size(self, value: float | RosTime, default: float) -> float:
-        """``value`` as the size of one step where the others are ``default`` seconds long."""
+        """``value`` as the size of one step; ``default`` is the usual step size in s."""
         number = self.step_size(value)
         if number != default and not self._description.can_handle_variable_step_size:
             raise self.refusal(
@@ -125,5 +125,5 @@ class Arguments:
 
 
 def _plain(value: object) -> object:
-    """A numpy scalar as the Python value; robot programs use many of them."""
+    """The Python value of a numpy scalar, which robot programs often use."""
     return value.item() if isinstance(value, np.generic) else value

@@ -80,7 +80,7 @@ class CallerClock(Protocol):
         ...
 
     def resolution(self, time: float) -> float:
-        """The largest difference in s of two equal times of the caller near the FMU's ``time``."""
+        """The largest difference in s at which two times of the caller near the FMU's ``time`` count as equal."""
         ...
 
 
@@ -93,7 +93,7 @@ class SecondsClock:
     """A clock in seconds.
 
     Args:
-        start: the caller's time of the FMU's 0.0, in s.
+        start: the caller's time in s when the FMU's time is 0.0.
     """
 
     def __init__(self, start: float) -> None:
@@ -114,8 +114,8 @@ class SecondsClock:
     def resolution(self, time: float) -> float:
         """8 units in the last place.
 
-        A float of today's Unix time is good to 0.24 us, and `start + 3 * 0.1` is not `start + 0.3`: a few units in the
-        last place are left to the rounding of one multiplication and one addition, as in `simtime.steps_between`.
+        Unix time in a float has a resolution of 0.24 us, and `start + 3 * 0.1` is not `start + 0.3`. This limit allows
+        for the rounding of one multiplication and one addition, as in `simtime.steps_between`.
         """
         return 8 * math.ulp(max(abs(self._start), abs(self._start + time)))
 
@@ -124,7 +124,7 @@ class NanosecondsClock:
     """A clock in whole nanoseconds, as in ROS: exact for any start.
 
     Args:
-        start: the caller's time of the FMU's 0.0, in ns.
+        start: the caller's time in ns when the FMU's time is 0.0.
     """
 
     def __init__(self, start: int) -> None:

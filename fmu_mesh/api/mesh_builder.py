@@ -22,11 +22,12 @@ from ..run.preparing import planned
 from ..run.run_plan import RunPlan
 from ..text import listed, shown
 from ..wire.views import MeshStatus
+from .open_system import System
 from .result import Result
 from .run_handle import Run
 from .run_thread import MEMORY_LIMIT, RunThread, Settings, memory_file
 
-__all__ = ["Check", "Mesh", "RunOptions", "load"]
+__all__ = ["Check", "Mesh", "RunOptions"]
 
 log = logging.getLogger("fmu_mesh.run")
 
@@ -81,6 +82,12 @@ class RunOptions(TypedDict, total=False):
 
 class Check(msgspec.Struct, frozen=True):
     """What `Mesh.check` found.
+
+    Example:
+        >>> import fmu_mesh
+        >>> check = fmu_mesh.load("configs/pendulum_delay.yaml").check()
+        >>> bool(check), check.findings
+        (True, ())
 
     Attributes:
         findings: everything that is wrong, each with its place; empty if the mesh can run.
@@ -282,10 +289,10 @@ class Mesh:
         Example:
             >>> import fmu_mesh
             >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
-            >>> mesh.connect("pendulum.b", "delay.x")
+            >>> mesh.add("gain", fmu="../fmus/Gian.fmu")
             >>> for finding in mesh.check().findings:
-            ...     print(finding.path, finding.suggestion)
-            connections[1].from pendulum.a
+            ...     print(finding.path, finding.suggestion[-8:])
+            instances.gain.fmu Gain.fmu
         """
         try:
             run = self._planned(_options_of(options))
@@ -351,6 +358,28 @@ class Mesh:
                 memory.parent.rmdir()
             raise
 
+    def open(self, start_values: Mapping[str, Any] | None = None) -> System:
+        """Open all instances in this process, for a program that steps them itself (docs/stepping.md).
+
+        Nothing is recorded into a file, and no other process is started.
+
+        Example:
+            >>> import fmu_mesh
+            >>> with fmu_mesh.load("configs/pendulum_delay.yaml").open({"pendulum.a": 0.5}) as system:
+            ...     system.step(100)
+            ...     system.time, system.get("pendulum.a") < 0.5
+            (0.2, True)
+
+        Args:
+            start_values: start values by `instance.variable`; they come before those of the configuration.
+
+        Raises:
+            ConfigurationError: the configuration, a model or a start value is wrong; carries all findings. Or two
+                instances need a process of their own each.
+            FmuError: an instance cannot be opened or initialized. Nothing is left behind.
+        """
+        return System(self._planned(_options_of({"start_values": start_values or {}})))
+
     def _planned(self, options: Options) -> RunPlan:
         if (place := being_imported()) is not None:
             hint = 'Write `if __name__ == "__main__":` before what the program does.'
@@ -373,21 +402,6 @@ class Mesh:
         if not isinstance(section, dict):
             raise ConfigurationError(f"'{key}' of '{self._plain.file}' is {shown(section)}, where a mapping should be")
         return section
-
-
-def load(path: str | Path) -> Mesh:
-    """Read a configuration file.
-
-    Example:
-        >>> import fmu_mesh
-        >>> fmu_mesh.load("configs/pendulum_delay.yaml").instances
-        ['pendulum', 'delay']
-
-    Raises:
-        ConfigurationError: the file cannot be read, or is no YAML. What it means is checked by `Mesh.check`, and before
-            a run.
-    """
-    return Mesh.from_file(path)
 
 
 def _options_of(given: RunOptions, memory: Path | None = None) -> Options:

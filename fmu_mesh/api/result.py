@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ..errors import ConfigurationError, UnknownName
 from ..run.outcome import Outcome
 from ..run.run_plan import RunPlan
-from ..system.system import System
+from ..system.system import ResolvedSystem
 from ..text import listed
 from ..variables.model_description import Variable
 from ..variables.value_types import VariableType, is_float
@@ -58,7 +58,7 @@ class Result(Mapping[str, NDArray[Any]]):
         *,
         file: Path | None = None,
         outcome: Outcome | None = None,
-        system: System | None = None,
+        system: ResolvedSystem | None = None,
         columns: Columns | None = None,
     ) -> None:
         self.title = title
@@ -128,7 +128,7 @@ class Result(Mapping[str, NDArray[Any]]):
         Example:
             >>> import fmu_mesh
             >>> result = fmu_mesh.load("configs/pendulum_delay.yaml").run(stop_time=1.0, record="memory")
-            >>> result.plot("pendulum.a", "delay.y").savefig("results/angles.png")
+            >>> result.plot("pendulum.a", "delay.y").savefig("angles.png")
 
         Raises:
             ConfigurationError: there is no such variable, or matplotlib is not installed.
@@ -193,12 +193,12 @@ def summary_of(outcome: Outcome, step_size: float) -> str:
     return f"{point} points in {seconds:.3f} s: {rate:.0f} points/s, real-time factor {factor:.3g}"
 
 
-def types_of(system: System | None) -> dict[str, VariableType] | None:
+def types_of(system: ResolvedSystem | None) -> dict[str, VariableType] | None:
     """The types of the recorded variables by name; None without a system."""
     return {name: variable.type for name, (_, variable) in _recorded(system).items()} if system is not None else None
 
 
-def _recorded(system: System | None) -> dict[str, tuple[str, Variable]]:
+def _recorded(system: ResolvedSystem | None) -> dict[str, tuple[str, Variable]]:
     """Instance and variable of each recorded column, by its name."""
     columns: dict[str, tuple[str, Variable]] = {}
     for instance, name in system.recorded if system is not None else ():
@@ -208,7 +208,7 @@ def _recorded(system: System | None) -> dict[str, tuple[str, Variable]]:
     return columns
 
 
-def _unit_passed_on(system: System, instance: str, variable: Variable) -> str | None:
+def _unit_passed_on(system: ResolvedSystem, instance: str, variable: Variable) -> str | None:
     """The unit of what comes out of an output again that declares none, such as that of a transport delay.
 
     It depends on a single input, which declares no unit either, and on nothing else that could have one.

@@ -5,14 +5,11 @@ from __future__ import annotations
 import asyncio
 import threading
 import time
-import weakref
-from collections.abc import Iterator, Mapping
 from concurrent.futures import Future
 from concurrent.futures import TimeoutError as NotYet
-from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
 from ..errors import (
     CallRefused,
@@ -22,13 +19,10 @@ from ..errors import (
     Interrupted,
     KeyboardInterrupted,
     MeshLost,
-    UnknownName,
     from_report,
 )
-from ..variables.value_conversion import from_plain
 from ..wire.client.mesh_client import MeshClient
 from ..wire.client.reaching import Meshes
-from ..wire.client.readings import Reading, Target
 from ..wire.client.waiting import rest
 from ..wire.views import (
     Command,
@@ -43,65 +37,16 @@ from ..wire.views import (
 from .notebook_progress import NotebookProgress
 from .result import Result
 from .run_thread import RunThread
+from .samples import Sample, Watch, sample_of, targets_of
 
-__all__ = ["Run", "Sample", "Watch", "attach"]
+__all__ = ["TIMEOUT_S", "Run"]
 
-_TIMEOUT_S = 5.0
+TIMEOUT_S = 5.0
+"""Default deadline of a question in s."""
+
 _LOOK_S = 0.2
 _FOREVER_S = 1e9
 _START_S = 120.0
-
-
-class Sample(NamedTuple):
-    """One value of a variable.
-
-    Attributes:
-        name: `instance.variable`.
-        value: a number, truth value, text or bytes; an array as a numpy array.
-        point: the communication point of the value.
-        time: the simulation time of this point in s.
-        unit: the unit, as FMI writes it; None without one.
-    """
-
-    name: str
-    value: Any
-    point: int
-    time: float
-    unit: str | None
-
-
-class Watch(Iterator[Sample]):
-    """The values of variables as they come, from when it was made until the mesh ends, or until it is closed.
-
-    Args:
-        client: the way into the mesh.
-        targets: the variables by their keys.
-    """
-
-    def __init__(self, client: MeshClient, targets: Mapping[str, Target]) -> None:
-        self._targets = targets
-        self._stack = ExitStack()
-        self._readings = self._stack.enter_context(client.watch(list(targets.values())))
-        weakref.finalize(self, self._stack.close)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
-
-    def __next__(self) -> Sample:
-        reading = next(self._readings, None)
-        if reading is None:
-            self.close()
-            raise StopIteration
-        return _sample(reading, self._targets[reading.key].variable)
-
-    def close(self) -> None:
-        """End it; may be called twice."""
-        self._stack.close()
 
 
 class Run:
@@ -193,8 +138,8 @@ class Run:
     def samples(self, *names: str) -> list[Sample]:
         """The current values of several variables, each with its point; `*` in a name stands for any characters."""
         client = self._running()
-        targets = {target.key: target for name in names for target in _targets(client, name)}
-        return [_sample(reading, targets[reading.key].variable) for reading in client.get(list(targets.values()))]
+        targets = {target.key: target for name in names for target in targets_of(client, name)}
+        return [sample_of(reading, targets[reading.key].variable) for reading in client.get(list(targets.values()))]
 
     def set(self, name: str, value: object, *, at: float | None = None) -> SetAnswer:
         """Give an unconnected input or a tunable parameter a value.
@@ -212,7 +157,7 @@ class Run:
         """
         client = self._running()
         try:
-            return client.set(_targets(client, name)[0], value, at)
+            return client.set(targets_of(client, name)[0], value, at)
         except ConfigurationError as error:
             raise CallRefused(error.message, hint=error.hint) from error
 
@@ -227,11 +172,11 @@ class Run:
             >>> with mesh.start(record="memory", stop_time=0.01, paused=True) as run:
             ...     samples = run.watch("delay.y")
             ...     answer = run.resume()
-            ...     [sample.point for sample in samples]
-            [1, 2, 3, 4, 5]
+            ...     [sample.point for sample in samples][-1]
+            5
         """
         client = self._running()
-        targets = {target.key: target for name in names for target in _targets(client, name)}
+        targets = {target.key: target for name in names for target in targets_of(client, name)}
         return Watch(client, targets)
 
     # --- steering
@@ -391,7 +336,7 @@ class Run:
             raise DeadlineExceeded(f"mesh '{self.name}' cannot be reached within {timeout:g} s")
         if not own.endpoints:
             raise MeshLost(f"the run of mesh '{self.name}' has ended")
-        meshes = Meshes(own.endpoints[:1], _TIMEOUT_S)
+        meshes = Meshes(own.endpoints[:1], TIMEOUT_S)
         self._meshes = meshes.__enter__()
         with meshes.changes() as wait:
             end = time.monotonic() + timeout
@@ -401,40 +346,6 @@ class Run:
                 wait(_LOOK_S)
                 meshes.look()
         return client
-
-
-def attach(name: str | None = None, *, connect: str | tuple[str, ...] = (), timeout: float = _TIMEOUT_S) -> Run:
-    """Find a running mesh that somebody else has started, such as `fmu-mesh launch` in another terminal.
-
-    Example:
-        >>> import fmu_mesh
-        >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
-        >>> with mesh.start(real_time_factor=1.0, record="memory") as started_elsewhere:
-        ...     state = started_elsewhere.status.state
-        ...     with fmu_mesh.attach("pendulum_delay") as run:
-        ...         for sample in run.watch("delay.y"):
-        ...             break
-        >>> sample.name, sample.value
-        ('delay.y', 0.0)
-
-    Args:
-        name: name or key of the mesh; None for the only one that runs.
-        connect: Zenoh endpoints of the mesh or of a router; default: the meshes of this user on this host.
-        timeout: deadline of every question in s.
-
-    Raises:
-        ConfigurationError: no such mesh is running, or there are several.
-        DeadlineExceeded: it does not answer.
-    """
-    endpoints = (connect,) if isinstance(connect, str) else tuple(connect)
-    meshes = Meshes(endpoints, timeout)
-    meshes.__enter__()
-    try:
-        client = meshes.one(None) if name is None else meshes.named(name)
-        return Run(client.keys.mesh, meshes=meshes)
-    except BaseException:
-        meshes.__exit__(None, None, None)
-        raise
 
 
 def _wait_until_it_runs(client: MeshClient) -> None:
@@ -447,18 +358,6 @@ def _wait_until_it_runs(client: MeshClient) -> None:
         for status in statuses:
             if status.state not in ("starting", "initializing"):
                 return
-
-
-def _targets(client: MeshClient, name: str) -> list[Target]:
-    try:
-        return client.targets(name)
-    except ConfigurationError as error:
-        raise UnknownName(error.message, hint=error.hint) from error
-
-
-def _sample(reading: Reading, view: VariableView) -> Sample:
-    value = from_plain(reading.value, view.type, view.shape)
-    return Sample(f"{reading.instance}.{reading.variable}", value, reading.point, reading.time, reading.unit)
 
 
 def _by_keyboard(error: Interrupted) -> KeyboardInterrupted:

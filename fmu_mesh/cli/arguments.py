@@ -1,4 +1,4 @@
-"""The common parts of all commands: adding one, its options, and readers of values with clear errors.
+"""The common parts of all commands: their parser, flags that several have, and readers of values with clear errors.
 
 argparse shows the name of a reader function in its own message for a wrong value, so these raise messages of their own.
 """
@@ -8,30 +8,27 @@ from __future__ import annotations
 import argparse
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
-from typing import Any, Literal, NoReturn
+from collections.abc import Callable, Mapping
+from typing import Any, NoReturn
 
-from .. import files
-from ..config.base import ENDPOINT_PATTERN, Endpoint
-from ..config.mesh import MAX_WINDOW
-from ..errors import ConfigurationError, LoadFailed
-from ..run.options import Options, option_fields
-from ..text import listed, nearest, nearest_file
+from ..config.base import ENDPOINT_PATTERN
+from ..errors import ConfigurationError
+from ..text import listed, nearest
 
 __all__ = [
     "CommandParser",
-    "add_command",
-    "add_options",
+    "Parsers",
+    "add_json",
+    "add_quiet",
+    "add_reaching",
     "count",
     "endpoint",
-    "no_fmu",
     "number",
     "positive_seconds",
-    "read_options",
+    "whole",
 ]
 
-Parsers = Sequence[argparse.ArgumentParser]
+_TIMEOUT_S = 5.0
 
 _NEGATIVE = re.compile(r"-(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?$|-\.?(?:inf|Inf|INF)$")
 
@@ -44,7 +41,11 @@ class CommandParser(argparse.ArgumentParser):
         self._negative_number_matcher = _NEGATIVE  # by default argparse takes -1e-3 and -inf for options
 
     def error(self, message: str) -> NoReturn:
-        """Exit with code 2 and one sentence about the error."""
+        """Raise one sentence about the error.
+
+        Raises:
+            ConfigurationError: always.
+        """
         name, _, what = message.removeprefix("argument ").partition(": ")
         hint = None
         if name == "the following arguments are required":
@@ -56,8 +57,7 @@ class CommandParser(argparse.ArgumentParser):
             text = f"{name} needs a value, as in `{name} {option.metavar}`"
         else:
             text = f"{name}: {what}" if what else name
-        problem = ConfigurationError(text, hint=hint)
-        self.exit(problem.exit_code, f"fmu-mesh: {problem}\n")
+        raise ConfigurationError(text, hint=hint)
 
     def unknown(self, argument: str, others: Mapping[str, CommandParser]) -> ConfigurationError:
         """The error for an argument that this command does not have; ``others`` are all commands."""
@@ -81,54 +81,37 @@ class CommandParser(argparse.ArgumentParser):
         return [name for name, action in self._option_string_actions.items() if action.help != argparse.SUPPRESS]
 
 
-def add_command(
-    commands: argparse._SubParsersAction[Any], name: str, text: str, parents: Parsers
-) -> argparse.ArgumentParser:
-    """Add a command; ``text`` is its line in the list of commands and the first line of its own help."""
-    description = f"{text[0].upper()}{text[1:]}."
-    parser: argparse.ArgumentParser = commands.add_parser(name, parents=parents, help=text, description=description)
-    return parser
+Parsers = Mapping[str, Callable[[CommandParser], None]]
+"""What a module of commands offers: for each command the function that adds its arguments and its `run_command`."""
 
 
-def add_options(
-    parser: argparse._ActionsContainer,
-    *names: str,
-    defaults: Mapping[str, str] | None = None,
-    metavars: Mapping[str, str] | None = None,
-) -> None:
-    """Add flags for options of a run, as `Options` describes them.
-
-    Args:
-        parser: the parser of a command, or a group of its flags.
-        names: the fields of `Options`.
-        defaults: by field, the default value for the help.
-        metavars: by field, the name of the value in the help, if it differs from that in `Options`.
-    """
-    for name in names:
-        setting = option_fields()[name]
-        flag, kind = setting.flag, setting.type
-        default = (defaults or {}).get(name)
-        text = setting.help + (f"; default: {default}" if default is not None else "")
-        details: dict[str, Any] = {"dest": name, "help": text.replace("%", "%%")}
-        if kind is bool:
-            parser.add_argument(flag.name, action="store_true", **details)
-            continue
-        details |= {"metavar": (metavars or {}).get(name, flag.metavar), "type": _READERS[kind]}
-        if setting.repeatable:
-            details |= {"action": "append", "default": []}
-        if flag.bare is not None:
-            details |= {"nargs": "?", "const": flag.bare, "type": _trace_file}
-        parser.add_argument(flag.name, **details)
+def add_json(parser: argparse.ArgumentParser, text: str = "JSON, one object per line") -> None:
+    """Add `--json`."""
+    parser.add_argument("--json", action="store_true", help=text)
 
 
-def read_options(arguments: argparse.Namespace) -> Options:
-    """The options from the arguments of a command."""
-    given: dict[str, Any] = {}
-    for name, setting in option_fields().items():
-        if hasattr(arguments, name):
-            value = getattr(arguments, name)
-            given[name] = tuple(value) if setting.repeatable else value
-    return Options(**given)
+def add_quiet(parser: argparse.ArgumentParser) -> None:
+    """Add `-q`."""
+    parser.add_argument("-q", "--quiet", action="store_true", help="print errors only")
+
+
+def add_reaching(parser: argparse.ArgumentParser, timeout_s: float = _TIMEOUT_S) -> None:
+    """Add the flags of all commands for running meshes; ``timeout_s`` is the default deadline of a query in s."""
+    parser.add_argument(
+        "--connect",
+        type=endpoint,
+        action="append",
+        default=[],
+        metavar="ENDPOINT",
+        help="Zenoh endpoint of a mesh or a router; repeatable; default: the meshes of this user on this host",
+    )
+    parser.add_argument(
+        "--timeout",
+        type=positive_seconds,
+        default=timeout_s,
+        metavar="S",
+        help=f"deadline of every query in s ({timeout_s:g})",
+    )
 
 
 def number(text: str) -> float:
@@ -149,7 +132,7 @@ def positive_seconds(text: str) -> float:
 
 def count(text: str) -> int:
     """A positive whole number."""
-    value = _whole(text)
+    value = whole(text)
     if value < 1:
         raise argparse.ArgumentTypeError(f"'{text}' is not a whole number of 1 or more")
     return value
@@ -162,34 +145,8 @@ def endpoint(text: str) -> str:
     return text
 
 
-def no_fmu(path: Path, error: LoadFailed) -> ConfigurationError:
-    """The error for a path that should be an FMU and is something else, or nothing."""
-    hint = error.hint
-    if not files.exists(path):
-        near = nearest_file(path)
-        hint = f"Did you mean '{near}'?" if near is not None else hint
-    elif path.suffix in (".yaml", ".yml"):
-        hint = f"A configuration is run by `fmu-mesh launch {path}`."
-    return ConfigurationError(error.message, hint=hint)
-
-
-def _trace_file(text: str) -> Path:
-    if not text.endswith(".json"):
-        raise argparse.ArgumentTypeError(f"'{text}' is no .json file; write --profile after the other arguments")
-    return Path(text)
-
-
-def _window(text: str) -> int | Literal["auto"]:
-    if text == "auto":
-        return "auto"
-    value = _whole(text)
-    if not 1 <= value <= MAX_WINDOW:
-        raise argparse.ArgumentTypeError(f"'{text}' is no window: auto, or from 1 to {MAX_WINDOW} points")
-    return value
-
-
-def _whole(text: str) -> int:
-    """A whole number; 0, which no option here allows, for any other text."""
+def whole(text: str) -> int:
+    """A whole number; 0, which no argument here allows, for any other text."""
     try:
         return int(text)
     except ValueError:
@@ -201,13 +158,3 @@ def _read(text: str) -> float:
         return float(text)
     except ValueError:
         raise argparse.ArgumentTypeError(f"'{text}' is no number") from None
-
-
-_READERS: dict[Any, Callable[[str], object]] = {
-    int: _window,
-    float: number,
-    str: str,
-    Path: Path,
-    Endpoint: endpoint,
-}
-"""The reader of a value by its type."""

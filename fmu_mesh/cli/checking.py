@@ -5,9 +5,11 @@ from __future__ import annotations
 import argparse
 import sys
 from pathlib import Path
-from typing import Any
+
+import msgspec
 
 from ..config.structure import schema_text
+from ..errors import FmuMeshError
 from ..instances.configuration import installed_config
 from ..instances.registry import check_engines
 from ..run.preparing import prepare
@@ -17,31 +19,59 @@ from ..system.plan import Plan
 from ..system.system import Connection, SystemInstance
 from ..text import listed, short_number, short_path, shown
 from ..variables.model_description import Variable
-from .arguments import add_command, add_options, read_options
-from .output.display import say
+from .arguments import CommandParser, Parsers, add_json, add_quiet
+from .output.display import teller
+from .output.json_output import Failure, failure_of, print_json
+from .output.plan_view import PlanView, plan_view
 from .output.tables import pairs, table
+from .run_options import add_configuration, read_options
 
-__all__ = ["add_commands", "plan_page"]
+__all__ = ["PARSERS", "CheckReport", "plan_page"]
 
 _PROBLEM_CHARACTERS = 100
 
 
-def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.ArgumentParser) -> None:
-    """Add the commands of this module."""
-    check = add_command(commands, "check", "check a configuration and show its plan, without running it", [common])
-    check.add_argument("config", type=Path, metavar="CONFIG", help="the configuration file")
-    add_options(check.add_argument_group("instead of what CONFIG says"), "window", "start_values")
-    add_options(check, "allow_code")
-    check.set_defaults(run_command=_check)
-    schema = add_command(commands, "schema", "print the JSON Schema of configurations", [common])
-    schema.set_defaults(run_command=_schema)
+class CheckReport(msgspec.Struct, frozen=True):
+    """The output of `check --json`.
+
+    Attributes:
+        file: the configuration as it was given.
+        exit_code: that of the command.
+        plan: what would run; None if the configuration is wrong.
+        error: what is wrong, with all findings.
+    """
+
+    file: str
+    exit_code: int
+    plan: PlanView | None = None
+    error: Failure | None = None
+
+
+def _add_check(parser: CommandParser) -> None:
+    add_configuration(parser)
+    add_quiet(parser)
+    add_json(parser, "print the plan, or all findings, as one JSON object")
+    parser.set_defaults(run_command=_check)
+
+
+def _add_schema(parser: CommandParser) -> None:
+    parser.set_defaults(run_command=_schema)
 
 
 def _check(arguments: argparse.Namespace) -> int:
-    plan = prepare(arguments.config, read_options(arguments), say)
-    print("\n".join(plan_page(plan)))
-    check_engines(plan.system.config.instances, str(arguments.config))
-    print(f"\nOK: {arguments.config} can run.")
+    try:
+        plan = prepare(arguments.config, read_options(arguments), teller(quiet=arguments.quiet))
+        if not arguments.json:
+            print("\n".join(plan_page(plan)))
+        check_engines(plan.system.config.instances, str(arguments.config))
+    except FmuMeshError as error:
+        if arguments.json:
+            print_json(CheckReport(str(arguments.config), error.exit_code, error=failure_of(error)))
+        raise
+    if arguments.json:
+        print_json(CheckReport(str(arguments.config), 0, plan_view(plan)))
+    else:
+        print(f"\nOK: {arguments.config} can run.")
     return 0
 
 
@@ -229,3 +259,6 @@ def _warnings(plan: Plan) -> list[str]:
 
 def _unit(variable: Variable | None) -> str:
     return f" {variable.unit}" if variable is not None and variable.unit else ""
+
+
+PARSERS: Parsers = {"check": _add_check, "schema": _add_schema}

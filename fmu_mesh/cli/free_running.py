@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,40 +16,44 @@ from msgspec.structs import replace
 
 from ..config.base import NAME_PATTERN
 from ..config.instance_sections import KIND
+from ..config.loading import PlainConfig
 from ..errors import ConfigurationError, LoadFailed
-from ..instances.configuration import parse
+from ..instances.configuration import examine_data
 from ..instances.registry import KINDS, describe
 from ..run.launcher import Launcher
-from ..run.options import Options
+from ..run.options import Options, with_config_values
 from ..run.preparing import planned
+from ..run.run_plan import RunPlan
 from ..variables.model_description import ModelDescription
-from .arguments import add_command, add_options, no_fmu, read_options
-from .output.display import Display, say, warn
-from .running import finish, run_launcher
+from .arguments import CommandParser, Parsers, add_json
+from .inspecting import no_fmu
+from .output.display import Display, teller, warn
+from .output.reports import RunReporter
+from .run_options import add_options, read_options
+from .running import add_output, finish, run_launcher
 
-__all__ = ["add_commands"]
+__all__ = ["PARSERS"]
 
 _SIMULATION = {"real_time_factor": 1.0, "update_period": 0.01, "catch_up": 1.0}
 """The keys of `simulation` with other defaults than in a file; options replace them."""
 
 
-def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.ArgumentParser) -> None:
-    """Add the command of this module."""
-    run = add_command(commands, "run", "run one FMU as a free-running node, without a file", [common])
-    run.add_argument("fmu", type=Path, metavar="MODEL.fmu", help="the FMU")
-    run.add_argument("--name", help="name of the mesh and of its instance; default: the model identifier")
-    run.add_argument(
+def _add_run(parser: CommandParser) -> None:
+    parser.add_argument("fmu", type=Path, metavar="MODEL.fmu", help="the FMU")
+    parser.add_argument("--name", help="name of the mesh and of its instance; default: the model identifier")
+    parser.add_argument(
         "--interpolation",
         choices=("hold", "linear"),
         default="linear",
         help="how a Real input changes between two given values; other types hold; default: linear",
     )
     add_options(
-        run,
+        parser,
         "step_size",
         "stop_time",
         *_SIMULATION,
         "start_values",
+        "config_values",
         "output",
         "listen",
         "connect",
@@ -60,14 +65,26 @@ def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.Arg
         },
         metavars={"start_values": "VARIABLE=VALUE"},
     )
-    run.add_argument("--no-progress", action="store_true", help="no progress line")
-    run.set_defaults(run_command=_run)
+    add_output(parser)
+    add_json(parser, "print the outcome as one JSON object, and nothing else on standard output")
+    parser.set_defaults(run_command=_run)
 
 
 def _run(arguments: argparse.Namespace) -> int:
+    with RunReporter(wanted=arguments.json) as reporter:
+        run = _planned(arguments, teller(quiet=arguments.quiet))
+        if not arguments.quiet:
+            warn(run.plan)
+        with Display(run.plan, show_progress=not arguments.no_progress, quiet=arguments.quiet) as display:
+            outcome = run_launcher(Launcher(run, display.event), run, reporter)
+        finish(run.plan, outcome, arguments)
+    return 0
+
+
+def _planned(arguments: argparse.Namespace, tell: Callable[[str], None]) -> RunPlan:
     try:
         section = msgspec.convert({KIND: "fmu", "fmu": str(arguments.fmu)}, KINDS.section("fmu"))
-        description = describe(arguments.fmu, section, tell=say)
+        description = describe(arguments.fmu, section, tell=tell)
     except LoadFailed as error:
         raise no_fmu(arguments.fmu, error) from error
     name = arguments.name if arguments.name is not None else description.model_identifier
@@ -76,16 +93,12 @@ def _run(arguments: argparse.Namespace) -> int:
         raise ConfigurationError(f"'{name}' is not {what}", hint="Give the mesh such a name with --name.")
     options = read_options(arguments)
     options = replace(options, start_values=tuple(f"{name}.{change}" for change in options.start_values))
-    text = msgspec.json.encode(_configuration(arguments, name, options, description)).decode()
-    loaded = parse(text, arguments.fmu, options.start_values)
+    plain = PlainConfig(_configuration(arguments, name, options, description), arguments.fmu)
+    loaded, findings = examine_data(with_config_values(plain, options.config_values), options.start_values)
+    findings.raise_any()
     named = {place: text.replace(f"--set {name}.", "--set ", 1) for place, text in loaded.overrides.items()}
-    loaded = replace(loaded, lines={}, overrides=named)  # nobody has written a file, so findings have no lines
-    run = planned(loaded, loaded.findings(), options, known={name: description})
-    warn(run.plan)
-    with Display(run.plan, show_progress=not arguments.no_progress) as display:
-        outcome = run_launcher(Launcher(run, display.event))
-    finish(run.plan, outcome, arguments)
-    return 0
+    loaded = replace(loaded, overrides=named)
+    return planned(loaded, loaded.findings(), options, known={name: description})
 
 
 def _configuration(
@@ -105,3 +118,6 @@ def _configuration(
         "instances": {name: {"fmu": str(arguments.fmu.absolute()), "interpolation": arguments.interpolation}},
         "record": {"file": None},
     }
+
+
+PARSERS: Parsers = {"run": _add_run}

@@ -9,18 +9,22 @@ import textwrap
 from base64 import b64encode
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import msgspec
 
+from .. import files
+from ..api.functions import inspect
 from ..errors import ConfigurationError, LoadFailed
 from ..instances.fmi import read_description, sha256_of
-from ..text import fits, nearest, short_number, shown
+from ..instances.registry import KINDS
+from ..text import fits, nearest, nearest_file, short_number, shown
 from ..variables.model_description import Causality, Kind, ModelDescription, Variable
-from .arguments import add_command, no_fmu
+from .arguments import CommandParser, Parsers, add_json
+from .output.json_output import print_failure
 from .output.tables import pairs
 
-__all__ = ["Inspection", "add_commands", "inspect_fmu", "inspection_page"]
+__all__ = ["PARSERS", "Inspection", "inspect_fmu", "inspection_page", "no_fmu"]
 
 _SHOWN_VARIABLES: Final = 20
 """Variables of one causality on a page without `--all`."""
@@ -66,31 +70,32 @@ class Inspection(msgspec.Struct, frozen=True, omit_defaults=False):
     description: ModelDescription
 
 
-def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.ArgumentParser) -> None:
-    """Add the commands of this module."""
-    inspect = add_command(commands, "inspect", "show the properties of an FMU, without running it", [common])
-    inspect.add_argument("fmu", type=Path, metavar="MODEL.fmu", help="the FMU, or the folder of an unpacked one")
-    inspect.add_argument(
+def _add_inspect(parser: CommandParser) -> None:
+    parser.add_argument("fmu", type=Path, metavar="MODEL.fmu", help="the FMU, or the folder of an unpacked one")
+    parser.add_argument(
         "variables",
         nargs="*",
         metavar="VARIABLE",
         help="show only these variables; * stands for any characters",
     )
-    inspect.add_argument(
+    parser.add_argument(
         "--all", action="store_true", help=f"show all variables instead of {_SHOWN_VARIABLES} of each causality"
     )
-    inspect.add_argument("--json", action="store_true", help="print everything as JSON")
-    inspect.set_defaults(run_command=_inspect)
+    add_json(parser, "print everything as one JSON object")
+    parser.set_defaults(run_command=_inspect)
 
 
 def inspect_fmu(path: Path) -> Inspection:
-    """Read all properties of an FMU without loading it.
+    """Read all properties of an FMU without loading it, or of a file whose ending is another kind of instance.
 
     Raises:
         ConfigurationError: it cannot be read; says why.
     """
     reasons: tuple[str, ...] = ()
     try:
+        if path.is_file() and path.suffix != ".fmu" and path.suffix[1:] in KINDS.names():
+            size, other = path.stat().st_size, inspect(path)
+            return Inspection(str(path), sha256_of(path), size, runs_here=True, problems=(), description=other)
         try:
             description = read_description(path)
         except LoadFailed as error:
@@ -108,6 +113,17 @@ def inspect_fmu(path: Path) -> Inspection:
         problems=(*reasons, *description.problems),
         description=description,
     )
+
+
+def no_fmu(path: Path, error: LoadFailed) -> ConfigurationError:
+    """The error for a path that should be an FMU and is something else, or nothing."""
+    hint = error.hint
+    if not files.exists(path):
+        near = nearest_file(path)
+        hint = f"Did you mean '{near}'?" if near is not None else hint
+    elif path.suffix in (".yaml", ".yml"):
+        hint = f"A configuration is run by `fmu-mesh launch {path}`."
+    return ConfigurationError(error.message, hint=hint)
 
 
 def inspection_page(
@@ -136,7 +152,12 @@ def inspection_page(
 
 
 def _inspect(arguments: argparse.Namespace) -> int:
-    inspection = inspect_fmu(arguments.fmu)
+    try:
+        inspection = inspect_fmu(arguments.fmu)
+    except ConfigurationError as error:
+        if arguments.json:
+            print_failure(error)
+        raise
     if arguments.json:
         sys.stdout.buffer.write(msgspec.json.format(msgspec.json.encode(inspection)) + b"\n")
         return 0
@@ -175,17 +196,19 @@ def _facts(inspection: Inspection, width: int) -> list[str]:
     if indicators := description.event_indicators:
         states.append(f"{indicators} event indicator{'s' if indicators > 1 else ''}")
     times += [f"tolerance {short_number(experiment.tolerance)}"] if experiment.tolerance is not None else []
+    kinds = " or ".join(_KIND_WORDS[kind] for kind in description.kinds)
+    platforms = ", ".join(_PLATFORM_WORDS.get(name, name) for name in description.platforms)
     size = f" ({inspection.bytes} bytes)" if inspection.bytes is not None else " (a folder)"
     facts = [
         ("File", f"{inspection.file}{size}"),
         ("SHA-256", inspection.sha256 or ""),
         ("Model", description.model_name),
         ("Description", description.description or ""),
-        ("Kind", f"FMI {description.fmi_version} {' or '.join(_KIND_WORDS[kind] for kind in description.kinds)}"),
+        ("Kind", f"FMI {description.fmi_version} {kinds}" if kinds else description.kind.replace("_", " ")),
         ("Identifier", description.model_identifier),
         ("GUID", description.guid),
         ("Made by", description.generation_tool or ""),
-        ("Platforms", ", ".join(_PLATFORM_WORDS.get(name, name) for name in description.platforms) or "none"),
+        ("Platforms", platforms or ("none" if kinds else "")),
         ("Runs here", "yes" if inspection.runs_here else "no, see Problems"),
         ("Can", ", ".join(can)),
         ("Needs", ", ".join(needs)),
@@ -258,3 +281,6 @@ def _start(variable: Variable) -> str:
             item = next((item for item, value in variable.items if value == start), None)
             text = f"{item} ({start})" if item is not None else shown(start)
     return f"= {text} {unit}".rstrip()
+
+
+PARSERS: Parsers = {"inspect": _add_inspect}

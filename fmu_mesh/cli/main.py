@@ -1,55 +1,118 @@
-"""The command `fmu-mesh`: finds the command's module, runs it, and turns errors into one paragraph and an exit code."""
+"""The command `fmu-mesh`: finds the module of a command, runs the command, and turns errors into text and an exit code.
+
+Only the module of the command that is asked for is imported.
+"""
 
 from __future__ import annotations
 
 import argparse
+import io
+import os
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from contextlib import nullcontext, redirect_stdout
 from functools import partial
-from pathlib import Path
+from importlib import import_module
+from pathlib import PurePath
+from typing import Final
 
 from .. import __version__
 from ..errors import ConfigurationError
 from ..run.limits import needed_mib
-from ..run.program import exit_code_of
 from ..text import nearest
-from . import checking, free_running, inspecting, looking, play, plotting, running, top
 from .arguments import CommandParser
 
-__all__ = ["command_parser", "main"]
+__all__ = ["COMMANDS", "command_parser", "main"]
+
+
+COMMANDS: Final[Mapping[str, tuple[str, str]]] = {
+    "launch": ("running", "run a mesh: one process per node, and the master"),
+    "run": ("free_running", "run one FMU as a free-running node, without a file"),
+    "new": ("new_mesh", "write a configuration for FMUs, with suggested connections"),
+    "check": ("checking", "check a configuration and show its plan, without running it"),
+    "inspect": ("inspecting", "show the properties of an FMU, without running it"),
+    "schema": ("checking", "print the JSON Schema of configurations"),
+    "ls": ("looking", "list meshes, instances and variables"),
+    "status": ("looking", "show the state and progress of a mesh or an instance"),
+    "top": ("top", "show a live table of all instances of a mesh"),
+    "info": ("looking", "show information about a mesh or an instance"),
+    "get": ("looking", "show current values"),
+    "set": ("looking", "set an unconnected input or a tunable parameter"),
+    "watch": ("looking", "show every value of variables until the mesh ends"),
+    "logs": ("logs", "show the log messages of a mesh"),
+    "wait": ("steering", "wait until a mesh is running, or in another state"),
+    "pause": ("steering", "pause a mesh at a point"),
+    "resume": ("steering", "resume a paused mesh"),
+    "step": ("steering", "run a mesh for some points and pause it again"),
+    "stop": ("steering", "end the run of a mesh"),
+    "play": ("play", "play a recorded bag into the inputs of a mesh"),
+    "plot": ("plotting", "plot a result file"),
+    "node": ("running", "start one node manually"),
+    "master": ("running", "start the master and the recorder manually"),
+    "gateway": ("running", "start the gateway to ROS manually"),
+    "router": ("running", "run a Zenoh router"),
+    "completion": ("completion", "print the script that completes commands in a shell"),
+}
+"""All commands in the order of the help: the module that has it in `PARSERS`, and one line about it."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code (design, section 7)."""
-    parser, commands = command_parser()
-    options = _parsed(sys.argv[1:] if arguments is None else arguments, parser, commands)
-    if isinstance(options, ConfigurationError):
-        print(f"fmu-mesh: {options}", file=sys.stderr)
-        return options.exit_code
+    if "_ARGCOMPLETE" in os.environ:  # a shell asks how the line goes on
+        from .completion import complete  # noqa: PLC0415 only then
+
+        return complete(command_parser)
+    given = [*(sys.argv[1:] if arguments is None else arguments)]
+    try:
+        options = _parsed(given)
+    except ConfigurationError as error:
+        print(f"fmu-mesh: {error}", file=sys.stderr)
+        if "--json" in given:
+            from .output.json_output import print_failure  # noqa: PLC0415 only then
+
+            print_failure(error)
+        return error.exit_code
+    if options is None:
+        return ConfigurationError.exit_code
+    from ..run.program import exit_code_of  # noqa: PLC0415 not for `--version` and `--help`
+
+    needed = needed_mib(options.command, local=getattr(options, "local", False))
+    return exit_code_of(partial(_run, options), needed, debug=options.debug)
+
+
+def _run(options: argparse.Namespace) -> int:
+    """Run the command; with `--quiet` and without `--json`, nothing of what it prints is shown but errors."""
+    quiet = getattr(options, "quiet", False) and not getattr(options, "json", False)
+    with redirect_stdout(io.StringIO()) if quiet else nullcontext():
+        code: int = options.run_command(options)
+    return code
+
+
+def _parsed(given: Sequence[str]) -> argparse.Namespace | None:
+    """The command and its arguments; None, after the help, without a command.
+
+    Raises:
+        ConfigurationError: there is no such command, or an argument is wrong.
+    """
+    name = next((argument for argument in given if not argument.startswith("-")), None)
+    if name is not None and given[0] == name and name not in COMMANDS:
+        raise _unknown(name)
+    parser, commands = command_parser([] if name is None else [name])
+    options, others = parser.parse_known_args(given)
+    if others:
+        commands = command_parser()[1]  # all of them: another one may have the option
+        wrong = next((other for other in others if other.startswith("-")), others[0])
+        raise commands.get(options.command, parser).unknown(wrong, commands)
     if options.command is None:
         parser.print_help()
-        return ConfigurationError.exit_code
-    needed = needed_mib(options.command, local=getattr(options, "local", False))
-    return exit_code_of(partial(options.run_command, options), needed, debug=options.debug)
+        return None
+    return options
 
 
-def _parsed(
-    given: Sequence[str], parser: CommandParser, commands: Mapping[str, CommandParser]
-) -> argparse.Namespace | ConfigurationError:
-    """The command and its arguments, or the error in them."""
-    if given and not given[0].startswith("-") and given[0] not in commands:
-        return _unknown(given[0], commands)
-    options, others = parser.parse_known_args(given)
-    if not others:
-        return options
-    wrong = next((other for other in others if other.startswith("-")), others[0])
-    return commands.get(options.command, parser).unknown(wrong, commands)
-
-
-def _unknown(name: str, commands: Iterable[str]) -> ConfigurationError:
+def _unknown(name: str) -> ConfigurationError:
     """The error for a first argument that is not a command, such as a file."""
-    suffix = Path(name).suffix
-    near = nearest(name, commands)
+    suffix = PurePath(name).suffix
+    near = nearest(name, COMMANDS)
     if suffix in (".yaml", ".yml", ".fmu"):
         hint = f"Did you mean `fmu-mesh {'run' if suffix == '.fmu' else 'launch'} {name}`?"
     else:
@@ -57,8 +120,12 @@ def _unknown(name: str, commands: Iterable[str]) -> ConfigurationError:
     return ConfigurationError(f"there is no command '{name}'.", hint=hint)
 
 
-def command_parser() -> tuple[CommandParser, Mapping[str, CommandParser]]:
-    """The parser, and the parsers of all commands by name."""
+def command_parser(needed: Collection[str] = COMMANDS) -> tuple[CommandParser, Mapping[str, CommandParser]]:
+    """The parser, and the parsers of all commands by name.
+
+    Args:
+        needed: the commands whose arguments are needed; the modules of others are not imported.
+    """
     parser = CommandParser(
         prog="fmu-mesh",
         description="A service mesh for co-simulation: FMUs as Zenoh nodes under one master.",
@@ -66,10 +133,10 @@ def command_parser() -> tuple[CommandParser, Mapping[str, CommandParser]]:
         "4 a node or the master was lost, 130 interrupted.",
     )
     parser.add_argument("--version", action="version", version=f"fmu-mesh {__version__}")
-    common = argparse.ArgumentParser(add_help=False)
-    common.add_argument("--debug", action="store_true", help="show the traceback of an error")
-    parser.set_defaults(debug=False)
     commands: argparse._SubParsersAction[CommandParser] = parser.add_subparsers(dest="command", metavar="COMMAND")
-    for module in (running, free_running, checking, inspecting, looking, top, play, plotting):
-        module.add_commands(commands, common)
+    for name, (module, text) in COMMANDS.items():
+        command = commands.add_parser(name, help=text, description=f"{text[0].upper()}{text[1:]}.")
+        command.add_argument("--debug", action="store_true", help="show the traceback of an error")
+        if name in needed:
+            import_module(f".{module}", __package__).PARSERS[name](command)
     return parser, commands.choices

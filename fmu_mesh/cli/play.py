@@ -4,53 +4,49 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
 
 from ..errors import ConfigurationError
 from ..instances.configuration import load
 from ..ros.bags.bag import Bag, chosen_topics
 from ..ros.bags.playing import grid_of, play, schedule
 from ..wire.client.reaching import Meshes
-from .arguments import add_command, number
-from .looking import reaching
+from .arguments import CommandParser, Parsers, add_quiet, add_reaching, number
 
-__all__ = ["add_commands"]
+__all__ = ["PARSERS"]
 
 _TIMEOUT_S = 60.0
 
 
-def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.ArgumentParser) -> None:
-    """Add the command of this module."""
-    command = add_command(
-        commands, "play", "play a recorded bag into the inputs of a mesh", [common, reaching(_TIMEOUT_S)]
-    )
-    command.add_argument("bag", type=Path, metavar="BAG", help="an MCAP file, or the folder of a `ros2 bag`")
-    command.add_argument("mesh", nargs="?", metavar="MESH", help="name or key of the mesh; default: the only one")
-    command.add_argument(
+def _add_play(parser: CommandParser) -> None:
+    add_reaching(parser, _TIMEOUT_S)
+    add_quiet(parser)
+    parser.add_argument("bag", type=Path, metavar="BAG", help="an MCAP file, or the folder of a `ros2 bag`")
+    parser.add_argument("mesh", nargs="?", metavar="MESH", help="name or key of the mesh; default: the only one")
+    parser.add_argument(
         "--topic",
         action="append",
         default=[],
         metavar="TOPIC[:FIELD]=INSTANCE.VARIABLE",
         help="a topic and its input; repeatable; default: the topics that the mesh subscribes to",
     )
-    command.add_argument(
+    parser.add_argument(
         "--start", type=number, metavar="T", help="simulation time of the first message in s; default: its stamp"
     )
-    command.add_argument(
+    parser.add_argument(
         "--stamps",
         choices=("header", "log"),
         default="header",
         help="use header stamps where messages have them, or log times (header)",
     )
-    command.add_argument(
+    parser.add_argument(
         "--config", type=Path, metavar="CONFIG", help="the configuration, if that of the mesh is not on this host"
     )
-    command.set_defaults(run_command=_play)
+    parser.set_defaults(run_command=_play)
 
 
 def _play(arguments: argparse.Namespace) -> int:
     with Bag(arguments.bag) as bag, Meshes(arguments.connect, arguments.timeout) as meshes:
-        client = meshes.named(arguments.mesh) if arguments.mesh is not None else meshes.one(None)
+        client = meshes.named(arguments.mesh)
         mesh = client.info()
         infos = {name: client.instance_info(name) for name in mesh.instances}
         loaded = load(arguments.config or Path(mesh.config))
@@ -81,3 +77,6 @@ def _nothing(arguments: argparse.Namespace, names: str, beyond: int) -> Configur
             hint="Say when the first one is: --start 0.",
         )
     return ConfigurationError(f"there is no message of {names} in '{arguments.bag}'.")
+
+
+PARSERS: Parsers = {"play": _add_play}

@@ -6,29 +6,27 @@ import argparse
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 from ..api.drawing import draw, require_matplotlib
 from ..api.result import Result
 from ..api.result_reading import require_csv
 from ..errors import ConfigurationError, FmuMeshError
 from ..system.plan import Plan
-from .arguments import add_command
+from .arguments import CommandParser, Parsers, add_quiet
 
-__all__ = ["add_commands", "check_plot", "plot_results", "plotted_where_it_ends"]
+__all__ = ["PARSERS", "check_plot", "plot_results", "plotted_where_it_ends"]
 
 
-def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.ArgumentParser) -> None:
-    """Add the command of this module."""
-    plot = add_command(commands, "plot", "plot a result file", [common])
-    plot.add_argument("results", type=Path, metavar="RESULTS.csv", help="the result file")
-    plot.add_argument(
+def _add_plot(parser: CommandParser) -> None:
+    parser.add_argument("results", type=Path, metavar="RESULTS.csv", help="the result file")
+    parser.add_argument(
         "--output", type=Path, metavar="FILE.png", help="file of the picture; default: beside the result file"
     )
-    plot.add_argument(
+    parser.add_argument(
         "--variables", nargs="+", metavar="INSTANCE.VARIABLE", help="plot only these; default: all of the file"
     )
-    plot.set_defaults(run_command=_plot)
+    add_quiet(parser)
+    parser.set_defaults(run_command=_plot)
 
 
 def _plot(arguments: argparse.Namespace) -> int:
@@ -89,3 +87,6 @@ def _state_of(result: str | None) -> tuple[int, int, int] | None:
         return None
     status = Path(result).stat()
     return status.st_ino, status.st_size, status.st_mtime_ns
+
+
+PARSERS: Parsers = {"plot": _add_plot}

@@ -8,7 +8,6 @@ import sys
 import threading
 from pathlib import Path
 from types import FrameType
-from typing import Any
 
 from msgspec.structs import replace
 
@@ -25,61 +24,74 @@ from ..run.roles import run_master, run_node
 from ..run.run_plan import RunPlan
 from ..system.plan import Plan
 from ..wire.session import run_router
-from .arguments import add_command, add_options, count, endpoint, read_options
-from .output.display import Display, say, stdout_as_stderr, summary, warn
+from .arguments import CommandParser, Parsers, add_json, add_quiet, count, endpoint
+from .output.display import Display, say, stdout_as_stderr, summary, teller, warn
 from .output.profile_table import show_profile
+from .output.reports import RunReporter
 from .plotting import check_plot, plot_results, plotted_where_it_ends
+from .run_options import add_configuration, add_options, read_options
 
-__all__ = ["add_commands", "finish", "run_launcher"]
+__all__ = ["PARSERS", "add_output", "finish", "run_launcher"]
 
 
-def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.ArgumentParser) -> None:
-    """Add the commands of this module."""
-    launch = add_command(commands, "launch", "run a mesh: one process per node, and the master", [common])
-    _add_config(launch, "paused", "allow_code", "view", "video", "profile")
-    launch.add_argument("--local", action="store_true", help="run everything in this one process")
-    launch.add_argument("--plot", type=Path, metavar="FILE.png", help="plot the result at the end")
-    launch.add_argument(
+def _add_launch(parser: CommandParser) -> None:
+    add_configuration(parser)
+    add_options(parser, "paused", "view", "video", "profile")
+    parser.add_argument("--local", action="store_true", help="run everything in this one process")
+    _add_plot(parser)
+    parser.add_argument(
         "--restarts",
         type=count,
         default=0,
         metavar="N",
         help="restart from the first point when a node or the master is lost, at most N times",
     )
-    launch.add_argument("--no-progress", action="store_true", help="no progress line")
-    launch.set_defaults(run_command=_launch)
+    add_output(parser)
+    add_json(parser, "print the outcome as one JSON object, and nothing else on standard output")
+    parser.set_defaults(run_command=_launch)
 
-    node = add_command(commands, "node", "start one node manually", [common])
-    _add_config(node, "allow_code", "view", "video")
-    node.add_argument("node", metavar="INSTANCE", help="name of the instance, or of its group")
-    node.set_defaults(run_command=_node)
 
-    master = add_command(commands, "master", "start the master and the recorder manually", [common])
-    _add_config(master, "paused", "allow_code", "profile")
-    master.add_argument("--plot", type=Path, metavar="FILE.png", help="plot the result at the end")
-    master.add_argument("--no-progress", action="store_true", help="no progress line")
-    master.set_defaults(run_command=_master)
+def _add_node(parser: CommandParser) -> None:
+    add_configuration(parser)
+    add_options(parser, "view", "video")
+    parser.add_argument("node", metavar="INSTANCE", help="name of the instance, or of its group")
+    parser.set_defaults(run_command=_node)
 
-    gateway = add_command(commands, "gateway", "start the gateway to ROS manually", [common])
-    _add_config(gateway, "allow_code")
-    gateway.set_defaults(run_command=_gateway)
 
-    router = add_command(commands, "router", "run a Zenoh router", [common])
-    router.add_argument(
+def _add_master(parser: CommandParser) -> None:
+    add_configuration(parser)
+    add_options(parser, "paused", "profile")
+    _add_plot(parser)
+    add_output(parser)
+    parser.set_defaults(run_command=_master)
+
+
+def _add_gateway(parser: CommandParser) -> None:
+    add_configuration(parser)
+    add_quiet(parser)
+    parser.set_defaults(run_command=_gateway)
+
+
+def _add_router(parser: CommandParser) -> None:
+    parser.add_argument(
         "--listen",
         type=endpoint,
         action="append",
         metavar="ENDPOINT",
         help="endpoint where others can connect; repeatable; default: tcp/127.0.0.1:7447",
     )
-    router.set_defaults(run_command=_router)
+    add_quiet(parser)
+    parser.set_defaults(run_command=_router)
 
 
-def _add_config(parser: argparse.ArgumentParser, *options: str) -> None:
-    parser.add_argument("config", type=Path, metavar="CONFIG", help="the configuration file")
-    instead = parser.add_argument_group("instead of what CONFIG says")
-    add_options(instead, "window", "start_values", "real_time_factor", "output", "listen", "connect")
-    add_options(parser, *options)
+def _add_plot(parser: CommandParser) -> None:
+    parser.add_argument("--plot", type=Path, metavar="FILE.png", help="plot the result at the end")
+
+
+def add_output(parser: CommandParser) -> None:
+    """Add the flags for what a run prints."""
+    parser.add_argument("--no-progress", action="store_true", help="no progress line")
+    add_quiet(parser)
 
 
 def _options(arguments: argparse.Namespace) -> Options:
@@ -95,6 +107,21 @@ def _options(arguments: argparse.Namespace) -> Options:
 
 
 def _launch(arguments: argparse.Namespace) -> int:
+    with RunReporter(wanted=arguments.json) as reporter:
+        run = _planned(arguments, _launch_options(arguments))
+        with (
+            plotted_where_it_ends(run.plan, arguments.plot),
+            Display(run.plan, show_progress=not arguments.no_progress, quiet=arguments.quiet) as display,
+        ):
+            if arguments.local:
+                outcome = _run_local(run, display, reporter)
+            else:
+                outcome = _run_processes(run, arguments.restarts, display, reporter)
+        finish(run.plan, outcome, arguments)
+    return 0
+
+
+def _launch_options(arguments: argparse.Namespace) -> Options:
     options = _options(arguments)
     if arguments.local and options.paused:
         raise ConfigurationError("--paused is for a mesh that others can reach, and --local has none of it.")
@@ -103,30 +130,24 @@ def _launch(arguments: argparse.Namespace) -> int:
     if arguments.restarts and (arguments.local or options.paused):
         other = "--local" if arguments.local else "--paused"
         raise ConfigurationError(f"--restarts and {other} do not go together", hint="Leave one of them out.")
-    run = _planned(arguments, options)
-    with (
-        plotted_where_it_ends(run.plan, arguments.plot),
-        Display(run.plan, show_progress=not arguments.no_progress) as display,
-    ):
-        outcome = _run_local(run, display) if arguments.local else _run_processes(run, arguments.restarts, display)
-    finish(run.plan, outcome, arguments)
-    return 0
+    return options
 
 
 def _planned(arguments: argparse.Namespace, options: Options) -> RunPlan:
     """Plan the run of a command, and check what it shows at the end."""
-    run = plan_run(arguments.config, options, say)
-    warn(run.plan)
+    run = plan_run(arguments.config, options, teller(quiet=arguments.quiet))
+    if not arguments.quiet:
+        warn(run.plan)
     if arguments.plot is not None:
         check_plot(arguments.plot, run.plan.system.result_file)
     return run
 
 
-def _run_processes(run: RunPlan, most_restarts: int, display: Display) -> Outcome:
+def _run_processes(run: RunPlan, most_restarts: int, display: Display, reporter: RunReporter) -> Outcome:
     """Run the mesh; if a process of it is lost, run it again from its first point, as often as `--restarts` allows."""
     while True:
         try:
-            return run_launcher(Launcher(run, display.event))
+            return run_launcher(Launcher(run, display.event), run, reporter)
         except MeshLost as error:
             if run.restarts == most_restarts or type(error) is not MeshLost:
                 raise
@@ -135,8 +156,9 @@ def _run_processes(run: RunPlan, most_restarts: int, display: Display) -> Outcom
             say(str(error.instead_of_hint(again)))
 
 
-def run_launcher(launcher: Launcher | InProcessRun) -> Outcome:
+def run_launcher(launcher: Launcher | InProcessRun, run: RunPlan, reporter: RunReporter) -> Outcome:
     """Run it; Ctrl-C and SIGTERM end the run instead of this process."""
+    reporter.started(run, launcher)
 
     def interrupt(_number: int, _frame: FrameType | None) -> None:
         launcher.interrupt()
@@ -149,9 +171,9 @@ def run_launcher(launcher: Launcher | InProcessRun) -> Outcome:
             signal.signal(number, handler)
 
 
-def _run_local(run: RunPlan, display: Display) -> Outcome:
+def _run_local(run: RunPlan, display: Display, reporter: RunReporter) -> Outcome:
     with stdout_as_stderr():
-        outcome = run_launcher(InProcessRun(run, display.event))
+        outcome = run_launcher(InProcessRun(run, display.event), run, reporter)
     display.event(outcome)
     return outcome
 
@@ -178,7 +200,9 @@ def _master(arguments: argparse.Namespace) -> int:
     run = _planned(arguments, _options(arguments))
     with (
         plotted_where_it_ends(run.plan, arguments.plot),
-        Display(run.plan, show_progress=not arguments.no_progress, waits_for_nodes=False) as display,
+        Display(
+            run.plan, show_progress=not arguments.no_progress, quiet=arguments.quiet, waits_for_nodes=False
+        ) as display,
     ):
         outcome = run_master(run, display.event)
     finish(run.plan, outcome, arguments)
@@ -202,3 +226,12 @@ def _router(arguments: argparse.Namespace) -> int:
         stop.wait()
     sys.stdout.flush()
     return 0
+
+
+PARSERS: Parsers = {
+    "launch": _add_launch,
+    "node": _add_node,
+    "master": _add_master,
+    "gateway": _add_gateway,
+    "router": _add_router,
+}

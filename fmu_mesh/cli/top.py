@@ -10,7 +10,7 @@ import argparse
 import shutil
 import sys
 from collections.abc import Sequence
-from typing import Any, Final
+from typing import Final
 
 import msgspec
 
@@ -18,13 +18,13 @@ from ..errors import DeadlineExceeded, Interrupted
 from ..wire.client.mesh_client import MeshClient
 from ..wire.client.reaching import Meshes
 from ..wire.views import InstanceStatus, MeshStatus
-from .arguments import add_command, positive_seconds
-from .looking import reaching
+from .arguments import CommandParser, Parsers, add_json, add_reaching, positive_seconds
 from .output.pages import progress, seconds
 from .output.screen import Screen
 from .output.tables import shortened, table, width_of
+from .output.terminal import may_draw
 
-__all__ = ["add_commands", "page"]
+__all__ = ["PARSERS", "page"]
 
 _INTERVAL_S = 1.0
 _HEADING = ["instance", "state", "point", "time", "step time", "wait", "points/s", "factor", "restarts", "activity"]
@@ -38,21 +38,20 @@ _DISPENSABLE: Final = ("time", "factor", "restarts", "state")
 Look = tuple[MeshStatus, dict[str, InstanceStatus]]
 
 
-def add_commands(commands: argparse._SubParsersAction[Any], common: argparse.ArgumentParser) -> None:
-    """Add the command of this module."""
-    top = add_command(commands, "top", "show a live table of all instances of a mesh", [common, reaching()])
-    top.add_argument("mesh", nargs="?", metavar="MESH", help="name or key of the mesh, if there are several")
-    top.add_argument("--once", action="store_true", help="show it once and exit")
-    top.add_argument(
+def _add_top(parser: CommandParser) -> None:
+    add_reaching(parser)
+    parser.add_argument("mesh", nargs="?", metavar="MESH", help="name or key of the mesh; default: the only one")
+    parser.add_argument("--once", action="store_true", help="show it once and exit")
+    parser.add_argument(
         "--interval", type=positive_seconds, default=_INTERVAL_S, metavar="S", help="time between two looks in s (1)"
     )
-    top.add_argument("--json", action="store_true", help="JSON, one object per look")
-    top.set_defaults(run_command=_top)
+    add_json(parser, "JSON, one object per look")
+    parser.set_defaults(run_command=_top)
 
 
 def _top(arguments: argparse.Namespace) -> int:
     with Meshes(arguments.connect, arguments.timeout) as meshes:
-        client = meshes.named(arguments.mesh) if arguments.mesh is not None else meshes.one(None)
+        client = meshes.named(arguments.mesh)
         if arguments.once:
             _show_once(client.all_status(), as_json=arguments.json)
             return 0
@@ -72,7 +71,7 @@ def _show_once(look: Look, *, as_json: bool) -> None:
 
 def _follow(client: MeshClient, interval_s: float, *, as_json: bool) -> int:
     """Look again and again until the mesh ends, or `q`; where there is no terminal, one table after the other."""
-    with Screen(drawn=sys.stdout.isatty() and not as_json) as screen, client.until_end(screen.wake) as ended:
+    with Screen(drawn=may_draw(sys.stdout) and not as_json) as screen, client.until_end(screen.wake) as ended:
         before: Look | None = None
         while not ended.is_set():
             try:
@@ -173,3 +172,6 @@ def _row(own: InstanceStatus, before: InstanceStatus | None, step_size: float) -
         str(own.restarts),
         own.activity.replace(f" at point {own.point}", "", 1),
     ]
+
+
+PARSERS: Parsers = {"top": _add_top}

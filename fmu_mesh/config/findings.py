@@ -47,7 +47,7 @@ class Findings:
         if any(_same_place(path, settled) for settled in self._settled):
             return
         self._places.add(path)
-        option = self._replaced.get(path)
+        option = self._option(path)
         line = None if option is not None or path.startswith("--") else locate(self._lines, path)
         self._items.append(Finding(self._file, option or path, found, expected, suggestion, line))
 
@@ -68,6 +68,10 @@ class Findings:
     def line(self, path: str) -> int | None:
         """The line of ``path``, or of the innermost part of the file around it that has one."""
         return locate(self._lines, path)
+
+    def _option(self, path: str) -> str | None:
+        """The option that replaced the value at ``path``, or a part of the file around it, such as a whole section."""
+        return self._replaced.get(max((own for own in self._replaced if _is_inside(path, own)), key=len, default=""))
 
     def __len__(self) -> int:
         return len(self._items)
@@ -98,5 +102,9 @@ def locate(lines: Mapping[str, int], path: str) -> int | None:
 
 def _same_place(path: str, other: str) -> bool:
     """Whether one of two paths is equal to the other one or inside it."""
-    short, long = sorted((path, other), key=len)
-    return long.startswith(short) and long[len(short) : len(short) + 1] in ("", ".", "[")
+    return _is_inside(path, other) or _is_inside(other, path)
+
+
+def _is_inside(path: str, outer: str) -> bool:
+    """Whether a path is equal to another one, or inside it."""
+    return path.startswith(outer) and path[len(outer) : len(outer) + 1] in ("", ".", "[")

@@ -52,12 +52,14 @@ class PlainConfig(NamedTuple):
         file: relative paths and findings refer to it; a configuration that a program has made has no such file.
         lines: line numbers, counted from 1, by path in the file; empty without a file.
         findings: what is wrong with the text, such as a key that stands there twice.
+        overrides: the option that replaced a value, by path in the file.
     """
 
     data: Plain
     file: Path
     lines: dict[str, int] = {}
     findings: tuple[Finding, ...] = ()
+    overrides: dict[str, str] = {}
 
 
 class LoadedConfig(msgspec.Struct, frozen=True):
@@ -100,7 +102,8 @@ def load(path: Path, overrides: Sequence[str], kinds: Kinds) -> LoadedConfig:
     """Read a configuration file.
 
     Example:
-        >>> load(Path("configs/pendulum_delay.yaml"), ["pendulum.l=2"]).config.mesh
+        >>> from fmu_mesh.instances.registry import KINDS
+        >>> load(Path("configs/pendulum_delay.yaml"), ["pendulum.l=2"], KINDS).config.mesh
         'pendulum_delay'
 
     Args:
@@ -167,8 +170,8 @@ def read_text(text: str, path: Path) -> PlainConfig:
 
 def examine_data(plain: PlainConfig, overrides: Sequence[str], kinds: Kinds) -> tuple[LoadedConfig, Findings]:
     """As `examine`, for values that were read before, or that a program has made."""
-    data, path, lines, first = plain
-    replaced: dict[str, str] = {}
+    data, path, lines, first, replaced = plain
+    replaced = dict(replaced)
     findings = Findings(str(path), lines, replaced, first)
     sections = kinds.own()
     if isinstance(data, dict):

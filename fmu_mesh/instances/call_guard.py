@@ -34,6 +34,7 @@ __all__ = [
     "ENDED",
     "CallWatch",
     "Guarded",
+    "Unwatched",
     "call_named",
     "current_function",
     "floating_point_changed",
@@ -134,9 +135,12 @@ class CallWatch:
     """Watches the calls of one thread; reports a call that misses its deadline on another thread.
 
     Example:
-        >>> with closing(CallWatch(report)) as watch:
-        ...     with watch.calling("pendulum", StepFailed, "step", 30.0):
-        ...         fmu.enterEventMode()  # after 30 s, `report` gets an error that names this function
+        >>> reported = threading.Event()
+        >>> watch = CallWatch(lambda error: reported.set())
+        >>> with watch.calling("pendulum", StepFailed, "step", 0.01):
+        ...     reported.wait(10)  # as long as a call of an FMU that does not return
+        True
+        >>> watch.close()
 
     Args:
         on_overrun: called with the error, which says the instance, the call and the point. The watched thread is still
@@ -226,6 +230,26 @@ class CallWatch:
         )
 
 
+class Unwatched:
+    """Takes the place of a `CallWatch` in a program that is not ours to end: no call has a deadline.
+
+    Between two steps this restores only the floating-point mode: the rest takes longer than a step.
+    """
+
+    @contextmanager
+    def calling(self, _instance: str, kind: type[FmuError], _setting: str, _limit_s: float) -> Iterator[None]:
+        """Around one call of an FMU."""
+        if kind is not StepFailed:
+            with kept_state():
+                yield
+            return
+        try:
+            yield
+        finally:
+            if floating_point_changed():
+                restore_floating_point()
+
+
 def current_function(thread: int) -> str | None:
     """The FMI function that a thread is in; None if it is in none, or in one of the compiled calls of a step."""
     return _functions.get(thread)
@@ -279,14 +303,16 @@ class Guarded(AroundInstance[Instance]):
     Args:
         name: instance name.
         open_: makes the instance; a call with a deadline like the others.
-        watch: watches the deadlines.
+        watch: watches the deadlines, or does not.
         timeouts: the deadlines.
 
     Attributes:
         do_step: that of the inner instance: `CallWatch.stepping` watches the steps.
     """
 
-    def __init__(self, name: str, open_: Callable[[], Instance], watch: CallWatch, timeouts: TimeoutsConfig) -> None:
+    def __init__(
+        self, name: str, open_: Callable[[], Instance], watch: CallWatch | Unwatched, timeouts: TimeoutsConfig
+    ) -> None:
         self._name = name
         self._watch = watch
         self._timeouts = timeouts

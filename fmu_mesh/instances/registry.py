@@ -77,7 +77,9 @@ def decode_section(type_: type, value: object) -> object:
     """The `dec_hook` of msgspec for what holds an `InstanceSection`: its tag says which kind decodes it.
 
     Example:
-        ``msgspec.json.decode(data, type=NodePlan, dec_hook=decode_section)``
+        >>> received = '{"@kind": "fmu", "fmu": "fmus/Gain.fmu"}'
+        >>> msgspec.json.decode(received, type=InstanceSection, dec_hook=decode_section).fmu
+        'fmus/Gain.fmu'
 
     Raises:
         ConfigurationError: no installed kind has this tag.

@@ -1,1 +1,1 @@
-"""The master: it lets the nodes step, watches them, and ends the run."""
+"""The master: grants points to the nodes, watches them, and ends the run."""

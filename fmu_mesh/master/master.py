@@ -1,11 +1,11 @@
-"""The master: readiness, grants, and the end of a run.
+"""The master: starts a run, grants points, and ends the run.
 
 ::
 
     wait until every node has registered; answer them all        (ready/ack)
     wait until every node is at point 0                          (Initialization Mode is over)
     until every node is at the last point, or at the one where an FMU asked to end the simulation:
-        grant = min(progress + window)                           (less where the wall clock or a pause holds it back)
+        grant = min(progress + window)                           (less if the wall clock or a pause limits it)
         publish the grant if it grew; wait for progress
     tell the nodes to finish; wait for their reports
 
@@ -60,7 +60,7 @@ class MasterSettings(msgspec.Struct, frozen=True):
         endpoints: where tools can reach this process, for `mesh/info`.
         config_file: name of the configuration file, for `mesh/info`.
         launch: the launcher that started this process; None if it was started manually.
-        profile: whether the nodes measure themselves, and the master what holds the grant.
+        profile: whether nodes measure their time, and the master what limits the grant.
         paused: whether the run begins paused at its first point.
     """
 
@@ -76,14 +76,14 @@ class Master:
 
     Args:
         plan: the plan of the whole mesh.
-        session: the session of this process; stays the caller's.
-        events: who is told what happens.
+        session: the session of this process; the caller closes it.
+        events: gets the status and the log messages of the run.
         settings: how the mesh is run.
         router: the link to the router that connects the nodes, if there is one.
 
     Attributes:
-        ended_by: what ended the simulation before its last point although nothing failed: an FMU that asked for it, or
-            `stop` where there is no stop time.
+        ended_by: why the simulation ended before its last point without a failure: an FMU asked for it, or there was a
+            `stop` and no stop time.
 
     Call `claim`, then `run` once, from the main thread, then `wait_for_followers` if it went well, then `close`.
     """
@@ -107,7 +107,7 @@ class Master:
         self._router = router or RouterLink(session)
         self._nodes = list(plan.nodes)
         self._numbers = {node: number for number, node in enumerate(self._nodes)}
-        # A slower instance tells the point up to which its outputs hold: its next own step less one.
+        # The progress of a slower instance is the point up to which its outputs hold: its next own point minus one.
         self._most_ahead = 2 * max(item.step_points for item in plan.system.instances.values()) - 2
         self._windows = [plan.nodes[node].window for node in self._nodes]
         self._most_instances = max(len(node.instances) for node in plan.nodes.values())
@@ -127,7 +127,7 @@ class Master:
         self._published = 0.0
         self._moved = time.monotonic()
         shares = config.zenoh.shared_memory and available()
-        # It is looked at closely only where nodes wait for every single grant.
+        # Polling before sleeping is useful only if nodes wait for every single grant.
         self._inbox = Inbox(SharedInbox(dict.fromkeys(self._nodes, 0), spins=plan.window == 1) if shares else None)
         senders = {self._run_keys.progress(node): node for node in self._nodes}
         capacity = (plan.window + 64) * len(self._nodes) + 1024
@@ -139,10 +139,10 @@ class Master:
         self._publish_status = self._server.publish_status
 
     def claim(self) -> None:
-        """Be the master of this mesh, and let it be seen; from now on questions wait until `run` answers them.
+        """Become the visible master of this mesh; from now on queries wait until `run` answers them.
 
         Raises:
-            ConfigurationError: another process is, there where this session connects to; it notices nothing.
+            ConfigurationError: another process that this session can reach is the master; it is not affected.
         """
         self._router.wait()
         self._token = self._session.liveliness().declare_token(self._run_keys.master)
@@ -150,7 +150,7 @@ class Master:
         if others:
             self._token.undeclare()
             raise ConfigurationError(
-                f"mesh '{self._keys.mesh}' runs already where this one connects to",
+                f"mesh '{self._keys.mesh}' is already running where this master connects",
                 hint="Stop it first, or give this mesh another name or another `zenoh.key_prefix`.",
             )
         self._declare()
@@ -160,7 +160,7 @@ class Master:
         """Run the mesh to its last point.
 
         Raises:
-            FmuMeshError: what ended the run early; all nodes have been told.
+            FmuMeshError: why the run ended early; all nodes have been informed.
         """
         try:
             self._wait_for_nodes()
@@ -187,7 +187,7 @@ class Master:
             self._token.undeclare()
 
     def wait_for_followers(self) -> None:
-        """Stay, as the router, until those that need the last sample have it."""
+        """Wait, because this process routes messages, until all followers have the last sample."""
         if self._failure is None:
             self._followers.wait(self._timeouts.stop)
 
@@ -204,11 +204,11 @@ class Master:
 
     @property
     def seconds(self) -> float:
-        """Wall-clock time from the first grant to the last point in s, pauses left out."""
+        """Wall-clock time from the first grant to the last point in s, without pauses."""
         return self._clock.elapsed()
 
     def profile(self) -> MeshProfile | None:
-        """What the nodes that ended well have measured; None if nothing was measured."""
+        """What the nodes without a failure have measured; None if nothing was measured."""
         if self._watch is None:
             return None
         reports = [self._reports[node] for node in self._nodes if node in self._reports]
@@ -221,7 +221,7 @@ class Master:
     # --- phases
 
     def _enter(self, state: MeshState) -> None:
-        """Be in another state; those who wait for it are told at once."""
+        """Change the state, and publish it at once."""
         self._state = state
         self._publish_status(at_once=True)
 
@@ -241,7 +241,7 @@ class Master:
         self._enter("paused" if self._settings.paused else "running")
         self._pacer.start(0)
         self._moved = time.monotonic()
-        # Each of them has its own deadline for a step; the instances of a group take theirs one after the other.
+        # Each instance has its own deadline for a step; the instances of a group step one after the other.
         patience_s = 3 * self._timeouts.step * self._most_instances
         while self._slowest < self._last_point:
             self._turn(self._publish_grant())
@@ -258,7 +258,7 @@ class Master:
         self._clock.stop()
 
     def _publish_grant(self) -> float:
-        """Publish the grant if it may grow; returns how long to wait for the next look, in s."""
+        """Publish the grant if it can be increased; return how long to wait until the next check, in s."""
         credit = min(map(operator.add, self._progress, self._windows))
         ahead = min(self._progress[number] for number in self._stepping)
         credit = min(credit, ahead + self._reach.points(ahead, time.monotonic()))
@@ -271,7 +271,7 @@ class Master:
             self._watch.look(self._holder(credit, grant))
         if grant > self._grant:
             now = time.monotonic()
-            if self._slowest >= self._grant:  # they had nothing to do until now: the wall clock held them
+            if self._slowest >= self._grant:  # they had nothing to do until now, because of the wall clock
                 self._moved = now
             self._grant = grant
             self._members.grant(grant)
@@ -279,14 +279,14 @@ class Master:
         return min(pause, STATUS_S, self._heartbeat_s)
 
     def _send_grant_as_sign_of_life(self) -> None:
-        """The same grant to all, so that those who wait for a slow FMU of another one know that the master lives."""
+        """Send the same grant again: nodes that wait for a slow FMU elsewhere then know that the master lives."""
         now = time.monotonic()
         if now - self._published >= self._heartbeat_s:
             self._published = now
             self._send(GRANT, self._grant)
 
     def _holder(self, credit: int, grant: int) -> str | None:
-        """What keeps the grant from growing, for a profile."""
+        """What limits the grant at present, for a profile."""
         if grant == self._last_point:
             return None
         if grant < credit:
@@ -314,7 +314,7 @@ class Master:
             self._turn(min(0.1, self._heartbeat_s))
 
     def _turn(self, timeout_s: float) -> None:
-        """Take what arrived, at least one message if one comes within ``timeout_s`` seconds.
+        """Handle all messages that have arrived; wait up to ``timeout_s`` seconds for the first one.
 
         Raises:
             FmuMeshError: a node failed or was lost.
@@ -323,7 +323,7 @@ class Master:
         while message is not None:
             moved = self._take_progress(*message) or moved
             message = self._inbox.poll()
-        if moved:  # whoever it was: the slowest may be the last of a row of slow ones
+        if moved:  # whichever it is: the slowest node may wait for another slow one
             self._slowest = min(self._progress)
             self._moved = time.monotonic()
         self._publish_status()
@@ -331,9 +331,9 @@ class Master:
             raise self._failure
 
     def _take_progress(self, node: str, kind: int, _link: int, _count: int, point: int, _data: bytes) -> bool:
-        """A message of a node; whether the node has moved."""
+        """Store the progress of a node; return whether it has increased."""
         if kind != PROGRESS:
-            self._inbox.refusals.add(spoken(node), f"a message of kind {kind} is nothing that the master takes")
+            self._inbox.refusals.add(spoken(node), f"a message of kind {kind} is not one that the master accepts")
             return False
         if not self._may_be_at(node, point):
             self._fail(self._broken(node, f"is at point {point}"))
@@ -367,10 +367,10 @@ class Master:
         node = RunKeys.node_in(str(query.key_expr))
         report = decode_json(payload_of(query), NodeReport)
         if report.node != node or not self._members.is_admitted(node):
-            raise MessageRefused("it is from no node that has registered")
+            raise MessageRefused("its sender has not registered")
         error = from_report(report.error) if report.error is not None else None
         if isinstance(error, TerminationRequested):
-            # Its node goes on with its other instances, and says so once more at the end.
+            # Its node continues with its other instances, and reports this again at the end.
             if error.point is None or not self._may_be_at(node, error.point):
                 self._fail(self._broken(node, f"has an FMU that ends the simulation at point {error.point}"))
             elif error.point < self._last_point:
@@ -385,7 +385,7 @@ class Master:
         query.drop()
 
     def _may_be_at(self, node: str, point: int) -> bool:
-        """Whether a node can have come there with what it was granted."""
+        """Whether a node can have reached this point with its grants."""
         ended = self.ended_by is not None and node != RECORDER
         most = self._plan.grid.last_point if ended else self._grant + self._most_ahead
         return -1 <= point <= most
@@ -394,14 +394,14 @@ class Master:
         return ProtocolBroken(
             f"{spoken(node)} says that it {what}, and the master has granted point {self._grant}",
             instance=self._instances_of(node),
-            hint="Does somebody else send in its name?",
+            hint="Does another process send messages with its name?",
         )
 
     def _instances_of(self, node: str) -> str | None:
         return ", ".join(item.name for item in self._plan.nodes[node].instances) or None
 
     def _lose(self, node: str) -> None:
-        """The process of a node is gone; whoever has reported may go."""
+        """The process of a node is gone; this is an error unless the node has reported its end."""
         if node in self._reports:
             return
         point = max(self._progress[self._numbers[node]], 0)
@@ -418,9 +418,9 @@ class Master:
         )
 
     def _command(self, query: zenoh.Query) -> None:
-        """pause, resume, step N and stop; the grant is all that they move."""
+        """Handle pause, resume, step N and stop, which only change the grant."""
         if query.payload is None and str(query.key_expr) != self._keys.mesh_key("command"):
-            query.drop()  # somebody looks at all keys
+            query.drop()  # a query for all keys
             return
         data = payload_of(query)
         try:
@@ -450,7 +450,7 @@ class Master:
         query.drop()
 
     def _stop(self) -> None:
-        """End the run: at the point that is granted where it has no other end, and otherwise as an interruption."""
+        """End the run: at the granted point if it has no stop time, otherwise as an interruption."""
         grid, self._hold = self._plan.grid, None
         if grid.stop_time is not None:
             text = f"stopped by a command before its stop time of {grid.stop_time:.12g} s"

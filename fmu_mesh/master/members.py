@@ -1,6 +1,6 @@
-"""The members of a mesh, as its master sees them: who is there, who has registered, and how each node is reached.
+"""The members of a mesh for its master: which nodes are present and registered, and how each node is reached.
 
-Owns the master's end of `fmu_mesh.wire.membership`. Knows nothing of points and progress; called on the main thread.
+Owns the master's part of `fmu_mesh.wire.membership`. Knows nothing of points and progress; called on the main thread.
 """
 
 from __future__ import annotations
@@ -33,17 +33,17 @@ class Members:
 
     Args:
         plan: the plan of the whole mesh.
-        session: the session of this process; stays the caller's.
-        keys: those of the run.
+        session: the session of this process; the caller closes it.
+        keys: the keys of the run.
         inbox: the inbox of the master.
         on_lost: called with the name of a node whose process is gone.
-        launch: the launcher that started this process; None where it was started by hand.
+        launch: the launcher that started this process; None if it was started manually.
 
     Attributes:
-        shared: who gets all messages through shared memory: names of nodes, `@mesh` for the master.
+        shared: the participants that get all messages through shared memory: names of nodes, `@mesh` for the master.
 
-    Call sequence: `register`, `ready` and `token_changed` with what arrives; `welcome` once all are `complete`; from
-    then on `send`. `abort` may come at any time, `close` at the end.
+    Call sequence: `register`, `ready` and `token_changed` for messages that arrive; `welcome` when `complete` is true;
+    then `send`. `abort` may be called at any time, `close` at the end.
     """
 
     def __init__(  # noqa: PLR0913, PLR0917  the run and what it is reached by
@@ -80,7 +80,7 @@ class Members:
         self._stepping = self._senders
 
     def register(self, query: zenoh.Query) -> None:
-        """Admit a node, or refuse one that does not belong here: nobody but itself notices.
+        """Admit a node, or refuse one that is not part of this run; the run is not affected.
 
         Raises:
             MessageRefused: it is no registration.
@@ -96,7 +96,7 @@ class Members:
                 self._refused.append(reason)
                 log.info("node_refused", extra={"reason": reason})
                 query.reply_err(reason)
-        # What another launch has started gets no answer: it is for its own master to tell it.
+        # A process of another launch gets no answer here: its own master answers it.
         query.drop()
 
     def _reason_against(self, registration: Registration) -> str | None:
@@ -106,7 +106,7 @@ class Members:
         if registration.digest != self._plan.digest:
             what = difference(self._plan.digest, registration.digest, self._plan.system.instances)
             return f"node '{node}' ({where}) has {what}, not that of the master"
-        # Who asks again, because no answer came, is the same.
+        # The same node may ask again if it got no answer.
         if self._admitted.get(node, registration) != registration:
             return f"node '{node}' is there already; two processes run it"
         return None
@@ -116,15 +116,15 @@ class Members:
         return node in self._admitted
 
     def ready(self, query: zenoh.Query) -> None:
-        """Take that a node is ready, which is answered by `welcome`.
+        """Store that a node is ready; `welcome` answers it.
 
         Raises:
-            MessageRefused: it is none, or not of a node of this run.
+            MessageRefused: it is no such message, or not of a node of this run.
         """
         node = RunKeys.node_in(str(query.key_expr))
         data = payload_of(query)
         if node not in self._admitted or node in self._ready:
-            raise MessageRefused("it is from no node that has registered")
+            raise MessageRefused("its sender has not registered")
         ready = decode_json(data, NodeReady)
         outlet = SharedOutlet.open(ready.offer, MASTER, spoken(node), self._inbox.stash, self._timeouts.step)
         if outlet is not None and self._inbox.offer is not None:
@@ -132,7 +132,7 @@ class Members:
         self._ready[node] = (ready, query)
 
     def token_changed(self, sample: zenoh.Sample) -> None:
-        """Take a liveliness token of a node that is gone, if it really is."""
+        """Handle a liveliness token that seems to be gone, if it really is."""
         node = RunKeys.node_in(str(sample.key_expr))
         gone = sample.kind == zenoh.SampleKind.DELETE and node in self._admitted
         if gone and not tokens(self._session, self._keys.node(node)):
@@ -144,9 +144,9 @@ class Members:
         return len(self._ready) >= len(self._nodes)
 
     def absence(self) -> DeadlineExceeded:
-        """The error that names who is not ready."""
+        """The error that names the nodes that are not ready."""
         missing = [node for node in self._nodes if node not in self._ready]
-        if len(missing) > 1:  # the recorder only waits for the others
+        if len(missing) > 1:  # the recorder only waits for the nodes
             missing = [node for node in missing if node != RECORDER]
         there = [node for node in missing if node in self._admitted]
         hint = f"Started, but not ready: {', '.join(there)}." if there else "None of them was started."
@@ -155,10 +155,10 @@ class Members:
         return DeadlineExceeded(f"not ready within {self._timeouts.start:g} s: {spoken(*missing)}", hint=hint)
 
     def welcome(self, profile_entries: int) -> None:
-        """Answer all nodes, and tell them who is reached through shared memory: the master is if all nodes are.
+        """Answer all nodes, and tell them who gets messages through shared memory: the master does if all nodes do.
 
         Args:
-            profile_entries: how many bursts and waits each node shall note for a profile; 0: nothing is measured.
+            profile_entries: how many bursts and waits each node stores for a profile; 0: nothing is measured.
         """
         shared = [node for node in self._nodes if node in self._outlets and self._ready[node][0].shared]
         self._stepping = [self._outlets[node].put for node in shared if node != RECORDER]
@@ -178,44 +178,45 @@ class Members:
             query.drop()
 
     def send(self, kind: int, point: int) -> None:
-        """Send a message of the master's to all nodes."""
+        """Send a message to all nodes."""
         message = HEADER.pack(kind, 0, 0, point)
         for send in self._senders:
             send(message)
 
     def grant(self, point: int) -> None:
-        """Send a grant to those who step; the recorder takes what comes, and each message would wake it for nothing."""
+        """Send a grant to all nodes but not to the recorder, which does not need it and would be woken up."""
         message = HEADER.pack(GRANT, 0, 0, point)
         for send in self._stepping:
             send(message)
 
     def abort(self, error: FmuMeshError) -> None:
-        """Tell the nodes why the run ends, and give them the time to end by themselves."""
+        """Tell the nodes why the run ends, and wait so that they can end themselves."""
         for send in self._senders:
             send(encode_abort(error.report()))
         if not self._welcomed:
-            for _, query in self._ready.values():  # they still wait to be let in
+            for _, query in self._ready.values():  # they still wait for admission
                 query.reply_err(str(error))
                 query.drop()
 
     def close(self) -> None:
-        """Undeclare what was sent on."""
+        """Undeclare all publishers."""
         undeclare_all(self._grants)
 
 
 def spoken(*nodes: str) -> str:
-    """The names of nodes as a message says them."""
+    """The names of nodes as text for a message."""
     return ", ".join("the recorder" if node == RECORDER else f"node '{node}'" for node in nodes)
 
 
 class Followers:
-    """The followers of one run: readers that must get the last sample, so the master, which routes it to them, stays.
+    """The followers of one run: readers that must get the last sample.
 
-    A follower has a liveliness token as long as it lacks samples; Zenoh itself does not tell.
+    The master waits for them at the end, because it routes samples. A follower has a liveliness token
+    until it has all samples; Zenoh itself does not report this.
 
     Args:
         inbox: the inbox of the master.
-        is_going_on: whether the run has not come to its end.
+        is_going_on: whether the run has not ended yet.
     """
 
     def __init__(self, inbox: Inbox, is_going_on: Callable[[], bool]) -> None:
@@ -225,7 +226,7 @@ class Followers:
         self._lost: set[str] = set()
 
     def changed(self, sample: zenoh.Sample) -> None:
-        """Take a token of a follower that is there, or gone."""
+        """Handle a token of a follower that appeared or is gone."""
         name = str(sample.key_expr)
         if sample.kind == zenoh.SampleKind.PUT:
             self._there.add(name)
@@ -236,12 +237,12 @@ class Followers:
                 self._lost.add(name)
 
     def wait(self, timeout_s: float) -> None:
-        """Stay until all of them have their last sample, for ``timeout_s`` seconds at most."""
+        """Wait until all followers have their last sample, for at most ``timeout_s`` seconds."""
         if self._lost:
-            log.warning("a gateway was gone before the last point; ROS has nothing of what came after it")
+            log.warning("a gateway was lost before the last point; ROS did not get the samples after it")
         deadline = time.monotonic() + timeout_s
         while self._there:
             if (left := deadline - time.monotonic()) <= 0:
-                log.warning("a gateway did not take its last samples within %g s", timeout_s)
+                log.warning("a gateway did not receive its last samples within %g s", timeout_s)
                 return
             self._inbox.wait(left)

@@ -1,6 +1,6 @@
-"""The master's face to the rest of the world: what it answers to queries, its status, and the log of all instances.
+"""What other programs see of the master: answers to queries, its status, and the log of all instances.
 
-Everything that arrives, on foreign threads, is posted to the main thread.
+Queries and samples arrive on threads of Zenoh, and are posted to the main thread.
 """
 
 from __future__ import annotations
@@ -8,11 +8,13 @@ from __future__ import annotations
 import os
 import socket
 import time
+from collections import deque
 from collections.abc import Callable, Collection, Sequence
 from typing import Literal, Protocol
 
 import msgspec
 import zenoh
+from msgspec.structs import replace
 
 from .. import __version__
 from ..errors import MessageRefused
@@ -27,13 +29,16 @@ from ..wire.views import LogLine, MeshInfo, MeshStatus
 __all__ = ["STATUS_S", "Events", "MasterServer", "mesh_info"]
 
 STATUS_S = 0.1
-"""How often the status is published."""
+"""Time in s between two publications of the status."""
 
 _MOST_LOG_BYTES = 1 << 20
+_KEPT_LINES = 1000
+_KEPT_BYTES = 1 << 20
+"""What is kept of the log: the newest lines, up to both limits."""
 
 
 class Events(Protocol):
-    """What the master tells whoever started it. Called on the master's main thread."""
+    """What the master reports to the program that started it. Called on the master's main thread."""
 
     def status(self, status: MeshStatus) -> None:
         """The state of the run, about ten times a second."""
@@ -48,7 +53,7 @@ class MasterServer:
     """Serves the queries of one run.
 
     Args:
-        session: the session of this process; stays the caller's.
+        session: the session of this process; the caller closes it.
         inbox: the inbox of the master.
         status: the state of the run right now.
         instances: the names of all instances.
@@ -71,12 +76,18 @@ class MasterServer:
         self._instances = frozenset(instances)
         self._status_published = 0.0
         self._entities: list[zenoh.Queryable[None] | zenoh.Subscriber[None]] = []
+        self._log_lines = 0
+        self._kept_log: deque[msgspec.Raw] = deque()
+        self._kept_bytes = 0
+        self._log_publisher = session.declare_publisher(
+            self._keys.mesh_key("log"), encoding=json_encoding, congestion_control=zenoh.CongestionControl.DROP
+        )
         self._status_publisher = session.declare_publisher(
             self._keys.mesh_key("status"), encoding=json_encoding, congestion_control=zenoh.CongestionControl.DROP
         )
 
     def serve(self, key: str, answer: Callable[[zenoh.Query], None]) -> None:
-        """From now on ``answer`` gets the queries of a key; what it refuses is answered with the reason."""
+        """From now on ``answer`` handles the queries of a key; if it refuses one, the reply is the reason."""
         post, guard = self._inbox.post, self._inbox.refusals.guard
 
         def take(query: zenoh.Query) -> None:
@@ -85,8 +96,8 @@ class MasterServer:
 
         self._entities.append(self._session.declare_queryable(key, lambda query: post(lambda: take(query))))
 
-    def show(self, what: Literal["info", "status", "plan"], view: Callable[[], object]) -> None:
-        """From now on a key of the mesh is answered with a view."""
+    def show(self, what: Literal["info", "status", "plan", "log"], view: Callable[[], object]) -> None:
+        """From now on queries of a key of the mesh are answered with a view."""
         key = self._keys.mesh_key(what)
 
         def reply(query: zenoh.Query) -> None:
@@ -105,7 +116,8 @@ class MasterServer:
         )
 
     def hand_on_logs(self) -> None:
-        """From now on the log of all instances is handed on."""
+        """From now on the log messages of all instances go to `Events.log`, are kept, and are published as one log."""
+        self.show("log", lambda: [*self._kept_log])
         post = self._inbox.post
         self._entities.append(
             self._session.declare_subscriber(f"{self._keys.root}/*/log", lambda sample: post(lambda: self._log(sample)))
@@ -113,14 +125,26 @@ class MasterServer:
 
     def _log(self, sample: zenoh.Sample) -> None:
         key = str(sample.key_expr)
+        if key == self._keys.mesh_key("log"):  # our own: `*` of the subscriber fits it, too
+            return
         with self._inbox.refusals.guard(key):
             line = decode_json(sample.payload.to_bytes(), LogLine, _MOST_LOG_BYTES)
             if key != f"{self._keys.instance(line.instance)}/log" or line.instance not in self._instances:
                 raise MessageRefused("it is not the log of an instance of this mesh")
             self._events.log(line)
+            self._log_lines += 1
+            self._keep(msgspec.json.encode(replace(line, number=self._log_lines)))
+
+    def _keep(self, line: bytes) -> None:
+        """Publish a line of the log of all instances, and keep it; forget the oldest ones beyond the limits."""
+        self._log_publisher.put(line)
+        self._kept_log.append(msgspec.Raw(line))
+        self._kept_bytes += len(line)
+        while len(self._kept_log) > _KEPT_LINES or self._kept_bytes > _KEPT_BYTES:
+            self._kept_bytes -= len(self._kept_log.popleft())
 
     def publish_status(self, *, at_once: bool = False) -> None:
-        """Publish the status if it is time to, or ``at_once``."""
+        """Publish the status if it is due, or ``at_once``."""
         now = time.monotonic()
         if not at_once and now - self._status_published < STATUS_S:
             return
@@ -132,7 +156,7 @@ class MasterServer:
 
     def close(self) -> None:
         """Undeclare everything."""
-        undeclare_all(self._entities, [self._status_publisher])
+        undeclare_all(self._entities, [self._status_publisher, self._log_publisher])
 
 
 def mesh_info(plan: Plan, run: str, config_file: str, endpoints: Sequence[str], shared: Sequence[str]) -> MeshInfo:
@@ -143,7 +167,7 @@ def mesh_info(plan: Plan, run: str, config_file: str, endpoints: Sequence[str], 
         run: the run's id.
         config_file: name of the configuration file.
         endpoints: where tools can reach this process.
-        shared: who gets all messages through shared memory.
+        shared: the participants that get all messages through shared memory.
     """
     config = plan.system.config
     grid = plan.grid

@@ -1,4 +1,4 @@
-"""The wall clock of a run: how long it took, how far it may be, how far ahead of the slowest; what holds the grant."""
+"""The pace of a run: its wall-clock time, how far real time and slow instances limit the grant, and what did."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from ..system.window import STEADY_POINTS
 __all__ = ["CLOCK", "PAUSE", "GrantWatch", "Pacer", "Reach", "RunClock"]
 
 CLOCK = "@clock"
-"""Holds the grant where the run keeps to the wall clock."""
+"""Name of what limits the grant if the run follows the wall clock."""
 
 PAUSE = "@pause"
-"""Holds the grant while the mesh is paused."""
+"""Name of what limits the grant while the mesh is paused."""
 
 _STEADY_S = 0.05
 _SPEED_S = 0.01
@@ -22,19 +22,19 @@ _TICK_S = 1e-6
 
 
 class RunClock:
-    """Wall-clock time since the first point; where the mesh rests it is held."""
+    """Wall-clock time since the first point, without pauses."""
 
     def __init__(self) -> None:
         self._before = 0.0
         self._since: float | None = None
 
     def start(self) -> None:
-        """Start, or go on after a pause."""
+        """Start, or continue after a pause."""
         if self._since is None:
             self._since = time.perf_counter()
 
     def stop(self) -> None:
-        """Hold it."""
+        """Stop until `start` is called again."""
         self._before = self.elapsed()
         self._since = None
 
@@ -46,11 +46,11 @@ class RunClock:
 class Reach:
     """How many points the grant may be ahead of the slowest instance.
 
-    A pause holds at the grant. What of the window goes beyond 1024 points is used as far as it takes 50 ms, at the
-    speed of late.
+    A pause takes effect at the grant. So more than 1024 points are granted only if they take less than 50 ms at the
+    present speed.
 
     Args:
-        window: the most, in points.
+        window: largest number of points.
     """
 
     def __init__(self, window: int) -> None:
@@ -60,9 +60,9 @@ class Reach:
         self._since = 0.0
 
     def points(self, slowest: int, now: float) -> int:
-        """So many, when the slowest instance is at this point; ``now`` is monotonic, in s.
+        """Number of points the grant may lead the slowest instance, at ``slowest``; ``now`` is monotonic, in s.
 
-        The speed is measured every 10 ms, and as soon as all of the last answer was used: at the start it is not known.
+        The speed is unknown at the start. It is measured every 10 ms, and when all points of the last answer are used.
         """
         gone, elapsed = slowest - self._slowest, now - self._since
         if self._window > STEADY_POINTS and (elapsed >= _SPEED_S or gone >= self._points):
@@ -73,10 +73,10 @@ class Reach:
 
 
 class Pacer:
-    """Holds the grant back to the wall clock; a real-time factor of 0 never does.
+    """Limits the grant to the points that are due by the wall clock; with a real-time factor of 0 there is no limit.
 
     Attributes:
-        overruns: points that were given up, because the run was too far behind the wall clock.
+        overruns: points by which the run fell behind the wall clock beyond `catch_up`.
     """
 
     def __init__(self, plan: Plan, real_time_factor: float) -> None:
@@ -89,12 +89,12 @@ class Pacer:
         self._started = 0.0
 
     def start(self, point: int) -> None:
-        """The wall clock and ``point`` belong together now."""
+        """Note that ``point`` is due now."""
         self._origin = point
         self._started = time.perf_counter()
 
     def limit(self, wanted: int, reached: int) -> tuple[int, float]:
-        """The point that may be granted now, and how long until ``wanted`` may be, in s; all are at ``reached``."""
+        """The point that may be granted now, and the time until the next check in s; all are at ``reached``."""
         if self._rate <= 0:
             return wanted, math.inf
         elapsed = time.perf_counter() - self._started
@@ -108,10 +108,10 @@ class Pacer:
         return allowed, max(0.0005, next_update - elapsed)
 
     def _give_up(self, behind: float) -> float:
-        """The wall-clock time in s that is given up, because the run is ``behind`` by so many points."""
+        """Move the schedule if the run is ``behind`` by too many points; return by how much, in s."""
         if self._catch_up is None:
             return 0.0
-        lost = math.floor(behind - (self._catch_up + self._period) * self._rate) - 1  # one point is on its way
+        lost = math.floor(behind - (self._catch_up + self._period) * self._rate) - 1  # one point is being computed
         if lost <= 0:
             return 0.0
         self.overruns += lost
@@ -120,7 +120,7 @@ class Pacer:
 
 
 class GrantWatch:
-    """Sums up how long what held the grant; `look` at every grant."""
+    """Sums up how long each participant limited the grant; call `look` at every grant."""
 
     def __init__(self) -> None:
         self.held_s: dict[str, float] = {}
@@ -128,7 +128,7 @@ class GrantWatch:
         self._since = 0.0
 
     def look(self, holder: str | None) -> None:
-        """From now on ``holder`` keeps the grant from growing; None: it is at the last point."""
+        """From now on ``holder`` limits the grant; None: the grant is the last point."""
         now = time.perf_counter()
         if self._holder is not None:
             self.held_s[self._holder] = self.held_s.get(self._holder, 0.0) + now - self._since

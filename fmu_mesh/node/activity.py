@@ -1,6 +1,6 @@
-"""What a node is doing right now, as `status` shows it and as a step that does not return is found.
+"""What a node is doing right now: the source of `status`, and the check for steps that do not return.
 
-The main thread only writes a few attributes; the server's thread looks at them and at how far the instances are.
+The main thread only writes a few attributes; the server thread reads them and the points of the instances.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Activity:
 
     Args:
         plan: the node's plan.
-        refusals: what its process did not take.
+        refusals: counts the messages that its process refused.
     """
 
     def __init__(self, plan: NodePlan, refusals: Refusals) -> None:
@@ -68,7 +68,7 @@ class Activity:
                 restarts=self._plan.restarts,
                 refused=self._refusals.count,
             )
-        step = runner.step  # the main thread goes on meanwhile: what is told belongs to one point
+        step = runner.step  # the main thread continues meanwhile: all values of an answer must belong to one point
         point = step * runner.plan.step_points
         return InstanceStatus(
             instance=name,
@@ -84,10 +84,10 @@ class Activity:
         )
 
     def look_at_steps(self, now: float) -> StepFailed | None:
-        """Look at the step that is under way; the error of one that has not returned in its time.
+        """Look at the running step; return an error if it has not returned within the time limit.
 
-        The burst that it belongs to is ended, and what came before it is sent if it takes longer than from one look to
-        the next: others may wait for that, and it shall not be lost with this process. Other calls of an FMU are
+        The burst ends after this step. If the step takes longer than the time between two looks, the rows before it are
+        sent: other nodes may wait for them, and they must not be lost if this process dies. Other calls of an FMU are
         watched by `fmu_mesh.instances.call_guard.CallWatch`.
         """
         if (unit := self.advancing) is None or self.state != "running":
@@ -113,7 +113,7 @@ class Activity:
         try:
             for runner in self.runners.values():
                 runner.flush()
-        except FmuMeshError as unreachable:  # the main thread will meet it, too
+        except FmuMeshError as unreachable:  # the main thread will get the same error
             log.info("rows_not_sent", extra={"error": str(unreachable)})
 
     def _in_words(self, runner: Runner) -> str:
@@ -129,7 +129,7 @@ class Activity:
         return f"in doStep at point {runner.point} for {now - self._since(runner, now):.1f} s"
 
     def _since(self, runner: Runner, now: float) -> float:
-        """Since when the step of a runner has been under way, as far as was seen; costs the hot loop nothing."""
+        """When this thread first saw the running step of a runner; the stepping loop measures no time for this."""
         if self._under_way is None or self._under_way[:2] != (runner.name, runner.step):
             self._under_way = (runner.name, runner.step, now)
         return self._under_way[2]

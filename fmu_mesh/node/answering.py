@@ -1,7 +1,7 @@
-"""Answers to the queries of a node, and the settings that it takes.
+"""Answers to the queries of a node, and the values that others set.
 
-On the server's thread. Values come from rows that were completed, or are read by the main thread at the next point;
-settings are checked here and made by the main thread. A query that waits for a point is refused when that takes long.
+All of it runs on the server thread. Values come from complete rows, or the main thread reads them at the next point.
+Settings are checked here and made by the main thread. A query that waits too long for a point is refused.
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ import msgspec
 import zenoh
 
 from ..system.plan import NodePlan
+from ..system.settable import check_settable
 from ..variables.model_description import Value, Variable
 from ..wire.inbox import Inbox
-from ..wire.keys import Keys
-from ..wire.values import ValueRefused, attachment, encode_value, json_encoding
+from ..wire.keys import Keys, unescape
+from ..wire.values import ValueRefused, attachment, decode_time, decode_value, encode_value, json_encoding
 from ..wire.views import LogLine, SetAnswer
 from .activity import Activity
 from .info import instance_info
 from .inputs import set_input
-from .settings import checked_setting
 from .stepping import Runner
 from .streams import kind_of
 
@@ -39,9 +39,9 @@ class Answers:
 
     Args:
         plan: what the node has to do.
-        inbox: the inbox of the node, for what the main thread has to do.
+        inbox: the inbox of the node, to let the main thread do something.
         activity: what the node is doing.
-        post: from any thread: has the server's thread do something.
+        post: lets the server thread do something; may be called from any thread.
         log: publishes a log message; on the server's thread.
     """
 
@@ -62,7 +62,7 @@ class Answers:
         self._pending: list[_Pending] = []
 
     def answer(self, name: str, query: zenoh.Query) -> None:
-        """Answer everything under the instance's key that the query's key expression matches."""
+        """Answer for every key of the instance that the query's key expression matches."""
         root = self._keys.instance(name)
         asked = query.key_expr
         runner = self._activity.runners.get(name)
@@ -97,7 +97,7 @@ class Answers:
             query.drop()
 
     def put_arrived(self, runner: Runner, sample: zenoh.Sample) -> None:
-        """On a foreign thread: take a value that was put; what is wrong with it goes into the log."""
+        """On a thread of Zenoh: accept a value that was put; if it is refused, the reason is logged."""
         attachment = sample.attachment.to_bytes() if sample.attachment is not None else None
         data = sample.payload.to_bytes()
         self._post(partial(self._take_put, runner, str(sample.key_expr), data, attachment))
@@ -120,10 +120,10 @@ class Answers:
         return matching
 
     def _from_rows(self, runner: Runner, wanted: list[tuple[str, Variable]]) -> tuple[list[tuple[str, Value]], int]:
-        """Values that the rows of the newest own step hold, and that step; what only the FMU knows is left out.
+        """The values in the rows of the newest own step, and that step; values that only the FMU has are not included.
 
-        The main thread steps meanwhile. It may come round to this row, which then holds values of a later step: what
-        was read is thrown away, and read again; after a few times it is left to the main thread.
+        The main thread steps meanwhile, and may overwrite this row of the ring with values of a later step. Then the
+        values are read again; after a few attempts the main thread reads them.
         """
         ring = runner.outputs
         names = {*ring.layout.names}
@@ -161,7 +161,7 @@ class Answers:
 
     def _take_put(self, runner: Runner, key: str, data: bytes, attachment: bytes | None) -> None:
         try:
-            new = checked_setting(runner, self._keys.instance(runner.name), key, data, attachment)
+            new = _checked_setting(runner, self._keys.instance(runner.name), key, data, attachment)
         except ValueRefused as refused:
             self._log(LogLine(runner.name, "warning", "set", str(refused), runner.point))
             return
@@ -175,7 +175,7 @@ class Answers:
         self._inbox.post(take)
 
     def _answer_setting(self, name: str, query: zenoh.Query) -> None:
-        """A query with a payload sets a value and is told from which point on it holds, or why it was refused."""
+        """Answer a query that sets a value: from which point on the value holds, or why it was refused."""
         runner = self._activity.runners.get(name)
         key = str(query.key_expr)
         if runner is None:
@@ -185,7 +185,7 @@ class Answers:
         data = query.payload.to_bytes() if query.payload else b""
         attachment = query.attachment.to_bytes() if query.attachment is not None else None
         try:
-            new = checked_setting(runner, self._keys.instance(runner.name), key, data, attachment)
+            new = _checked_setting(runner, self._keys.instance(runner.name), key, data, attachment)
         except ValueRefused as refused:
             query.reply_err(str(refused))
             query.drop()
@@ -212,7 +212,7 @@ class Answers:
 
 
 class _Pending:
-    """A query that waits for its instance to come to a point."""
+    """A query that waits until its instance reaches a point."""
 
     def __init__(self, instance: str, query: zenoh.Query) -> None:
         self.instance = instance
@@ -222,3 +222,42 @@ class _Pending:
     def refuse(self, reason: str) -> None:
         self.query.reply_err(reason)
         self.query.drop()
+
+
+class _Setting(msgspec.Struct, frozen=True):
+    """A value for a variable; ``time`` (s) is from when on, of an input; None: from the next point on."""
+
+    variable: str
+    value: Value
+    time: float | None = None
+
+
+def _checked_setting(runner: Runner, root: str, key: str, data: bytes, attachment: bytes | None) -> _Setting:
+    """The variable, value and time of a setting that arrived for an instance.
+
+    Args:
+        runner: the instance.
+        root: what its keys start with.
+        key: the key that the value was sent to.
+        data: the value as JSON.
+        attachment: the time of the value as JSON, if there is one.
+
+    Raises:
+        ValueRefused: with the reason.
+    """
+    parts = key.removeprefix(root + "/").split("/")
+    if len(parts) != 2 or "*" in key:
+        raise ValueRefused(f"'{key}' is not the key of one variable")
+    kind, name = parts[0], unescape(parts[1])
+    variable = runner.instance.description.variable(name)
+    if variable is None or kind_of(variable) != kind:
+        raise ValueRefused(f"'{runner.name}' has no variable '{name}' under '{kind}'")
+    try:
+        check_settable(runner.plan, variable)
+    except ValueRefused as refused:
+        raise ValueRefused(f"'{runner.name}.{name}' {refused}") from refused
+    try:
+        time = decode_time(attachment) if attachment is not None else None
+        return _Setting(name, decode_value(data, variable), time)
+    except ValueRefused as refused:
+        raise ValueRefused(f"'{runner.name}.{name}': {refused}") from refused

@@ -1,7 +1,8 @@
-"""Initialization Mode over the wire: values become known level by level, here and in other nodes (FMI 2.0, 4.2.3).
+"""Initialization Mode over the wire: values are calculated level by level, here and in other nodes (FMI 2.0, 4.2.3).
 
-An algebraic loop is iterated by all nodes that have outputs of it. They exchange the values of every sweep, and each of
-them runs the same `FixedPoint` on the same values, so that all stop at the same sweep; others see the last one only.
+All nodes that have outputs of an algebraic loop iterate it. They exchange the values of every iteration (sweep), and
+each of them runs the same `FixedPoint` on the same values. So all of them stop at the same sweep; other nodes get only
+the values of the last one.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from .stepping import Runner
 __all__ = ["Initialization"]
 
 _SWEEP = 1 << 32
-"""In an INITIAL message, the level plus so many times the sweep."""
+"""An INITIAL message has the number `level + sweep * this`."""
 
 Key = tuple[str, str]
 
@@ -33,10 +34,10 @@ class Initialization:
 
     Args:
         plan: the node's plan.
-        wait: waits at most so many seconds for something to arrive, and takes it.
+        wait: waits for a message for at most this time in s, and handles it.
 
     Attributes:
-        out_links: the links out that carry nothing afterwards.
+        out_links: the links that are needed only during Initialization Mode.
     """
 
     def __init__(self, plan: NodePlan, wait: Callable[[float], None]) -> None:
@@ -58,7 +59,7 @@ class Initialization:
         self._end = 0.0
 
     def take(self, link: Link, tag: int, data: bytes) -> None:
-        """Take an INITIAL message of another node."""
+        """Store an INITIAL message of another node."""
         sweep, level = divmod(tag, _SWEEP)
         iterated = any(loop.first <= level <= loop.last for loop in self._plan.loops)
         for name, value in initial_values(link, level, data).items():
@@ -68,7 +69,7 @@ class Initialization:
                 self._known[link.source, name] = value
 
     def run(self, runners: Collection[Runner]) -> None:
-        """Propagate all connected values; every instance must be in Initialization Mode.
+        """Set and get the values of all connections; every instance must be in Initialization Mode.
 
         Raises:
             DeadlineExceeded: the initial value of another node did not come in time.
@@ -94,7 +95,7 @@ class Initialization:
         self.out_links.clear()
 
     def _iterate(self, loop: Loop, runners: Collection[Runner]) -> None:
-        """Sweep through the levels of a loop until it is consistent."""
+        """Iterate the levels of a loop until its values are consistent."""
         members = frozenset(loop.outputs)
         point = FixedPoint(loop, self._plan.initialization)
         own = [
@@ -125,7 +126,7 @@ class Initialization:
             self._send(runner, level, {name: self._known[runner.name, name] for name in names}, loop)
 
     def _set_inputs(self, runner: Runner, below: int | None) -> None:
-        """Set the inputs whose sources are known below a level (None: all)."""
+        """Set the inputs whose sources have a level below this one (None: all)."""
         values: dict[str, Value] = {}
         for feed in runner.plan.feeds:
             for source, target, factor, offset in feed.columns:
@@ -136,7 +137,7 @@ class Initialization:
             runner.instance.set_values(merged(values, runner.plan.inputs, runner.instance.get_values))
 
     def _set_inputs_of_loop(self, runner: Runner, level: int, sweep: int, point: FixedPoint, loop: Loop) -> None:
-        """Set the assumed inputs, and those whose sources are known below a level of a loop in a sweep."""
+        """In a sweep of a loop: set the assumed inputs, and those whose sources have a level below this one."""
         values: dict[str, Value] = {}
         for feed in runner.plan.feeds:
             for source, target, factor, offset in feed.columns:

@@ -1,7 +1,7 @@
-"""Unconnected inputs and tunable parameters over time: values that came with a time, as any program sends them.
+"""Unconnected inputs and tunable parameters over time: values that a program sends with a time from which on they hold.
 
-Owns how such a value becomes what a step uses (the node-based use of ROS's `fmi_adapter`). Which settings are allowed
-at all is `fmu_mesh.node.settings`.
+Owns how a step gets its value from them, as `fmi_adapter` does for a ROS node. `fmu_mesh.system.settable` says which
+variables may be set.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ _WAITING = 1 << 16
 
 
 class TimedInputs(AroundInstance[Instance]):
-    """An `Instance` whose unconnected inputs follow trajectories; everything else goes to the one within.
+    """An `Instance` whose inputs and parameters may follow trajectories; all other calls go to the inner instance.
 
-    The step from t sets each of these inputs to its value at t. A value that comes without a time holds from the next
-    step on, one whose time is past does so too, unless a later one is in use. Every instance of a mesh can be one.
+    The step from t sets each of these variables to its value at t. A value without a time holds from the next step on.
+    So does a value with a past time, unless a value with a later time is already used. The instance may be of any kind.
 
     Args:
-        instance: the one within.
-        interpolation: linear between two times for Reals, or constant from each time on.
+        instance: the inner instance.
+        interpolation: linear between two times for inputs of type Real, or constant from each time on.
     """
 
     def __init__(self, instance: Instance, interpolation: Literal["hold", "linear"]) -> None:
@@ -49,19 +49,19 @@ class TimedInputs(AroundInstance[Instance]):
         self._step = 0
 
     def bind(self, inputs: Ring, outputs: Sequence[Ring], grid: TimeGrid, points: int, step: int = 0) -> None:
-        """As the one within; from now on there is a time, and values that came before it get theirs."""
+        """Bind the inner instance. From now on there is a time; values that came before get the present one."""
         self._instance.bind(inputs, outputs, grid, points, step)
         self.start(grid, points, step)
 
     def start(self, grid: TimeGrid, points: int, step: int) -> None:
-        """From now on there is a time, that of own step ``step`` with ``points`` of ``grid`` each."""
+        """Start the time at own step ``step``; each own step has ``points`` points of ``grid``."""
         self._grid, self._points, self._step = grid, points, step
         early, self._early = self._early, []
         for name, value, time in early:
             self.add(name, value, time)
 
     def do_step(self, step: int) -> None:
-        """Set what follows a trajectory to its value at the start of the step, then as the one within."""
+        """Set all inputs with a trajectory to their values at the start of the step, then step the inner instance."""
         if self._trajectories:
             time = self._time(step)
             now = {name: own.value(time, self._resolution(time)) for name, own in self._trajectories.items()}
@@ -73,7 +73,7 @@ class TimedInputs(AroundInstance[Instance]):
         self._step = step + 1
 
     def add(self, name: str, value: Value, time: float | None) -> int:
-        """A value of a variable from ``time`` (s; None: now) on; returns the own step that is the first to use it.
+        """Give a variable a value from ``time`` (s; None: now) on; return the first own step that uses it.
 
         Raises:
             ValueRefused: too many values wait for their time, or this one is too late.
@@ -105,7 +105,7 @@ class TimedInputs(AroundInstance[Instance]):
         return name in self._trajectories or (variable is not None and variable.causality == "input")
 
     def get_state(self) -> object:
-        """See `KeepsState`; values whose time is to come are part of the state."""
+        """See `KeepsState`; values with a later time are part of the state."""
         inputs = {name: trajectory.samples for name, trajectory in self._trajectories.items()}
         return _TimedState(super().get_state(), _Inputs(self._step, dict(self._used), inputs))
 
@@ -136,7 +136,7 @@ class TimedInputs(AroundInstance[Instance]):
         return self._grid.time(step * self._points)
 
     def _resolution(self, time: float) -> float:
-        """How far apart two times may be and still mean the same: rounding of one multiplication and one addition."""
+        """Largest difference of two equal times: the rounding of one multiplication and one addition."""
         assert self._grid is not None
         return 8 * math.ulp(max(abs(self._grid.start_time), abs(time)))
 
@@ -157,9 +157,9 @@ class _TimedState(NamedTuple):
 
 
 def set_input(runner: Runner, name: str, value: Value, time: float | None) -> int:
-    """On the main thread, between steps: set a variable; returns the own step that is the first to use it.
+    """On the main thread, between steps: set a variable; return the first own step that uses it.
 
-    The first value with a time makes the instance one that follows them: without any, a step costs what it costs.
+    Only the first value with a time wraps the instance in `TimedInputs`. So steps of other instances do not get slower.
 
     Raises:
         FmuError: the FMU refused it.

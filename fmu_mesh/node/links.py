@@ -1,4 +1,4 @@
-"""The sending end of a link: frames out of an output ring. The receiving end is `fmu_mesh.wire.frames`."""
+"""The sending end of a link: makes frames from an output ring. The receiving end is `fmu_mesh.wire.frames`."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ class OutLink:
     """Sends the rows of one instance to one node; a frame holds all rows since the last one.
 
     Attributes:
-        sent: own steps sent so far; the next frame starts here.
+        sent: own steps sent so far; the next frame starts at this step.
         capacity: rows after which a frame is full.
-        lazy: whether nobody steps on these rows, so that they may wait a little when others are sent.
+        lazy: whether no step needs these rows, so that they may be sent a little later than others.
     """
 
     def __init__(self, link: Link, outputs: Ring, put: Callable[[bytes], None], window: int) -> None:
@@ -36,7 +36,7 @@ class OutLink:
         if self.lazy:
             rows, size = lazy_frame_rows(window), _LAZY_FRAME_BYTES
         else:
-            # A quarter of the window, so that the consumer has work while the credit for more is on its way.
+            # A quarter of the window: the consumer can step on these rows while the next grant is on its way.
             rows, size = min(_FRAME_POINTS, max(1, window // (4 * link.step_points))), _FRAME_BYTES
         self.capacity = max(1, min(rows, size // max(link.layout.row_size, 1)))
         self._outputs = outputs
@@ -67,12 +67,12 @@ class OutLink:
         self.sent = end
 
     def send_last(self, end: int) -> None:
-        """The run ends early: send what is left up to own step ``end - 1``, and that there is no more."""
+        """The run ends early: send the remaining rows up to own step ``end - 1``, and that no more will come."""
         self.flush(end)
         self._put(HEADER.pack(LAST, self.link.index, 0, end))
 
     def send_initial(self, tag: int, values: Mapping[str, Value]) -> None:
-        """Send the values of one level of Initialization Mode, which ``tag`` tells; other columns are zero."""
+        """Send the values of one level of Initialization Mode; ``tag`` is its number, and other columns are zero."""
         row = Ring(self.link.layout, 1)
         for name in row.layout.names:
             if name in values:

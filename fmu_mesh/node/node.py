@@ -4,11 +4,11 @@ One step of a node, in pseudocode::
 
     while an instance has steps left:
         for unit in units:                      # in the order of the plan
-            step as far as k < grant and the inputs allow, one burst (about 1 ms) at most
-            send the frames that are full, or whose burst took its time
-        take what arrived: frames into the input rings, a higher grant
+            step as far as k < grant and the inputs allow, for at most one burst (about 1 ms)
+            send the frames that are full, or whose burst is over
+        handle the messages that arrived: frames go into the input rings, a higher grant is stored
         if nothing was stepped:
-            send all frames, tell the master the progress, wait for the next message
+            send all frames, send the progress to the master, wait for the next message
 
 Owns the life of the process between `ready` and `done`. The FMUs are only called here, on the main thread; queries are
 served by `fmu_mesh.node.node_server` from snapshots.
@@ -71,7 +71,7 @@ _TELL_S = 0.1
 _LAST_WORD_S = 0.3
 _ALONE_S = 60.0
 _NO_MASTER_S = 1.0
-"""How long a failure waits for a master that was never seen."""
+"""How long in s the report of a failure waits for a master that was never seen."""
 
 _NO_FEEDS: tuple[None, list[RemoteFeed]] = (None, [])
 
@@ -81,14 +81,14 @@ class Node:
 
     Args:
         plan: what it has to do.
-        session: the session of this process; stays the caller's.
-        open_instance: opens an instance of the plan by name; instances stay the caller's, too.
+        session: the session of this process; the caller closes it.
+        open_instance: opens an instance of the plan by name; the caller closes the instances too.
         on_hang: called on another thread if a step does not return in time.
         router: the link to the router that connects this node to the others, if there is one.
-        launch: the launcher that started this process; None where it was started by hand.
+        launch: the launcher that started this process; None if it was started manually.
 
     Attributes:
-        failure_is_known: whether somebody else knows what ended the run: the master, or who sees that it is gone.
+        failure_is_known: whether others know what ended the run: the master knows it, or is gone.
 
     Call `run` once, from the main thread.
     """
@@ -130,7 +130,7 @@ class Node:
         """Load, initialize and step to the last point, then report to the master.
 
         Raises:
-            FmuMeshError: what ended the run early; the master knows of it already if it could be reached.
+            FmuMeshError: why the run ended early; it was reported to the master if the master could be reached.
         """
         try:
             self._membership.register(self.server.open, self._master_token_went)
@@ -139,14 +139,14 @@ class Node:
             self._connect()
             self._initialize()
             self._step_to_the_end()
-            self.server.close()  # the last samples, while the master is there to bring them to clients
+            self.server.close()  # the last samples, while the master is there to route them to clients
             for runner in self._runners.values():
-                runner.instance.close()  # before the report, so that what fails in it can be told
+                runner.instance.close()  # before the report, so that the report can contain its error
             self._tell_end(None, self._plan.timeouts.stop)
         except FmuMeshError as error:
             located = self._located(error)
             aborted = isinstance(error, _Aborted)
-            if aborted or not self._membership.lost_master:  # its token may be gone before its last word comes
+            if aborted or not self._membership.lost_master:  # its token may be gone before its last message arrives
                 self._send_last_rows()
             self.failure_is_known = aborted or self._report_failure(located)
             raise located from error
@@ -160,7 +160,7 @@ class Node:
         self._inbox.post(lambda: _raise(Interrupted(reason)))
 
     def report_hang(self, error: FmuError) -> bool:
-        """From a watching thread, while an FMU does not return: tell the master; whether it knows now."""
+        """On a watching thread, while an FMU does not return: report to the master; return whether it knows now."""
         if (unit := self._activity.advancing) is not None and not self._membership.lost_master:
             unit.meanwhile(self._send_last_rows)  # should the step end now, the main thread waits for this
         elif self._activity.state == "running" and not self._membership.lost_master:
@@ -171,7 +171,7 @@ class Node:
     # --- before the first point
 
     def _load(self) -> None:
-        """Instantiate the FMUs and wire rings, feeds and links together."""
+        """Instantiate the FMUs, and connect rings, feeds and links."""
         plan = self._plan
         self._activity.state = "loading"
         for item in plan.instances:
@@ -183,7 +183,7 @@ class Node:
         self._units = [Unit([self._runners[name] for name in names]) for names in plan.units]
 
     def _meet(self) -> None:
-        """Join the mesh: from now on all others are there."""
+        """Join the mesh: afterwards all other nodes are ready."""
         self._activity.state = "waiting for the mesh"
         try:
             self._membership.keys(self._plan.timeouts.start)
@@ -198,7 +198,7 @@ class Node:
             self._profiler = Profiler(self._plan.node, welcome.profile, self._plan.window)
 
     def _connect(self) -> None:
-        """Make what sends to the other nodes and to the master."""
+        """Create the senders to the other nodes and to the master."""
         plan, membership = self._plan, self._membership
         keys = membership.keys(plan.timeouts.start)
         for link in plan.links_out:
@@ -216,7 +216,7 @@ class Node:
             self._calls = self._profiler.measured_calls(self._calls)
 
     def _initialize(self) -> None:
-        """Initialization Mode: set and get level by level, exchange over the wire, then make the outputs point 0."""
+        """Initialization Mode: set, get and exchange values level by level; then the outputs are those of point 0."""
         self._activity.state = "initializing"
         grid = self._plan.grid
         for runner in self._runners.values():
@@ -264,7 +264,7 @@ class Node:
                 self._wait()
 
     def _end_early(self, unit: Unit, asked: TerminationRequested) -> None:
-        """An FMU asks to end the simulation: its unit stays where it is, and the master ends the run at its point."""
+        """An FMU asks to end the simulation: its unit stops stepping, and the master ends the run at its point."""
         self._units.remove(unit)
         point = self._runners[asked.instance or ""].covered
         for runner in unit.runners:
@@ -273,7 +273,7 @@ class Node:
         self._tell_end(asked.at(point, self._plan.grid.time(point)), self._plan.timeouts.stop)
 
     def _flush_before_waiting(self) -> None:
-        """Send what a consumer could be waiting for; what is only recorded at least every 50 ms, and at the end."""
+        """Send rows that a consumer may wait for; rows that are only recorded every 50 ms, and at the end."""
         now = time.monotonic()
         done = self._covered() == self._plan.grid.last_point
         lazy = done or self._waited_long or now - self._lazy_flushed > LAZY_S
@@ -284,7 +284,7 @@ class Node:
         self._lazy_pending = not lazy
 
     def _wait(self) -> None:
-        """Wait for one message; nothing can be stepped before it comes."""
+        """Wait for one message; no instance can step before it arrives."""
         started = time.monotonic()
         self._activity.waiting = True
         message = self._inbox.wait(LAZY_S if self._lazy_pending else _LOOK_S)
@@ -301,7 +301,7 @@ class Node:
             raise DeadlineExceeded(text, hint="Is its process stopped, or its host gone?")
 
     def _sort_in(self, message: Message) -> None:
-        """One message into the rings, or a new grant; one that is neither is refused."""
+        """Put a frame into the rings, or store a new grant; any other message is refused."""
         self._inbox.hand_on(message, self._take_from_master, self._take_from_node)
 
     def _take_from_node(self, message: Message) -> None:
@@ -319,7 +319,7 @@ class Node:
         elif kind == INITIAL:
             self._initialization.take(receiver.link, point, data)
         else:
-            raise MessageRefused(f"a message of kind {kind} is nothing that a node sends")
+            raise MessageRefused(f"a message of kind {kind} is not one that a node sends")
 
     def _take_from_master(self, message: Message) -> None:
         _, kind, _, _, point, data = message
@@ -328,7 +328,7 @@ class Node:
             if point > most:
                 raise ProtocolBroken(
                     f"the master grants point {point} to node '{self._plan.node}', which may be granted {most} at most",
-                    hint="Does somebody else send in its name?",
+                    hint="Does another process send messages with its name?",
                 )
             self._heard = time.monotonic()
             self._grant = max(self._grant, min(point, self._plan.grid.last_point))
@@ -337,16 +337,16 @@ class Node:
         elif kind == ABORT:
             raise _Aborted(from_report(decode_abort(data)))
         else:
-            raise MessageRefused(f"a message of kind {kind} is nothing that the master sends")
+            raise MessageRefused(f"a message of kind {kind} is not one that the master sends")
 
     def _covered(self) -> int:
         return min(runner.covered for runner in self._runners.values())
 
     def _tell_progress(self) -> None:
-        """Tell the master how far this node is, if the grant can hang on it or somebody may want to see it.
+        """Send the progress of this node to the master, if the grant may depend on it or a status needs it.
 
-        A node that waits for another one keeps quiet: nobody waits for what it could say, because what it has not told
-        is less than a quarter of the window, and the other one has the rest.
+        A node that waits for another node sends nothing: the progress that it has not sent is less than a quarter of
+        the window, so the other node can still step.
         """
         covered = self._covered()
         if covered == self._progress_sent:
@@ -361,15 +361,15 @@ class Node:
     # --- the end
 
     def _master_token_went(self) -> None:
-        """On a foreign thread: the master's token is gone, or that of somebody who pretends to be the master."""
+        """On a thread of Zenoh: the token of the master is gone, or a token with its key from another process."""
         if not self._finished:
             self._inbox.post(self._end_without_master)
 
     def _end_without_master(self) -> None:
-        """The master's token is gone; what it said last may still be on its way.
+        """The master's token is gone; its last message may still arrive.
 
         Raises:
-            FmuMeshError: why the master ended the run, or that it is gone.
+            FmuMeshError: why the master ended the run, or that the master is gone.
         """
         if not self._membership.master_is_gone:
             return
@@ -391,7 +391,7 @@ class Node:
         return error
 
     def _send_last_rows(self) -> None:
-        """The run ends early: whoever failed, what this node has for the recorder is sent, and that it is all."""
+        """The run ends early, here or elsewhere: send the recorder the remaining rows, and that no more come."""
         running = self._activity.state == "running"
         try:
             for runner in self._runners.values():
@@ -400,7 +400,7 @@ class Node:
             log.info("last_rows_not_sent", extra={"error": str(unreachable)})
 
     def _report_failure(self, error: FmuMeshError) -> bool:
-        """Tell the master, unless it is the one that is gone; whether it knows now."""
+        """Report the failure to the master, unless the master is gone; return whether it knows now."""
         self._activity.advancing = None
         self._activity.state = "failed"
         if self._membership.lost_master:
@@ -414,7 +414,7 @@ class Node:
         return True
 
     def _as_others_see(self, error: FmuMeshError) -> FmuMeshError:
-        """Whoever ends this process means this process: for the others it is lost."""
+        """The error as other processes see it: if a signal ends this process, for them this node is lost."""
         if not isinstance(error, Interrupted):
             return error
         point = min((runner.point for runner in self._runners.values()), default=0)
@@ -426,7 +426,7 @@ class Node:
         )
 
     def _patience_s(self) -> float:
-        """How long a failure waits for the master to take it."""
+        """How long in s a report of a failure may take."""
         stop_s = self._plan.timeouts.stop
         return stop_s if self._membership.is_admitted else min(stop_s, _NO_MASTER_S)
 
@@ -434,12 +434,12 @@ class Node:
         point = min((runner.point for runner in self._runners.values()), default=0)
         profile = self._profiler.profile() if self._profiler is not None and error is None else None
         report = NodeReport(self._plan.node, point, error.report() if error is not None else None, profile)
-        # Behind the last samples: the master, who brings them to clients, goes when it has all reports.
+        # After the last samples: the master routes them to clients, and ends when it has all reports.
         self._membership.report(report, timeout_s, priority=PRIORITY)
 
 
 class _Aborted(FmuMeshError):
-    """The master ended the run; carries why."""
+    """The master ended the run; contains the reason."""
 
     def __init__(self, cause: FmuMeshError) -> None:
         super().__init__(cause.message)

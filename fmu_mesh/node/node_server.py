@@ -1,8 +1,8 @@
-"""The node's face to the rest of the world: info, status, current values, settings, streams and log.
+"""What other programs see of a node: info, status, current values, settings, streams and log.
 
-Runs on a thread of its own; what it answers is in `fmu_mesh.node.answering`. Values come from the rings (rows that were
-completed), or are read by the main thread at the next point. So a query never waits for a step, a step never waits for
-a query, and `status` answers while an FMU hangs.
+The server has its own thread; `fmu_mesh.node.answering` has the answers. Values come from complete rows in the rings,
+or the main thread reads them at the next point. So a query never waits for a step, a step never waits for a query, and
+`status` is answered while an FMU hangs.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _LAST_ROWS_S = 1.0
 _LAST_WORDS_S = 0.5
 _STREAM_SHARE = 4.0
 _EARLY_LINES = 1000
-"""How many log messages are kept until this node belongs to a mesh."""
+"""Largest number of log messages that are kept until this node has joined the mesh."""
 
 
 class NodeServer:
@@ -50,8 +50,8 @@ class NodeServer:
         session: the session of this process; stays the caller's.
         inbox: the inbox of the node.
         activity: what the node is doing.
-        report: tells the master how the node has ended, within so many seconds.
-        on_hang: called on the server's thread if a step does not return in time.
+        report: tells the master how the node has ended; its argument is the time limit in s.
+        on_hang: called on the server thread if a step does not return in time.
     """
 
     def __init__(  # noqa: PLR0913, PLR0917  one node and whom it tells
@@ -83,13 +83,13 @@ class NodeServer:
         self._thread.start()
 
     def open(self) -> None:
-        """From any thread, when the node belongs to the mesh: from now on it is seen, even while FMUs are loaded."""
+        """From any thread, after the node has joined the mesh: it is visible from now on, even while FMUs load."""
         self._jobs.put(self._declare)
 
     # --- called by the main thread
 
     def serve(self, runners: Mapping[str, Runner]) -> None:
-        """From now on values can be asked for and set, and outputs be subscribed."""
+        """From now on values can be read and set, and streams can be subscribed."""
         self._activity.runners = runners
         for runner in runners.values():
             self._streams.append(
@@ -101,7 +101,7 @@ class NodeServer:
                 self._entities.append(self._session.declare_subscriber(key, take, allowed_origin=zenoh.Locality.REMOTE))
 
     def stepped(self) -> None:
-        """Hand rows that were just stepped to the streams that have subscribers."""
+        """Give new rows to the streams that have subscribers."""
         for streams in self._streams:
             collected = streams.collect(self._waiting_rows)
             if collected is not None:
@@ -110,7 +110,7 @@ class NodeServer:
                 self._jobs.put(partial(self._publish_rows, rows, batch))
 
     def started(self) -> None:
-        """All streams begin at the first point: subscriptions made before it are looked at now."""
+        """All streams begin at the first point: find the subscriptions that were made before it."""
         self._activity.started()
         for streams in self._streams:
             streams.update()
@@ -163,7 +163,7 @@ class NodeServer:
             self._on_hang(hang)
 
     def report_hang(self, error: FmuError, deadline_s: float) -> bool:
-        """From a watching thread: tell the master that an FMU does not return; whether it knows now."""
+        """On a watching thread: tell the master that an FMU does not return; return whether it knows now."""
         runner = self._activity.runners.get(error.instance or "")
         if runner is not None and self._activity.state != "initializing":
             error = error.at(runner.point, self._plan.grid.time(runner.point))
@@ -187,7 +187,7 @@ class NodeServer:
         root = self._keys.instance(name)
         self._entities.append(self._session.liveliness().declare_token(root))
         self._entities.append(self._session.declare_queryable(f"{root}/**", partial(self._query_arrived, name)))
-        # A log message is not lost; the status is told again.
+        # A log message must not be lost; the status is published again.
         for what, publishers, congestion_control in (
             ("status", self._status_publishers, zenoh.CongestionControl.DROP),
             ("log", self._log_publishers, zenoh.CongestionControl.BLOCK),
@@ -206,14 +206,14 @@ class NodeServer:
     # --- publishing
 
     def say_everything(self) -> None:
-        """Let what was logged so far go out before what follows from it; not for longer than `_LAST_WORDS_S`."""
+        """Wait until all log messages so far are published, before their consequences; at most for `_LAST_WORDS_S`."""
         said = threading.Event()
         self._jobs.put(said.set)
         said.wait(_LAST_WORDS_S)
 
     def _streams_changed(self, streams: InstanceStreams) -> None:
         def update() -> None:
-            self.stepped()  # what was stepped before belongs to the old set of variables
+            self.stepped()  # the earlier rows belong to the old set of variables
             streams.update()
 
         self._inbox.post(update)
@@ -224,7 +224,7 @@ class NodeServer:
         streams.publish(first, columns)
         self._waiting_rows -= rows
         if self._waiting_rows > MAX_WAITING_ROWS // 2:
-            # Subscribers cannot keep up with this run: they get a share of the node's time, and samples are left out.
+            # Subscribers are slower than this run: publishing gets a share of the node's time, and samples are dropped.
             self._closing.wait(_STREAM_SHARE * (time.monotonic() - started))
 
     def _publish_log(self, line: LogLine) -> None:

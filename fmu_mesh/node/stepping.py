@@ -1,7 +1,8 @@
-"""Stepping: the hot loop of a node.
+"""Stepping: the inner loop of a node.
 
-A `Runner` is one instance with its rings and feeds. A `Unit` is what is stepped together: one runner, which goes as far
-ahead as its inputs and the grant allow, or a cycle of runners, which go point by point. Nothing here waits.
+A `Runner` is one instance with its rings and feeds; a feed brings values of a source into the input ring. A `Unit` is
+stepped together: it is one runner, which steps as far as its inputs and the grant allow, or a cycle of runners, which
+step point by point. Nothing here waits.
 """
 
 from __future__ import annotations
@@ -26,10 +27,10 @@ from .links import OutLink
 __all__ = ["LAZY_S", "LocalFeed", "RemoteFeed", "Runner", "Unit", "connect_feeds"]
 
 _BURST_S = 0.001
-"""A burst of steps ends after about this time, so that its rows are sent and messages are looked at."""
+"""A burst of steps ends after about this time in s, so that its rows are sent and messages are handled."""
 
 LAZY_S = 0.05
-"""How long rows that nobody steps on may wait for more of them: each frame wakes a process that needs a core for it."""
+"""How long in s rows that no step needs may wait for more rows: each frame wakes a process, which needs a core."""
 
 
 Wrapped = TypeVar("Wrapped", bound=Instance)
@@ -58,7 +59,7 @@ class Runner:
     """One instance with its rings.
 
     Attributes:
-        step: own steps done; the row of this step in `outputs` is the newest.
+        step: number of own steps done; this is also the newest row of `outputs`.
     """
 
     def __init__(self, plan: InstancePlan, instance: Instance, grid: TimeGrid, ring_rows: int) -> None:
@@ -77,20 +78,20 @@ class Runner:
         self.grid = grid
 
     def bind(self) -> None:
-        """Let the instance work on the rings, and read the current outputs. Call after Initialization Mode."""
+        """Bind the instance to its rings, and read the current outputs. Call after Initialization Mode."""
         connected = [target for feed in self.plan.feeds for _, target, _, _ in feed.columns]
         fill_unconnected(self.inputs, connected, self.instance.get_values)
         outputs = (self.outputs,) if self.watched is None else (self.outputs, self.watched)
         self.instance.bind(self.inputs, outputs, self.grid, self.plan.step_points, self.step)
 
     def watch(self, names: Sequence[str]) -> None:
-        """From now on also read these outputs after every step; they are not among the plan's columns."""
+        """From now on also read these outputs after every step; the plan does not contain them."""
         variables = {variable.name: variable for variable in self.instance.description.variables}
         self.watched = Ring(Layout.of(variables[name] for name in names), self.outputs.rows) if names else None
         self.bind()
 
     def wrap(self, wrapper: Callable[[Instance], Wrapped]) -> Wrapped:
-        """From the next step on, step what ``wrapper`` makes around the instance; returns it."""
+        """Replace the instance by what ``wrapper`` makes of it, from the next step on; return the new one."""
         self.instance = wrapped = wrapper(self.instance)
         return wrapped
 
@@ -101,7 +102,7 @@ class Runner:
 
     @property
     def covered(self) -> int:
-        """The last point for which nobody has to wait for this instance: its outputs hold until its next own point."""
+        """The last point for which the outputs are known: they hold until the next own point."""
         if self.step >= self.last_step:
             return self.grid.last_point
         return min((self.step + 1) * self.plan.step_points - 1, self.grid.last_point)
@@ -111,7 +112,7 @@ class Runner:
         return min(-(-grant // self.plan.step_points), self.last_step, *self.ready_steps())
 
     def ready_steps(self, without: frozenset[str] = frozenset()) -> Iterator[int]:
-        """Own steps for which each feed has its values; feeds from the instances in ``without`` are left out."""
+        """Number of own steps for which all feeds have values; feeds from the instances in ``without`` are ignored."""
         for remote in self.remote_feeds:
             yield remote.ready
         for local in self.local_feeds:
@@ -119,7 +120,7 @@ class Runner:
                 yield local.transfer.ready(local.source.step + 1)
 
     def lacking(self) -> str:
-        """In words what the next step waits for: the first feed that is not there, or the grant."""
+        """What the next step waits for, in words: the first feed without a value, or the grant."""
         feeds: list[RemoteFeed | LocalFeed] = [*self.remote_feeds, *self.local_feeds]
         for feed in feeds:
             source_steps = feed.receiver.received if isinstance(feed, RemoteFeed) else feed.source.step + 1
@@ -137,7 +138,7 @@ class Runner:
                 link.flush(end)
 
     def send_last(self, end: int) -> None:
-        """The run ends early: send the recorder the rows before own step ``end`` that it lacks, and that it is all."""
+        """The run ends early: send the recorder the remaining rows before own step ``end``, and that no more come."""
         for link in self.out_links:
             if link.lazy:
                 link.send_last(end)
@@ -153,8 +154,8 @@ class Runner:
 class Unit:
     """Runners that are stepped together, in the order of the plan.
 
-    How long a burst takes is known from those before it only, and an FMU may become slow from one step to the next:
-    another thread may then end the burst (`hurry`) and do what cannot wait (`meanwhile`).
+    The length of a burst is estimated from earlier bursts, but an FMU may become slow from one step to the next. Then
+    another thread may end the burst (`hurry`), and send rows during a long step (`meanwhile`).
     """
 
     def __init__(self, runners: Sequence[Runner]) -> None:
@@ -172,18 +173,18 @@ class Unit:
 
     @property
     def current(self) -> Runner:
-        """The runner whose step is under way while this is advanced."""
+        """The runner that is stepping."""
         return min(self.runners, key=lambda runner: (runner.step + 1) * runner.plan.step_points)
 
     def hurry(self) -> None:
-        """From another thread: end the burst that is under way after the current step."""
+        """From another thread: end the burst after the current step."""
         self._hurry = True
 
     def meanwhile(self, action: Callable[[], None]) -> None:
-        """From another thread: call ``action`` if a burst is under way; for that time it alone uses links and inbox.
+        """From another thread: call ``action`` if a burst is running; meanwhile only ``action`` uses links and inbox.
 
-        The thread that steps sets `_stepping` before it looks at `_hurry`, and this one the other way round: one of the
-        two sees the other, and the one that steps waits at the end of its burst until ``action`` is over.
+        The stepping thread sets `_stepping` before it reads `_hurry`, and this thread does the opposite. So one of the
+        two sees the flag of the other, and the stepping thread waits at the end of its burst until ``action`` is done.
         """
         with self._returning:
             self._hurry = True
@@ -191,7 +192,7 @@ class Unit:
                 action()
 
     def advance(self, grant: int) -> bool:
-        """Step as far as inputs and ``grant`` allow, for one burst at most; whether anything was stepped."""
+        """Step as far as inputs and ``grant`` allow, for at most one burst; return whether there was a step."""
         started = perf_counter()
         self._stepping = True
         try:
@@ -253,7 +254,7 @@ class Unit:
         return end - first
 
     def _step_together(self, first: int, end: int) -> int:
-        """From point ``first`` to ``end``, or less far in a hurry; returns how far."""
+        """Step from point ``first`` to ``end``, or less far after `hurry`; return the point that was reached."""
         one, half_ulp, quarter_ulp, tiny = DEFAULT_MODE
         members = [
             (runner, [feed.step for feed in runner.local_feeds], runner.instance.do_step) for runner in self.runners
@@ -274,7 +275,7 @@ class Unit:
         """As `_step_together`."""
         for point in range(first, end):
             for runner in self.runners:
-                # A slower instance steps when the end of its step is reached: only then all its inputs can be there.
+                # A slower instance steps when the end of its step is reached: only then all its inputs can be known.
                 step, rest = divmod(point + 1 - runner.plan.step_points, runner.plan.step_points)
                 if rest:
                     continue
@@ -289,12 +290,12 @@ class Unit:
         return max(first, end)
 
     def _cycle_limit(self, grant: int) -> int:
-        """The point up to which the whole cycle may step: bounded by the grant and by what comes from outside."""
+        """The point up to which the whole cycle may step: limited by the grant and by inputs from other units."""
         limit = grant
         for runner in self.runners:
             for ready in runner.ready_steps(without=self._inner):
                 if ready < runner.last_step:
-                    # The first own step that lacks something is taken at its last point; the others go on up to there.
+                    # The first own step without all inputs is taken at its last point; the others may step up to there.
                     limit = min(limit, (ready + 1) * runner.plan.step_points - 1)
             for link in runner.out_links:
                 limit = min(limit, max(runner.step + 1, link.sent + link.capacity - 1) * link.link.step_points)
@@ -302,7 +303,7 @@ class Unit:
 
 
 def connect_feeds(plan: NodePlan, runners: Mapping[str, Runner]) -> dict[int, tuple[FrameReceiver, list[RemoteFeed]]]:
-    """Give all runners their feeds; returns who receives the frames of each link, by its index, and what they feed."""
+    """Give all runners their feeds; return the receiver of each link, by its index, with the feeds that use it."""
     remote: dict[int, tuple[FrameReceiver, list[RemoteFeed]]] = {}
     for link in plan.links_in:
         fed: list[RemoteFeed] = []
@@ -336,5 +337,5 @@ def connect_feeds(plan: NodePlan, runners: Mapping[str, Runner]) -> dict[int, tu
 
 
 def _fit(feeds: Sequence[RemoteFeed], end: int) -> bool:
-    """Whether the source's rows before own step ``end`` overwrite no input that was not used yet."""
+    """Whether the rows of the source before own step ``end`` fit into the ring without overwriting unused inputs."""
     return all(feed.transfer.ready(end) - feed.target.step <= feed.target.inputs.rows for feed in feeds)

@@ -1,7 +1,7 @@
-"""Streams: every value of a variable as a Zenoh sample, while somebody subscribes, and no work while nobody does.
+"""Streams: every value of a variable as a Zenoh sample. Without subscribers there is no work.
 
-The main thread only copies the subscribed columns of the rows it has just stepped; encoding and publishing happen on
-the server's thread. A subscriber that stops loses samples (their points tell which), and slows nobody down.
+The main thread only copies the subscribed columns of new rows; the server thread encodes and publishes them. A
+subscriber that stops loses samples (their points show which), and does not slow down the mesh.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ __all__ = ["MAX_WAITING_ROWS", "PRIORITY", "Batch", "InstanceStreams", "kind_of"
 MAX_WAITING_ROWS = 1 << 14
 
 PRIORITY = zenoh.Priority.DATA_LOW
-"""Frames and grants must not queue behind what is only looked at."""
+"""Frames and grants must not wait behind samples for subscribers."""
 
 Batch = tuple["InstanceStreams", int, dict[str, NDArray[Any]]]
 """Streams, first own step, and the values by variable name."""
@@ -50,7 +50,7 @@ class InstanceStreams:
     """The streams of one instance.
 
     Args:
-        changed: called on a foreign thread when a variable gets its first or loses its last subscriber.
+        changed: called on a thread of Zenoh when a variable gets its first or loses its last subscriber.
     """
 
     def __init__(
@@ -83,7 +83,7 @@ class InstanceStreams:
             self._listeners.append(publisher.declare_matching_listener(lambda _status: changed(self)))
 
     def update(self) -> None:
-        """On the main thread, between steps: see which variables have subscribers, and read those from now on."""
+        """On the main thread, between steps: find the variables that have subscribers, and read them from now on."""
         active = tuple(name for name, publisher in self._publishers.items() if matches(publisher))
         if active == self._active:
             return
@@ -128,7 +128,7 @@ class InstanceStreams:
                 put(encode_value(values[offset]), attachment=stamp)
 
     def take_dropped(self) -> int:
-        """How many rows were left out since the last call."""
+        """Number of rows that were dropped since the last call."""
         dropped, self._dropped = self._dropped, 0
         return dropped
 

@@ -1,7 +1,7 @@
-"""Measuring one node: where its time goes, and what it waits for.
+"""Measures how a node spends its time, and what it waits for.
 
-A node that is not profiled runs none of this: the measured forms of its units, links and calls take the place of the
-plain ones when the master asks for a profile, before the first point.
+Without a profile none of this runs. If the master asks for a profile, measured units, links and calls replace those of
+the node before the first point.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class Profiler:
 
     Args:
         node: name of the node.
-        entries: how many bursts and waits are noted; sums go on.
+        entries: largest number of bursts and waits that are stored; the sums contain all of them.
         window: window of the node's plan, from which the capacity of links follows.
 
     Call `link`, `measured_units` and `measured_calls` before Initialization Mode and `start` after it, then step; at
@@ -108,7 +108,7 @@ class Profiler:
         return measured
 
     def stepped(self, burst: Burst) -> None:
-        """Note a burst; what is sent and received after the last one is no part of the run."""
+        """Add a burst; sending and receiving after the last burst are not part of the run."""
         self._ended = burst.end
         self._transport_s = self.sent_s + self._received_s
         if len(self._bursts) + len(self._waits) < self._entries:
@@ -117,8 +117,8 @@ class Profiler:
             self._cut += 1
 
     def waited(self, seconds: float, *, running: bool) -> None:
-        """Note a wait that has just ended, before its message is taken; ``running``: whether there was a grant yet."""
-        if not running:  # the others are not at point 0: the run begins with the first grant
+        """Add a wait that has just ended, before its message is handled; ``running``: whether there was a grant."""
+        if not running:  # other nodes are not at point 0 yet: the run begins with the first grant
             self.start()
             return
         ended = perf_counter()
@@ -148,7 +148,7 @@ class Profiler:
         )
 
     def _behind(self) -> str | None:
-        """The instance of another node that keeps this one waiting, `GRANT`, or None if it has nothing left to do."""
+        """The instance of another node for which this node waits, `GRANT`, or None after the last point."""
         unfinished = False
         for unit in self._units:
             for runner in unit.runners:
@@ -161,7 +161,7 @@ class Profiler:
 
 
 class _MeasuredUnit(Unit):
-    """A unit that tells its bursts."""
+    """A unit that reports its bursts to the profiler."""
 
     def __init__(self, runners: Sequence[Runner], number: int, profiler: Profiler) -> None:
         super().__init__(runners)
@@ -190,7 +190,7 @@ class _MeasuredUnit(Unit):
 
 
 class _MeasuredLink(OutLink):
-    """A link that tells the time that sending takes."""
+    """A link that reports the time of sending to the profiler."""
 
     def __init__(
         self, profiler: Profiler, link: Link, outputs: Ring, put: Callable[[bytes], None], window: int

@@ -1,1 +1,1 @@
-"""Recording: rows of all instances, put together by point, into the result file."""
+"""Recording: writes the rows of all instances, combined by point, into the result file."""

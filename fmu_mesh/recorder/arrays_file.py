@@ -37,7 +37,7 @@ def read_arrays(path: Path, types: Sequence[VariableType]) -> tuple[NDArray[np.f
     """Read a file of this module.
 
     Args:
-        path: the file; without one there are no rows.
+        path: the file; if it does not exist there are no rows.
         types: the types of the columns.
 
     Returns:
@@ -119,7 +119,7 @@ class ArraysFile:
         self.rows += len(times)
 
     def flush(self) -> None:
-        """Nothing waits: `write` gives everything to the operating system."""
+        """Do nothing: `write` gives everything to the operating system."""
 
     def close(self) -> None:
         """Close the file."""

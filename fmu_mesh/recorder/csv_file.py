@@ -1,7 +1,7 @@
-"""The result CSV: first column `time`, then `<instance>.<variable>`, floats written shortest-round-trip.
+"""The result CSV: the first column is `time`, the others are `<instance>.<variable>`.
 
-A float is written with as few digits as read back to the same bits; Boolean as `true` or `false`; String as quoted
-text; Binary as base64.
+A float has the smallest number of digits that gives the same bits when it is read; a Boolean is `true` or `false`, a
+String is quoted text, a Binary is base64.
 """
 
 from __future__ import annotations
@@ -30,23 +30,23 @@ from .lines import in_lines, prepare
 __all__ = ["CsvFile"]
 
 _CHUNK_NUMBERS = 4096
-"""What is formatted at once: more would not stay in the cache, and its memory would come from the system each time."""
+"""How much is formatted at once: more does not fit into the cache, and needs new memory from the system each time."""
 
 _BUFFER_BYTES = 1 << 16
 _READ_BYTES = 1 << 20
 
 
 class CsvFile:
-    """Writes rows of results, always whole ones at once.
+    """Writes rows of results, always complete rows.
 
     Args:
-        path: the file; its folder is made, an older file is replaced by the first row.
+        path: the file; its folder is created, and the first row replaces an older file.
         columns: (name, type) of every column but `time`.
 
     Attributes:
         path: the file.
-        rows: rows written so far; once it is closed, those that are in the file.
-        kept: what the operating system has by now.
+        rows: number of rows written so far; after `close`, the number of rows in the file.
+        kept: what the operating system has.
 
     Raises:
         ConfigurationError: the file cannot be written, or another run writes into it.
@@ -77,7 +77,7 @@ class CsvFile:
 
     @classmethod
     def check(cls, recording: Recording, findings: Findings) -> None:
-        """A CSV can hold everything."""
+        """Do nothing: a CSV file can hold values of all types."""
 
     @classmethod
     def open(cls, path: Path, recording: Recording) -> Self:
@@ -86,17 +86,17 @@ class CsvFile:
 
     @staticmethod
     def keep_whole_rows(path: Path, kept: Kept) -> int:
-        """Cut a result file off after its last complete row; returns how many rows it has.
+        """Cut a result file off after its last complete row; return the number of its rows.
 
         Args:
-            path: the file; nobody writes it any more.
+            path: the file, which no process writes any more.
             kept: rows that are known to be complete; only what follows them is read.
         """
         lines, end, quoted = 0, kept.size, False
         with path.open("r+b") as file:
             offset = file.seek(kept.size)
             while piece := file.read(_READ_BYTES):
-                for number, part in enumerate(piece.split(b'"')):  # text may have line ends in it
+                for number, part in enumerate(piece.split(b'"')):  # a String may contain line ends
                     if number:
                         quoted = not quoted
                         offset += 1
@@ -121,7 +121,7 @@ class CsvFile:
                 self.flush()
 
     def flush(self) -> None:
-        """Hand everything to the operating system, so that it survives the end of this process."""
+        """Give everything to the operating system, so that it is not lost if this process dies."""
         if not self._waiting_bytes:
             return
         left = memoryview(b"".join(self._waiting))
@@ -135,21 +135,21 @@ class CsvFile:
         self.kept = Kept(self.rows, self._file.size)
 
     def close(self) -> None:
-        """Write what is left and close the file; without a row, nothing has changed."""
+        """Write what is left and close the file. Without a row, nothing has changed."""
         try:
             self.flush()
         finally:
             self._file.close()
 
     def _rows_in_file(self) -> int:
-        """Rows that are there after a write failed, the last of them complete."""
+        """Number of complete rows in the file after a write has failed."""
         with suppress(OSError):
             if self.path.is_file():
                 return self.keep_whole_rows(self.path, self.kept)
         return self.kept.rows
 
     def _format(self, columns: Sequence[NDArray[Any]]) -> bytes | memoryview:
-        # JSON's numbers are shortest-round-trip, too, and orjson writes those of an array without a Python object each.
+        # JSON numbers also have the smallest number of digits, and orjson writes an array without Python objects.
         if self._is_float:
             values = np.stack(columns, axis=1)
             if np.isfinite(values).all():
@@ -161,7 +161,7 @@ class CsvFile:
 
 
 def _text(value: Value) -> str:
-    """One value where JSON has no word for it: `nan`, `inf`, `-inf`, text; all others as JSON has them."""
+    """One value as text: `nan`, `inf`, `-inf` and strings are not as in JSON; all others are."""
     match value:
         case str():
             return '"' + value.replace('"', '""') + '"'

@@ -1,7 +1,7 @@
-"""Numbers of a JSON array as lines of a CSV file: every so many commas, one becomes the end of a line.
+"""Makes lines of a CSV file from a JSON array of numbers: after a line's last number, the comma becomes a line end.
 
-orjson writes the numbers; to find the commas with NumPy takes a third of the time of both, so that a compiled function
-does it where there is llvmlite.
+orjson writes the numbers. With NumPy, finding the commas would take a third of the time of both steps. So a compiled
+function does it if llvmlite is available.
 """
 
 from __future__ import annotations
@@ -72,12 +72,12 @@ done:
 
 
 def prepare() -> None:
-    """Compile what `in_lines` calls, which takes some milliseconds, before the first row comes."""
+    """Compile the function that `in_lines` calls before the first row arrives; this takes some milliseconds."""
     _compiled()
 
 
 def in_lines(numbers: bytes, width: int) -> memoryview:
-    """A JSON array of numbers, one at least, as lines with ``width`` of them each."""
+    """Lines with ``width`` numbers each, from a JSON array of at least one number."""
     text = bytearray(numbers)
     characters = np.frombuffer(text, dtype=np.uint8)
     if len(text) >= _BLOCK and (compiled := _compiled()) is not None:
@@ -100,6 +100,6 @@ def _compiled() -> _EndLines | None:
     code = compile_function("end_lines", _ENDS)
     if code is None:
         return None
-    # It keeps the interpreter's lock: to give it away and get it back costs more than the call.
+    # It keeps the interpreter's lock: releasing and acquiring it takes longer than the call.
     function = ctypes.PYFUNCTYPE(None, ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64)
     return _EndLines(function(code.address), code)

@@ -1,7 +1,7 @@
-"""The recorder: it takes frames as a node does, and writes rows as soon as they are complete.
+"""The recorder: receives frames like a node, and writes rows as soon as they are complete.
 
-It runs on a thread of the master's process, with an inbox, a liveliness token and progress of its own: what it has not
-written yet holds the grant back, so that nothing has to be dropped and memory stays bounded.
+It has its own thread in the master's process, and its own inbox, liveliness token and progress. The grant waits for
+rows that are not written yet. So no row is dropped, and memory is bounded.
 """
 
 from __future__ import annotations
@@ -48,13 +48,13 @@ log = logging.getLogger(__name__)
 _LOOK_S = 0.2
 _WRITE_ROWS = 4096
 _REST_S = 0.005
-"""How long frames may gather while rows come by the thousand: each frame that wakes the recorder takes a processor from
-somebody who steps, and to write many rows at once costs less."""
+"""How long in s the recorder pauses while thousands of rows arrive: each frame that wakes the recorder takes a
+processor from a node that steps, and writing many rows at once takes less time."""
 
 _LEAST_REST_S = 0.0005
 _REST_ROWS = 256
 _LAST_S = 0.5
-"""How long the nodes may take to send their last rows when a run ends early."""
+"""How long in s the recorder waits for the last rows of the nodes when a run ends early."""
 
 _TELL_S = 0.1
 _FLUSH_S = 0.2
@@ -66,11 +66,11 @@ class Recorder:
 
     Args:
         plan: the recorder's part of the plan.
-        session: the session of this process; stays the caller's.
+        session: the session of this process; the caller closes it.
         file: the result file; closed by the recorder.
         has_begun: whether all instances have reached point 0; nothing is written before.
 
-    Use it as a context manager: the thread runs inside, and the file is complete up to the last complete row outside.
+    Use it as a context manager: the thread runs inside; afterwards the file has all complete rows.
     """
 
     def __init__(
@@ -99,11 +99,11 @@ class Recorder:
         self._progress_sent = -1
         self._progress_told_at = 0.0
         self._finished = False
-        # At the end the main thread writes what is left, and on a slow disk the thread may still be at it.
+        # At the end the main thread writes what is left; on a slow disk this thread may still be writing.
         self._writing = threading.Lock()
         self._flushed = time.monotonic()
         self._flushed_rows = 0
-        self._inbox = Inbox(shared_inbox(plan, spins=False))  # nobody waits for it, but others need the processor
+        self._inbox = Inbox(shared_inbox(plan, spins=False))  # no process waits for it, but others need the processor
         self._membership = Membership(plan, session, self._inbox, launch)
         self._put_progress: Callable[[bytes], None]
         self._turns: _Turns
@@ -111,7 +111,7 @@ class Recorder:
 
     @property
     def rows(self) -> int:
-        """Rows written so far; outside, those that are in the file."""
+        """Number of rows written so far; after the `with` block, the number of rows in the file."""
         return self._file.rows
 
     def __enter__(self) -> Self:
@@ -129,7 +129,7 @@ class Recorder:
         try:
             self._finish_file()
         except OSError as failure:
-            # A failure during the run is what the master has ended with; this one came after the last point.
+            # The master has already reported a failure during the run; this failure came after the last point.
             if error is None:
                 raise unwritable(self._file.path, failure) from failure
         finally:
@@ -163,7 +163,7 @@ class Recorder:
         try:
             self._meet()
         except MeshLost as error:
-            # The master meets the same deadline, and names all nodes that are missing; it must not miss this one, too.
+            # The master has the same deadline, and names all missing nodes; the recorder must not be one of them.
             patience_s = self._plan.timeouts.stop if isinstance(error, DeadlineExceeded) else 0.0
             end = time.monotonic() + patience_s
             while not self._finished and time.monotonic() < end:
@@ -177,7 +177,7 @@ class Recorder:
         self._put_progress = self._membership.sender(MASTER, progress)
 
     def _record(self) -> None:
-        """Take what comes, write rows when they are many or nothing more is there, and tell the progress."""
+        """Receive rows, write them when there are many or when no message is left, and send the progress."""
         heard = self._rested_at = time.monotonic()
         while not self._finished:
             message = self._inbox.poll()
@@ -193,14 +193,14 @@ class Recorder:
                     self._write_complete_rows()
                     self._tell_progress()
             elif time.monotonic() - heard > self._plan.timeouts.step:
-                raise DeadlineExceeded("the recorder heard nothing from the master")
+                raise DeadlineExceeded("the recorder received nothing from the master")
         while self._leaving.is_set() and (message := self._inbox.poll()) is not None:
-            self._take(message)  # what came before the end, above all the reason for it
+            self._take(message)  # messages that arrived before the end, above all its reason
 
     def _rest(self) -> None:
-        """Let frames gather, if many rows have come since the last rest.
+        """Pause, so that several frames arrive, if many rows have come since the last pause.
 
-        At most for a quarter of the time that the run still takes at the speed of late: its end waits for nobody.
+        At most for a quarter of the remaining time of the run at its present speed, so that its end is not delayed.
         """
         written, now = self._written, time.monotonic()
         came = written - self._rested
@@ -226,7 +226,7 @@ class Recorder:
         elif kind == LAST:
             source.end()
         elif kind != INITIAL:
-            raise MessageRefused(f"a message of kind {kind} is nothing that a node sends")
+            raise MessageRefused(f"a message of kind {kind} is not one that a node sends")
 
     def _take_from_master(self, message: Message) -> None:
         _, kind, _, _, _, data = message
@@ -237,10 +237,10 @@ class Recorder:
             self._take_last_rows(cause)
             raise _Ended(cause)
         elif kind != GRANT:
-            raise MessageRefused(f"a message of kind {kind} is nothing that the master sends")
+            raise MessageRefused(f"a message of kind {kind} is not one that the master sends")
 
     def _fits(self, link: Link, end: int) -> bool:
-        """Whether rows of a source before its own step ``end`` overwrite none that is not written yet."""
+        """Whether rows of a source before its own step ``end`` overwrite no rows that are not written yet."""
         return end - self._written // link.step_points <= self._plan.ring_rows
 
     def _complete(self) -> int:
@@ -260,15 +260,15 @@ class Recorder:
         if rows <= self._written or not (self._written or self._has_begun()):
             return
         while (first := self._written) < rows:
-            end = min(rows, first - first % self._plan.ring_rows + self._plan.ring_rows)  # rings are read in one piece
+            end = min(rows, first - first % self._plan.ring_rows + self._plan.ring_rows)  # read without wrap-around
             columns = [column(first, end) for column in self._columns]
             self._file.write(self._plan.grid.times(first, end), columns)
             self._written = end
 
     def _take_last_rows(self, cause: FmuMeshError) -> None:
-        """Take the frames that are still to come when a run ends early; what they complete is written at the end.
+        """When a run ends early, wait for the last frames; the rows that they complete are written at the end.
 
-        Who is alive says when it has sent its last rows; who is lost has.
+        Wait until every live node has reported that it has sent its last rows; lost nodes send nothing more.
         """
         if isinstance(cause, MeshLost):
             lost = (cause.instance or "").split(", ")
@@ -287,13 +287,13 @@ class Recorder:
                 self._take(message)
 
     def _rows_are_missing(self) -> bool:
-        """Whether rows are still to come that those of the sources that have ended make complete."""
+        """Whether rows are still missing that would complete rows of the sources that have ended."""
         last_point, sources = self._plan.grid.last_point, self._sources.values()
         end = min((source.covered(last_point) for source in sources if source.ended), default=last_point)
         return any(not source.ended and source.covered(last_point) < end for source in sources)
 
     def _tell_progress(self) -> None:
-        """Tell the master how far the rows are complete, if the grant can hang on it or somebody may want to see it."""
+        """Send the progress to the master, if the grant may depend on it or a status needs it."""
         complete = self._complete()
         now = time.monotonic()
         due = complete - self._progress_sent >= self._plan.progress_stride or now - self._progress_told_at > _TELL_S
@@ -303,7 +303,7 @@ class Recorder:
             self._put_progress(HEADER.pack(PROGRESS, 0, 0, complete))
 
     def _report(self, error: FmuMeshError | None) -> None:
-        """Tell the master how recording ended; one that leaves takes no reports any more, and waits for this end."""
+        """Report to the master how recording ended. A master that ends accepts no reports; it waits for this thread."""
         report = NodeReport(RECORDER, max(self._written - 1, 0), error.report() if error is not None else None)
         patience_s, left = self._plan.timeouts.stop, self._leaving.is_set
         try:
@@ -320,14 +320,14 @@ class Recorder:
 
 
 class _Ended(FmuMeshError):
-    """The run ended before its last point; what was written stays."""
+    """The run ended before its last point; the written rows are kept."""
 
     def __init__(self, cause: FmuMeshError) -> None:
         super().__init__(cause.message)
 
 
 class _Source:
-    """Rows of one instance that wait for those of the others; ``ended`` if there will be no more of them."""
+    """Rows of one instance that wait for rows of the others; ``ended``: no more rows will come."""
 
     def __init__(self, receiver: FrameReceiver) -> None:
         self.receiver = receiver
@@ -335,7 +335,7 @@ class _Source:
         self.ended = False
 
     def end(self) -> None:
-        """No more rows come."""
+        """Note that no more rows will come."""
         self.ended = True
 
     def covered(self, last_point: int) -> int:
@@ -346,7 +346,7 @@ class _Source:
         return received * points - 1
 
     def column(self, variable: str) -> Callable[[int, int], NDArray[Any]]:
-        """What returns the values of a variable at the points first to end - 1, between which no ring begins anew."""
+        """A function that returns the values of a variable at the points first to end - 1, without wrap-around."""
         ring, step_points = self.receiver.kept, self.receiver.link.step_points
         place = ring.layout.place(variable)
         values, mask = ring.parts[place.part][:, place.first], ring.mask
@@ -363,14 +363,14 @@ class _Source:
 
 
 class _Turns:
-    """Lets a thread that works now and then take its time from all processors in turn.
+    """Moves a thread that works from time to time to another processor each time.
 
-    The scheduler wakes a thread where it slept last. A recorder left alone takes its time from the same node again and
-    again, which then holds up the others, and often two nodes are left on one processor while another one is idle.
+    The scheduler wakes a thread on the processor on which it slept. So a recorder would interrupt the same node again
+    and again, and this node would delay the others. Often two nodes then share one processor while another one is idle.
 
     Args:
-        busy: how many nodes of this host step all the time. Where there are more processors than that, the scheduler
-            finds the idle one by itself, and nothing is done.
+        busy: number of nodes of this host that step all the time. If there are more processors, the scheduler finds the
+            idle one, and this class does nothing.
     """
 
     def __init__(self, busy: int) -> None:
@@ -378,10 +378,10 @@ class _Turns:
         self._turn = 0
 
     def next(self) -> None:
-        """Move the calling thread to the next processor; it is not bound to it, and may go where one is idle."""
+        """Move the calling thread to the next processor; the scheduler may move it on to an idle one."""
         processors = sorted(os.sched_getaffinity(0)) if _CAN_CHOOSE else []
         if 1 < len(processors) <= self._busy:
             self._turn = (self._turn + 1) % len(processors)
-            with suppress(OSError):  # just taken from this process
+            with suppress(OSError):  # this processor was just taken from this process
                 os.sched_setaffinity(0, {processors[self._turn]})
                 os.sched_setaffinity(0, processors)

@@ -1,4 +1,4 @@
-"""Rows of single values on their way into a result file, many at once: what a run in one process records."""
+"""Collects rows of single values and writes many at once into a result file: used by a run in one process."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ class RowBuffer:
     """The rows of a run, from point 0 on.
 
     Args:
-        file: where they go; None: nowhere.
+        file: the result file; None: nothing is recorded.
         grid: their times.
         types: of their columns.
 
     Attributes:
-        flushed_at: when others could last read all rows; monotonic, in s.
+        flushed_at: last time at which other processes could read all rows; monotonic, in s.
 
-    Call `add` for every point and `write` now and then; `close` at the end, also from another thread.
+    Call `add` for every point and `write` from time to time; `close` at the end, also from another thread.
     """
 
     def __init__(self, file: ResultFile | None, grid: TimeGrid, types: Sequence[VariableType]) -> None:
@@ -43,7 +43,7 @@ class RowBuffer:
 
     @property
     def count(self) -> int:
-        """Rows given to the file; once it is closed, those that are in it."""
+        """Number of rows given to the file; after `close`, the number of rows in the file."""
         return self._file.rows if self._file is not None else 0
 
     def add(self, row: list[Value]) -> None:
@@ -51,7 +51,7 @@ class RowBuffer:
         self._waiting.append(row)
 
     def write(self, *, flush: bool = False) -> None:
-        """Give the file what has been added; with ``flush``, others can read it then.
+        """Give the new rows to the file; with ``flush``, other processes can read them then.
 
         Raises:
             ConfigurationError: it cannot be written.
@@ -75,7 +75,7 @@ class RowBuffer:
             ConfigurationError: it cannot be written.
         """
         if self._file is None or not self._writing.acquire(timeout=_CLOSE_S):
-            return  # another thread is writing, to a disk that does not answer
+            return  # another thread is writing to a disk that does not answer
         try:
             try:
                 self._write(self._file)

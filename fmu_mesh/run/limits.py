@@ -21,7 +21,7 @@ _LOCAL_MIB = 660
 """Need of a run in one process. Measured: 630."""
 RUN_MIB = 1700
 """Need of a master, a node, and of what starts them. Measured: 1540, of which about a tenth is used."""
-_WITHOUT_SESSION = ("check", "schema", "inspect", "plot")
+_WITHOUT_SESSION = ("check", "completion", "inspect", "new", "plot", "schema")
 _RUNS = ("launch", "run", "node", "master", "gateway")
 _NO_MEMORY = ("can't start new thread", "failed to map segment", "Cannot allocate memory")
 """Texts in other errors than MemoryError that mean a lack of memory."""

@@ -6,6 +6,7 @@ from the annotations of `Options`. Knows nothing of argparse.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, get_type_hints
@@ -16,12 +17,14 @@ from msgspec.structs import replace
 
 from ..config.base import Base, Endpoint
 from ..config.findings import Findings
-from ..config.loading import LoadedConfig
+from ..config.loading import LoadedConfig, PlainConfig
 from ..config.mesh import RecordConfig, SimulationConfig, ZenohConfig
 from ..config.structure import check
+from ..config.yaml_text import Plain, read
 from ..instances.contract import Showing
+from ..text import listed, nearest
 
-__all__ = ["Flag", "OptionField", "Options", "option_fields", "with_options"]
+__all__ = ["Flag", "OptionField", "Options", "option_fields", "with_config_values", "with_options"]
 
 _SECTIONS: dict[str, type[Base]] = {"simulation": SimulationConfig, "record": RecordConfig, "zenoh": ZenohConfig}
 
@@ -50,9 +53,11 @@ class Options(msgspec.Struct, frozen=True):
     Each field is an option, and its annotation says how the command line spells it.
 
     Example:
-        >>> prepare(Path("mesh.yaml"), Options(window=1, start_values=("gain.k=2.5",)))
+        >>> Options(window=1, start_values=("gain.k=2.5",)).window
+        1
     """
 
+    algorithm: Annotated[str | None, Flag("--algorithm", "NAME", "simulation.algorithm")] = None
     step_size: Annotated[float | None, Flag("--step-size", "S", "simulation.step_size")] = None
     stop_time: Annotated[float | None, Flag("--stop-time", "S", "simulation.stop_time")] = None
     window: Annotated[int | Literal["auto"] | None, Flag("--window", "N", "simulation.window")] = None
@@ -61,6 +66,10 @@ class Options(msgspec.Struct, frozen=True):
     catch_up: Annotated[float | None, Flag("--catch-up", "S", "simulation.catch_up")] = None
     start_values: Annotated[
         tuple[str, ...], Flag("--set", "INSTANCE.VARIABLE=VALUE", text="start value of a variable")
+    ] = ()
+    config_values: Annotated[
+        tuple[str, ...],
+        Flag("--set-config", "KEY=VALUE", text="any key by its path, as in simulation.window=16; the value is YAML"),
     ] = ()
     output: Annotated[
         Path | None, Flag("--output", "FILE", "record.file", "result file; its ending chooses the format")
@@ -124,6 +133,63 @@ def option_fields() -> dict[str, OptionField]:
     return found
 
 
+def with_config_values(plain: PlainConfig, config_values: Sequence[str]) -> PlainConfig:
+    """The values of a configuration with keys replaced by `--set-config`; they are checked with the others.
+
+    Example:
+        >>> from pathlib import Path
+        >>> from fmu_mesh.config.loading import read_text
+        >>> plain = read_text("simulation: {step_size: 0.1}", Path("mesh.yaml"))
+        >>> with_config_values(plain, ["simulation.window=16", "zenoh={mode: client}"]).data
+        {'simulation': {'step_size': 0.1, 'window': 16}, 'zenoh': {'mode': 'client'}}
+
+    Args:
+        plain: the values of the file.
+        config_values: `KEY=VALUE` each: the path of a key in the file, and its value as YAML.
+    """
+    findings = Findings(str(plain.file))
+    data, overrides = plain.data, dict(plain.overrides)
+    for text in config_values:
+        option, (path, equals, written) = f"--set-config {text}", text.partition("=")
+        keys = path.split(".")
+        value = read(written, wrong := Findings(option), {})
+        if not (equals and written and all(keys)):
+            findings.add(option, "no value of a key", "KEY=VALUE, such as simulation.window=16")
+        elif "[" in path:
+            findings.add(option, "a key inside a list", f"the whole list, as in {path.partition('[')[0]}=[...]")
+        elif keys[2:3] == ["start_values"]:
+            findings.add(option, "a start value", f"--set {'.'.join((keys[1], *keys[3:]))}={written}")
+        elif len(wrong):
+            findings.add(option, next(iter(wrong)).found, "a value in YAML")
+        elif (problem := _obstacle(data, keys)) is not None:
+            findings.add(option, *problem)
+        else:
+            data = _replaced(data, keys, value)
+            overrides[path] = option
+    return plain._replace(data=data, findings=(*plain.findings, *findings), overrides=overrides)
+
+
+def _obstacle(data: Plain, keys: Sequence[str]) -> tuple[str, str, str | None] | None:
+    """Why a key cannot be replaced: what was found, what was expected, and the nearest name."""
+    for depth, key in enumerate(keys):
+        if not isinstance(data, dict | None):
+            where = ".".join(keys[:depth])
+            what = "a list" if isinstance(data, list) else "a single value"
+            return f"a key inside '{where}', which is {what}", f"{where}=VALUE", None
+        if keys[0] == "instances" and depth == 1 and key not in (names := list(data or {})):
+            return f"the unknown instance '{key}'", f"one of {listed(names)}", nearest(key, names)
+        data = (data or {}).get(key)
+    return None
+
+
+def _replaced(data: Plain, keys: Sequence[str], value: Plain) -> Plain:
+    """Nested mappings with another value of one key; mappings on the way are made where there are none."""
+    if not keys:
+        return value
+    section = data if isinstance(data, dict) else {}
+    return {**section, keys[0]: _replaced(section.get(keys[0]), keys[1:], value)}
+
+
 def with_options(loaded: LoadedConfig, options: Options, findings: Findings | None = None) -> LoadedConfig:
     """The configuration with its keys replaced by the options that are given.
 
@@ -138,6 +204,8 @@ def with_options(loaded: LoadedConfig, options: Options, findings: Findings | No
         if flag.key is None or value in (None, ()):
             continue
         section, _, key = flag.key.partition(".")
+        if flag.key in overrides and findings is not None:
+            findings.add(flag.key, f"replaced by {flag.name} as well", "one of the two options")
         overrides[flag.key] = f"{flag.name} {_written(value)}"
         plain = list(value) if setting.repeatable else str(value.absolute()) if isinstance(value, Path) else value
         config = replace(config, **{section: replace(getattr(config, section), **{key: plain})})

@@ -15,16 +15,16 @@ from msgspec.structs import replace
 from .. import files
 from ..config.findings import Findings
 from ..config.instance_sections import InstanceSection, key_of, placed
-from ..config.loading import LoadedConfig
+from ..config.loading import LoadedConfig, read_file
 from ..errors import Finding, LoadFailed
-from ..instances.configuration import examine
+from ..instances.configuration import examine_data
 from ..instances.registry import check_showing, content, describe, expected_model
 from ..ros.gateway.mapping import resolve as resolve_ros
 from ..system.plan import Plan, make_plan
 from ..system.system import build
 from ..text import nearest_file
 from ..variables.model_description import ModelDescription
-from .options import Options, with_options
+from .options import Options, with_config_values, with_options
 from .results import check_results
 from .run_plan import RunPlan
 
@@ -55,7 +55,7 @@ def plan_run(
     Raises:
         ConfigurationError: the configuration or an FMU is wrong; carries all findings.
     """
-    loaded, findings = examine(path, options.start_values)
+    loaded, findings = examine_data(with_config_values(read_file(path), options.config_values), options.start_values)
     return planned(loaded, findings, options, tell)
 
 

@@ -23,7 +23,7 @@ from ..errors import ConfigurationError
 from ..files import Kept, open_alone
 from ..recorder.arrays_file import ENDING
 from ..system.recording import Recording, ResultFile, ResultFormat, result_format
-from ..system.system import System
+from ..system.system import ResolvedSystem
 
 __all__ = ["check_results", "open_result", "rows_left", "what_is_kept"]
 
@@ -31,7 +31,7 @@ _NAME = "recorded"
 _NOTE = struct.Struct("<qq")
 
 
-def check_results(loaded: LoadedConfig, system: System) -> None:
+def check_results(loaded: LoadedConfig, system: ResolvedSystem) -> None:
     """Check that the result file can hold what is recorded.
 
     Raises:
@@ -43,7 +43,7 @@ def check_results(loaded: LoadedConfig, system: System) -> None:
         findings.raise_any()
 
 
-def open_result(loaded: LoadedConfig, system: System, folder: Path | None = None) -> ResultFile:
+def open_result(loaded: LoadedConfig, system: ResolvedSystem, folder: Path | None = None) -> ResultFile:
     """Open the result file of a run.
 
     Args:
@@ -97,7 +97,7 @@ def _format(path: str | Path) -> ResultFormat:
     return found
 
 
-def _recording(loaded: LoadedConfig, system: System) -> Recording:
+def _recording(loaded: LoadedConfig, system: ResolvedSystem) -> Recording:
     descriptions = {name: instance.description for name, instance in system.instances.items()}
     return Recording(loaded, descriptions, system.recorded)
 

@@ -17,7 +17,7 @@ from ..variables.model_description import Variable
 from ..variables.value_conversion import to_plain
 from ..variables.value_types import PlainValue, Value, VariableType, nested, zero
 from .graph import reaches, strongly_connected
-from .system import Connection, System
+from .system import Connection, ResolvedSystem
 
 __all__ = ["InitializationPlan", "Loop", "Tear", "plan_initialization"]
 
@@ -73,7 +73,7 @@ class InitializationPlan(msgspec.Struct, frozen=True):
     loops: tuple[Loop, ...]
 
 
-def plan_initialization(system: System, connections: Sequence[Connection]) -> InitializationPlan:
+def plan_initialization(system: ResolvedSystem, connections: Sequence[Connection]) -> InitializationPlan:
     """Levels of all connected outputs, and the loops.
 
     Args:
@@ -133,7 +133,7 @@ def _torn(
     return [c for c in connections if id(c) in torn], kept
 
 
-def _tear(system: System, connection: Connection) -> Tear:
+def _tear(system: ResolvedSystem, connection: Connection) -> Tear:
     instance, variable = system.instances[connection.target_instance], connection.target
     start: Value | None = instance.start_values.get(variable.name, variable.start)
     if start is None:  # an input must have one (FMI 2.0, 2.2.7)

@@ -1,7 +1,7 @@
 """The plan of a mesh: delays, order, cycles, initialization levels, and the tasks of every node.
 
-Owns the synchronization model (docs/architecture.md) as data. The plan is a pure function of a `System`. Every process
-of a mesh computes or receives the same plan; they compare its digest.
+Owns the synchronization model (docs/architecture.md) as data. The plan is a pure function of a
+`ResolvedSystem`. Every process of a mesh computes or receives the same plan; they compare its digest.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from .graph import cycle_through, feedback_edges, strongly_connected, topologica
 from .initialization_plan import InitializationPlan, Loop, plan_initialization
 from .layout import Layout, rows_for
 from .linear_inputs import LinearInput, linear_inputs
-from .system import Connection, System, SystemInstance
+from .system import Connection, ResolvedSystem, SystemInstance
 from .window import LAZY_ROWS, recorder_window, window_of
 
 __all__ = ["RECORDER", "Feed", "InstancePlan", "Link", "NodePlan", "Plan", "make_plan"]
@@ -152,7 +152,7 @@ class Plan(msgspec.Struct, frozen=True):
         nodes: by node name, with the recorder if there is one.
     """
 
-    system: System
+    system: ResolvedSystem
     connections: tuple[Connection, ...]
     order: tuple[str, ...]
     cycles: tuple[tuple[str, ...], ...]
@@ -173,7 +173,7 @@ class Plan(msgspec.Struct, frozen=True):
 
 
 def make_plan(
-    system: System,
+    system: ResolvedSystem,
     *,
     window: int | None = None,
     file: str = "",
@@ -218,7 +218,7 @@ def make_plan(
     return replace(plan, digest=digest, nodes={name: replace(node, digest=digest) for name, node in nodes.items()})
 
 
-def _digest(system: System, nodes: dict[str, NodePlan], contents: Mapping[str, str]) -> str:
+def _digest(system: ResolvedSystem, nodes: dict[str, NodePlan], contents: Mapping[str, str]) -> str:
     """The digest that all processes must have: it covers the content of files, but not where they are on each host."""
     agreed = [
         replace(
@@ -234,7 +234,7 @@ def _digest(system: System, nodes: dict[str, NodePlan], contents: Mapping[str, s
     return digest_of(agreed, models)
 
 
-def _with_delays(system: System) -> tuple[tuple[Connection, ...], tuple[Connection, ...]]:
+def _with_delays(system: ResolvedSystem) -> tuple[tuple[Connection, ...], tuple[Connection, ...]]:
     """All connections with a delay of 0 or 1, and those that got 1 because they close a cycle."""
     if system.config.simulation.algorithm == "jacobi":
         return tuple(replace(c, delay=1) if c.delay is None else c for c in system.connections), ()

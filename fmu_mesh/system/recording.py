@@ -25,6 +25,9 @@ __all__ = ["Recording", "ResultFile", "ResultFormat", "has_unknown_ending", "res
 
 _GROUP = "fmu_mesh.recorders"
 _DEFAULT = "csv"
+_IN_MEMORY = "arrays"
+"""What the library keeps in memory; no file that anybody names."""
+
 _PLAIN = ("", "txt")
 """Endings that ask for no format in particular; a number, as in `result.2`, does not either."""
 
@@ -175,7 +178,7 @@ def has_unknown_ending(path: str | Path) -> bool:
 
 def result_endings() -> list[str]:
     """The endings that result files can have, such as `.csv`, ours first."""
-    return [f".{name}" for name in plugin_names(_GROUP)]
+    return [f".{name}" for name in plugin_names(_GROUP) if name != _IN_MEMORY]
 
 
 def _ending(path: str | Path) -> str:

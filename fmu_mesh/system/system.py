@@ -35,7 +35,7 @@ from fmu_mesh.text import nearest_file, shown
 from fmu_mesh.variables.model_description import ModelDescription, Value
 from fmu_mesh.variables.value_types import element_name, is_text
 
-__all__ = ["Connection", "System", "SystemInstance", "build"]
+__all__ = ["Connection", "ResolvedSystem", "SystemInstance", "build"]
 
 _RESERVED_NAME = "mesh"
 
@@ -60,7 +60,7 @@ class SystemInstance(msgspec.Struct, frozen=True):
     node: str
 
 
-class System(msgspec.Struct, frozen=True):
+class ResolvedSystem(msgspec.Struct, frozen=True):
     """A configuration whose names are all resolved.
 
     Attributes:
@@ -82,7 +82,7 @@ class System(msgspec.Struct, frozen=True):
 
 def build(
     loaded: LoadedConfig, descriptions: Mapping[str, ModelDescription], findings: Iterable[Finding] = ()
-) -> System:
+) -> ResolvedSystem:
     """Resolve every name of a configuration.
 
     Args:
@@ -131,7 +131,7 @@ def build(
     unit_warnings(connections, descriptions, warnings)
     _needed_tools(config, descriptions, warnings)
     _ending_warning(loaded, result_file, warnings)
-    return System(config, grid, instances, connections, recorded, result_file, tuple(warnings))
+    return ResolvedSystem(config, grid, instances, connections, recorded, result_file, tuple(warnings))
 
 
 def _grid(config: Config, findings: Findings) -> TimeGrid | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from .layout import Layout
-from .system import System
+from .system import ResolvedSystem
 
 __all__ = [
     "AUTO_WINDOW_POINTS",
@@ -60,7 +60,7 @@ def lazy_frame_rows(window: int) -> int:
     return min(_LAZY_FRAME_ROWS, max(LAZY_ROWS // 2, window // 4))
 
 
-def window_of(system: System) -> int:
+def window_of(system: ResolvedSystem) -> int:
     """The window of the configuration in points; `auto` is as large as the memory for the rows allows.
 
     A large window costs memory only. Values do not depend on it; a node flushes a frame when a consumer could be

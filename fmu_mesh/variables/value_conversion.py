@@ -17,7 +17,7 @@ from ..text import listed, nearest
 from .model_description import Variable
 from .value_types import DTYPES, INTEGERS, PlainValue, Value, VariableType, flattened, nested
 
-__all__ = ["MAX_TEXT_SIZE", "ValueRefused", "from_plain", "range_of", "to_plain", "to_value"]
+__all__ = ["MAX_TEXT_SIZE", "ValueRefused", "checked_value", "from_plain", "range_of", "to_plain", "to_value"]
 
 MAX_TEXT_SIZE = 16 * 2**20
 """Largest size of a String or Binary in bytes."""
@@ -57,6 +57,25 @@ def to_value(plain: object, variable: Variable) -> Value:
     plain = plain.tolist() if isinstance(plain, np.ndarray | np.generic) else plain
     values = [_element(element, variable) for element in _elements(plain, variable, variable.shape)]
     return nested(values, variable.shape)
+
+
+def checked_value(plain: object, variable: Variable, said: str) -> Value:
+    """As `to_value`, with a whole sentence as the message of the error.
+
+    Args:
+        plain: the value that somebody gave.
+        variable: what it is for.
+        said: the value as the sentence shows it.
+
+    Raises:
+        ValueRefused: it is no value of the variable's type and shape, or out of its range.
+    """
+    try:
+        return to_value(plain, variable)
+    except ValueRefused as refused:
+        what = "is out of its range" if refused.out_of_range else f"is no {variable.type_name} value for it"
+        near = f" (did you mean '{refused.suggestion}'?)" if refused.suggestion else ""
+        raise ValueRefused(f"{said} {what}; expected {refused.expected}{near}") from refused
 
 
 def to_plain(value: Value) -> PlainValue:

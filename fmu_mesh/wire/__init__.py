@@ -1,5 +1,5 @@
-"""Zenoh as this project uses it: keys, messages, sessions, the inbox.
+"""How this project uses Zenoh: keys, messages, sessions, the inbox.
 
-Sessions are opened here only. `node`, `master`, `record` and `ros` import zenoh, too, and declare on a session that
-they are given.
+Only this package opens sessions. `node`, `master`, `recorder` and `ros` also import zenoh, and use a session that they
+are given.
 """

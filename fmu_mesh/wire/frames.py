@@ -1,4 +1,4 @@
-"""The receiving end of a link: frames in, new rows out; nothing missing, nothing twice (design, invariant 3)."""
+"""The receiving end of a link: checks frames and returns new rows; no row may be missing or come twice."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ class FrameReceiver:
 
     Args:
         link: the link.
-        target: who receives, for errors.
-        keep: how many rows are kept, a power of two: at least the window, so that a frame always fits.
-        fits: whether rows up to this own step of the source, itself not included, overwrite none that is still needed.
+        target: the receiver, for errors.
+        keep: how many rows are kept: a power of two, and at least the window, so that a frame always fits.
+        fits: whether rows before this own step of the source overwrite no row that is still needed.
 
     Attributes:
         kept: the newest rows.
-        received: own steps of the source whose rows are here; the next row must be this one.
+        received: number of own steps of the source that were received; the next row must have this number.
     """
 
     def __init__(self, link: Link, target: str, keep: int, fits: Callable[[int], bool] = lambda _end: True) -> None:
@@ -42,24 +42,23 @@ class FrameReceiver:
         """The new rows of a FRAME message with ``count`` rows from own step ``first`` of the source on.
 
         Returns:
-            The own step of the first new row and the rows, or None if all of them came before.
+            The own step of the first new row and the rows; None if all of them were received before.
 
         Raises:
-            MessageRefused: it is no frame of this link.
-            FrameGap: rows are missing before it, or a row came twice with other values.
-            ProtocolBroken: it holds more rows than were granted.
+            MessageRefused: it is not a frame of this link.
+            FrameGap: rows before it are missing, or a row came twice with different values.
+            ProtocolBroken: it has more rows than were granted.
         """
         rows = decode_rows(data, count, self._parts)
         if first < 0:
-            raise MessageRefused(f"a frame from point {first} on holds none of the run")
+            raise MessageRefused(f"a frame from point {first} on has no point of this run")
         if count > self.kept.rows or (first <= self.received < first + count and not self._fits(first + count)):
             last = (first + count - 1) * self.link.step_points
             raise ProtocolBroken(
-                f"'{self.link.source}' sends its values up to point {last} to {self._target}, which has no room for "
-                "them: more than was granted",
+                f"'{self.link.source}' sends its values up to point {last} to {self._target}, more than was granted",
                 instance=self.link.source,
                 point=first * self.link.step_points,
-                hint="Does somebody else send in its name?",
+                hint="Does another process send messages with its name?",
             )
         if first > self.received:
             missing, last = self.received * self.link.step_points, first * self.link.step_points - 1
@@ -84,7 +83,7 @@ class FrameReceiver:
             part[: count - cut] = new[cut:]
 
     def _compare(self, first: int, known: int, rows: Rows) -> None:
-        """A row that came before must come again with the same bits, as far as it is still kept."""
+        """A row that is received again must have the same bits; this is checked for the rows that are still kept."""
         for row in range(max(0, self.received - self.kept.rows - first), known):
             slot = (first + row) & self.kept.mask
             kept = [_bits(part, slot) for part in self.kept.parts]
@@ -98,7 +97,7 @@ class FrameReceiver:
 
 
 def _bits(array: NDArray[Any], row: int) -> bytes | list[str | bytes]:
-    """What two rows must have alike: the bits of numbers, which tell -0.0 from 0.0; text as it is."""
+    """What must be equal in two rows: the bits of numbers, which distinguish -0.0 from 0.0, and the texts."""
     if array.dtype == object:
         texts: list[str | bytes] = array[row].tolist()
         return texts
@@ -107,10 +106,10 @@ def _bits(array: NDArray[Any], row: int) -> bytes | list[str | bytes]:
 
 
 def initial_values(link: Link, level: int, data: bytes) -> dict[str, Value]:
-    """The values in an INITIAL message that became known at ``level``.
+    """The values of ``level`` in an INITIAL message.
 
     Raises:
-        MessageRefused: it is none of this link.
+        MessageRefused: it is not a message of this link.
     """
     row = Ring(link.layout, 1)
     for part, new in zip(row.parts, decode_rows(data, 1, link.layout.parts), strict=True):

@@ -1,8 +1,8 @@
-"""The inbox of a process: the one place where its main thread waits.
+"""The inbox of a process: the only place where its main thread waits.
 
-Frames, grants and progress arrive through one Zenoh FIFO channel, which no Python code on a foreign thread touches, or
-through shared memory, once it is known that all who send are on this host. Everything rare (a query to serve, a lost
-token, an end that was asked for) is posted by any thread and wakes the main thread up. No wait is without a deadline.
+Frames, grants and progress arrive through one Zenoh FIFO channel, without Python code on a thread of Zenoh, or through
+shared memory, if all senders are on this host. Rare events (a query, a lost token, a request to end) are posted by any
+thread and wake the main thread. Every wait has a deadline.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ Message = tuple[str, int, int, int, int, bytes]
 _WAKE: Final = HEADER.pack(WAKE, 0, 0, 0)
 _TIMER_PERIOD_S: Final = 0.05
 _NOBODY: Final = ""
-"""The sender of what is no message: a wake-up, or what was refused."""
+"""Stands for the sender if there is no message to handle: a wake-up, or a refused message."""
 
 
 class _Source(Protocol):
@@ -55,14 +55,14 @@ class _Source(Protocol):
 
 
 class Inbox:
-    """Receives what is sent to one process; until it is opened nothing can be, and only posted actions are run.
+    """Receives the messages for one process; until `open`, there are none, and only posted actions are run.
 
     Args:
-        shared: shared memory that `share` changes over to; None where nothing is shared.
+        shared: the shared memory that `share` switches to; None if there is none.
 
     Attributes:
-        offer: where senders on this host find the shared memory; None where nothing is shared.
-        refusals: what was not taken.
+        offer: where senders on this host find the shared memory; None if there is none.
+        refusals: counts the refused messages.
     """
 
     def __init__(self, shared: SharedInbox | None = None) -> None:
@@ -81,27 +81,27 @@ class Inbox:
         self.close()
 
     def open(self, session: zenoh.Session, keys: RunKeys, name: str, senders: Mapping[str, str], capacity: int) -> None:
-        """From now on the process ``name`` receives what is sent through Zenoh.
+        """From now on the process ``name`` receives messages through Zenoh.
 
         Args:
             session: the session of this process.
-            keys: those of the run.
+            keys: the keys of the run.
             name: of the node, or of the master.
-            senders: who may send to it, by the key that they send on; what comes by any other key is refused.
-            capacity: messages that fit; at least as many as the senders have credit for.
+            senders: the allowed senders by their keys; a message with any other key is refused.
+            capacity: number of messages that fit; at least as many as the senders may have on the way.
         """
         self._source = _ZenohSource(session, keys, name, senders, capacity, self.refusals)
         self._source.wake()  # for what was posted meanwhile
 
     def share(self) -> None:
-        """From now on everything comes through shared memory; call it before the first message."""
+        """From now on all messages come through shared memory; call it before the first message."""
         assert self._shared is not None
         zenoh_source, self._source = self._source, self._shared
         zenoh_source.close()
         self._source.wake()  # for what was posted meanwhile
 
     def stash(self) -> bool:
-        """For a sender that finds no room: take over what came through shared memory; whether the run is over."""
+        """For a sender that waits for free space: read the shared memory empty; return whether the run is over."""
         return self._shared.stash() if self._shared is not None else False
 
     def post(self, action: Callable[[], None]) -> None:
@@ -110,7 +110,7 @@ class Inbox:
         self._source.wake()
 
     def poll(self) -> Message | None:
-        """The next message if one is there; runs posted actions on the way."""
+        """The next message if there is one; also runs posted actions."""
         if self._posted:
             self._run_posted()
         while (arrived := self._source.take()) is not None:
@@ -119,7 +119,7 @@ class Inbox:
         return None
 
     def wait(self, timeout_s: float) -> Message | None:
-        """The next message, or None after ``timeout_s`` seconds or when posted actions were run."""
+        """Wait for the next message; None after ``timeout_s`` seconds, or after posted actions were run."""
         if self._run_posted():
             return None
         arrived = self._source.take_within(timeout_s)
@@ -131,7 +131,7 @@ class Inbox:
     def hand_on(
         self, message: Message, from_master: Callable[[Message], None], from_node: Callable[[Message], None]
     ) -> None:
-        """Give a message to who takes those of its sender; what that one refuses is counted."""
+        """Give a message to the handler of its sender; a message that the handler refuses is counted."""
         sender = message[0]
         try:
             (from_master if sender == MASTER else from_node)(message)
@@ -154,7 +154,7 @@ class Inbox:
             self._shared.close()
 
     def _run_posted(self) -> bool:
-        """Run what was posted; whether there was anything."""
+        """Run the posted actions; return whether there were any."""
         found = bool(self._posted)
         while self._posted:
             with self.refusals.guard("a query or a setting"):
@@ -163,7 +163,7 @@ class Inbox:
 
 
 class _Unopened:
-    """Nobody can send anything yet; a wait ends by its time or a wake-up."""
+    """Before `open`: there are no messages; a wait ends by its time or a wake-up."""
 
     def __init__(self) -> None:
         self._woken = threading.Event()
@@ -225,7 +225,7 @@ class _ZenohSource:
         key = str(sample.key_expr)
         sender = self._senders.get(key)
         if sender is None:
-            self._refusals.add(key, "nobody of this run sends on this key")
+            self._refusals.add(key, "no participant of this run sends with this key")
             return _NOBODY, b""
         return sender, sample.payload.to_bytes()
 
@@ -247,7 +247,7 @@ class _ZenohSource:
     def _run_timer(self) -> None:
         """Put a wake message when the deadline of the current wait has passed.
 
-        Waits that are longer than the period need not notify: the deadline is looked at once a period.
+        Waits that are longer than the period need not notify this thread: it checks the deadline once per period.
         """
         with self._condition:
             while not self._closed:

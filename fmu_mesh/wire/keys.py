@@ -1,4 +1,4 @@
-"""The key space (design, section 6): one place that knows how a key is spelt."""
+"""The key space (docs/key-space.md): the only module that knows how keys are written."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ _ESCAPED = re.compile(r"%([0-9A-F]{2})")
 _GRANT_CHUNKS = 16
 
 MASTER = "@mesh"
-"""Name of the master where node names stand."""
+"""Name of the master in place of a node name."""
 
 RUN_ID_BYTES = 8
-"""A run's id is written as hexadecimal digits, so it never begins with `@`, whose chunk matches no wildcard."""
+"""Hexadecimal digits of a run's id. So the id never begins with `@`: wildcards do not match such a chunk."""
 
 
 def escape(name: str) -> str:
@@ -35,7 +35,7 @@ def unescape(chunk: str) -> str:
 
 
 class Keys(msgspec.Struct, frozen=True):
-    """The public keys of one mesh, and where its internal ones begin.
+    """The public keys of one mesh, and the beginning of its internal keys.
 
     Attributes:
         prefix: first part of every key, `fmu_mesh` by default.
@@ -51,14 +51,14 @@ class Keys(msgspec.Struct, frozen=True):
         return f"{self.prefix}/{self.mesh}"
 
     def instance(self, name: str) -> str:
-        """Liveliness token of an instance, and what its keys start with."""
+        """Liveliness token of an instance, and the beginning of its keys."""
         return f"{self.root}/{name}"
 
     def variable(self, instance: str, kind: VariableKind, variable: str) -> str:
-        """Value of one variable."""
+        """Key of the value of one variable."""
         return f"{self.root}/{instance}/{kind}/{escape(variable)}"
 
-    def mesh_key(self, what: Literal["info", "status", "plan", "command", "ros"]) -> str:
+    def mesh_key(self, what: Literal["info", "status", "plan", "command", "log", "ros"]) -> str:
         """A queryable of the master; `ros` begins the keys of the gateways to ROS."""
         return f"{self.root}/mesh/{what}"
 
@@ -78,7 +78,7 @@ class Keys(msgspec.Struct, frozen=True):
 
 
 class RunKeys(msgspec.Struct, frozen=True):
-    """The internal keys of one run of a mesh. They carry its id, so that two runs never take each other's messages.
+    """The internal keys of one run of a mesh. They contain its id, so that two runs never exchange messages.
 
     Attributes:
         root: what every key of the mesh starts with.
@@ -90,7 +90,7 @@ class RunKeys(msgspec.Struct, frozen=True):
 
     @classmethod
     def new(cls, keys: Keys) -> RunKeys:
-        """The keys of a new run, whose id is random."""
+        """The keys of a new run, with a random id."""
         return keys.run(secrets.token_hex(RUN_ID_BYTES))
 
     @property
@@ -113,19 +113,19 @@ class RunKeys(msgspec.Struct, frozen=True):
         return f"{self.base}/node/{_of(node)}"
 
     def follower(self, name: str) -> str:
-        """Liveliness token of a reader that has not got its last sample yet: the master stays for it."""
+        """Liveliness token of a reader that has not got its last sample yet: the master waits for it."""
         return f"{self.base}/follower/{name}"
 
     def hello(self, node: str) -> str:
-        """Queryable of a node that tells whether it can reach the shared memory of whoever asks."""
+        """Queryable of a node that answers whether it can open the shared memory of the asking node."""
         return f"{self.base}/hello/{_of(node)}"
 
     def ready(self, node: str) -> str:
-        """Queryable of the master where a node says that its links work; answered when all have said so."""
+        """Queryable of the master where a node reports that its links work; it answers when all nodes have reported."""
         return f"{self.base}/ready/{_of(node)}"
 
     def report(self, node: str) -> str:
-        """Queryable of the master that takes the end or the failure of a node."""
+        """Queryable of the master where a node reports its end or its failure."""
         return f"{self.base}/report/{_of(node)}"
 
     def inbox(self, node: str) -> str:
@@ -141,7 +141,7 @@ class RunKeys(msgspec.Struct, frozen=True):
         return f"{self.base}/progress/{_of(node)}/to={MASTER}"
 
     def wake(self, node: str) -> str:
-        """A node's own key to wake itself up; never leaves the process."""
+        """A key with which a node wakes itself up; messages with it never leave the process."""
         return f"{self.base}/wake/to={node}"
 
     def grants(self, nodes: Iterable[str]) -> list[str]:
@@ -150,7 +150,7 @@ class RunKeys(msgspec.Struct, frozen=True):
 
 
 def _of(node: str) -> str:
-    """The chunk of a node, or of all; a name may begin with `@`, and such a chunk would match no wildcard."""
+    """The chunk of a node, or of all nodes. A name may begin with `@`, and wildcards do not match such a chunk."""
     return node if node == "*" else f"of={node}"
 
 

@@ -1,12 +1,12 @@
-"""How a node or the recorder joins a mesh, and by which way its messages reach each of the others.
+"""How a node or the recorder joins a mesh, and how its messages reach the other participants.
 
-In three steps, each a query that is answered:
+There are three steps; each is a query with an answer:
 
-* **register** with the master, which admits the node and tells it the run's id, or refuses it. Nothing else is declared
-  before, so that a process that does not belong to the run leaves no trace in it.
-* **hello** to every node that sends frames to this one: a source that answers has the subscription of who asked. On the
-  way it tells whether it reaches the shared memory of who asked.
-* **ready** to the master, which answers when all nodes are.
+* **register** with the master, which admits the node and answers with the run's id, or refuses it. The node declares
+  nothing before, so a process that is not part of the run does not affect it.
+* **hello** to every node that sends frames to this one: a source that answers knows the subscription of this node. The
+  answer also says whether the source can open the shared memory of this node.
+* **ready** to the master, which answers when all nodes are ready.
 """
 
 from __future__ import annotations
@@ -40,10 +40,10 @@ _GRACE_S = 1.0
 
 
 class Registration(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Who wants to be a node of the mesh.
+    """A process that wants to be a node of the mesh.
 
     Attributes:
-        launch: the launcher that started it; None for one that was started by hand.
+        launch: the launcher that started it; None if it was started manually.
     """
 
     node: str
@@ -58,7 +58,7 @@ class Admission(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     Attributes:
         run: the id of the run.
-        grants: the key that the master sends to this node on.
+        grants: the key of the master's messages to this node.
     """
 
     run: Annotated[str, msgspec.Meta(pattern=f"^[0-9a-f]{{{2 * RUN_ID_BYTES}}}$")]
@@ -66,18 +66,18 @@ class Admission(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Hello(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a node tells its sources: who it is, and where its shared memory is."""
+    """What a node sends to its sources: its name, and where its shared memory is."""
 
     node: str
     offer: Offer | None = None
 
 
 class NodeReady(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a node says about itself when its links work.
+    """What a node reports when its links work.
 
     Attributes:
         offer: its shared memory.
-        shared: whether all its sources can reach that.
+        shared: whether all its sources can open it.
     """
 
     offer: Offer | None = None
@@ -85,11 +85,11 @@ class NodeReady(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Welcome(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The master's answer to those that are ready, when all nodes are.
+    """The master's answer to all nodes when all of them are ready.
 
     Attributes:
-        profile: how many bursts and waits the node shall note for a profile; 0: nothing is measured.
-        shared: who gets all messages through shared memory: names of nodes, `@mesh` for the master.
+        profile: how many bursts and waits the node stores for a profile; 0: nothing is measured.
+        shared: the participants that get all messages through shared memory: names of nodes, `@mesh` for the master.
         offer: the shared memory of the master, if it is among them.
     """
 
@@ -99,7 +99,7 @@ class Welcome(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def shared_inbox(plan: NodePlan, *, spins: bool) -> SharedInbox | None:
-    """Shared memory with room for what each sender of this node has credit for; None where nothing can be shared."""
+    """Shared memory with space for all messages that the senders of this node may send ahead; None if there is none."""
     if not plan.shared_memory or not available():
         return None
     senders = {MASTER: 0}
@@ -114,16 +114,16 @@ class Membership:
 
     Args:
         plan: what the participant has to do.
-        session: the session of this process; stays the caller's.
+        session: the session of this process; the caller closes it.
         inbox: its inbox, made with `shared_inbox`; opened by `join`.
-        launch: the launcher that started this process; None where it was started by hand.
+        launch: the launcher that started this process; None if it was started manually.
         router: the link to the router that connects this process to the others, if there is one.
 
     Attributes:
         given_up: whether `give_up` was called.
         lost_master: whether the master was found to be gone.
 
-    Call sequence: `register`, then `join` once, then `sender` for everything that is sent to, and `close` at the end.
+    Call sequence: `register`, then `join` once, then `sender` for each receiver, and `close` at the end.
     """
 
     def __init__(
@@ -153,11 +153,11 @@ class Membership:
     def register(
         self, on_admitted: Callable[[], None] = lambda: None, on_master_gone: Callable[[], None] = lambda: None
     ) -> None:
-        """Begin to register, on a thread of its own: an FMU may be loaded meanwhile.
+        """Begin to register, on a separate thread: FMUs can be loaded meanwhile.
 
         Args:
-            on_admitted: called when the master has admitted this node, on that thread.
-            on_master_gone: called when the master's liveliness token goes, on a foreign thread; look whether it is so.
+            on_admitted: called on that thread when the master has admitted this node.
+            on_master_gone: called on a thread of Zenoh when the master's token seems to be gone; call `master_is_gone`.
         """
 
         def run() -> None:
@@ -166,7 +166,7 @@ class Membership:
                 on_admitted()
             except FmuMeshError as error:
                 self._refusal = error
-            except zenoh.ZError as error:  # the session is closed meanwhile
+            except zenoh.ZError as error:  # the session was closed meanwhile
                 self._refusal = MeshLost(f"this process cannot join the mesh: {error}")
             finally:
                 self._answered.set()
@@ -174,18 +174,18 @@ class Membership:
         threading.Thread(target=run, name="register", daemon=True).start()
 
     def give_up(self) -> None:
-        """From any thread: let `join` end with an error, because there is nothing to join any more."""
+        """From any thread: let `join` end with an error, because the mesh is gone."""
         self.given_up = True
 
     def keys(self, patience_s: float) -> RunKeys:
         """The keys of the run, once the master has admitted this node.
 
         Raises:
-            DeadlineExceeded: it has not within ``patience_s`` seconds.
-            MeshLost: it has refused to; the message says why.
+            DeadlineExceeded: the master did not answer within ``patience_s`` seconds.
+            MeshLost: the master refused this node; the message says why.
         """
         if not self._answered.wait(patience_s):
-            raise DeadlineExceeded(f"nobody answered for the master within {patience_s:g} s")
+            raise DeadlineExceeded(f"the master did not answer within {patience_s:g} s")
         if self._refusal is not None:
             raise self._refusal
         assert self._keys is not None
@@ -198,11 +198,11 @@ class Membership:
 
     @property
     def master_is_gone(self) -> bool:
-        """Whether the master's token is gone; may ask, so it is no question for a callback of Zenoh."""
+        """Whether the master's token is gone. This may send a query, so do not call it in a callback of Zenoh."""
         return self._keys is not None and not tokens(self._session, self._keys.master)
 
     def without_master(self) -> MeshLost:
-        """What to say where the master is gone, which is so from now on."""
+        """The error for a lost master; also stores that the master is lost."""
         self.lost_master = True
         loss = self._router.loss()
         if loss is not None:
@@ -216,16 +216,16 @@ class Membership:
         over: Callable[[], bool] = lambda: False,
         priority: zenoh.Priority = zenoh.Priority.DEFAULT,
     ) -> None:
-        """From any thread: tell the master how this participant has ended.
+        """From any thread: report to the master how this participant has ended.
 
         Args:
-            report: what it is told.
-            timeout_s: how long it may take to take it, in s.
-            over: whether nobody wants to know any more.
-            priority: behind what was sent with the same one before.
+            report: the report.
+            timeout_s: how long the master may take to answer, in s.
+            over: whether the report is not needed any more.
+            priority: the report arrives after earlier messages of the same priority.
 
         Raises:
-            MeshLost: the master has not taken it in time, or this is no node of its run.
+            MeshLost: the master did not accept it in time, or this is not a node of its run.
         """
         key = self.keys(timeout_s).report(self._plan.node)
         question = Question(key, "the master", timeout_s, msgspec.json.encode(report), priority=priority)
@@ -235,8 +235,8 @@ class Membership:
         """Wait until the links with all other nodes work in both directions, then tell the master.
 
         Raises:
-            DeadlineExceeded: somebody was not there in time.
-            MeshLost: the master refused this node, the message says why; or this node has given up.
+            DeadlineExceeded: a participant did not answer in time.
+            MeshLost: the master refused this node, the message says why; or `give_up` was called.
         """
         plan, inbox = self._plan, self._inbox
         deadline_s = plan.timeouts.start
@@ -267,7 +267,7 @@ class Membership:
         return welcome
 
     def sender(self, target: str, key: str) -> Callable[[bytes], None]:
-        """What sends a message to a target: through shared memory, or as a publication on ``key``."""
+        """A function that sends a message to a target: through shared memory, or as a publication on ``key``."""
         if target in self._shared:
             return self._outlets[target].put
         publisher = self._session.declare_publisher(key, congestion_control=zenoh.CongestionControl.BLOCK, express=True)
@@ -275,12 +275,12 @@ class Membership:
         return publisher.put
 
     def close(self) -> None:
-        """Undeclare what this has declared."""
+        """Undeclare everything that this object has declared."""
         self.given_up = True
         self._stack.close()
 
     def _enter(self, on_master_gone: Callable[[], None]) -> None:
-        """Register, and be there: from now on others may say hello, and the master sees when this process is lost."""
+        """Register, then declare the token and `hello`: the master notices from now on if this process is lost."""
         plan, stack = self._plan, self._stack
         registration = Registration(plan.node, plan.digest, os.getpid(), socket.gethostname(), self._launch)
         public = Keys(plan.key_prefix, plan.mesh)
@@ -302,11 +302,11 @@ class Membership:
         stack.callback(self._session.liveliness().declare_token(keys.node(plan.node)).undeclare)
 
     def _answer_hello(self, query: zenoh.Query) -> None:
-        """On a foreign thread: a target asks; tell it whether its shared memory can be reached from here."""
+        """On a thread of Zenoh: answer a target whether its shared memory can be opened from here."""
         with self._inbox.refusals.guard(str(query.key_expr), query):
             hello = decode_json(payload_of(query), Hello)
             if hello.node not in {link.target_node for link in self._plan.links_out}:
-                raise MessageRefused("it is from no node that this one sends to")
+                raise MessageRefused("its sender receives nothing from this node")
             outlet = self._outlet(hello.offer, hello.node, f"node '{hello.node}'")
             query.reply(query.key_expr, _SHARED if outlet is not None else b"")
             query.drop()
@@ -325,10 +325,10 @@ class Membership:
 
 
 def _understood(answer: bytes, kind: type[T]) -> T:
-    """The master's answer.
+    """The decoded answer of the master.
 
     Raises:
-        MeshLost: it is none of this version.
+        MeshLost: it is not an answer of this version.
     """
     try:
         return decode_json(answer, kind)

@@ -1,9 +1,9 @@
 """The messages of the synchronization, as bytes.
 
 Every message starts with 24 bytes, little endian: kind (u8), three spare bytes, number of the link (u32), count (u32),
-four spare bytes, point (i64). A frame follows with its rows (`fmu_mesh.wire.rows`). Abort follows with an `ErrorReport`
-as JSON. Last tells that a link brings no more rows, because the run has ended early. Every decoder checks sizes before
-it touches anything, and raises nothing but `MessageRefused`.
+four spare bytes, point (i64). In a frame the rows follow (`fmu_mesh.wire.rows`), in an ABORT an `ErrorReport` as
+JSON. LAST says that no more rows of a link come, because the run has ended early. Every decoder checks sizes before it
+reads anything, and raises only `MessageRefused`.
 """
 
 from __future__ import annotations
@@ -78,9 +78,9 @@ def decode_json(data: bytes, type_: type[T], most: int = MAX_MESSAGE_SIZE) -> T:
         MessageRefused: it is not JSON of that type, or larger.
     """
     if len(data) > most:
-        raise MessageRefused(f"it has {len(data)} bytes, and {most} are the most")
+        raise MessageRefused(f"it has {len(data)} bytes; the limit is {most}")
     try:
         return msgspec.json.decode(data, type=type_)
-    # msgspec lets what Python itself raises through, such as UnicodeDecodeError.
+    # msgspec does not catch exceptions of Python itself, such as UnicodeDecodeError.
     except (msgspec.MsgspecError, ValueError, OverflowError, RecursionError) as error:
         raise MessageRefused(str(error)) from error

@@ -1,6 +1,6 @@
-"""What comes over the wire and is not taken: it is counted, told once, and the run goes on (design, invariant 7).
+"""Refused messages: they are counted and logged once, and the run continues (ADR 8).
 
-Everything that a stranger can send is handled inside `Refusals.guard`: whatever is wrong with it ends there.
+Everything that an unknown sender can send is handled inside `Refusals.guard`, which catches all errors of a message.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class Refusals:
     """The refused messages of one process.
 
     Attributes:
-        count: how many there were.
+        count: number of refused messages.
     """
 
     def __init__(self) -> None:
@@ -33,7 +33,7 @@ class Refusals:
         self._told: set[tuple[str, str]] = set()
 
     def add(self, key: str, reason: str) -> None:
-        """Count a message that came by ``key``; tell it unless one like it was told."""
+        """Count a message with ``key``; log it unless a similar one was logged."""
         self.count += 1
         shown = key if len(key) <= _SHOWN_KEY else f"{key[:_SHOWN_KEY]}..."
         like = shown, reason.partition(":")[0]
@@ -45,15 +45,15 @@ class Refusals:
 
     @contextmanager
     def guard(self, key: str, query: zenoh.Query | None = None) -> Iterator[None]:
-        """Handle inside what came by ``key``; if it is refused, whoever sent the ``query`` is told.
+        """Handle a message with ``key`` inside this context; if it is refused, the ``query`` gets the reason.
 
-        An error that ends the run, such as that of an FMU, goes through.
+        Errors that end the run, such as those of an FMU, are not caught.
         """
         try:
             yield
         except MessageRefused as refused:
             self._refuse(key, str(refused), query)
-        except zenoh.ZError as error:  # whoever asked is gone
+        except zenoh.ZError as error:  # the client is gone
             log.info("answer_not_sent", extra={"error": str(error)})
         except FmuMeshError:
             raise
@@ -72,7 +72,7 @@ class Refusals:
 
 
 def payload_of(query: zenoh.Query) -> bytes:
-    """What came with a query that was sent to one key.
+    """The payload of a query that was sent to exactly one key.
 
     Raises:
         MessageRefused: it was sent to a key with wildcards, which may reach every run.

@@ -1,8 +1,8 @@
 """Rows as bytes: the values that follow the header of a frame.
 
-Part by part in the order of the layout: what has a fixed size as little-endian numbers, row by row (a Boolean as one
-byte, 0 or 1); String and Binary as the lengths of all values in bytes (u32), then the values themselves (UTF-8, raw
-bytes). Every decoder checks sizes before it touches anything.
+The parts are in the order of the layout. Numbers are little endian, row by row; a Boolean is one byte, 0 or 1. For
+String and Binary, the lengths of all values in bytes (u32) come first, then the values (UTF-8, raw bytes). Every
+decoder checks sizes before it reads anything.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ assert sys.byteorder == "little", "numbers go over the wire as they lie in memor
 
 
 def encode_rows(kind: int, link: int, first: int, rows: Rows) -> bytes:
-    """A FRAME or INITIAL message with consecutive rows of one part or more, from own step ``first`` on."""
+    """A FRAME or INITIAL message with consecutive rows from own step ``first`` on; there is at least one part."""
     header = HEADER.pack(kind, link, len(rows[0]), first)
     if len(rows) == 1 and rows[0].dtype != np.object_:
         return header + rows[0].tobytes()
@@ -37,10 +37,10 @@ def encode_rows(kind: int, link: int, first: int, rows: Rows) -> bytes:
 
 
 def encode_frames(kind: int, link: int, first: int, rows: Rows) -> Iterator[bytes]:
-    """As `encode_rows`, in as many messages as it takes for none to be too large; text can make a row of any size.
+    """As `encode_rows`, but in several messages if one would be too large; texts have no fixed size.
 
     Raises:
-        FmuMeshError: one row alone is too large.
+        FmuMeshError: a single row is too large.
     """
     message = encode_rows(kind, link, first, rows)
     if len(message) <= MAX_MESSAGE_SIZE:
@@ -48,20 +48,20 @@ def encode_frames(kind: int, link: int, first: int, rows: Rows) -> Iterator[byte
         return
     half = len(rows[0]) // 2
     if not half:
-        text = f"the values of one point take {len(message)} bytes, and {MAX_MESSAGE_SIZE} are the most"
+        text = f"the values of one point take {len(message)} bytes; the limit is {MAX_MESSAGE_SIZE}"
         raise FmuMeshError(text, hint="Connect and record fewer or smaller variables.")
     yield from encode_frames(kind, link, first, tuple(part[:half] for part in rows))
     yield from encode_frames(kind, link, first + half, tuple(part[half:] for part in rows))
 
 
 def decode_rows(data: bytes, count: int, parts: Sequence[Part]) -> Rows:
-    """The ``count`` rows of a FRAME or INITIAL message, read-only where they are numbers.
+    """The ``count`` rows of a FRAME or INITIAL message; arrays of numbers are read-only.
 
     Raises:
-        MessageRefused: it does not hold just these rows.
+        MessageRefused: it does not contain exactly these rows.
     """
     if len(data) > MAX_MESSAGE_SIZE:
-        raise _refused(data, count, f"{MAX_MESSAGE_SIZE} are the most")
+        raise _refused(data, count, f"at most {MAX_MESSAGE_SIZE} are allowed")
     place = HEADER.size
     rows: list[NDArray[Any]] = []
     for type_, _, width in parts:
@@ -90,7 +90,7 @@ def _texts(part: NDArray[Any]) -> bytes:
 def _decode_texts(
     data: bytes, place: int, count: int, size: int, type_: VariableType
 ) -> tuple[NDArray[np.object_], int]:
-    """The values of a part with text, and where they end."""
+    """The values of a part with text, and the position after them."""
     first = place + size * _LENGTH.itemsize
     if first > len(data):
         raise _refused(data, count, f"at least {first} are expected")

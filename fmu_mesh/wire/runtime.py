@@ -1,7 +1,7 @@
 """The runtime folder: where the processes of a mesh on one host find each other, and where tools find meshes.
 
-Owns the folder of a run (sockets, plans, extracted FMUs) and the note about a running mesh. A run's folder is removed
-by whoever made it, whatever becomes of the processes that used it.
+Owns the folder of a run (sockets, plans, extracted FMUs) and the note about a running mesh. The process that creates
+the folder of a run also removes it, even if processes that used it were killed.
 """
 
 from __future__ import annotations
@@ -43,20 +43,20 @@ __all__ = [
 
 _SOCKET_PATH_LIMIT = 100
 _NAME_LIMIT = 40
-"""Characters of a mesh's name in that of its folder; of a longer one the beginning, and a hash to tell it by."""
+"""Largest length of a mesh's name in the name of its folder; a longer name is cut, and a hash is added."""
 
 _runs = itertools.count(1)
 
 _held: dict[Path, TextIO] = {}
-"""The open notes of this process by the folder of their run; they hold their locks."""
+"""The open notes of this process by the folder of their run; an open file keeps its lock."""
 
 
 class MeshNote(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What the note about a running mesh says.
+    """The content of the note about a running mesh.
 
     Attributes:
         endpoints: Zenoh endpoints where the master can be reached, the socket of this user first.
-        pid: process that keeps the note: the launcher, or a master started by hand.
+        pid: the process of the note: the launcher, or a master that was started manually.
     """
 
     mesh: str
@@ -67,15 +67,15 @@ class MeshNote(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def runtime_folder() -> Path:
-    """The user's own folder for running meshes, which nobody else can enter; made if it is not there.
+    """The user's folder for running meshes, which other users cannot enter; created if it does not exist.
 
     Raises:
-        ConfigurationError: it cannot be made, or others can get into it.
+        ConfigurationError: it cannot be created, or other users can enter it.
     """
     base = Path(os.environ.get("XDG_RUNTIME_DIR") or "/nonexistent")
     if chosen := os.environ.get("FMU_MESH_RUNTIME_DIR"):
         folder = Path(chosen).absolute()
-    elif base.is_dir() and base.stat().st_uid == os.getuid():  # `su` leaves that of the other user in place
+    elif base.is_dir() and base.stat().st_uid == os.getuid():  # after `su` it is that of another user
         folder = base.absolute() / "fmu_mesh"
     else:
         folder = Path(tempfile.gettempdir()) / f"fmu_mesh-{os.getuid()}"
@@ -83,10 +83,10 @@ def runtime_folder() -> Path:
 
 
 def run_folder(mesh: str, run: str) -> Path:
-    """The folder of one run of a mesh; ``run`` is its name, see `run_name`, or `hand` for those by hand.
+    """The folder of one run of a mesh; ``run`` is its name (see `run_name`), or `hand` if it is started manually.
 
     Raises:
-        ConfigurationError: it cannot be made, or others can get into it.
+        ConfigurationError: it cannot be created, or other users can enter it.
     """
     name = mesh
     if len(mesh) > _NAME_LIMIT:  # FMUs have long names, and the path of a socket must be short
@@ -97,7 +97,7 @@ def run_folder(mesh: str, run: str) -> Path:
 
 
 def run_name() -> str:
-    """A name for a run of this process: its process id; from the second run on with the number of the run."""
+    """A name for a run of this process: the process id, and from the second run on also the number of the run."""
     number = next(_runs)
     return f"{os.getpid()}" if number == 1 else f"{os.getpid()}-{number}"
 
@@ -109,9 +109,9 @@ def launcher_of(folder: Path) -> int | None:
 
 
 def _private(folder: Path) -> Path:
-    """Make a folder with mode 0700, or see that the one that is there is this user's alone.
+    """Create a folder with mode 0700, or check that an existing folder belongs only to this user.
 
-    The sockets in it are the doors of a mesh: whoever can enter it, or has put it there, can read, set and end a run.
+    Everybody who can enter it can connect to the sockets in it, and so read and set values and end the run.
     """
     hint = "Set FMU_MESH_RUNTIME_DIR to a folder of your own."
     try:
@@ -134,7 +134,7 @@ def _private(folder: Path) -> Path:
 
 
 def remove_run_folder(folder: Path) -> None:
-    """Remove the folder of a run and all that is in it."""
+    """Remove the folder of a run with its content."""
     shutil.rmtree(folder, ignore_errors=True)
 
 
@@ -144,24 +144,24 @@ def fmu_folder(folder: Path) -> Path:
 
 
 def enter_run_folder(folder: Path, node: str) -> None:
-    """Note that this process is the node ``node`` of a run, so that others can tidy up for it if it is killed."""
-    _private(folder)  # whoever left it last may just have removed it
+    """Note that this process is the node ``node`` of a run, so that others can remove its files if it is killed."""
+    _private(folder)  # the last process that left the folder may just have removed it
     draft = folder / f"{os.getpid()}.new"
     file = draft.open("w", encoding="utf-8")
     _held[folder] = file
     file.write(_socket_name(node))
     file.flush()
-    fcntl.flock(file, fcntl.LOCK_EX)  # gone with the process, however it ends
+    fcntl.flock(file, fcntl.LOCK_EX)  # the lock ends with the process, however it ends
     draft.rename(folder / f"{os.getpid()}.pid")
 
 
 def tidy_run_folder(folder: Path) -> None:
-    """Remove what processes that were killed have left in the folder of a run."""
+    """Remove the files of killed processes from the folder of a run."""
     for note in folder.glob("*.pid"):
         try:
             with note.open(encoding="utf-8") as file:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:  # its process holds it, or somebody else was faster
+        except OSError:  # its process still holds the lock, or another process was faster
             continue
         _remove_traces(folder, note.stem)
 
@@ -175,32 +175,32 @@ def _remove_traces(folder: Path, pid: str) -> None:
     except FileNotFoundError:
         return
     if socket.endswith(".sock") and "/" not in socket:
-        for name in (socket, f"{socket}.lock"):  # Zenoh locks its sockets by a file beside them
+        for name in (socket, f"{socket}.lock"):  # Zenoh uses a lock file beside its socket
             (folder / name).unlink(missing_ok=True)
     note.unlink(missing_ok=True)
 
 
 def leave_run_folder(folder: Path) -> None:
-    """Remove the folder of a run if nobody uses it any more; called by every process on its way out."""
+    """Remove the folder of a run if no process uses it any more; every process calls this when it ends."""
     _remove_traces(folder, str(os.getpid()))
     if (held := _held.pop(folder, None)) is not None:
         held.close()
     tidy_run_folder(folder)
     note = _read_note(folder / "mesh.json")
-    if note is not None and note.pid == os.getpid():  # the master of processes started by hand
+    if note is not None and note.pid == os.getpid():  # the master of processes that were started manually
         (folder / "mesh.json").unlink(missing_ok=True)
     elif note is not None and not is_alive(note.pid):
         remove_run_folder(folder)  # the launcher was killed
         return
     elif note is None and (launcher := launcher_of(folder)) is not None and is_alive(launcher):
-        return  # a run is over before its launcher has come to write the note; it removes the folder, too
+        return  # the run was over before its launcher wrote the note; the launcher removes the folder too
     for empty in (folder / "fmus", folder):
         try:
             empty.rmdir()
         except FileNotFoundError:
             continue
         except OSError:
-            return  # somebody still uses it
+            return  # another process still uses it
 
 
 def socket_endpoint(folder: Path, node: str) -> str:
@@ -223,14 +223,14 @@ def _socket_name(node: str) -> str:
 
 
 def write_note(folder: Path, note: MeshNote) -> None:
-    """Write the note of a running mesh in one step, so that no reader sees half of it."""
+    """Write the note of a running mesh atomically, so that no reader gets an incomplete one."""
     temporary = folder / "mesh.json.new"
     temporary.write_bytes(msgspec.json.format(msgspec.json.encode(note)))
     temporary.replace(folder / "mesh.json")
 
 
 def meshes() -> Iterator[MeshNote]:
-    """The meshes that run on this host for this user; folders whose process is gone are removed on the way."""
+    """The meshes of this user on this host; also removes folders whose process is gone."""
     for file in sorted(runtime_folder().glob("*/mesh.json")):
         note = _read_note(file)
         if note is not None and is_alive(note.pid):
@@ -240,13 +240,13 @@ def meshes() -> Iterator[MeshNote]:
 
 
 def remove_stale_folders() -> None:
-    """Remove the folders of runs whose launcher is gone and whose processes could not do it themselves."""
+    """Remove the folders of runs whose launcher is gone and whose processes could not remove them."""
     for _ in meshes():
         continue
     for folder in runtime_folder().glob("*.hand"):
         tidy_run_folder(folder)
         for empty in (folder / "fmus", folder):
-            with suppress(OSError):  # somebody uses it
+            with suppress(OSError):  # a process still uses it
                 empty.rmdir()
 
 
@@ -258,7 +258,7 @@ def _read_note(file: Path) -> MeshNote | None:
 
 
 def is_alive(pid: int) -> bool:
-    """Whether this process still runs; one that has ended, but whose parent has not asked how, does not."""
+    """Whether this process still runs; a zombie process does not."""
     try:
         os.kill(pid, 0)
     except ProcessLookupError:
@@ -266,7 +266,7 @@ def is_alive(pid: int) -> bool:
     except PermissionError:
         return True
     state = process_state(pid)
-    if state is None:  # gone meanwhile, or a system without /proc
+    if state is None:  # it has ended meanwhile, or the system has no /proc
         return not Path("/proc/self/stat").exists()
     return state not in {"Z", "X"}
 

@@ -1,4 +1,4 @@
-"""Opening Zenoh sessions; the only `zenoh.open` of the project, and the reasons for every setting."""
+"""Opens Zenoh sessions: the only `zenoh.open` of the project, and the reason for every setting."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ __all__ = [
 ]
 
 LEASE_MS = 4_000
-"""A stopped (not dead) process is noticed after this time; a dead one within milliseconds."""
+"""A stopped process is detected after this time; a dead process within milliseconds."""
 
 STUCK_US = 1000 * LEASE_MS
-"""How long a sender stays blocked before the link is closed, and with it the peer's tokens.
+"""How long a sender may be blocked before the link is closed, and with it the peer's tokens.
 
-Credit keeps every queue of a living peer from filling up, so only a stopped process blocks a sender. While it does, the
-lease does not fire; this has to end what the lease cannot.
+Grants limit the messages on the way, so the queue of a live peer never fills up, and only a stopped process blocks a
+sender. The lease does not expire while the sender is blocked, so this limit is needed in addition.
 """
 
 _OWN_SOURCE = re.compile(r" at /\S+\.rs:\d+\.?")
@@ -53,13 +53,13 @@ _CANNOT_LISTEN = (
     ("Cannot assign requested address", "this host has no such address", "0.0.0.0 stands for all that it has."),
     ("Permission denied", "this user may not", "Take a port above 1023."),
 )
-"""The system's words for why an endpoint cannot be listened at, ours, and the way out."""
+"""Why a session cannot listen at an endpoint: the text of the system, our text, and a hint."""
 
 
 _CLOSE_S = 1.0
 _LOOK_S = 0.05
 _TIMEOUT = "Timeout"
-"""What Zenoh answers in the name of somebody who did not."""
+"""The reply of Zenoh itself if a queryable did not answer in time."""
 _TOKENS_S = 2.0
 _TOKENS_TRIES = 3
 _LINK_S = 1.0
@@ -73,8 +73,8 @@ class Wiring(msgspec.Struct, frozen=True):
     Attributes:
         mode: `peer` or `client`.
         listen: endpoints to listen on.
-        connect: endpoints to connect to; tried again until they answer.
-        gossip: whether peers learn of each other through those they know (meshes over several hosts).
+        connect: endpoints to connect to; repeated until they answer.
+        gossip: whether peers find each other through other peers (meshes over several hosts).
         config: a Zenoh configuration file to start from.
         patience_s: how long a client tries to connect, in s.
     """
@@ -91,7 +91,7 @@ def open_session(wiring: Wiring) -> zenoh.Session:
     """Open a session.
 
     Raises:
-        ConfigurationError: an endpoint or the configuration file is not usable.
+        ConfigurationError: an endpoint or the configuration file cannot be used.
     """
     zenoh.init_log_from_env_or("error")
     try:
@@ -101,7 +101,7 @@ def open_session(wiring: Wiring) -> zenoh.Session:
 
 
 def reason_of(error: zenoh.ZError) -> str:
-    """What an error of Zenoh says, without the places in its own sources."""
+    """The text of an error of Zenoh, without places in Zenoh's source code."""
     return _OWN_SOURCE.sub("", str(error))
 
 
@@ -123,23 +123,23 @@ def _configuration(wiring: Wiring) -> zenoh.Config:
         raise ConfigurationError(f"'{wiring.config}' is no Zenoh configuration: {reason_of(error)}") from error
     settings: dict[str, Any] = {
         "mode": wiring.mode,
-        # Nothing on the network unless the user asked for it: no multicast, and gossip only between hosts.
+        # No access to the network unless the user asks for it: no multicast, and gossip only between hosts.
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": wiring.gossip,
         "listen/endpoints": list(wiring.listen),
         "connect/endpoints": list(wiring.connect),
-        # Processes start in any order: an endpoint that does not answer yet is tried again, in the background.
+        # Processes start in any order: while an endpoint does not answer, connecting is repeated in the background.
         "connect/exit_on_failure": False,
         "connect/timeout_ms": -1 if wiring.mode == "peer" else round(1000 * wiring.patience_s),
         "connect/retry": {"period_init_ms": 20, "period_max_ms": 250, "period_increase_factor": 1.5},
         "listen/exit_on_failure": True,
         "transport/link/tx/lease": LEASE_MS,
         "transport/link/tx/queue/congestion_control/block/wait_before_close": STUCK_US,
-        # A subscriber that does not take its samples must not hold up what shares a link with them: they are dropped at
-        # once (the default waits a millisecond for each), and the queue for streams is as long as it may be instead.
+        # A slow subscriber must not delay other messages on its link: its samples are dropped at once (the default is
+        # to wait a millisecond for each). To drop fewer samples, the queue for streams has the largest possible size.
         "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,
         "transport/link/tx/queue/size/data_low": 16,
-        # Measured: the implicit shared memory slows Python down from 3 kB on.
+        # Measured: with the implicit shared memory, Python is slower for messages of 3 kB and more.
         "transport/shared_memory/enabled": False,
         "adminspace/enabled": True,
     }
@@ -149,10 +149,10 @@ def _configuration(wiring: Wiring) -> zenoh.Config:
 
 
 def close_session(session: zenoh.Session) -> None:
-    """Close a session, without waiting long for others.
+    """Close a session without waiting long.
 
-    Where an endpoint accepts and says nothing, or lets all packets fall, Zenoh waits ten seconds for it first. Whoever
-    has to close a session has nothing left to send, and the end of the process closes what is open then.
+    If an endpoint accepts a connection without an answer, or drops all packets, Zenoh waits ten seconds for it. When a
+    session is closed, nothing is left to send, and the end of the process closes what is still open.
     """
     closing = threading.Thread(target=session.close, name="close", daemon=True)
     closing.start()
@@ -160,27 +160,27 @@ def close_session(session: zenoh.Session) -> None:
 
 
 def own_endpoints(session: zenoh.Session, deadline_s: float = 5.0) -> tuple[str, ...]:
-    """The endpoints this session really listens on, with the ports that the system chose.
+    """The endpoints on which this session listens, with the ports that the system has chosen.
 
     Raises:
-        DeadlineExceeded: the session does not tell within ``deadline_s`` seconds.
+        DeadlineExceeded: they are not known within ``deadline_s`` seconds.
     """
-    answer = ask(session, Question(f"@/{session.zid()}/*", "the session's own endpoints", deadline_s))
+    answer = ask(session, Question(f"@/{session.zid()}/*", "this Zenoh session", deadline_s))
     return tuple(str(locator) for locator in json.loads(answer).get("locators", ()))
 
 
 def matches(entity: zenoh.Publisher | zenoh.Querier) -> bool:
-    """Whether anybody is there for what this publisher or querier sends."""
+    """Whether this publisher or querier has a receiver."""
     # The stub says bool, but it is an object that is always true (zenoh-python 1.10).
     return bool(entity.matching_status.matching)  # type: ignore[attr-defined]  # the stub is wrong
 
 
 def tokens(session: zenoh.Session, key: str, timeout_s: float = _TOKENS_S) -> list[str]:
-    """The keys of the liveliness tokens that match ``key``; for a thread that may wait, and no callback of Zenoh.
+    """The keys of the liveliness tokens that match ``key``. This waits, so do not call it in a callback of Zenoh.
 
-    A subscriber is told that a token is gone although another session still holds one with this key; this is the truth.
-    It asks again where the answer is empty: a session in client mode that has a subscriber for these tokens, too, gets
-    an empty answer now and then (1 of 30 with zenoh 1.10.2, 1 of 4 while the subscriber is new).
+    A subscriber is notified that a token is gone even if another session still has a token with this key; this query is
+    reliable. It is repeated if the answer is empty: a session in client mode that also has a subscriber for these
+    tokens sometimes gets an empty answer (1 of 30 with zenoh 1.10.2, 1 of 4 while the subscriber is new).
     """
     for _ in range(_TOKENS_TRIES):
         replies = session.liveliness().get(key, timeout=timeout_s)
@@ -190,11 +190,11 @@ def tokens(session: zenoh.Session, key: str, timeout_s: float = _TOKENS_S) -> li
 
 
 class RouterLink:
-    """Whether a process still reaches the router through which it reaches the others.
+    """Watches the link of a process to the router that connects it to the other processes.
 
     Args:
         session: the session of this process.
-        endpoints: where it connects to; none if all that it needs is on this host.
+        endpoints: where it connects to; empty if everything that it needs is on this host.
     """
 
     def __init__(self, session: zenoh.Session, endpoints: Iterable[str] = ()) -> None:
@@ -203,27 +203,27 @@ class RouterLink:
         self._had_router = False
 
     def wait(self) -> None:
-        """Give the link a moment to come up: a session in peer mode is open before it is."""
+        """Wait a moment for the link: a session in peer mode is open before the link is."""
         if self._endpoints:
             self._waits_until(there=True, seconds=_LINK_S)
 
     def look(self) -> bool:
-        """Whether there is a router; from the first time on, it counts as lost where there is none."""
+        """Whether there is a router. After it was found once, a missing router counts as lost."""
         there = bool(self._endpoints) and any(True for _ in self._session.info.routers_zid())
         self._had_router = self._had_router or there
         return there
 
     def loss(self) -> str | None:
-        """In words that the router is gone; None where it is there, or there was none.
+        """A text that says that the router is lost; None if it is there, or if there was none.
 
-        Zenoh tells that the tokens behind a link are gone a moment before it lets go of the link itself.
+        Zenoh reports the tokens behind a link as gone a moment before it reports the link as closed.
         """
         if not self._had_router or not self._waits_until(there=False, seconds=_UNLINK_S):
             return None
         return f"the link to the router at {', '.join(self._endpoints)} was lost"
 
     def _waits_until(self, *, there: bool, seconds: float) -> bool:
-        """Wait until the router is there, or is not; whether that came."""
+        """Wait until the router is there, or until it is not; return whether that happened in time."""
         end = time.monotonic() + seconds
         never = threading.Event()
         while self.look() != there:
@@ -248,12 +248,12 @@ class Question(msgspec.Struct, frozen=True):
 
     Attributes:
         key: key expression of the queryable.
-        whom: who is asked, for the error.
+        whom: the receiver, for the error.
         deadline_s: how long to wait for an answer, in s.
-        payload: JSON that goes with the query, if anything.
-        attachment: JSON that goes with the payload, if anything.
-        answer_s: how long somebody who is there may take to answer, in s, if that is longer.
-        priority: the query goes ahead of what has a lower one, and behind what was sent before with its own.
+        payload: JSON of the query, if there is any.
+        attachment: JSON of the attachment, if there is any.
+        answer_s: how long an existing queryable may take to answer, in s, if that is longer.
+        priority: the query overtakes messages of lower priority, and follows earlier ones of the same priority.
     """
 
     key: str
@@ -273,20 +273,20 @@ def ask(session: zenoh.Session, question: Question, over: Callable[[], bool] = l
 def answers(
     session: zenoh.Session, question: Question, over: Callable[[], bool] = lambda: False, *, every: bool = True
 ) -> list[zenoh.Sample]:
-    """Query until somebody is there to answer; at least one answer.
+    """Query until a queryable answers; return at least one answer.
 
-    A query sent before the queryable is known gets no reply at all, so this waits until a queryable matches, and asks
-    again when the matching changes.
+    A query that is sent before the queryable is known gets no reply. So this waits until a queryable matches, and
+    repeats the query when the matching changes.
 
     Args:
         session: the session to ask with.
         question: what is asked.
-        over: whether the answer is not wanted any more.
+        over: whether the answer is not needed any more.
         every: whether to wait for the end of the query; False: the first answer is enough.
 
     Raises:
-        DeadlineExceeded: nobody answered in time.
-        MeshLost: the answer was an error; its text is the message. Or it is not wanted any more.
+        DeadlineExceeded: there was no answer in time.
+        MeshLost: the answer was an error, whose text is the message; or the answer is not needed any more.
     """
     end = time.monotonic() + question.deadline_s
     changed = threading.Event()
@@ -298,22 +298,22 @@ def answers(
             while (left := end - time.monotonic()) > 0:
                 changed.clear()
                 if matches(querier):
-                    # Zenoh does not tell when whoever took the query is gone: it would wait for the timeout.
+                    # Zenoh does not report that the process of the queryable is gone: it would wait for the timeout.
                     replies: queue.SimpleQueue[zenoh.Reply | None] = queue.SimpleQueue()
                     handler = Callback(replies.put, partial(replies.put, None))
                     querier.get(handler, payload=question.payload, encoding=encoding, attachment=question.attachment)
                     if samples := _collected(replies, over, every=every):
                         return samples
                 if over():
-                    raise MeshLost(f"{question.whom} has not answered yet, and the asker gave up")
+                    raise MeshLost(f"{question.whom} has not answered yet, and this process does not wait any more")
                 changed.wait(min(left, _LOOK_S))
         finally:
             listener.undeclare()
-    raise DeadlineExceeded(f"nobody answered for {question.whom} within {question.deadline_s:g} s")
+    raise DeadlineExceeded(f"{question.whom} did not answer within {question.deadline_s:g} s")
 
 
 def answer_of(reply: zenoh.Reply) -> zenoh.Sample | None:
-    """What was answered; None where Zenoh itself says that somebody did not answer in time.
+    """The payload of a reply; None if it is Zenoh's own message that a queryable did not answer in time.
 
     Raises:
         MeshLost: the answer is an error; its text is the message.
@@ -329,7 +329,7 @@ def answer_of(reply: zenoh.Reply) -> zenoh.Sample | None:
 def _collected(
     replies: queue.SimpleQueue[zenoh.Reply | None], over: Callable[[], bool], *, every: bool
 ) -> list[zenoh.Sample]:
-    """The answers of one query, to its end, marked by None, or to the first one."""
+    """The answers of one query up to its end, which None marks, or only the first one."""
     samples: list[zenoh.Sample] = []
     while not over():
         with suppress(queue.Empty):
@@ -344,12 +344,12 @@ def _collected(
 
 @contextmanager
 def run_router(listen: Sequence[str]) -> Iterator[tuple[str, ...]]:
-    """A Zenoh router in this process, while inside, for a host without `zenohd`; gives the endpoints it listens on.
+    """Run a Zenoh router in this process, for a host without `zenohd`; yields the endpoints on which it listens.
 
     Raises:
         ConfigurationError: an endpoint cannot be used.
     """
-    # Peers behind it, such as ROS nodes, learn of each other here and meet directly: it passes nothing on for them.
+    # Peers that connect to it, such as ROS nodes, find each other here and connect directly; it does not route.
     session = open_session(Wiring(mode="router", listen=tuple(listen), gossip=True))
     try:
         yield own_endpoints(session)

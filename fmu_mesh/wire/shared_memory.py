@@ -1,12 +1,12 @@
-"""Messages between processes of one host through shared memory: bounded buffers, and a doorbell to sleep on.
+"""Messages between processes of one host through shared memory: bounded buffers, and a semaphore to wait for.
 
-A receiver owns one piece of anonymous memory with one buffer for each of its senders. Whoever may open it finds it by
-process id and descriptor, which an `Offer` tells; a random token proves that it is the same host. There is no file, so
-nothing is left behind, whoever is killed.
+A receiver owns anonymous memory with one buffer for each of its senders. An `Offer` contains its process id and file
+descriptor, with which processes of the same user can open it; a random token proves that it is the same host. There is
+no file, so nothing is left behind if a process is killed.
 
-Each buffer is the bounded buffer of Dijkstra: the semaphore ``items`` counts messages that are written, ``spaces``
-those that are read. All order between processes comes from these semaphores, so it holds on every processor. One more
-semaphore of the receiver, the doorbell, is what it waits on; it is rung after every message.
+Each buffer is Dijkstra's bounded buffer: the semaphore ``items`` counts messages that are written, ``spaces`` messages
+that are read. These semaphores determine the order of all memory accesses between processes, on every processor. The
+receiver waits on one more semaphore, the doorbell, which a sender posts after every message.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from .runtime import is_alive
 __all__ = ["Arrived", "Offer", "SharedInbox", "SharedOutlet", "available"]
 
 Arrived = tuple[str, bytes]
-"""Who sent a message, and the message."""
+"""The sender of a message, and the message."""
 
 _NAME: Final = "fmu_mesh"
 _ABORT: Final = bytes((ABORT,))
@@ -45,15 +45,15 @@ _DATA: Final = 128
 _MIN_SIZE: Final = 64 * 1024
 _MAX_SIZE: Final = 16 * 2**20
 _AT_ONCE_SIZE: Final = 16 * 2**20
-"""Up to this size all pages are made when the memory is: the first one to write into a page would wait for it."""
+"""Up to this size all pages are allocated when the memory is created, so that the first write to a page is fast."""
 
 _LENGTH: Final = struct.Struct("<I")
 _MORE: Final = 1 << 31
-"""Set in a length where the message goes on in the next record: it was too long for one."""
+"""Set in the length of a record if the message continues in the next record, because it is too long for one."""
 
 _LOOK_S: Final = 0.05
 _SPIN_S: Final = 50e-6
-"""How long a receiver looks for the next message before it sleeps: about what it takes to wake up on another core."""
+"""How long in s a receiver polls before it sleeps: about the time that a wake-up on another core takes."""
 
 _PATIENCE: Final = 3
 _REST: Final = 30
@@ -65,9 +65,9 @@ class _Timespec(ctypes.Structure):
 
 
 def _functions() -> tuple[Any, Any, Any, Any] | None:
-    """sem_init, sem_post, sem_trywait and sem_clockwait, or None where the C library has not all of them.
+    """sem_init, sem_post, sem_trywait and sem_clockwait; None if the C library does not have all of them.
 
-    Those that cannot block keep the interpreter's lock: letting it go costs more than they do.
+    Functions that cannot block keep the interpreter's lock: releasing it takes longer than the call.
     """
     quick, slow = ctypes.PyDLL(None), ctypes.CDLL(None)
     if not hasattr(slow, "sem_clockwait"):
@@ -79,7 +79,7 @@ _SEMAPHORES: Final = _functions()
 
 
 def available() -> bool:
-    """Whether this system has what sharing needs: Linux with a C library that has `sem_clockwait` (glibc 2.30)."""
+    """Whether this system supports shared memory: Linux, and a C library with `sem_clockwait` (glibc 2.30)."""
     return _SEMAPHORES is not None and hasattr(os, "memfd_create") and Path("/proc/self/fd").is_dir()
 
 
@@ -87,10 +87,10 @@ class Offer(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Where the memory of a receiver is.
 
     Attributes:
-        pid: process that has it open.
-        descriptor: as which file descriptor.
-        token: hexadecimal; stands at its beginning.
-        size: of all of it, in bytes.
+        pid: the process that has the memory open.
+        descriptor: its file descriptor there.
+        token: hexadecimal; the first bytes of the memory.
+        size: total size in bytes.
         channels: (offset, bytes of data) of the buffer of each sender.
     """
 
@@ -102,7 +102,7 @@ class Offer(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class _Memory:
-    """A mapping and its address; it stays as long as something refers to it."""
+    """A mapping and its address; it exists as long as an object refers to it."""
 
     def __init__(self, descriptor: int, size: int) -> None:
         populate = getattr(mmap, "MAP_POPULATE", 0) if size <= _AT_ONCE_SIZE else 0
@@ -115,14 +115,14 @@ class _Memory:
 
 
 class SharedInbox:
-    """The receiving end: everything that is sent to one process, in the order of each sender.
+    """The receiving end: all messages to one process; messages of one sender keep their order.
 
     Args:
-        senders: bytes that may be on their way, by sender; more than that blocks it.
-        spins: whether it looks again for a moment before it sleeps, for those whose messages are waited for.
+        senders: size of the buffer in bytes, by sender; a sender waits when its buffer is full.
+        spins: whether to poll for a moment before sleeping, for receivers whose delay slows down the mesh.
 
     Raises:
-        OSError: the system gives no memory.
+        OSError: the system has no memory.
 
     One thread receives; `wake` may be called by any thread.
     """
@@ -139,7 +139,7 @@ class SharedInbox:
         token = secrets.token_bytes(_TOKEN_SIZE)
         self._descriptor = os.memfd_create(_NAME, os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
         os.ftruncate(self._descriptor, end)
-        # A sender cannot make the mapping of the others shorter.
+        # A sender cannot shrink the memory of the others.
         fcntl.fcntl(self._descriptor, fcntl.F_ADD_SEALS, fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL)
         self._memory = memory = _Memory(self._descriptor, end)
         memory.view[:_TOKEN_SIZE] = token
@@ -168,7 +168,7 @@ class SharedInbox:
         until = None
         while not arrived and not self._woken:
             if self._trywait(self._doorbell) != 0:
-                # The bell may ring once more for what was taken already; then it is waited on again.
+                # The doorbell may be posted for a message that was already taken; then wait again.
                 until = until or _after(timeout_s)
                 if (
                     not self._rings_soon()
@@ -180,28 +180,28 @@ class SharedInbox:
         return arrived.popleft() if arrived else None
 
     def stash(self) -> bool:
-        """Make room for those who send to this process, while it waits for room itself; whether the run is over."""
+        """Make space for senders to this process, while it waits for space itself; return whether the run is over."""
         if self._trywait(self._doorbell) == 0:
             self._collect()
-            # What was taken here must not be slept over later.
+            # The messages that were taken here must not wait until the next doorbell.
             self._post(self._doorbell)
         return any(message[:1] == _ABORT for _, message in self._arrived)
 
     def wake(self) -> None:
-        """From any thread: let `take_within` come back."""
+        """From any thread: let `take_within` return."""
         self._woken = True
         self._post(self._doorbell)
 
     def close(self) -> None:
-        """No further sender can open the memory; it is free when the last one lets go of it."""
+        """From now on no sender can open the memory; it is freed when the last sender has closed it."""
         if self._descriptor >= 0:
             os.close(self._descriptor)
             self._descriptor = -1
 
     def _rings_soon(self) -> bool:
-        """Look again and again for a moment, as long as that has been worth it of late.
+        """Poll for a moment, if polling was successful recently.
 
-        Where it was in vain, somebody else may need the processor: then it is left alone for a number of waits.
+        If it was not, other processes may need the processor: then the next waits do not poll.
         """
         if not self._spins:
             return False
@@ -218,7 +218,7 @@ class SharedInbox:
         return False
 
     def _collect(self) -> None:
-        """Take over all messages; the doorbell was rung for at least one of them."""
+        """Take all messages; the doorbell was posted for at least one of them."""
         while self._trywait(self._doorbell) == 0:
             continue
         arrived = self._arrived
@@ -270,9 +270,9 @@ class SharedOutlet:
         offer: where the memory of the receiver is.
         sender: which of its buffers is ours.
         target: who the receiver is, for errors.
-        own: the sender's own inbox if it has one; it is emptied while there is no room in this buffer, so that two who
-            send to each other do not wait for each other.
-        deadline_s: how long to wait for room, in s.
+        own: the sender's own inbox, if it has one. It is read while this buffer is full, so that two processes that
+            send to each other do not block each other.
+        deadline_s: how long to wait for space, in s.
     """
 
     def __init__(
@@ -313,8 +313,8 @@ class SharedOutlet:
         """Send a message.
 
         Raises:
-            DeadlineExceeded: the receiver takes nothing.
-            FmuMeshError: the message is larger than any may be.
+            DeadlineExceeded: the receiver does not read.
+            FmuMeshError: the message is larger than the limit.
         """
         size = len(message)
         if size <= self._size // 4:
@@ -347,10 +347,10 @@ class SharedOutlet:
         self._post(self._doorbell)
 
     def _make_room(self, needed: int) -> bool:
-        """Wait until the receiver has read enough; False if nobody reads any more.
+        """Wait until the receiver has read enough; return False if no process reads any more.
 
         Raises:
-            DeadlineExceeded: it takes nothing for as long as a step may take.
+            DeadlineExceeded: it has read nothing for as long as a step may take.
         """
         started = time.monotonic()
         while True:
@@ -368,13 +368,13 @@ class SharedOutlet:
 
 
 def _after(seconds: float) -> _Timespec:
-    """The instant in so many seconds, for `sem_clockwait`."""
+    """The time after this number of seconds, for `sem_clockwait`."""
     end = time.monotonic() + seconds
     return _Timespec(int(end), int(end % 1.0 * 1e9))
 
 
 def _space(length: int) -> int:
-    """Bytes that a record takes: its length word and its message, in multiples of 8 so that no length word is cut."""
+    """Size of a record in bytes: length word and message, a multiple of 8, so that a length word is never divided."""
     return (length + 11) & ~7
 
 
@@ -386,7 +386,7 @@ def _open(offer: Offer) -> _Memory:
         ValueError: it is not the memory that was offered.
     """
     path = Path(f"/proc/{offer.pid}/fd/{offer.descriptor}")
-    if not str(path.readlink()).startswith(f"/memfd:{_NAME}"):  # opening a device could do something
+    if not str(path.readlink()).startswith(f"/memfd:{_NAME}"):  # opening a device may have side effects
         msg = f"descriptor {offer.descriptor} of process {offer.pid} is no such memory"
         raise ValueError(msg)
     descriptor = os.open(path, os.O_RDWR | os.O_CLOEXEC)

@@ -1,7 +1,7 @@
-"""Where the wall-clock time of a run went, as Structs: measured by nodes and the master, shown by whoever started them.
+"""How a run spent its wall-clock time, as Structs: nodes and the master measure it, `launch` shows it.
 
-All times are in s. Instants are those of `time.perf_counter`: on Linux one clock for all processes of a host, so that
-time lines of several processes fit together; those of another host need an origin of their own.
+All times are in s. Instants are those of `time.perf_counter`. On Linux this is one clock for all processes of a host,
+so their time lines can be compared; time lines of another host need another origin.
 """
 
 from __future__ import annotations
@@ -11,10 +11,10 @@ import msgspec
 __all__ = ["GRANT", "TIME_LINE_ENTRIES", "Burst", "MeshProfile", "NodeProfile", "UnitProfile", "Wait"]
 
 TIME_LINE_ENTRIES = 100_000
-"""How many bursts and waits the time lines of all nodes of a mesh hold together; sums are never cut."""
+"""Largest number of bursts and waits in the time lines of all nodes of a mesh; the sums contain all of them."""
 
 GRANT = ""
-"""What stands for the master's grant where the name of an instance could stand."""
+"""Stands for the master's grant in place of the name of an instance."""
 
 
 class Burst(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
@@ -23,7 +23,7 @@ class Burst(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=
     Attributes:
         unit: index of the unit that stepped, in `NodeProfile.units`.
         steps: own steps of its first instance.
-        sent_s: how much of the time, at its end, went into sending frames.
+        sent_s: time at the end of the burst for sending frames.
     """
 
     start: float
@@ -34,7 +34,7 @@ class Burst(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=
 
 
 class Wait(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
-    """A wait of a node for one message; ``reason`` is the source instance that was behind, or `GRANT`."""
+    """A wait of a node for one message; ``reason`` is the source instance that it waited for, or `GRANT`."""
 
     start: float
     end: float
@@ -42,12 +42,12 @@ class Wait(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=T
 
 
 class UnitProfile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What is stepped together: one instance, or the instances of a cycle within one node.
+    """Instances that step together: one instance, or the instances of a cycle within one node.
 
     Attributes:
         steps: own steps of its first instance.
-        bursts: bursts they were taken in.
-        compute_s: time spent in them: the FMU, and the rows it reads and writes.
+        bursts: number of bursts.
+        compute_s: time spent in them: in the FMU, and for reading and writing rows.
     """
 
     instances: tuple[str, ...]
@@ -61,12 +61,12 @@ class NodeProfile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     Attributes:
         started: instant of point 0.
-        ended: instant at which it had no step left to take.
-        transport_s: time spent encoding and sending frames, and decoding those that came.
-        wait_s: time spent waiting for a message, by the source instance that was behind, or `GRANT`.
-        bursts: the time line of stepping; the first ones, if there were more than it may hold.
+        ended: instant of the end of its last step.
+        transport_s: time spent encoding and sending frames, and decoding received ones.
+        wait_s: time spent waiting for a message, by the source instance that it waited for, or `GRANT`.
+        bursts: the time line of stepping; only the first ones, if there are too many.
         waits: likewise, the time line of waiting.
-        cut: entries that the time lines do not hold.
+        cut: number of entries that are missing in the time lines.
     """
 
     node: str
@@ -93,7 +93,7 @@ class NodeProfile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def waited_s(self) -> float:
-        """Time spent waiting, whatever for."""
+        """Time spent waiting, for any reason."""
         return sum(self.wait_s.values())
 
 
@@ -102,7 +102,7 @@ class MeshProfile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     Attributes:
         nodes: in the order of the plan; the recorder is not among them.
-        held_s: how long which node was the one that kept the grant from growing.
+        held_s: how long each node limited the grant.
     """
 
     nodes: tuple[NodeProfile, ...]

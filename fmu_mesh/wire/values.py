@@ -11,7 +11,7 @@ import zenoh
 from ..errors import MessageRefused
 from ..simtime import ENDLESS
 from ..variables.model_description import Value, Variable
-from ..variables.value_conversion import MAX_TEXT_SIZE, ValueRefused, to_plain, to_value
+from ..variables.value_conversion import MAX_TEXT_SIZE, ValueRefused, checked_value, to_plain
 from .messages import decode_json
 
 __all__ = [
@@ -47,13 +47,13 @@ def decode_stamp(data: bytes) -> Stamp:
     """The point and time in an attachment.
 
     Raises:
-        MessageRefused: it is none of ours.
+        MessageRefused: it is not an attachment of a value.
     """
     return decode_json(data, Stamp)
 
 
 def decode_time(data: bytes) -> float:
-    """The time in s in the attachment of a value that is sent to an input: `{"time": 1.5}`, as a `Stamp` has it, too.
+    """The time in s in the attachment of a value that is sent to an input, such as `{"time": 1.5}` or a `Stamp`.
 
     Raises:
         ValueRefused: it has none.
@@ -77,7 +77,7 @@ class _Moment(msgspec.Struct, frozen=True):
 
 
 def encode_value(value: Value) -> bytes:
-    """A value as JSON; NaN and the infinities, which JSON does not have, as FMI 3.0 writes them; Binary as base64."""
+    """A value as JSON; NaN and infinities are text as in FMI 3.0, because JSON does not have them; Binary is base64."""
     return msgspec.json.encode(to_plain(value))
 
 
@@ -85,7 +85,7 @@ def decode_value(data: bytes, variable: Variable) -> Value:
     """The value that JSON ``data`` gives for ``variable``.
 
     Raises:
-        ValueRefused: it is no JSON, or not of the variable's type, shape or range.
+        ValueRefused: it is not JSON, or has a wrong type, shape or range.
     """
     if len(data) > MAX_VALUE_SIZE:
         raise ValueRefused(f"{len(data)} bytes are too many for a value")
@@ -93,10 +93,4 @@ def decode_value(data: bytes, variable: Variable) -> Value:
         value: Any = decode_json(data, object)
     except MessageRefused as error:
         raise ValueRefused(f"it is no JSON value ({error})") from error
-    try:
-        return to_value(value, variable)
-    except ValueRefused as refused:
-        what = "is out of its range" if refused.out_of_range else f"is no {variable.type_name} value for it"
-        near = f" (did you mean '{refused.suggestion}'?)" if refused.suggestion else ""
-        text = f"{data[:80].decode(errors='replace')} {what}; expected {refused.expected}{near}"
-        raise ValueRefused(text) from refused
+    return checked_value(value, variable, data[:80].decode(errors="replace"))

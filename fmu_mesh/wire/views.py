@@ -1,4 +1,4 @@
-"""What the queryables answer, as Structs: `info` and `status` of an instance and of the mesh (design, section 6)."""
+"""The answers of the queryables as Structs: `info` and `status` of an instance and of the mesh (docs/key-space.md)."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ __all__ = [
 MeshState = Literal["starting", "initializing", "running", "paused", "stopping", "done", "failed"]
 
 GOING_ON: frozenset[MeshState] = frozenset(("starting", "initializing", "running", "paused"))
-"""The states of a mesh that has not come to its end."""
+"""The states of a mesh that has not ended."""
 
 
 class VariableView(msgspec.Struct, frozen=True, omit_defaults=True):
-    """One variable as `info` shows it; ``key`` is where its value is, ``shape`` the sizes of an array's dimensions."""
+    """One variable in `info`; ``key`` is the key of its value, ``shape`` the sizes of an array's dimensions."""
 
     name: str
     key: str
@@ -47,7 +47,7 @@ class VariableView(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 class ConnectionView(msgspec.Struct, frozen=True):
-    """One connection as `info` shows it."""
+    """One connection in `info`."""
 
     source: str = msgspec.field(name="from")
     target: str = msgspec.field(name="to")
@@ -79,16 +79,16 @@ class InstanceInfo(msgspec.Struct, frozen=True):
 
 
 class InstanceStatus(msgspec.Struct, frozen=True):
-    """Answer of `…/<instance>/status`, and what is published there about twice a second.
+    """Answer of `…/<instance>/status`, and what is published there about four times a second.
 
     Attributes:
         state: loading, waiting for the mesh, initializing, running, done or failed.
-        activity: in words what the instance does right now, such as `in doStep at point 812 for 12.4 s`.
+        activity: a text that says what the instance does at present, such as `in doStep at point 812 for 12.4 s`.
         time: simulation time in s.
         step_time: mean wall-clock time of a step in s.
         wait_time: wall-clock time spent waiting since the first point in s.
         running_time: wall-clock time since the first point in s.
-        refused: messages that its process did not take: malformed ones, and those of nobody who may send them.
+        refused: messages that its process refused: malformed ones, and those of unknown senders.
     """
 
     instance: str
@@ -105,17 +105,18 @@ class InstanceStatus(msgspec.Struct, frozen=True):
 
 
 class LogLine(msgspec.Struct, frozen=True):
-    """One line of `…/<instance>/log`."""
+    """One line of `…/<instance>/log`, and of `…/mesh/log`, where ``number`` counts the lines of all from 1."""
 
     instance: str
     status: str
     category: str
     message: str
     point: int
+    number: int = 0
 
 
 class SetAnswer(msgspec.Struct, frozen=True):
-    """Answer to a query that carries a value for an input or a parameter: the point from which on it holds."""
+    """Answer to a query that sets an input or a parameter: the point from which on the value holds."""
 
     key: str
     point: int
@@ -126,9 +127,9 @@ class MeshInfo(msgspec.Struct, frozen=True):
     """Answer of `…/mesh/info`.
 
     Attributes:
-        run: the id of the run, which all its internal keys carry.
+        run: the id of the run, which all its internal keys contain.
         shared_memory: nodes that get their messages through shared memory, and `@mesh` if the master does; all others
-            get them through Zenoh. Known when all are there.
+            get them through Zenoh. Empty until all nodes are ready.
     """
 
     mesh: str
@@ -157,9 +158,9 @@ class MeshStatus(msgspec.Struct, frozen=True):
         point: the last point that every instance has reached; ``time`` is its time in s.
         points_per_second: since the first point, or since the last pause.
         real_time_factor: simulated over wall-clock time since the first point.
-        overruns: points of the wall clock that were given up, because the run was too far behind it.
+        overruns: points by which the run fell behind the wall clock beyond `catch_up`.
         progress: last point of every node.
-        refused: messages that the master did not take: malformed ones, and those of nobody who may send them.
+        refused: messages that the master refused: malformed ones, and those of unknown senders.
     """
 
     mesh: str
@@ -176,13 +177,13 @@ class MeshStatus(msgspec.Struct, frozen=True):
 
 
 class RosView(msgspec.Struct, frozen=True):
-    """Answer of `…/mesh/ros/<id>`: what a gateway to ROS reaches.
+    """Answer of `…/mesh/ros/<id>`: the link of a gateway to ROS.
 
     Attributes:
-        endpoints: where it looks for ROS, and where it listens.
-        connected: whether somebody is there.
-        activity: the same in words, such as `nobody answers at tcp/127.0.0.1:7447`.
-        other_clocks: who else publishes `/clock` there, in words.
+        endpoints: where it connects to, and where it listens.
+        connected: whether a bridge or router answers.
+        activity: the same as text, such as `nobody answers at tcp/127.0.0.1:7447`.
+        other_clocks: other publishers of `/clock`, as text.
     """
 
     profile: str
@@ -193,18 +194,18 @@ class RosView(msgspec.Struct, frozen=True):
 
 
 class Command(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What `…/mesh/command` takes; ``points`` belongs to step."""
+    """A query to `…/mesh/command`; ``points`` is for `step` only."""
 
     command: Literal["pause", "resume", "step", "stop"]
     points: Annotated[int, msgspec.Meta(le=ENDLESS)] = 1
 
 
 class CommandAnswer(msgspec.Struct, frozen=True):
-    """What `…/mesh/command` answers.
+    """Answer of `…/mesh/command`.
 
     Attributes:
         point: the last point that every instance has reached.
-        hold: the point where all of them are going to rest; None while the mesh runs on.
+        hold: the point at which all of them will pause; None if the mesh continues to run.
     """
 
     command: str

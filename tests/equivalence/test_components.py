@@ -564,7 +564,7 @@ def test_a_component_of_another_python_is_refused_in_one_process_and_in_a_group_
 
     assert (local.wait(), grouped.wait()) == (2, 2)
     assert (
-        f"'c' needs the Python '{other_python}', and this process is another one. Run it without --local."
+        f"'c' needs the Python '{other_python}', and this process is another one. Run the mesh in processes"
         in local.errors
     )
     assert "expected one interpreter for all components of the group 'g'" in grouped.errors

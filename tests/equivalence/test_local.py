@@ -11,8 +11,9 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from fmu_mesh.errors import StepFailed
+from fmu_mesh.errors import FmuError, StepFailed
 from fmu_mesh.run.local import LocalMesh
+from fmu_mesh.run.preparing import prepare
 from fmu_mesh.system.plan import Plan
 from tests.helpers import Place, row_count, rows_of, wait_until, write_config
 from tests.scenarios.scenario import Counter, Scenario
@@ -120,3 +121,18 @@ def test_the_rows_before_a_step_that_does_not_return_are_kept_when_the_process_i
 
     assert found == ["time,a.point,b.point\n" + "".join(f"{k}.0,{k}.0,{k}.0\n" for k in range(4))]
     assert result.read_text() == found[0]
+
+
+def test_what_lasts_between_two_points_is_no_hang(tmp_path: Path) -> None:
+    """A slow disk, or whoever hears of the progress: the instance that stepped last has returned."""
+    plan = prepare(write_config(tmp_path, stop_time=2.0, timeouts={"step": 0.5}))
+    hangs: list[FmuError] = []
+    waited: list[bool] = []
+
+    def progress(point: int) -> None:
+        if point == 1023:
+            waited.append(threading.Event().wait(1.5))
+
+    outcome = LocalMesh(plan, progress=progress, on_hang=hangs.append).run()
+
+    assert (outcome.point, waited, hangs) == (2000, [False], [])

@@ -209,11 +209,11 @@ def test_ls_shows_the_mesh_its_instances_and_their_variables(mesh: Mesh, call: C
 
 
 def test_status_and_info_name_meshes_and_instances_in_every_form(call: Call) -> None:
-    for key in ("looked_at", ROOT, f"{ROOT}/mesh/status"):
+    for key in ("looked_at", ROOT, f"{ROOT}/mesh/status", "looked_at/mesh"):
         status = json.loads(call("status", key, "--json")[1])
         assert (status["mesh"], status["state"], status["last_point"]) == ("looked_at", "running", 60_000)
         assert set(status["progress"]) == {"pendulum", "gain", "free", "@record"}
-    for key in ("gain", f"{ROOT}/gain", f"{ROOT}/gain/info"):
+    for key in ("gain", "looked_at/gain", f"{ROOT}/gain", f"{ROOT}/gain/info"):
         info = json.loads(call("info", key, "--json")[1])
         assert (info["instance"], info["model_name"]) == ("gain", "Gain")
         assert info["connections"] == [{"from": "pendulum.a", "to": "gain.u", "delay": 0, "factor": 1.0, "offset": 0.0}]
@@ -243,6 +243,52 @@ def test_get_takes_names_keys_and_wildcards(call: Call) -> None:
     outputs = ["pendulum.a", "pendulum.der(a)", "pendulum.der(a,2)", "gain.y", "free.y"]
     assert names == [*outputs, "gain.u", "free.u"]
     assert all(reading["time"] == reading["point"] * 0.01 for reading in readings)
+
+
+def test_a_short_key_names_the_mesh_in_front(call: Call) -> None:
+    def key_of(reference: str) -> str:
+        key: str = json.loads(call("get", "--json", reference)[1])["key"]
+        return key
+
+    short = ("looked_at/pendulum.der(a,2)", "looked_at/*.der(a,2)", "looked_at/pendulum/out/der(a,2)")
+    assert {key_of(reference) for reference in short} == {f"{ROOT}/pendulum/out/der(a,2)"}
+    assert call("set", "looked_at/free.u", "0.75")[1].startswith(f"{ROOT}/free/in/u holds from point ")
+    assert len(call("watch", "looked_at/gain.y", "--count", "2")[1].splitlines()) == 2
+
+    code, _, err = call("get", "loked_at/gain.y")
+    assert (code, err) == (2, "fmu-mesh: no mesh 'loked_at/gain.y' is running. Did you mean 'looked_at/gain.y'?\n")
+
+
+def test_log_messages_from_before_are_shown_and_chosen_by_instance_and_level(
+    call: Call, session: zenoh.Session
+) -> None:
+    refused = Samples(session, f"{ROOT}/mesh/log")
+    for key in ("gain/in/u", "gain/in/u", "pendulum/param/l"):
+        session.put(f"{ROOT}/{key}", "1")
+    told = [json.loads(refused.until(lambda _: True).payload.to_bytes()) for _ in range(3)]
+
+    lines = [json.loads(line) for line in call("logs", "--json")[1].splitlines()]
+
+    assert lines[-3:] == told
+    assert [line["number"] for line in lines] == [*range(1, len(lines) + 1)]
+    own = call("logs", "looked_at", "--instance", "pendulum")[1].splitlines()
+    assert own
+    assert all(line.startswith("pendulum at point ") and ": warning: " in line for line in own)
+    assert call("logs", "--level", "error") == (0, "", "")
+    assert "Did you mean 'gain'?" in call("logs", "--instance", "gian")[2]
+
+
+def test_of_a_long_log_the_newest_messages_are_kept(call: Call, session: zenoh.Session) -> None:
+    published = Samples(session, f"{ROOT}/mesh/log")
+    for _ in range(1100):
+        session.put(f"{ROOT}/gain/in/u", "1")
+    first = json.loads(published.until(lambda _: True).payload.to_bytes())["number"]
+    published.until(lambda sample: json.loads(sample.payload.to_bytes())["number"] >= first + 1099)
+
+    numbers = [json.loads(line)["number"] for line in call("logs", "--json")[1].splitlines()]
+
+    assert numbers == [*range(numbers[-1] - 999, numbers[-1] + 1)]
+    assert numbers[-1] >= first + 1099
 
 
 def test_set_takes_effect_at_the_point_that_it_answers(call: Call) -> None:
@@ -318,6 +364,19 @@ def test_a_paused_mesh_steps_answers_and_runs_on(call: Call, session: zenoh.Sess
         code, out, _ = call("resume", ROOT)
     assert (code, out.split(" at ")[0]) == (0, "mesh 'looked_at' is running")
     statuses.until(lambda sample: decoded(sample) >= ("running", held + 20))
+
+
+def test_the_only_mesh_needs_no_name_and_a_number_alone_means_points(call: Call) -> None:
+    try:
+        paused = json.loads(call("pause", "--json")[1])
+        stepped = json.loads(call("step", "10", "--json")[1])
+        assert (paused["state"], stepped["point"]) == ("paused", paused["point"] + 10)
+        assert json.loads(call("step", "looked_at", "2", "--json")[1])["point"] == stepped["point"] + 2
+        assert json.loads(call("step", "--json")[1])["point"] == stepped["point"] + 3
+        for number in ("0", "-1", "1.5"):
+            assert call("step", number) == (2, "", f"fmu-mesh: N: '{number}' is not a whole number of 1 or more\n")
+    finally:
+        assert call("resume", "--quiet") == (0, "", "")
 
 
 def test_the_clock_stands_while_a_mesh_rests_after_a_step_that_was_given_while_it_ran(call: Call) -> None:

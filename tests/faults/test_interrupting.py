@@ -21,11 +21,11 @@ import os, runpy, signal, sys
 
 class Finder:
     def find_spec(self, name, path=None, target=None):
-        if name == "fmu_mesh.cli.running":
+        if name == "MODULE":
             os.kill(os.getpid(), signal.SIGINT)
 
 sys.meta_path.insert(0, Finder())
-sys.argv = ["fmu-mesh", "--version"]
+sys.argv = ["fmu-mesh", "launch", "--help"]
 runpy.run_module("fmu_mesh", run_name="__main__")
 """
 
@@ -85,8 +85,9 @@ def test_a_run_that_is_interrupted_is_plotted_up_to_there(place: Place, options:
     assert plot.read_bytes().startswith(b"\x89PNG")
 
 
-def test_ctrl_c_while_the_command_is_being_loaded_is_told_like_any_other() -> None:
-    program = [sys.executable, "-c", _INTERRUPTED_WHILE_LOADING]
+@pytest.mark.parametrize("module", ["fmu_mesh.cli.main", "fmu_mesh.cli.running", "fmu_mesh.node.node"])
+def test_ctrl_c_while_the_command_is_being_loaded_is_told_like_any_other(module: str) -> None:
+    program = [sys.executable, "-c", _INTERRUPTED_WHILE_LOADING.replace("MODULE", module)]
 
     done = subprocess.run(program, capture_output=True, text=True, check=False, timeout=DEADLINE_S)
 

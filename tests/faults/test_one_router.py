@@ -53,7 +53,9 @@ def test_a_second_launch_of_a_mesh_is_refused_in_words_and_the_first_does_not_no
     second = place.start("launch", config, "--no-progress", "--output", "second.csv")
 
     assert second.wait() == 2
-    assert second.message.startswith("fmu-mesh: mesh 'pair' runs already where this one connects to. Stop it first")
+    assert second.message.startswith(
+        "fmu-mesh: mesh 'pair' is already running where this master connects. Stop it first"
+    )
     assert not (place.folder / "second.csv").exists()
     assert_ends_well(first, result)
 

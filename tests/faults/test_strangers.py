@@ -259,7 +259,7 @@ def too_many_rows(stranger: Stranger) -> None:
         (progress, ("says that it is at point 2000, and the master has granted point ",)),
         (end, ("node 'left' says that it has ended at point 2000, and the master has granted point ",)),
         (termination, ("node 'left' says that it has an FMU that ends the simulation at point 1500, and the master",)),
-        (too_many_rows, ("'left' sends its values up to point 65535 to node 'right', which has no room for them",)),
+        (too_many_rows, ("'left' sends its values up to point 65535 to node 'right', more than was granted",)),
     ],
     ids=lambda value: getattr(value, "__name__", ""),
 )

@@ -255,6 +255,28 @@ NOT_RUN = [
         "sudo bridges/gazebo_classic/setup.sh /opt/gazebo_classic",
         "it takes 15 minutes; .ci/long runs it",
     ),
+    (
+        "docs/onnx.md",
+        "import torch",
+        "PyTorch is no requirement here; tests/unit/test_onnx.py reads models of this form",
+    ),
+    (
+        "docs/onnx.md",
+        "import jax.numpy as jnp",
+        "JAX is no requirement here; tests/unit/test_onnx.py reads models of this form",
+    ),
+    (
+        "docs/onnx.md",
+        "from pathlib import Path",
+        "scikit-learn is no requirement here; tests/unit/test_onnx.py reads models of this form",
+    ),
+    ("docs/installation.md", "pipx install '.[plot]'", "it installs into your home; .ci/run installs the same wheel"),
+    (
+        "docs/installation.md",
+        "uv tool install '.[plot]'",
+        "it installs into your home; .ci/run installs the same wheel",
+    ),
+    ("docs/installation.md", "python3 -m venv .my-venv", "it downloads 150 MB; .ci/run installs the same wheel"),
     ("docs/performance.md", "make bench", "it takes 20 minutes, and figures of a busy machine mean nothing"),
     (
         "docs/ros-node.md",
@@ -276,6 +298,11 @@ NOT_RUN = [
         "docs/ros.md",
         "$ ros2 param get /pendulum_ros gain.k",
         "`ros2` is not on PyPI; tests/ros/test_rmw_zenoh.py calls these services",
+    ),
+    (
+        "examples/cart_pole/README.md",
+        "python examples/cart_pole/train.py --output policy.onnx",
+        "it takes 10 s; tests/physics/test_cart_pole.py runs it with less training",
     ),
     (
         "examples/gazebo/README.md",

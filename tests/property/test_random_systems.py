@@ -27,7 +27,7 @@ from fmu_mesh.run.local import LocalMesh
 from fmu_mesh.simtime import TimeGrid
 from fmu_mesh.system.connections import Connection
 from fmu_mesh.system.plan import Plan, make_plan
-from fmu_mesh.system.system import System, SystemInstance
+from fmu_mesh.system.system import ResolvedSystem, SystemInstance
 from fmu_mesh.variables.model_description import Causality, ModelDescription, Value, Variable, VariableType
 from tests.scenarios.simulated import SimulatedMesh
 
@@ -261,7 +261,7 @@ def planned(drawn: Drawn) -> Plan:
         Config,
         dec_hook=decode_section,
     )
-    system = System(
+    system = ResolvedSystem(
         config=config,
         grid=TimeGrid(0.0, STEP_SIZE, drawn.last_point),
         instances={

@@ -26,7 +26,7 @@ from fmu_mesh.variables.model_description import Value, Variable, VariableType
 from fmu_mesh.variables.value_types import DTYPES, INTEGERS, TYPES, is_text, nested
 from fmu_mesh.wire.frames import FrameReceiver
 from fmu_mesh.wire.keys import Keys, escape, unescape
-from fmu_mesh.wire.messages import FRAME, HEADER, decode_abort, encode_abort
+from fmu_mesh.wire.messages import FRAME, HEADER, decode_abort, decode_json, encode_abort
 from fmu_mesh.wire.rows import decode_rows, encode_frames, encode_rows
 from fmu_mesh.wire.values import ValueRefused, attachment, decode_stamp, decode_value, encode_value
 
@@ -131,7 +131,7 @@ def test_rows_too_large_for_one_message_go_in_several(monkeypatch: pytest.Monkey
     assert [first for _, _, _, first in heads] == [10, 11, 13, 15]
     back = [decode_rows(message, head[2], layout.parts) for message, head in zip(messages, heads, strict=True)]
     assert all_bits(tuple(np.concatenate(parts) for parts in zip(*back, strict=True))) == all_bits(rows)
-    with pytest.raises(FmuMeshError, match="the values of one point take 129 bytes, and 100 are the most"):
+    with pytest.raises(FmuMeshError, match="the values of one point take 129 bytes; the limit is 100"):
         list(encode_frames(FRAME, 3, 0, (rows[0][:1], np.array([[b"x" * 100]], dtype=np.object_))))
 
 
@@ -178,6 +178,11 @@ wild = st.binary(max_size=300) | deep | st.text(max_size=100).map(lambda text: b
 def test_bytes_that_are_no_report_are_refused(data: bytes) -> None:
     with pytest.raises(MessageRefused):
         decode_abort(HEADER.pack(6, 0, 0, 0) + data)
+
+
+def test_json_that_is_too_large_is_refused_with_the_limit() -> None:
+    with pytest.raises(MessageRefused, match="it has 5 bytes; the limit is 4"):
+        decode_json(b"[1,2]", list[int], 4)
 
 
 @given(wild)

@@ -142,8 +142,8 @@ def test_a_gateway_that_had_no_processor_at_the_end_still_carries_every_sample(p
 @pytest.mark.parametrize(
     ("away", "says"),
     [
-        (False, "a gateway did not take its last samples within 1 s"),
-        (True, "a gateway was gone before the last point; ROS has nothing of what came after it"),
+        (False, "a gateway did not receive its last samples within 1 s"),
+        (True, "a gateway was lost before the last point; ROS did not get the samples after it"),
     ],
     ids=["at the end", "for longer than Zenoh's lease"],
 )

@@ -20,7 +20,7 @@ from fmu_mesh.run.local import LocalMesh
 from fmu_mesh.simtime import TimeGrid
 from fmu_mesh.system.connections import Connection
 from fmu_mesh.system.plan import Plan, make_plan
-from fmu_mesh.system.system import System, SystemInstance
+from fmu_mesh.system.system import ResolvedSystem, SystemInstance
 from fmu_mesh.variables.model_description import ModelDescription, Value, Variable
 from tests.scenarios.simulated import SimulatedMesh
 
@@ -73,7 +73,7 @@ class Scenario:
             dec_hook=decode_section,
         )
         descriptions = {name: self._description(name, [s for s, t, _ in ends if t == name]) for name in names}
-        system = System(
+        system = ResolvedSystem(
             config=config,
             grid=TimeGrid(0.0, 1.0, self.points),
             instances={

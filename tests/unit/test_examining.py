@@ -61,8 +61,12 @@ def test_a_build_description_with_a_document_type_is_refused(tmp_path: Path) -> 
 
 CANNOT_RUN = [
     pytest.param(("<?xml", "<<?xml"), "cannot be read: ", id="XML that is not well-formed"),
-    pytest.param(('fmiVersion="2.0"', 'fmiVersion="3.0-beta.2"'), "is for FMI 3.0-beta.2, a version before", id="beta"),
-    pytest.param(('fmiVersion="2.0"', 'fmiVersion="9"'), "is for FMI '9'; there are FMI 1.0, 2.0 and 3.0", id="FMI 9"),
+    pytest.param(
+        ('fmiVersion="2.0"', 'fmiVersion="3.0-beta.2"'), "is for FMI 3.0-beta.2, a preliminary version", id="beta"
+    ),
+    pytest.param(
+        ('fmiVersion="2.0"', 'fmiVersion="9"'), "is for FMI '9'; supported are FMI 1.0, 2.0 and 3.0", id="FMI 9"
+    ),
     pytest.param(
         ('causality="input"', 'causality="inptu"'),
         "variable 'u' (line 27): causality: The value 'inptu' is not an element of the set",
@@ -186,4 +190,4 @@ def test_a_model_for_the_other_kind_only_is_refused_with_the_way_out(tmp_path: P
     with pytest.raises(LoadFailed, match="is for model exchange only, not for co-simulation") as refused:
         read_description(path, kind="co_simulation")
 
-    assert refused.value.hint == "`kind: auto` takes what there is."
+    assert refused.value.hint == "`kind: auto` uses the kind that the FMU has."

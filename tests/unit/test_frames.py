@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fmu_mesh.errors import FmuMeshError, FrameGap
+from fmu_mesh.errors import FmuMeshError, FrameGap, MessageRefused
 from fmu_mesh.system.layout import Layout
 from fmu_mesh.system.plan import Link
 from fmu_mesh.wire.frames import FrameReceiver, initial_values, needed_levels
@@ -99,9 +99,14 @@ def test_rows_that_are_no_longer_kept_cannot_be_compared(receiver: FrameReceiver
         receiver.take(*frame(2, (9.0, 9.0, 9)))
 
 
+def test_a_frame_before_the_first_point_is_refused(receiver: FrameReceiver) -> None:
+    with pytest.raises(MessageRefused, match="a frame from point -1 on has no point of this run"):
+        receiver.take(*frame(-1, (0.0, 0.0, 0)))
+
+
 def test_a_frame_larger_than_any_window_is_refused(receiver: FrameReceiver) -> None:
     with pytest.raises(
-        FmuMeshError, match="'source' sends its values up to point 8 to node 'right', which has no room for them"
+        FmuMeshError, match="'source' sends its values up to point 8 to node 'right', more than was granted"
     ):
         receiver.take(*frame(0, *[(0.0, 0.0, 0)] * 5))
 

@@ -110,7 +110,7 @@ def test_of_several_libraries_with_other_names_none_is_taken(tmp_path: Path) -> 
 
     assert caught.value.message == (
         f"'{fmu}' has no 'binaries/linux64/Gain.so'; it has 'binaries/linux64/model.so' and "
-        "'binaries/linux64/solver.so', and which of them to load cannot be told."
+        "'binaries/linux64/solver.so', and it is not clear which of them to load."
     )
 
 
@@ -150,6 +150,7 @@ def test_an_fmu_without_model_identifier_and_library_is_shown_and_refused_with_t
     assert "Inputs (1)" in page
     assert reason in page
     assert reason in said
+    assert "Report it to the maker of its tool" in said
 
 
 KINDS = [

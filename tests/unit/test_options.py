@@ -8,12 +8,17 @@ from typing import Any
 
 import pytest
 
-from fmu_mesh.cli.arguments import add_options, read_options
 from fmu_mesh.cli.main import command_parser
+from fmu_mesh.cli.run_options import add_options, read_options
 from fmu_mesh.config.findings import Findings
+from fmu_mesh.config.loading import read_text
+from fmu_mesh.config.mesh import SimulationConfig
 from fmu_mesh.config.structure import json_schema
+from fmu_mesh.errors import ConfigurationError
 from fmu_mesh.instances.configuration import installed_config, parse
-from fmu_mesh.run.options import Options, option_fields, with_options
+from fmu_mesh.run.options import Options, option_fields, with_config_values, with_options
+from fmu_mesh.run.preparing import prepare
+from tests.helpers import FMUS
 
 TEXT = """\
 mesh: one
@@ -21,6 +26,7 @@ simulation: {stop_time: 1, step_size: 0.1}
 instances: {gain: {fmu: Gain.fmu}}
 """
 GIVEN: dict[str, tuple[str | None, Any]] = {
+    "algorithm": ("jacobi", "jacobi"),
     "step_size": ("0.5", 0.5),
     "stop_time": ("7", 7.0),
     "window": ("3", 3),
@@ -28,6 +34,7 @@ GIVEN: dict[str, tuple[str | None, Any]] = {
     "update_period": ("0.25", 0.25),
     "catch_up": ("4", 4.0),
     "start_values": ("gain.k=1", ("gain.k=1",)),
+    "config_values": ("zenoh.mode=client", ("zenoh.mode=client",)),
     "output": ("r.csv", Path("r.csv")),
     "listen": ("tcp/127.0.0.1:1", ("tcp/127.0.0.1:1",)),
     "connect": ("tcp/127.0.0.1:2", ("tcp/127.0.0.1:2",)),
@@ -96,3 +103,71 @@ def test_a_value_that_its_key_does_not_allow_is_a_finding_that_names_the_flag() 
         "one.yaml: --update-period -1: -1.0; expected a finite number >= 0",
         "one.yaml: --catch-up -2: -2.0; expected a finite number >= 0 or null",
     ]
+
+
+def values_of(*config_values: str, text: str = TEXT) -> tuple[Any, list[str]]:
+    """The data of a configuration with these keys replaced, and the findings."""
+    changed = with_config_values(read_text(text, Path("one.yaml")), config_values)
+    return changed.data, [str(finding) for finding in changed.findings]
+
+
+def test_any_key_is_replaced_by_its_path_with_a_value_in_yaml() -> None:
+    data, findings = values_of(
+        "simulation.window=16",
+        "zenoh={mode: client}",
+        "zenoh.connect=[tcp/a:1]",
+        "instances.gain.group=fast",
+        "ros=null",
+    )
+
+    assert findings == []
+    assert data["simulation"] == {"stop_time": 1, "step_size": 0.1, "window": 16}
+    assert data["zenoh"] == {"mode": "client", "connect": ["tcp/a:1"]}
+    assert data["instances"] == {"gain": {"fmu": "Gain.fmu", "group": "fast"}}
+    assert data["ros"] is None
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ("simulation.window", "no value of a key; expected KEY=VALUE, such as simulation.window=16"),
+        (".window=3", "no value of a key; expected KEY=VALUE, such as simulation.window=16"),
+        ("connections[0].factor=2", "a key inside a list; expected the whole list, as in connections=[...]"),
+        ("connections.factor=2", "a key inside 'connections', which is a list; expected connections=VALUE"),
+        ("simulation.step_size.s=2", "a key inside 'simulation.step_size', which is a single value; expected "),
+        ("instances.gian.group=a", "the unknown instance 'gian'; expected one of gain. Did you mean 'gain'?"),
+        ("instances.gain.start_values.k=2", "a start value; expected --set gain.k=2"),
+        ("zenoh={mode", "expected a value in YAML"),
+    ],
+)
+def test_a_key_that_cannot_be_replaced_is_a_finding_that_names_the_option(given: str, words: str) -> None:
+    _, findings = values_of(given, text=f"{TEXT}connections: [a.y -> b.u]\n")
+
+    assert len(findings) == 1
+    assert findings[0].startswith(f"one.yaml: --set-config {given}: ")
+    assert words in findings[0]
+
+
+def test_a_replaced_value_is_checked_like_the_file(tmp_path: Path) -> None:
+    file = tmp_path / "one.yaml"
+    file.write_text(TEXT.replace("Gain.fmu", str(FMUS / "Gain.fmu")))
+
+    def findings(**options: Any) -> list[str]:  # noqa: ANN401 the values of options
+        with pytest.raises(ConfigurationError) as raised:
+            prepare(file, Options(**options))
+        return [str(finding).removeprefix(f"{file}: ") for finding in raised.value.findings]
+
+    keys = ", ".join(SimulationConfig.__struct_fields__)
+    assert findings(config_values=("simulation.windw=3", "zenoh={mode: pear}", "timeouts.step=0")) == [
+        f"--set-config simulation.windw=3: an unknown key; expected one of {keys}. Did you mean 'window'?",
+        "--set-config zenoh={mode: pear}: 'pear'; expected client or peer. Did you mean 'peer'?",
+        "--set-config timeouts.step=0: 0; expected a finite number > 0",
+    ]
+    assert findings(algorithm="jacoby") == [
+        "--algorithm jacoby: 'jacoby'; expected gauss_seidel or jacobi. Did you mean 'jacobi'?"
+    ]
+    assert findings(window=3, config_values=("simulation.window=4",)) == [
+        "--set-config simulation.window=4: replaced by --window as well; expected one of the two options"
+    ]
+    plan = prepare(file, Options(algorithm="jacobi", step_size=0.25, config_values=("simulation.stop_time=null",)))
+    assert (plan.system.config.simulation.algorithm, plan.grid.step_size, plan.grid.stop_time) == ("jacobi", 0.25, None)

@@ -51,7 +51,7 @@ def test_a_session_towards_somebody_who_accepts_and_says_nothing_opens_and_close
 def test_a_question_that_nobody_wants_answered_any_more_ends() -> None:
     session = open_session(Wiring())
 
-    with pytest.raises(MeshLost, match="the asker gave up"):
+    with pytest.raises(MeshLost, match="this process does not wait any more"):
         ask(session, Question("nobody/there", "nobody", 10 * DEADLINE_S), lambda: True)
 
     close_session(session)

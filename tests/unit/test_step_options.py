@@ -68,7 +68,7 @@ def test_a_kind_that_an_fmu_has_not_is_refused(
     message = refused(tmp_path, {"ball": {"fmu": str(event_fmu("Ball", 3, only=only)), "kind": kind}})
 
     assert says in message
-    assert "`kind: auto` takes what there is" in message
+    assert "`kind: auto` uses the kind that the FMU has" in message
 
 
 def test_settings_of_a_solver_are_checked_together(event_fmu: EventFmu, tmp_path: Path) -> None:

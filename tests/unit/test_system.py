@@ -9,7 +9,7 @@ import pytest
 from fmu_mesh.errors import ConfigurationError, Finding
 from fmu_mesh.instances.configuration import examine, parse
 from fmu_mesh.simtime import TimeGrid
-from fmu_mesh.system.system import System, build
+from fmu_mesh.system.system import ResolvedSystem, build
 from fmu_mesh.variables.model_description import Causality, ModelDescription, Value, Variable, VariableType
 
 FILE = Path("/models/configs/mesh.yaml")
@@ -86,7 +86,7 @@ connections: [{connections}]
 """
 
 
-def built(config: str, *overrides: str) -> System:
+def built(config: str, *overrides: str) -> ResolvedSystem:
     return build(parse(config, FILE, overrides), DESCRIPTIONS)
 
 

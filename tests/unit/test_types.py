@@ -249,7 +249,7 @@ def test_a_beta_version_of_fmi_3_is_refused(folder: Path, tmp_path: Path) -> Non
         for name in source.namelist():
             target.writestr(name, source.read(name).replace(b'fmiVersion="3.0"', b'fmiVersion="3.0-beta.4"'))
 
-    with pytest.raises(LoadFailed, match=r"is for FMI 3\.0-beta\.4, a version before the standard was finished"):
+    with pytest.raises(LoadFailed, match=r"is for FMI 3\.0-beta\.4, a preliminary version of the standard"):
         read_description(path)
 
 

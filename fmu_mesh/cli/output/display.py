@@ -11,7 +11,6 @@ from contextlib import contextmanager
 from types import TracebackType
 from typing import Final, Self
 
-from rich.console import Console
 from rich.markup import escape
 
 from ...api.result import summary_of
@@ -23,8 +22,9 @@ from ...system.plan import Plan
 from ...text import short_path
 from ...wire.views import LogLine, MeshStatus
 from .progress import ProgressLine
+from .terminal import error_console
 
-__all__ = ["Display", "say", "stdout_as_stderr", "summary", "warn"]
+__all__ = ["Display", "say", "stdout_as_stderr", "summary", "teller", "warn"]
 
 _SHOWN_TIMES: Final = 5
 _WARNINGS: Final = 5
@@ -33,6 +33,7 @@ _COUNTED: Final = 1000
 """Number of different messages that are counted."""
 _HELD: Final = 100
 """Number of messages that are held back because their FMU may fail next."""
+_ERRORS: Final = ("error", "fatal")
 _STYLES = {"ok": "dim", "warning": "yellow", "discard": "yellow", "error": "red", "fatal": "red"}
 
 
@@ -42,14 +43,16 @@ class Display:
     Args:
         plan: the plan of the run.
         show_progress: whether to draw the progress line, if standard error is a terminal.
+        quiet: show nothing but errors, and what processes of the run write themselves.
         waits_for_nodes: whether the address is shown only when all instances answer. Nodes that are started manually
             need it earlier.
     """
 
-    def __init__(self, plan: Plan, *, show_progress: bool, waits_for_nodes: bool = True) -> None:
+    def __init__(self, plan: Plan, *, show_progress: bool, quiet: bool = False, waits_for_nodes: bool = True) -> None:
         self._plan = plan
-        self._console = Console(stderr=True, highlight=False)
-        self._progress = ProgressLine(plan, self._console, show=show_progress)
+        self._console = error_console()
+        self._quiet = quiet
+        self._progress = ProgressLine(plan, self._console, show=show_progress and not quiet)
         self._waits_for_nodes = waits_for_nodes
         self._times: Counter[tuple[str, str]] = Counter()
         self._held: deque[LogLine] = deque()
@@ -73,7 +76,7 @@ class Display:
         """Show one event of the master."""
         match event:
             case Reachable(endpoints):
-                self._endpoints = endpoints
+                self._endpoints = endpoints if not self._quiet else ()
                 self._warn()
                 if not self._waits_for_nodes:
                     self._show_address()
@@ -86,7 +89,7 @@ class Display:
             case Restarted(error, number):
                 again = f"The run starts again from its first point (restart {number})."
                 say(str(from_report(error).instead_of_hint(again)))
-            case Outcome(ended_by=ErrorReport() as report):
+            case Outcome(ended_by=ErrorReport() as report) if not self._quiet:
                 self.ended(from_report(report))
             case Outcome():
                 pass
@@ -100,7 +103,11 @@ class Display:
     def _warn(self) -> None:
         """Warn if other hosts can reach it."""
         config = self._plan.system.config
-        if config.zenoh.mode == "peer" and (wide := ", ".join(filter(leaves_host, config.zenoh.listen))):
+        if (
+            not self._quiet
+            and config.zenoh.mode == "peer"
+            and (wide := ", ".join(filter(leaves_host, config.zenoh.listen)))
+        ):
             text = f"warning: whoever can reach this host at {wide} can read, set and end this mesh"
             self._console.print(f"[yellow]{escape(text)}[/]", soft_wrap=True)
 
@@ -113,6 +120,8 @@ class Display:
 
         A warning or error is held back until the FMU has taken the next step. If that fails, the error has the text.
         """
+        if self._quiet and line.status not in _ERRORS:
+            return
         if line.status == "ok":
             self._show(line)
             return
@@ -166,6 +175,11 @@ def say(text: str) -> None:
     print(f"fmu-mesh: {text}", file=sys.stderr, flush=True)
 
 
+def teller(*, quiet: bool) -> Callable[[str], None]:
+    """`say`, or nothing if ``quiet``."""
+    return (lambda _text: None) if quiet else say
+
+
 def warn(plan: Plan) -> None:
     """Print the first five warnings about a system on standard error before it runs."""
     for warning in plan.system.warnings[:_WARNINGS]:
@@ -176,14 +190,14 @@ def warn(plan: Plan) -> None:
 
 @contextmanager
 def stdout_as_stderr() -> Iterator[None]:
-    """In the block, output of an instance in this process goes to standard error: standard output is for results."""
+    """In the block, output of an FMU in this process goes to standard error: standard output is for results."""
     sys.stdout.flush()
     stdout = os.dup(1)
     os.dup2(2, 1)
     try:
         yield
     finally:
-        sys.stdout.flush()  # of a component in Python
+        sys.stdout.flush()
         ctypes.CDLL(None).fflush(None)  # output of the FMU may still be in the buffer of the C library
         os.dup2(stdout, 1)
         os.close(stdout)

@@ -17,6 +17,7 @@ from ...simtime import TimeGrid
 from ...system.plan import Plan
 from ...wire.views import MeshStatus
 from .tables import shortened
+from .terminal import may_draw
 
 __all__ = ["ProgressLine", "progress_parts"]
 
@@ -41,7 +42,7 @@ class ProgressLine:
         self._grid = plan.grid
         self._status: MeshStatus | None = None
         self._started: float | None = None
-        drawn = show and console.is_terminal and not console.is_dumb_terminal and console.file.isatty()
+        drawn = show and may_draw(console.file) and console.is_terminal and not console.is_dumb_terminal
         self._live = Live(self, console=console, transient=True, refresh_per_second=10) if drawn else None
 
     def start(self) -> None:

@@ -2,8 +2,9 @@
 
 FMPy's proxy, which formats the variadic messages of an FMU, has one logger for the whole process. So a message goes to
 the instance whose address comes with it: the environment that the instance was made with (FMI 2.0, 2.1.5), or the
-component (FMI 1.0, 2.3). Some FMUs pass neither; then the instance name decides. If this name is unknown as well, every
-instance gets the message, because it may be the reason why a call fails.
+component (FMI 1.0, 2.3). Some FMUs pass neither; then the instance name decides, which instances of several meshes in
+one process may share. If this name is unknown as well, every instance gets the message, because it may be the reason
+why a call fails.
 """
 
 from __future__ import annotations
@@ -38,19 +39,13 @@ class Logged(Protocol):
 
 
 _by_address: dict[int, Logged] = {}
-_by_name: dict[bytes, Logged] = {}
+_registered: dict[int, tuple[bytes, Logged]] = {}
+"""Names and instances, by the identity of the instance."""
 
 
 def register(name: str, instance: Logged) -> None:
-    """Messages of the instance called ``name`` go to ``instance`` from now on.
-
-    Raises:
-        ValueError: the name is taken.
-    """
-    if name.encode() in _by_name:
-        msg = f"two instances of one process have the name '{name}'"
-        raise ValueError(msg)
-    _by_name[name.encode()] = instance
+    """Messages of the instance called ``name`` go to ``instance`` from now on."""
+    _registered[id(instance)] = name.encode(), instance
     _by_address[id(instance)] = instance
 
 
@@ -61,9 +56,8 @@ def register_component(component: int, instance: Logged) -> None:
 
 def unregister(instance: Logged) -> None:
     """Discard messages of ``instance`` from now on."""
-    for name in [name for name, one in _by_name.items() if one is instance]:
-        del _by_name[name]
-    for address in [address for address, one in _by_address.items() if one is instance]:
+    _registered.pop(id(instance), None)
+    for address in [address for address, one in tuple(_by_address.items()) if one is instance]:
         del _by_address[address]
 
 
@@ -75,8 +69,9 @@ def fmi2_callbacks(instance: Logged) -> fmi2CallbackFunctions:
 
 
 def _log(address: int | None, name: bytes | None, status: int, category: bytes | None, message: bytes | None) -> None:
-    found = _by_address.get(address or 0) or _by_name.get(name or b"")
-    for instance in (found,) if found is not None else tuple(_by_name.values()):
+    addressed, everyone = _by_address.get(address or 0), tuple(_registered.values())
+    named = [instance for own, instance in everyone if own == name]
+    for instance in [addressed] if addressed is not None else named or [one for _, one in everyone]:
         instance.logged(status, category or b"", message or b"")
 
 

@@ -40,8 +40,12 @@ class FmpyCalls:
     """FMPy's object of an FMU; a deadline watch can ask which FMI function one of its methods is in.
 
     Example:
-        >>> calls = FmpyCalls(FMU2Slave(...), "fmi2")
-        >>> calls.enterInitializationMode()  # meanwhile, `current_function` gives "fmi2EnterInitializationMode"
+        >>> import threading
+        >>> from types import SimpleNamespace
+        >>> from fmu_mesh.instances.call_guard import current_function
+        >>> fmu = SimpleNamespace(enterEventMode=lambda: current_function(threading.get_ident()))
+        >>> FmpyCalls(fmu, "fmi2", {}).enterEventMode()
+        'fmi2EnterEventMode'
 
     Args:
         fmu: FMPy's object; its attributes are attributes of this, too.

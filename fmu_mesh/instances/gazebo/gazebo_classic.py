@@ -119,7 +119,9 @@ class GazeboClassicInstance:
         for name, value in values.items():
             if name not in self._inputs_by_name:
                 raise InitializationFailed(
-                    f"'{name}' is what the file says: Gazebo starts a world as it is", instance=self.name, variable=name
+                    f"'{name}' cannot be set: Gazebo starts a world with the values of its file",
+                    instance=self.name,
+                    variable=name,
                 )
             place = self._inputs_by_name[name]
             self._arrays[place.where][place.index] = value

@@ -93,7 +93,7 @@ def play(
 
     Raises:
         ConfigurationError: a value was refused.
-        MeshLost: the mesh has ended, or somebody else commands it, too.
+        MeshLost: the mesh has ended, or another program controls it too.
         DeadlineExceeded: the mesh does not reach the next moment.
     """
     hold = _commanded(client, Command("pause"))
@@ -121,14 +121,14 @@ def _commanded(client: MeshClient, command: Command) -> int:
     """Give a command that pauses the mesh; returns the point at which it will be paused."""
     hold = client.command(command).hold
     if hold is None:
-        raise ConfigurationError("the mesh does not say where it rests.", hint="Is it another version of fmu_mesh?")
+        raise ConfigurationError("the mesh does not say where it pauses.", hint="Is it another version of fmu_mesh?")
     return hold
 
 
 def _go_on(client: MeshClient, hold: int, point: int) -> int:
     """Let the mesh run from the point at which it is or will be paused to a later one; returns that point."""
     if point > hold and _commanded(client, Command("step", point - hold)) != point:
-        raise MeshLost(f"the mesh goes to another point than {point}: somebody else commands it, too.")
+        raise MeshLost(f"the mesh runs to another point than {point}: another program controls it too.")
     return point
 
 
@@ -157,7 +157,7 @@ def _wait_until_at(client: MeshClient, instance: str, point: int, timeout_s: flo
             look, reached, moved = _LOOK_S, status.point, now
         if now - moved > timeout_s:
             raise DeadlineExceeded(
-                f"it does not come to point {point}: {status.activity}.", instance=instance, point=reached
+                f"it does not reach point {point}: {status.activity}.", instance=instance, point=reached
             )
         never.wait(look)
         look = min(2 * look, _LONGEST_LOOK_S)

@@ -252,7 +252,7 @@ class Gateway:
     def _report_left_out(self) -> None:
         count, self._left_out = self._left_out, 0
         if count:
-            log.warning("%d samples were left out: the mesh is faster than ROS can be told", count)
+            log.warning("%d samples were left out: the mesh is faster than ROS can receive", count)
 
     def _token_changed(self, sample: zenoh.Sample) -> None:
         self._events.put(self._end_mesh if sample.kind == zenoh.SampleKind.DELETE else self._meet_mesh)
@@ -285,7 +285,7 @@ class _SubscribedTopic(WarnOnce):
         """The time from which on a value with this stamp in s holds, encoded; None: as soon as it arrives."""
         if stamp is not None and self._stop_time is not None and stamp > self._stop_time:
             self.warn(
-                "its stamps are behind the end of the simulation, so its messages hold as they come; "
+                "its stamps are after the end of the simulation, so its messages hold as soon as they arrive; "
                 "does its publisher run with use_sim_time?"
             )
             return None

@@ -1,1 +1,1 @@
-"""A running mesh from outside: finding it, asking it, following it, waiting for it."""
+"""Access to a running mesh from outside: find it, query it, follow it, wait for it."""

@@ -1,6 +1,6 @@
-"""What a mesh publishes, as a tool follows it to the end of the mesh.
+"""Follows what a mesh publishes until the mesh ends.
 
-Owns how that end is noticed: by the liveliness token of the master, which goes with a killed master, too.
+Owns the detection of that end: the liveliness token of the master disappears, also if the master is killed.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ class Follower(Generic[Item]):
 
     Args:
         session: a session that reaches the mesh.
-        keys: those of the mesh.
+        keys: the keys of the mesh.
 
     Attributes:
-        arrived: what subscribers have put there, in order; None where the mesh has ended.
-        there: set when the mesh was seen.
+        arrived: what subscribers have received, in order; None marks the end of the mesh.
+        there: set when the mesh was found.
     """
 
     def __init__(self, session: zenoh.Session, keys: Keys) -> None:
@@ -55,11 +55,11 @@ class Follower(Generic[Item]):
         self._stack.close()
 
     def subscribe(self, key: str, take: Callable[[zenoh.Sample], None]) -> None:
-        """From now on ``take`` gets the samples of a key."""
+        """From now on ``take`` is called with the samples of a key."""
         self._stack.callback(self._session.declare_subscriber(key, take).undeclare)
 
     def to_the_last(self, deadline: float | None = None) -> Iterator[Item]:
-        """What arrives until the mesh has ended, and what comes behind that, unless the mesh starts again.
+        """Everything that arrives until the mesh has ended, and shortly after, unless the mesh starts again.
 
         Raises:
             DeadlineExceeded: the mesh has not ended before the monotonic time ``deadline`` in s.
@@ -77,11 +77,11 @@ class Follower(Generic[Item]):
         try:
             return self.arrived.get(timeout=max(0.0, deadline - time.monotonic()))
         except queue.Empty:
-            raise DeadlineExceeded(f"mesh '{self._keys.mesh}' says nothing more in time") from None
+            raise DeadlineExceeded(f"mesh '{self._keys.mesh}' did not end in time") from None
 
     def _token_changed(self, sample: zenoh.Sample) -> None:
         if sample.kind == zenoh.SampleKind.PUT and not self._over:
-            self.there.set()  # Zenoh may say so twice, as where somebody else of this session asks for tokens
+            self.there.set()  # Zenoh may report it twice, for example if other code with this session queries tokens
         else:
             self._over = True
             self.arrived.put(None)

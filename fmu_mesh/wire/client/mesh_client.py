@@ -1,8 +1,8 @@
-"""A running mesh as a tool sees it: its views, its values, its settings and its streams.
+"""A client of a running mesh: its views, values, settings and streams.
 
-Owns the questions that the commands ask. Which meshes there are, and which one a key means, is
-`fmu_mesh.wire.client.reaching`. Nothing here prints, and nothing here is needed by a mesh itself: it is what any Zenoh
-program can do (docs/key-space.md), with deadlines and with names instead of keys.
+Owns the queries of the commands. `fmu_mesh.wire.client.reaching` finds meshes, and the mesh that a key means. Nothing
+here prints. A mesh itself does not need this module: any Zenoh program can do the same (docs/key-space.md), but here
+there are deadlines, and names instead of keys.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from itertools import chain
 from typing import Any, TypeVar, cast
 
 import msgspec
@@ -28,6 +29,7 @@ from ..views import (
     CommandAnswer,
     InstanceInfo,
     InstanceStatus,
+    LogLine,
     MeshInfo,
     MeshStatus,
     RosView,
@@ -45,14 +47,14 @@ class MeshClient:
     """One running mesh, seen from outside.
 
     Args:
-        session: a session that reaches the mesh; stays the caller's.
+        session: a session that reaches the mesh; the caller closes it.
         keys: the keys of the mesh.
-        endpoints: where the session reaches it, for a person to read.
-        timeout_s: the deadline of every question in s.
+        endpoints: where the session reaches the mesh, for messages.
+        timeout_s: the deadline of every query in s.
 
     Raises:
-        ConfigurationError: (every method) a name is unknown, or the mesh refused; says why.
-        DeadlineExceeded: (every method) nobody answered in time.
+        ConfigurationError: (every method) a name is unknown, or the mesh refused; the message has the reason.
+        DeadlineExceeded: (every method) there was no answer in time.
     """
 
     def __init__(self, session: zenoh.Session, keys: Keys, endpoints: Sequence[str], timeout_s: float) -> None:
@@ -67,16 +69,16 @@ class MeshClient:
         return self._session
 
     def info(self) -> MeshInfo:
-        """What the mesh is."""
+        """The description of the mesh."""
         return self._view(self.keys.mesh_key("info"), MeshInfo, f"mesh '{self.keys.mesh}'")
 
     def status(self) -> MeshStatus:
-        """How far the mesh is."""
+        """The state and the point of the mesh."""
         return self._view(self.keys.mesh_key("status"), MeshStatus, f"mesh '{self.keys.mesh}'")
 
     def ros(self) -> list[RosView]:
-        """What the gateways to ROS reach; none where the mesh has none."""
-        # A get: a mesh without a gateway has nobody to wait for.
+        """The links of the gateways to ROS; empty if the mesh has no gateway."""
+        # This does not wait for a queryable, because a mesh without a gateway has none.
         samples = self._get(f"{self.keys.mesh_key('ros')}/*")
         try:
             return [decode_json(sample.payload.to_bytes(), RosView) for sample in samples]
@@ -84,19 +86,19 @@ class MeshClient:
             raise _not_understood(f"the gateway of mesh '{self.keys.mesh}'", error) from error
 
     def instance_info(self, instance: str) -> InstanceInfo:
-        """What an instance is: model description, connections, process. Waits while its FMU is being loaded."""
+        """The description of an instance: variables, connections, process. Waits while its FMU is being loaded."""
         return self._view(f"{self._instance_key(instance)}/info", InstanceInfo, f"instance '{instance}'")
 
     def instance_status(self, instance: str) -> InstanceStatus:
-        """How far an instance is, and what it is doing."""
+        """The state, the point and the activity of an instance."""
         return self._view(f"{self._instance_key(instance)}/status", InstanceStatus, f"instance '{instance}'")
 
     def all_status(self) -> tuple[MeshStatus, dict[str, InstanceStatus]]:
-        """How far the mesh and all its instances are, by one question; an instance that does not answer is left out."""
-        # A querier for a key that spans several queryables is not told that they match (zenoh 1.10): this is a get.
+        """The status of the mesh and of its instances, with one query; instances that do not answer are left out."""
+        # A querier does not notice several queryables that match its key (zenoh 1.10), so this is a get.
         found = {str(s.key_expr): s.payload.to_bytes() for s in self._get(f"{self.keys.root}/*/status")}
         mesh = found.pop(self.keys.mesh_key("status"), None)
-        status = self.status() if mesh is None else None  # nothing is known of the mesh yet, or it is gone
+        status = self.status() if mesh is None else None  # this session does not know the mesh yet, or the mesh is gone
         try:
             status = status or decode_json(mesh or b"", MeshStatus)
             views = [decode_json(data, InstanceStatus) for data in found.values()]
@@ -106,7 +108,7 @@ class MeshClient:
 
     @contextmanager
     def until_end(self, tell: Callable[[], None] = lambda: None) -> Iterator[threading.Event]:
-        """An event that is set when the mesh ends, or is gone; ``tell`` is called then, on a foreign thread."""
+        """An event that is set when the mesh ends or is gone; then ``tell`` is called, on a thread of Zenoh."""
         there, ended = threading.Event(), threading.Event()
 
         def changed(sample: zenoh.Sample) -> None:
@@ -123,16 +125,17 @@ class MeshClient:
             token.undeclare()
 
     def instance_in(self, reference: str) -> str | None:
-        """The instance that a reference names; None if it names the mesh as a whole."""
-        name = reference.removeprefix(self.keys.root).strip("/")
+        """The instance that a reference names; None if the reference means the whole mesh."""
+        name = self._within(reference).removeprefix(self.keys.root).strip("/")
         name = name.removesuffix("/info").removesuffix("/status")
         return None if name in ("", "mesh") or reference == self.keys.mesh else name
 
     def targets(self, reference: str) -> list[Target]:
-        """The variables that a reference means: `instance.variable` or a key, either of them with wildcards.
+        """The variables that a reference means: `instance.variable`, `mesh/instance.variable`, or a key.
 
-        In the short form `*` stands for any characters; in a key the wildcards are those of Zenoh.
+        All may have wildcards: in the short forms `*` means any characters; a key has the wildcards of Zenoh.
         """
+        reference = self._within(reference)
         if not is_key(reference, self.keys):
             return self._targets_by_name(reference)
         asked = key_expression(reference)
@@ -157,7 +160,7 @@ class MeshClient:
         return found[0]
 
     def get(self, targets: Sequence[Target]) -> list[Reading]:
-        """The current values, in the order of the targets; each comes with the point that it belongs to."""
+        """The current values with their points, in the order of the targets."""
         readings: dict[str, Reading] = {}
         for instance in dict.fromkeys(target.instance for target in targets):
             own = {target.key: target for target in targets if target.instance == instance}
@@ -169,7 +172,7 @@ class MeshClient:
         return [readings[target.key] for target in targets if target.key in readings]
 
     def set(self, target: Target, value: object, at: float | None = None) -> SetAnswer:
-        """Give an unconnected input or a tunable parameter a value; the answer says from which point on it holds.
+        """Set an unconnected input or a tunable parameter; the answer says from which point on the value holds.
 
         Args:
             target: the variable.
@@ -185,15 +188,15 @@ class MeshClient:
         return self._view(target.key, SetAnswer, who, payload, encode_time(at) if at is not None else None)
 
     def command(self, command: Command) -> CommandAnswer:
-        """Pause, resume, step or stop the mesh; the answer comes before the mesh rests where it is told to."""
+        """Pause, resume, step or stop the mesh; the answer comes before the mesh has paused."""
         payload = msgspec.json.encode(command)
         return self._view(self.keys.mesh_key("command"), CommandAnswer, f"mesh '{self.keys.mesh}'", payload)
 
     @contextmanager
     def statuses(self, timeout_s: float | None = None) -> Iterator[Iterator[MeshStatus]]:
-        """The status of the mesh from now on, ten times a second, to its last; none if the mesh is gone already.
+        """Every status of the mesh from now on, ten times a second, to the last one; none if the mesh is gone already.
 
-        After ``timeout_s`` seconds, by default those of a question, the iterator raises `DeadlineExceeded`.
+        After ``timeout_s`` seconds (by default the deadline of a query) the iterator raises `DeadlineExceeded`.
         """
         timeout_s = timeout_s if timeout_s is not None else self._timeout_s
         deadline = time.monotonic() + timeout_s
@@ -209,16 +212,40 @@ class MeshClient:
 
     @contextmanager
     def watch(self, targets: Sequence[Target]) -> Iterator[Iterator[Reading]]:
-        """Every value from now on, in the order in which it comes; ends when the mesh does.
+        """Every value from now on, in the order of arrival; ends when the mesh ends.
 
-        A reader that falls far behind loses the newest samples; the points tell which.
+        A reader that is much too slow loses the newest samples; the points show which.
         """
         with Follower[Reading](self._session, self.keys) as follower:
             for target in targets:
                 follower.subscribe(target.key, Keeper(target, follower.arrived).keep)
             yield follower.to_the_last() if follower.there.wait(self._timeout_s) else iter(())
 
+    @contextmanager
+    def logs(self, *, follow: bool) -> Iterator[Iterator[LogLine]]:
+        """The log messages that the mesh has kept, the oldest first; then all new ones until it ends, if ``follow``."""
+        with Follower[LogLine](self._session, self.keys) as follower:
+
+            def take(sample: zenoh.Sample) -> None:
+                with suppress(MessageRefused):
+                    follower.arrived.put(decode_json(sample.payload.to_bytes(), LogLine))
+
+            if follow:  # from before the question, so that no message is missing between the two
+                follower.subscribe(self.keys.mesh_key("log"), take)
+            kept = self._view(self.keys.mesh_key("log"), list[LogLine], f"mesh '{self.keys.mesh}'")
+            last = kept[-1].number if kept else 0
+            there = follow and follower.there.wait(self._timeout_s)
+            new = follower.to_the_last() if there else iter(())
+            yield chain(kept, (line for line in new if line.number > last))
+
     # --- names
+
+    def _within(self, reference: str) -> str:
+        """A reference without the name of this mesh in front; of `mesh/instance/out/y` the whole key."""
+        short = reference.removeprefix(f"{self.keys.mesh}/")
+        if short == reference or reference.startswith(f"{self.keys.prefix}/"):
+            return reference
+        return f"{self.keys.root}/{short}" if "/" in short.partition(".")[0] else short
 
     def _targets_by_name(self, reference: str) -> list[Target]:
         instance, _, name = reference.partition(".")
@@ -277,7 +304,7 @@ class MeshClient:
             raise ConfigurationError(error.message) from error
 
     def _get(self, key: str) -> list[zenoh.Sample]:
-        """What whoever is there answers now; a question that waits for nobody."""
+        """The answers of all queryables that exist now; this does not wait for others."""
         try:
             replies = self._session.get(key, timeout=self._timeout_s)
             return [sample for reply in replies if (sample := answer_of(reply)) is not None]
@@ -291,10 +318,10 @@ def is_key(reference: str, keys: Keys) -> bool:
 
 
 def key_expression(text: str) -> zenoh.KeyExpr:
-    """A key expression that a person wrote.
+    """The key expression in a text of the user.
 
     Raises:
-        ConfigurationError: it is none.
+        ConfigurationError: it is not a key expression.
     """
     try:
         return zenoh.KeyExpr(text)

@@ -1,7 +1,7 @@
 """Which meshes a tool can reach, and which of them a key means.
 
-Owns the way from the notes in the runtime folder, or from endpoints, to a `MeshClient` for each running mesh. Tools
-open sessions in client mode: the master, which is their way in, passes everything on to the nodes.
+Makes a `MeshClient` for each running mesh, from the notes in the runtime folder or from endpoints. Tools open sessions
+in client mode: they connect to the master, which routes their messages to and from the nodes.
 """
 
 from __future__ import annotations
@@ -36,15 +36,15 @@ _NOBODY = "nobody answered"
 class Meshes:
     """The meshes that can be reached, as long as the `with` block lasts.
 
-    Where the notes tell of several, only what is asked for is opened: a mesh that does not answer is no reason to keep
-    somebody from another one.
+    If there are notes of several meshes, only the requested one is opened: a mesh that does not answer must not prevent
+    access to another one.
 
     Args:
-        endpoints: Zenoh endpoints to connect to; without any, the notes of this user's meshes on this host tell.
+        endpoints: Zenoh endpoints to connect to; if empty, the notes of this user's meshes on this host are used.
         timeout_s: the deadline of every wait in s.
 
     Attributes:
-        silent: why meshes that have a note are not among `all`.
+        silent: for meshes with a note that are not in `all`, the reason.
     """
 
     def __init__(self, endpoints: Sequence[str], timeout_s: float) -> None:
@@ -73,7 +73,7 @@ class Meshes:
         self._close()
 
     def look(self) -> None:
-        """Look which meshes there are now.
+        """Find the meshes that run now.
 
         Raises:
             DeadlineExceeded: an endpoint does not answer.
@@ -83,11 +83,11 @@ class Meshes:
 
     @contextmanager
     def changes(self) -> Iterator[Callable[[float], None]]:
-        """While inside, a function that waits until there may be other meshes, for some seconds at most."""
+        """Within the context: a function that waits until the meshes may have changed, for at most some seconds."""
         changed = threading.Event()
 
         def wait(left_s: float) -> None:
-            # Nobody tells of a note; of a token somebody does, but an answer about it may still have been empty.
+            # There is no event for a new note. There is one for a token, but a query for it may still have been empty.
             changed.wait(min(left_s, _AGAIN_S if self._endpoints else _LOOK_S))
             changed.clear()
 
@@ -99,14 +99,14 @@ class Meshes:
             yield wait
 
     def appeared(self, mesh: str | None) -> MeshClient | None:
-        """The mesh with this name or key, or the only one; None if there is none.
+        """The mesh with this name or key, or the only mesh; None if there is none.
 
         Raises:
             ConfigurationError: there are several.
             DeadlineExceeded: it does not answer.
         """
         if mesh is None:
-            return self.one(None) if self._found else None
+            return self.named(None) if self._found else None
         return self.named(mesh) if any(found.is_called(mesh) for found in self._found) else None
 
     def all(self) -> list[MeshClient]:
@@ -133,7 +133,7 @@ class Meshes:
     def answers(
         self, clients: Sequence[MeshClient], question: Callable[[MeshClient], Answer]
     ) -> list[tuple[MeshClient, Answer]]:
-        """What those of some meshes answer that do, at least one; the others join the `silent` ones.
+        """The answers of the meshes that answer, at least one; the others are added to `silent`.
 
         Raises:
             FmuMeshError: none of them answers.
@@ -168,29 +168,33 @@ class Meshes:
             raise _same_name(running, listed([found.keys.mesh for found in running]))
         raise ConfigurationError(
             f"{len(running)} meshes are running: {listed([found.keys.mesh for found in running])}.",
-            hint=f"Say which one by a full key, such as '{running[0].keys.root}/INSTANCE/out/VARIABLE'.",
+            hint=f"Say which one, as in '{running[0].keys.mesh}/INSTANCE.VARIABLE'.",
         )
 
-    def named(self, mesh: str) -> MeshClient:
-        """The mesh with this name, or with this key.
+    def named(self, mesh: str | None) -> MeshClient:
+        """The mesh with this name, or with this key; None for the only one.
 
         Raises:
             ConfigurationError: there is none, or more than one.
             DeadlineExceeded: it does not answer.
         """
         running = self._running()
-        named = [found for found in running if found.is_called(mesh)]
+        named = [found for found in running if mesh is None or found.is_called(mesh)]
         if len(named) == 1:
             return self._client(named[0])
         if named:
             roots = listed([found.keys.root for found in named])
             if len({found.keys.root for found in named}) < len(named):
                 raise _same_name(named, roots)
+            if mesh is None:
+                names = listed([found.keys.mesh for found in named])
+                raise ConfigurationError(f"{len(named)} meshes are running: {names}.", hint="Give the name of one.")
             raise ConfigurationError(f"{len(named)} meshes are named '{mesh}': {roots}.", hint="Give the key.")
+        assert mesh is not None  # otherwise all that are running would be meant, at least one
         raise _not_running(mesh, running)
 
     def _running(self) -> list[_Found]:
-        """What was found, at least one.
+        """The meshes that were found, at least one.
 
         Raises:
             ConfigurationError: there is none.
@@ -201,7 +205,7 @@ class Meshes:
 
     @property
     def absence(self) -> ConfigurationError | None:
-        """What to say where no mesh was found; None if one was."""
+        """The error if no mesh was found; None if one was."""
         if self._found:
             return None
         if self._endpoints:
@@ -217,15 +221,15 @@ class Meshes:
             yield _Found(Keys(note.key_prefix, note.mesh), note.endpoints, opening)
 
     def _shown(self) -> Iterator[_Found]:
-        """Every mesh whose master shows at the endpoints."""
+        """Every mesh whose master can be reached at the endpoints."""
         opening = self._open(self._endpoints, _NOBODY)
         for key in tokens(opening.session(), _TOKENS, self._timeout_s):
             *prefix, mesh, _ = key.split("/")
-            if prefix:  # otherwise it is a token of something else
+            if prefix:  # otherwise it is not a token of a mesh
                 yield _Found(Keys("/".join(prefix), mesh), self._endpoints, opening)
 
     def _open(self, endpoints: tuple[str, ...], else_: str) -> _Opening:
-        """The session with these endpoints; there is one, however often it is asked for."""
+        """The session with these endpoints; later calls return the same one."""
         return self._openings.setdefault(endpoints, _Opening(endpoints, else_, self._timeout_s))
 
     def _client(self, found: _Found) -> MeshClient:
@@ -237,15 +241,15 @@ class Meshes:
 
 
 class _Opening:
-    """A session in client mode that is opened when it is wanted.
+    """A session in client mode that is opened when it is needed.
 
-    On a thread: several are opened at the same time. It comes back soon after the deadline; a process that ended while
-    it was still inside Zenoh could be aborted by that.
+    It is opened on its own thread, so several can be opened at the same time. `session` waits for that thread shortly
+    beyond the deadline, because a process that ends while the thread is inside Zenoh may abort.
 
     Args:
-        endpoints: where.
-        else_: what to say when it is not open in time.
-        timeout_s: from its start on, in s.
+        endpoints: where to connect.
+        else_: the message if it is not open in time.
+        timeout_s: time limit from `start` on, in s.
     """
 
     def __init__(self, endpoints: Sequence[str], else_: str, timeout_s: float) -> None:
@@ -259,14 +263,14 @@ class _Opening:
         self._thread: threading.Thread | None = None
 
     def start(self) -> None:
-        """Begin to open it, if that has not begun."""
+        """Begin to open the session, unless that has begun already."""
         if self._thread is None:
             self._end = time.monotonic() + self._timeout_s
             self._thread = threading.Thread(target=self._run, name="open", daemon=True)
             self._thread.start()
 
     def session(self) -> zenoh.Session:
-        """The session, as soon as it is open.
+        """Wait until the session is open, and return it.
 
         Raises:
             FmuMeshError: it cannot be opened, or not in time.
@@ -284,7 +288,7 @@ class _Opening:
         )
 
     def close(self) -> None:
-        """Close it if it is open."""
+        """Close the session if it is open."""
         self._join()
         for session in self._sessions:
             close_session(session)
@@ -303,26 +307,28 @@ class _Opening:
 
 
 class _Found(NamedTuple):
-    """A mesh, and how it is reached."""
+    """A mesh, and how to reach it."""
 
     keys: Keys
     endpoints: tuple[str, ...]
     opening: _Opening
 
     def is_called(self, mesh: str) -> bool:
-        """Whether this is its name, or its key."""
+        """Whether this is the name or the key of the mesh."""
         return mesh in (self.keys.mesh, self.keys.root)
 
 
 def _means(keys: Keys, reference: str) -> bool:
-    """Whether a reference says that it is about this mesh."""
-    if reference in (keys.mesh, keys.root):
+    """Whether a reference means this mesh."""
+    if reference in (keys.mesh, keys.root) or (
+        reference.startswith(f"{keys.mesh}/") and not reference.startswith(f"{keys.prefix}/")
+    ):
         return True
     return is_key(reference, keys) and key_expression(reference).intersects(zenoh.KeyExpr(f"{keys.root}/**"))
 
 
 def _same_name(found: Sequence[_Found], names: str) -> ConfigurationError:
-    """Meshes that no name and no key tells apart, such as one that was launched twice."""
+    """Meshes with the same name and key, such as one that was launched twice."""
     where = ", ".join(endpoint for one in found for endpoint in one.endpoints[:1])
     return ConfigurationError(
         f"{len(found)} meshes are running: {names}.", hint=f"Say which one by --connect and its endpoint: {where}."
@@ -331,6 +337,9 @@ def _same_name(found: Sequence[_Found], names: str) -> ConfigurationError:
 
 def _not_running(reference: str, running: Sequence[_Found]) -> ConfigurationError:
     names = [name for found in running for name in (found.keys.mesh, found.keys.root)]
+    first = reference.partition("/")[0]
+    if "/" in reference and not any(reference.startswith(f"{found.keys.prefix}/") for found in running):
+        names = [found.keys.mesh + reference.removeprefix(first) for found in running]
     suggestion = nearest(reference, names)
     hint = (
         f"Did you mean '{suggestion}'?"

@@ -25,7 +25,7 @@ Item = TypeVar("Item")
 
 
 class Target(msgspec.Struct, frozen=True):
-    """One variable of the mesh, and the key where its value is."""
+    """One variable of the mesh, and the key of its value."""
 
     instance: str
     key: str
@@ -33,7 +33,7 @@ class Target(msgspec.Struct, frozen=True):
 
 
 class Reading(msgspec.Struct, frozen=True, omit_defaults=True):
-    """One value as it came, with its communication point and the time of that in s."""
+    """One value that was received, with its communication point and the time of that point in s."""
 
     key: str
     instance: str
@@ -45,7 +45,7 @@ class Reading(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 def reading_of(target: Target, sample: zenoh.Sample) -> Reading | None:
-    """A sample as a value; None if it has no point, as what somebody else puts on the key of an input."""
+    """The value of a sample; None if it has no point, as values that others put on the key of an input."""
     if sample.attachment is None:
         return None
     try:
@@ -58,9 +58,9 @@ def reading_of(target: Target, sample: zenoh.Sample) -> Reading | None:
 
 
 class Keeper:
-    """Puts the samples of one subscriber into the queue of all.
+    """Puts the samples of one subscriber into the common queue.
 
-    A reader that falls far behind loses samples: this runs on a thread of Zenoh, which must not wait for it.
+    A reader that is much too slow loses samples: this runs on a thread of Zenoh, which must not wait for the reader.
     """
 
     def __init__(self, target: Target, arrived: queue.SimpleQueue[Reading | None]) -> None:
@@ -76,11 +76,11 @@ class Keeper:
 
 
 def latecomers(arrived: queue.SimpleQueue[Item]) -> Iterator[Item]:
-    """What still comes after the master's token has gone, until nothing has come for a quarter of a second.
+    """The samples that arrive after the master's token has gone, until none has arrived for a quarter of a second.
 
-    Zenoh tells of the token before samples that were sent earlier: it goes ahead of them on the way, by its priority,
-    and here, where each subscriber has a thread of its own. Looks are counted, not time: a process that had no
-    processor meanwhile has not looked.
+    The loss of the token can overtake samples that were sent earlier: it has a higher priority on the network, and each
+    subscriber has its own thread here. This counts looks into the queue instead of time, because this process may have
+    had no processor for a while.
     """
     looks = 0
     while looks < _LOOKS:

@@ -1,4 +1,4 @@
-"""Waiting for a running mesh: until it rests, or is in a state, from before it is there."""
+"""Waits until a mesh has paused, or is in a state; the mesh may start later."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ _RANKS: Final[dict[MeshState, int]] = {
     "failed": 4,
 }
 _GOES_AND_RESTS: Final = 2
-"""A mesh goes from a state of this rank to the other one and back."""
+"""Running and paused have the same rank: a mesh can change from each of them to the other."""
 
 
 def rest(client: MeshClient, command: Command) -> CommandAnswer:
-    """Pause or step a mesh; the answer comes when it rests, and its point is the one where it does.
+    """Pause or step a mesh; return when it has paused, with the point at which it has.
 
     Raises:
         ConfigurationError: it refused.
-        MeshLost: it ends or is resumed before, or does not rest in time.
+        MeshLost: it ended or was resumed before, or did not pause in time.
         FmuMeshError: it has failed before.
     """
     mesh, what, last = client.keys.mesh, "come to rest", None
-    with client.statuses() as statuses:  # from before the command, so that the last one of a short run is not missed
+    with client.statuses() as statuses:  # before the command, so that the last status of a short run is not missed
         answer, holds = client.command(command), False
         try:
             for last in statuses:
@@ -56,14 +56,14 @@ def wait_for(meshes: Meshes, mesh: str | None, state: MeshState, timeout_s: floa
     """The first status in which a mesh is in a state.
 
     Args:
-        meshes: where it is looked for.
+        meshes: the meshes that can be reached.
         mesh: its name or key; None for the only one.
-        state: as `status` names it.
-        timeout_s: from now on, in s.
+        state: as in `status`.
+        timeout_s: time limit in s.
 
     Raises:
         ConfigurationError: there are several.
-        MeshLost: it is not there, or not in this state, in time; or it has ended and will not be.
+        MeshLost: it did not start, or was not in this state, in time; or it has ended.
         FmuMeshError: it has failed.
     """
     end = time.monotonic() + timeout_s
@@ -78,7 +78,7 @@ def wait_for(meshes: Meshes, mesh: str | None, state: MeshState, timeout_s: floa
 
 
 def _in_state(client: MeshClient, state: MeshState, timeout_s: float) -> MeshStatus:
-    """The first status in which a mesh that is there is in a state."""
+    """The first status in which a running mesh is in a state."""
     mesh, last = client.keys.mesh, None
     with client.statuses(timeout_s) as statuses:
         try:
@@ -95,12 +95,12 @@ def _in_state(client: MeshClient, state: MeshState, timeout_s: float) -> MeshSta
 
 
 def _can_become(state: MeshState, wanted: MeshState) -> bool:
-    """Whether a mesh that is in a state can come to another one."""
+    """Whether a mesh can change from one state to another."""
     return _RANKS[wanted] > _RANKS[state] or _RANKS[wanted] == _RANKS[state] == _GOES_AND_RESTS
 
 
 def _ended(status: MeshStatus, what: str) -> FmuMeshError:
-    """Why a mesh has not come to what somebody waits for."""
+    """The error for a mesh that ended before it was in the expected state."""
     if status.error is None:
         return MeshLost(f"mesh '{status.mesh}' is {status.state} at point {status.point}, and does not {what} any more")
     error = from_report(status.error)

@@ -266,7 +266,7 @@ def _check_entry(path: Path, entry: zipfile.ZipInfo) -> None:
     if "\\" in name:
         raise LoadFailed(
             f"'{path}' has an entry with a backslash in its name: '{name}' (FMI 2.0, 2.3: the separator is '/').",
-            hint="Unpack it with a tool that bears with that, and zip it again.",
+            hint="Unpack it with a tool that accepts backslashes, and zip it again.",
         )
     kind = stat.S_IFMT(entry.external_attr >> 16)
     if kind == stat.S_IFLNK:

@@ -148,7 +148,7 @@ def _direct_dependencies(source: FmpyDescription, elements: Iterable[ET.Element]
 def _array_start(type_: VariableType, texts: list[str], shape: tuple[int, ...]) -> Value | None:
     """The start value of a scalar or an array, for which one value stands for all elements (FMI 3.0, 2.4.7)."""
     if math.prod(shape) > MAX_ELEMENTS:
-        raise ValueError(f"an array of {math.prod(shape)} elements; {MAX_ELEMENTS} are the most")
+        raise ValueError(f"an array of {math.prod(shape)} elements; the limit is {MAX_ELEMENTS}")
     if len(texts) == 1:
         texts *= math.prod(shape)
     values = [_start(type_, text) for text in texts]

@@ -56,16 +56,16 @@ def examine(fmu: OpenFmu) -> Contents:
     version = root.get("fmiVersion") or ""
     if re.match(r"3\.\d+(\.\d+)?-", version):
         raise LoadFailed(
-            f"'{path}' is for FMI {version}, a version before the standard was finished, which nothing can rely on.",
+            f"'{path}' is for FMI {version}, a preliminary version of the standard, which is not supported.",
             hint="Export it for FMI 3.0.",
         )
     if root.tag != "fmiModelDescription" or version[:1] not in _SCHEMA_FILES:
         shown = f"FMI '{version}'" if root.tag == "fmiModelDescription" else f"a <{root.tag}>"
-        raise LoadFailed(f"the modelDescription.xml of '{path}' is for {shown}; there are FMI 1.0, 2.0 and 3.0.")
+        raise LoadFailed(f"the modelDescription.xml of '{path}' is for {shown}; supported are FMI 1.0, 2.0 and 3.0.")
     if illegal := list(_illegal_values(root, version[0])):
         rest = f", and {len(illegal) - _SHOWN} more" if len(illegal) > _SHOWN else ""
         text = f"the modelDescription.xml of '{path}' has illegal values: {'; '.join(illegal[:_SHOWN])}{rest}."
-        raise LoadFailed(text, hint="Its tool has to be told, or the file corrected.")
+        raise LoadFailed(text, hint="Report it to the maker of its tool, or correct the file.")
     return contents
 
 
@@ -84,7 +84,7 @@ def safe_xml(data: bytes, what: str) -> Any:  # noqa: ANN401 lxml ships no types
         return etree.fromstring(data, _parser())
     except _DocumentTypeError as error:
         raise LoadFailed(
-            f"{what} declares a document type, through which XML can expand without end and reach for other files.",
+            f"{what} declares a document type, with which XML can expand without limit and read other files.",
             hint="No FMI document has one: remove its <!DOCTYPE>.",
         ) from error
     except etree.XMLSyntaxError as error:
@@ -132,7 +132,7 @@ def find_library(path: Path, names: Collection[str], identifiers: Sequence[str],
     what = f"'{path}' has no '{wanted}'" if identifier else f"'{path}' has no model identifier to find its library by"
     if others:
         raise LoadFailed(
-            f"{what}; it has {' and '.join(map(repr, others))}, and which of them to load cannot be told.",
+            f"{what}; it has {' and '.join(map(repr, others))}, and it is not clear which of them to load.",
             hint="The library must have the name of the model identifier (FMI 2.0, 2.3).",
         )
     if identifier and source_names(names):
@@ -143,7 +143,7 @@ def find_library(path: Path, names: Collection[str], identifiers: Sequence[str],
             hint="Leave `kind` to the other one, or export it with both libraries.",
         )
     if not identifier:
-        raise LoadFailed(f"{what}, nor a library for this platform.", hint="Its tool has to be told.")
+        raise LoadFailed(f"{what}, nor a library for this platform.", hint="Report it to the maker of its tool.")
     platforms = sorted({name.split("/")[1] for name in names if re.fullmatch(r"binaries/[^/]+/.+", name)})
     raise LoadFailed(
         f"'{path}' has no binary for this platform ({folder.rpartition('/')[2]}); it has: "

@@ -64,7 +64,7 @@ def description_of(fmu: OpenFmu, kind: Literal["auto"] | Kind = "auto", *, to_ru
     source, problems = _parse(path, contents)
     version = source.fmiVersion or ""
     if not version.startswith(_VERSIONS) or "-" in version:  # 3.0-beta.1 is another interface than 3.0
-        raise LoadFailed(f"'{path}' is an FMI {version} FMU; FMI 1.0, 2.0 and 3.0 are what can run.")
+        raise LoadFailed(f"'{path}' is an FMI {version} FMU; supported are FMI 1.0, 2.0 and 3.0.")
     kind = _kind(source, kind, path)
     platforms = tuple(fmpy.supported_platforms(_readable(path, contents)))
     interfaces = [_interface(source, kind), *(_interface(source, other) for other in _WORDS if other != kind)]
@@ -79,7 +79,7 @@ def description_of(fmu: OpenFmu, kind: Literal["auto"] | Kind = "auto", *, to_ru
     try:
         description = _convert(source, kind, root, platforms, problems)
     except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
-        raise LoadFailed(f"the modelDescription.xml of '{path}' has a value that cannot be: {error}") from error
+        raise LoadFailed(f"the modelDescription.xml of '{path}' has an invalid value: {error}") from error
     identifier = identifiers[0] or (PurePosixPath(library).stem if library is not None else "")
     return replace(description, model_identifier=identifier, library=library)
 
@@ -100,7 +100,7 @@ def _kind(source: FmpyDescription, wanted: str, path: Path) -> Kind:
         )
     raise LoadFailed(
         f"'{path}' is for {has} only, not for {missed}.",
-        hint="`kind: auto` takes what there is." if there else None,
+        hint="`kind: auto` uses the kind that the FMU has." if there else None,
     )
 
 

@@ -177,7 +177,9 @@ class Fmi2Instance(Fmi2Values):
 
     def _restore(self, kept: Bookkeeping) -> None:
         super()._restore(kept)
-        self._terminated = False
+        if self._terminated:
+            self._terminated = False
+            self._use_compiled(self._compiled)
 
     def _free(self) -> None:
         if self._retrying is not None:

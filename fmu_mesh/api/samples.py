@@ -1,0 +1,94 @@
+"""Values of a running mesh as a program gets them."""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack
+from types import TracebackType
+from typing import Any, NamedTuple, Self
+
+from ..errors import ConfigurationError, UnknownName
+from ..variables.value_conversion import from_plain
+from ..wire.client.mesh_client import MeshClient
+from ..wire.client.readings import Reading, Target
+from ..wire.views import VariableView
+
+__all__ = ["Sample", "Watch", "sample_of", "targets_of"]
+
+
+class Sample(NamedTuple):
+    """One value of a variable.
+
+    Example:
+        >>> import fmu_mesh
+        >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
+        >>> with mesh.start(record="memory", paused=True) as run:
+        ...     run.samples("pendulum.a")
+        [Sample(name='pendulum.a', value=1.3, point=0, time=0.0, unit='rad')]
+
+    Attributes:
+        name: `instance.variable`.
+        value: a number, truth value, text or bytes; an array as a numpy array.
+        point: the communication point of the value.
+        time: the simulation time of this point in s.
+        unit: the unit, as FMI writes it; None without one.
+    """
+
+    name: str
+    value: Any
+    point: int
+    time: float
+    unit: str | None
+
+
+class Watch(Iterator[Sample]):
+    """The values of variables as they come, from when it was made until the mesh ends, or until it is closed.
+
+    Args:
+        client: the way into the mesh.
+        targets: the variables by their keys.
+    """
+
+    def __init__(self, client: MeshClient, targets: Mapping[str, Target]) -> None:
+        self._targets = targets
+        self._stack = ExitStack()
+        self._readings = self._stack.enter_context(client.watch(list(targets.values())))
+        weakref.finalize(self, self._stack.close)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def __next__(self) -> Sample:
+        reading = next(self._readings, None)
+        if reading is None:
+            self.close()
+            raise StopIteration
+        return sample_of(reading, self._targets[reading.key].variable)
+
+    def close(self) -> None:
+        """End it; may be called twice."""
+        self._stack.close()
+
+
+def targets_of(client: MeshClient, name: str) -> list[Target]:
+    """The variables with a name; `*` in it stands for any characters.
+
+    Raises:
+        UnknownName: there is none.
+    """
+    try:
+        return client.targets(name)
+    except ConfigurationError as error:
+        raise UnknownName(error.message, hint=error.hint) from error
+
+
+def sample_of(reading: Reading, view: VariableView) -> Sample:
+    """A value as it came over the wire as a sample."""
+    value = from_plain(reading.value, view.type, view.shape)
+    return Sample(f"{reading.instance}.{reading.variable}", value, reading.point, reading.time, reading.unit)

@@ -1,0 +1,116 @@
+"""The plan of a mesh as `check --json` prints it: names and plain values, without what only nodes need."""
+
+from __future__ import annotations
+
+import msgspec
+
+from ...config.mesh import SimulationConfig
+from ...errors import Finding
+from ...system.plan import Plan
+from ...variables.value_conversion import to_plain
+from ...variables.value_types import PlainValue
+
+__all__ = ["PlanView", "plan_view"]
+
+
+class PlannedInstance(msgspec.Struct, frozen=True):
+    """One instance: its model, step size in s, node (process), and start values."""
+
+    name: str
+    model: str
+    step_size: float
+    node: str
+    start_values: dict[str, PlainValue]
+
+
+class PlannedConnection(msgspec.Struct, frozen=True):
+    """One connection: the input is factor * output + offset, ``delay`` points later."""
+
+    source: str = msgspec.field(name="from")
+    target: str = msgspec.field(name="to")
+    delay: int
+    factor: float
+    offset: float
+    units: str
+    closes_cycle: bool
+
+
+class PlanView(msgspec.Struct, frozen=True):
+    """What would run.
+
+    Attributes:
+        simulation: the section of the configuration, options applied.
+        last_point: number of the last point; None without a stop time.
+        window: how many points a node may run ahead of the slowest.
+        order: the instances in the order in which they step.
+        cycles: the instances of each cycle.
+        free_inputs: `instance.variable` of the inputs that are not connected.
+        levels: level in the initialization of each connected output.
+        recorded: `instance.variable` of the columns of the result file.
+        result_file: the result file; None if nothing is recorded.
+        warnings: findings that do not prevent a run.
+    """
+
+    mesh: str
+    simulation: SimulationConfig
+    last_point: int | None
+    window: int
+    instances: list[PlannedInstance]
+    connections: list[PlannedConnection]
+    order: list[str]
+    cycles: list[list[str]]
+    free_inputs: list[str]
+    levels: dict[str, int]
+    recorded: list[str]
+    result_file: str | None
+    warnings: tuple[Finding, ...]
+
+
+def plan_view(plan: Plan) -> PlanView:
+    """The plan as plain values."""
+    system, grid = plan.system, plan.grid
+    closing = {str(connection) for connection in plan.closing}
+    connected = {(c.target_instance, c.target.name) for c in plan.connections}
+    instances = [
+        PlannedInstance(
+            own.name,
+            own.fmu,
+            own.step_points * grid.step_size,
+            own.node,
+            {name: to_plain(value) for name, value in own.start_values.items()},
+        )
+        for own in system.instances.values()
+    ]
+    connections = [
+        PlannedConnection(
+            f"{c.source_instance}.{c.source_name}",
+            f"{c.target_instance}.{c.target_name}",
+            c.delay or 0,
+            c.factor,
+            c.offset,
+            c.units,
+            str(c) in closing,
+        )
+        for c in plan.connections
+    ]
+    free = (
+        f"{name}.{variable.name}"
+        for name, own in system.instances.items()
+        for variable in own.description.variables
+        if variable.causality == "input" and (name, variable.name) not in connected
+    )
+    return PlanView(
+        mesh=system.config.mesh,
+        simulation=system.config.simulation,
+        last_point=grid.last_point if grid.stop_time is not None else None,
+        window=plan.window,
+        instances=instances,
+        connections=connections,
+        order=[*plan.order],
+        cycles=[[*cycle] for cycle in plan.cycles],
+        free_inputs=[*free],
+        levels={f"{name}.{variable}": level for (name, variable), level in plan.initialization.levels.items()},
+        recorded=[f"{name}.{variable}" for name, variable in system.recorded],
+        result_file=system.result_file,
+        warnings=system.warnings,
+    )

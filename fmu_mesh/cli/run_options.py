@@ -1,0 +1,99 @@
+"""The options of a run as flags of the command line: `Options` says which there are and how they are spelt."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+from ..config.base import Endpoint
+from ..config.mesh import MAX_WINDOW
+from ..run.options import Options, option_fields
+from .arguments import endpoint, number, whole
+
+__all__ = ["add_configuration", "add_options", "read_options"]
+
+
+def add_configuration(parser: argparse.ArgumentParser) -> None:
+    """Add the argument CONFIG, and the flags that replace what CONFIG says."""
+    parser.add_argument("config", type=Path, metavar="CONFIG", help="the configuration file")
+    add_options(
+        parser.add_argument_group("instead of what CONFIG says"),
+        "algorithm",
+        "step_size",
+        "stop_time",
+        "window",
+        "real_time_factor",
+        "start_values",
+        "config_values",
+        "output",
+        "listen",
+        "connect",
+    )
+    add_options(parser, "allow_code")
+
+
+def add_options(
+    parser: argparse._ActionsContainer,
+    *names: str,
+    defaults: Mapping[str, str] | None = None,
+    metavars: Mapping[str, str] | None = None,
+) -> None:
+    """Add flags for options of a run, as `Options` describes them.
+
+    Args:
+        parser: the parser of a command, or a group of its flags.
+        names: the fields of `Options`.
+        defaults: by field, the default value for the help.
+        metavars: by field, the name of the value in the help, if it differs from that in `Options`.
+    """
+    for name in names:
+        setting = option_fields()[name]
+        flag, kind = setting.flag, setting.type
+        default = (defaults or {}).get(name)
+        text = setting.help + (f"; default: {default}" if default is not None else "")
+        details: dict[str, Any] = {"dest": name, "help": text.replace("%", "%%")}
+        if kind is bool:
+            parser.add_argument(flag.name, action="store_true", **details)
+            continue
+        details |= {"metavar": (metavars or {}).get(name, flag.metavar), "type": _READERS.get(kind, str)}
+        if setting.repeatable:
+            details |= {"action": "append", "default": []}
+        if flag.bare is not None:
+            details |= {"nargs": "?", "const": flag.bare, "type": _trace_file}
+        parser.add_argument(flag.name, **details)
+
+
+def read_options(arguments: argparse.Namespace) -> Options:
+    """The options from the arguments of a command."""
+    given: dict[str, Any] = {}
+    for name, setting in option_fields().items():
+        if hasattr(arguments, name):
+            value = getattr(arguments, name)
+            given[name] = tuple(value) if setting.repeatable else value
+    return Options(**given)
+
+
+def _trace_file(text: str) -> Path:
+    if not text.endswith(".json"):
+        raise argparse.ArgumentTypeError(f"'{text}' is no .json file; write --profile after the other arguments")
+    return Path(text)
+
+
+def _window(text: str) -> int | Literal["auto"]:
+    if text == "auto":
+        return "auto"
+    value = whole(text)
+    if not 1 <= value <= MAX_WINDOW:
+        raise argparse.ArgumentTypeError(f"'{text}' is no window: auto, or from 1 to {MAX_WINDOW} points")
+    return value
+
+
+_READERS: dict[Any, Callable[[str], object]] = {
+    int: _window,
+    float: number,
+    Path: Path,
+    Endpoint: endpoint,
+}
+"""The reader of a value by its type; text for any other type. What words a key allows is checked with the file."""

@@ -1,0 +1,1 @@
+"""ONNX models as instances; the only package that imports onnxruntime."""

@@ -1,0 +1,374 @@
+"""All instances of a plan in this process, stepped point by point in the plainest way: the reference of invariant 1.
+
+It uses the same plan as the nodes but none of their code. A distributed run must give bit-for-bit the same result. Owns
+the order of calls at a point and the state of the whole system. Knows no files, no wall clock and no deadlines:
+`local.py` records and watches what this module steps, and `fmu_mesh.api.open_system` gives it to a program.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack, suppress
+from functools import partial
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+from ..errors import ConfigurationError, FmuError, TerminationRequested
+from ..instances.call_guard import Guarded, floating_point_changed, restore_floating_point
+from ..instances.contract import LogMessage, Opening, Showing
+from ..rings.array_elements import element_of, scaled
+from ..rings.ring import Ring, Rows
+from ..simtime import TimeGrid
+from ..system.algebraic_loop import FixedPoint
+from ..system.coupling_rule import CouplingRule
+from ..system.initialization_plan import Loop, Tear
+from ..system.layout import Layout
+from ..system.plan import InstancePlan, Plan
+from ..variables.value_types import Value
+from .child import is_other_python
+from .threads import one_thread_meanwhile
+
+__all__ = ["LocalSystem", "SavedSystem", "check_one_process", "opening_of"]
+
+
+class LocalSystem:
+    """The instances of a plan and what moves values between them.
+
+    Call sequence: `start`, then `step` as often as there are points, with all other methods in between; at the end, and
+    after any exception, `close`. After an exception of `step` only `restore` brings the system back to a point.
+
+    Args:
+        plan: the plan; its nodes and its window are not used.
+
+    Attributes:
+        point: the last point that all instances reached.
+        stepping: name of the instance whose step is under way, or has failed; empty between two points.
+    """
+
+    def __init__(self, plan: Plan) -> None:
+        self.point = 0
+        self.stepping = ""
+        self._plan = plan
+        self._grid = plan.grid
+        self._members: dict[str, _Member] = {}
+        self._steps: tuple[tuple[str, Callable[[int], None]], ...] = ()
+        self._kept: dict[int, SavedSystem] = {}
+        self._threads = ExitStack()
+
+    def start(self, open_instance: Callable[[str], Guarded]) -> None:
+        """Open all instances and initialize them; then they are at point 0.
+
+        Args:
+            open_instance: opens an instance by name; it is closed here.
+
+        Raises:
+            FmuError: an instance cannot be opened or initialized.
+        """
+        self._threads.enter_context(one_thread_meanwhile())
+        for name in self._plan.order:
+            self._members[name] = _Member(self._plan, name, open_instance(name))
+        self._threads.enter_context(one_thread_meanwhile())  # with the libraries that a component has imported
+        self._initialize()
+        self._steps = tuple((name, member.step_from) for name, member in self._members.items())
+
+    def step(self) -> None:
+        """Take all steps that end at the next point, in the order of the plan.
+
+        Raises:
+            FmuError: a step failed; it has the point and the time.
+            TerminationRequested: an FMU asks to end the simulation. All outputs are still those of `point`.
+        """
+        point, steps = self.point, self._steps
+        try:
+            for self.stepping, step_from in steps:
+                step_from(point)
+        except (FmuError, TerminationRequested) as error:
+            error.at(point, self._grid.time(point))
+            raise
+        self.point = point + 1
+        self.stepping = ""
+
+    def reader(self, instance: str, variable: str) -> tuple[Callable[[int], Value], int]:
+        """A function that reads an output of the plan or an element of it, and the points of an own step.
+
+        The value at a point is that of the last own step that ended there or before: ``read(point // points)``.
+        """
+        return self._members[instance].reader(variable)
+
+    def getter(self, instance: str, variable: str) -> Callable[[int], Value]:
+        """A function that returns the value of a variable, or of an element of an array, at the current point."""
+        return self._members[instance].getter(variable)
+
+    def set(self, instance: str, variable: str, value: Value) -> None:
+        """Set an unconnected input or a tunable parameter; the next step of the instance uses it."""
+        self._members[instance].set(variable, value)
+
+    def save(self) -> SavedSystem:
+        """Save the state of all instances between two points. `free` or `close` frees it."""
+        states: dict[str, _SavedMember] = {}
+        try:
+            for name, member in self._members.items():
+                states[name] = member.save()
+        except BaseException:
+            self._free(SavedSystem(self.point, states))
+            raise
+        saved = SavedSystem(self.point, states)
+        self._kept[id(saved)] = saved
+        return saved
+
+    def restore(self, saved: SavedSystem) -> None:
+        """Go back, or ahead, to a state of `save`."""
+        members = self._members
+        for self.stepping, member in members.items():  # until all are there, the system is at no point
+            member.restore(saved.members[self.stepping])
+        self.point = saved.point
+        self.stepping = ""
+
+    def free(self, saved: SavedSystem) -> None:
+        """Free a state; nothing happens if it is freed already."""
+        if self._kept.pop(id(saved), None) is not None:
+            self._free(saved)
+
+    def close(self) -> None:
+        """Free all states and close all instances. Never raises; may be called twice."""
+        for saved in self._kept.values():
+            with suppress(FmuError):  # it has failed before, and now its memory goes anyway
+                self._free(saved)
+        self._kept.clear()
+        for member in self._members.values():
+            member.instance.close()
+        self._threads.close()
+
+    def _free(self, saved: SavedSystem) -> None:
+        for name, own in saved.members.items():
+            self._members[name].instance.free_state(own.state)
+
+    def _initialize(self) -> None:
+        grid, members = self._grid, self._members
+        for member in members.values():
+            stop_time = grid.told_stop_time(member.plan.step_points)
+            member.instance.enter_initialization(grid.start_time, stop_time, member.plan.start_values)
+        levels = self._plan.initialization.levels
+        known: dict[tuple[str, str], Value] = {}
+        loops = iter((*self._plan.initialization.loops, None))
+        loop = next(loops)
+        for (name, variable), level in sorted(levels.items(), key=lambda item: item[1]):
+            if loop is not None and level >= loop.first:
+                self._iterate(loop, known)
+                loop = next(loops)
+            if (name, variable) not in known:
+                members[name].set_initial_inputs(known)
+                known[(name, variable)] = members[name].instance.get_values([variable])[0]
+        for member in members.values():
+            member.set_initial_inputs(known)
+        for member in members.values():
+            member.instance.exit_initialization()
+            member.bind(grid, members)
+
+    def _iterate(self, loop: Loop, known: dict[tuple[str, str], Value]) -> None:
+        """Iterate an algebraic loop until its values are consistent."""
+        members = self._members
+        point = FixedPoint(loop, self._plan.system.config.initialization)
+        before = dict(known)
+        consistent = False
+        while not consistent:
+            known.clear()
+            known.update(before)
+            for name, variable in loop.outputs:
+                members[name].set_initial_inputs(known, point.assumed)
+                known[(name, variable)] = members[name].instance.get_values([variable])[0]
+            consistent = point.update([self._brought(tear, known) for tear in loop.tears])
+        for name, variable in point.assumed:
+            members[name].settled.add(variable)
+
+    def _brought(self, tear: Tear, known: dict[tuple[str, str], Value]) -> Value:
+        c = next(c for c in self._plan.connections if (c.target_instance, c.target_name) == (tear.target, tear.input))
+        return scaled(_at(known[c.source_instance, c.source.name], c.source_index), c.factor, c.offset)
+
+
+class _SavedMember(NamedTuple):
+    """The state of one instance, its own steps done, those done when something was last set, and its rows."""
+
+    state: object
+    step: int
+    set_at: int
+    outputs: Rows
+
+
+class SavedSystem(NamedTuple):
+    """The state of a `LocalSystem` at a point."""
+
+    point: int
+    members: Mapping[str, _SavedMember]
+
+
+class _Member:
+    """One instance of a `LocalSystem`.
+
+    Attributes:
+        settled: inputs that keep the values of the iteration of a loop at the start.
+    """
+
+    def __init__(self, plan: Plan, name: str, instance: Guarded) -> None:
+        self.plan = _instance_plan(plan, name)
+        self.connections = [c for c in plan.connections if c.target_instance == name]
+        self.instance = instance
+        self._do_step = instance.do_step
+        self._inputs = Ring(self.plan.inputs, 1)
+        # A slower instance reads values that are as old as its own step.
+        oldest = max(instance.step_points for instance in plan.system.instances.values())
+        self._outputs = Ring(self.plan.outputs, 1 << (2 * oldest).bit_length())
+        self._points = self.plan.step_points
+        self._feeds: list[_Feed] = []
+        self._set_at = -1
+        self.step = 0
+        self.settled: set[str] = set()
+
+    def set_initial_inputs(
+        self, known: Mapping[tuple[str, str], Value], assumed: Mapping[tuple[str, str], Value] = MappingProxyType({})
+    ) -> None:
+        """Set every connected input whose source is known, or which has an assumed value."""
+        values: dict[str, Value] = {}
+        for c in self.connections:
+            key = (c.source_instance, c.source.name)
+            own = (c.target_instance, c.target_name)
+            if own in assumed:
+                value = assumed[own]
+            elif key in known and c.target_name not in self.settled:
+                value = scaled(_at(known[key], c.source_index), c.factor, c.offset)
+            else:
+                continue
+            if not c.target_index:
+                values[c.target.name] = value
+                continue
+            if c.target.name not in values:
+                values[c.target.name] = self.instance.get_values([c.target.name])[0]
+            row = values[c.target.name]
+            for i in c.target_index[:-1]:
+                row = _at(row, (i,))
+            assert isinstance(row, list)
+            row[c.target_index[-1]] = value
+        if values:
+            self.instance.set_values(values)
+
+    def bind(self, grid: TimeGrid, members: Mapping[str, _Member]) -> None:
+        """Prepare `step_from`: what it needs at every point is looked up here, once."""
+        arrays = [column.name for column in self.plan.inputs.columns if column.shape]
+        for name, value in zip(arrays, self.instance.get_values(arrays) if arrays else [], strict=True):
+            self._inputs.put(0, name, value)  # elements that are not connected keep it
+        self.instance.bind(self._inputs, (self._outputs,), grid, self.plan.step_points)
+        for c in self.connections:
+            read, points = members[c.source_instance].reader(c.source_name)
+            lead = CouplingRule(c.delay or 0, points, self._points).lead
+            same = (c.factor, c.offset) == (1.0, 0.0)
+            change = None if same else partial(scaled, factor=c.factor, offset=c.offset)
+            self._feeds.append(_Feed(read, points, lead, change, self._inputs.writer(c.target_name)))
+
+    def reader(self, variable: str) -> tuple[Callable[[int], Value], int]:
+        """See `LocalSystem.reader`."""
+        return self._outputs.reader(variable), self.plan.step_points
+
+    def step_from(self, point: int) -> None:
+        """Take the own step that ends at ``point + 1``, if there is one, with the inputs that the delays prescribe."""
+        if (point + 1) % self._points:
+            return
+        step = self.step
+        start = step * self._points
+        for read, points, lead, change, write in self._feeds:
+            value = read((start + lead) // points)  # `CouplingRule.row_for`, without a call
+            write(0, value if change is None else change(value))
+        self._do_step(step)
+        if floating_point_changed():
+            restore_floating_point()
+        self.step = step + 1
+
+    def getter(self, name: str) -> Callable[[int], Value]:
+        """See `LocalSystem.getter`: from the row of the point, or from the model if something was set since then."""
+        variable = self.instance.description.variable_of(name)
+        assert variable is not None
+        column = Layout.of([variable]).columns[0]
+
+        def from_model(_point: int) -> Value:
+            return element_of(self.instance.get_values([column.name])[0], column, name)
+
+        if column.name not in self.plan.outputs.names:
+            return from_model
+        read = self._outputs.reader(name)
+        return lambda point: from_model(point) if self._set_at == self.step else read(point // self._points)
+
+    def set(self, name: str, value: Value) -> None:
+        """See `LocalSystem.set`."""
+        self._set_at = self.step
+        self.instance.set_values({name: value})
+
+    def save(self) -> _SavedMember:
+        """See `LocalSystem.save`."""
+        rows = tuple(part.copy() for part in self._outputs.parts)
+        return _SavedMember(self.instance.get_state(), self.step, self._set_at, rows)
+
+    def restore(self, saved: _SavedMember) -> None:
+        """See `LocalSystem.restore`. The input row needs none: each step writes what is connected anew."""
+        self.instance.set_state(saved.state)
+        self.step, self._set_at = saved.step, saved.set_at
+        for part, kept in zip(self._outputs.parts, saved.outputs, strict=True):
+            part[...] = kept
+
+
+class _Feed(NamedTuple):
+    """How an input gets its value: ``read`` a row of the source; see `CouplingRule` for ``points`` and ``lead``."""
+
+    read: Callable[[int], Value]
+    points: int
+    lead: int
+    change: Callable[[Value], Value] | None
+    write: Callable[[int, Value], None]
+
+
+def check_one_process(plan: Plan) -> None:
+    """Refuse what cannot run in one process; groups do not matter here.
+
+    Raises:
+        ConfigurationError: a component needs another Python, or there are two instances of an FMU that allows one.
+    """
+    for node in plan.nodes.values():
+        if node.interpreter is not None and is_other_python(node.interpreter):
+            text = f"'{node.node}' needs the Python '{node.interpreter}', and this process is another one"
+            raise ConfigurationError(text, hint="Run the mesh in processes: `fmu-mesh launch` without --local.")
+    first_of: dict[str, str] = {}
+    for name, instance in plan.system.instances.items():
+        if instance.description.only_once_per_process:
+            first = first_of.setdefault(instance.description.guid, name)
+            if first != name:
+                text = f"'{first}' and '{name}' cannot run in one process: their FMU allows one instance per process"
+                raise ConfigurationError(text, hint="Run the mesh in processes: `fmu-mesh launch` without --local.")
+
+
+def opening_of(
+    plan: Plan, name: str, folder: Path, log: Callable[[LogMessage], None], showing: Showing
+) -> Opening[Any]:
+    """What the kind of an instance gets to open it; its files go into ``folder``."""
+    own = _instance_plan(plan, name)
+    return Opening(
+        name=name,
+        path=Path(own.fmu),
+        section=own.section,
+        description=plan.system.instances[name].description,
+        folder=folder,
+        limits=plan.system.config.limits,
+        linear_inputs=own.linear_inputs,
+        log=log,
+        showing=showing,
+    )
+
+
+def _instance_plan(plan: Plan, name: str) -> InstancePlan:
+    return plan.nodes[plan.node_of(name)].instance(name)
+
+
+def _at(value: Value, index: tuple[int, ...]) -> Value:
+    """An element of an array; the value itself if there is no index."""
+    for number in index:
+        assert isinstance(value, list)
+        value = value[number]
+    return value

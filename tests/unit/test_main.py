@@ -1,0 +1,96 @@
+"""The table of commands: each module has what the table says, and a command imports only what it needs."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+
+from fmu_mesh.cli.main import COMMANDS, main
+
+ROUNDS = 15
+HEAVY = {"numpy", "zenoh", "rich", "fmpy", "lxml", "ruamel", "llvmlite", "logging", "matplotlib", "argcomplete"}
+
+
+def imported(*arguments: str) -> set[str]:
+    """The top-level modules that a command has imported at its end."""
+    program = (
+        "import contextlib, io, sys\n"
+        "from fmu_mesh.__main__ import main\n"
+        "sys.argv[0] = 'fmu-mesh'\n"
+        "with contextlib.suppress(SystemExit), contextlib.redirect_stdout(io.StringIO()): main()\n"
+        "print(*{name.partition('.')[0] for name in sys.modules})"
+    )
+    done = subprocess.run([sys.executable, "-c", program, *arguments], capture_output=True, text=True, check=True)
+    return set(done.stdout.split())
+
+
+def test_each_module_has_the_commands_that_the_table_names() -> None:
+    modules = {module for module, _ in COMMANDS.values()}
+
+    found = {(name, module) for module in modules for name in import_module(f"fmu_mesh.cli.{module}").PARSERS}
+
+    assert found == {(name, module) for name, (module, _) in COMMANDS.items()}
+
+
+@pytest.mark.parametrize("arguments", [("--version",), ("--help",)])
+def test_the_version_and_the_list_of_commands_need_nothing_large(arguments: Sequence[str]) -> None:
+    assert imported(*arguments) & HEAVY == set()
+
+
+@pytest.mark.parametrize(
+    ("command", "not_needed"),
+    [
+        ("ls", {"fmpy", "ruamel", "matplotlib"}),
+        ("stop", {"fmpy", "ruamel", "matplotlib"}),
+        ("inspect", {"zenoh", "matplotlib"}),
+    ],
+)
+def test_a_command_does_not_import_what_only_others_need(command: str, not_needed: set[str]) -> None:
+    assert imported(command, "--help") & not_needed == set()
+
+
+def test_the_version_takes_at_most_twice_as_long_as_an_import_of_msgspec() -> None:
+    def seconds(*arguments: str) -> float:
+        started = time.perf_counter()
+        subprocess.run([sys.executable, *arguments], check=True, stdout=subprocess.DEVNULL)
+        return time.perf_counter() - started
+
+    # In turn, and the shortest of each: what else the machine does only adds time.
+    times = [(seconds("-m", "fmu_mesh", "--version"), seconds("-c", "import msgspec")) for _ in range(ROUNDS)]
+
+    assert min(own for own, _ in times) <= 2 * min(other for _, other in times)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("launch", "--json"), "`fmu-mesh launch` needs CONFIG"),
+        (("launch", "a.yaml", "--json", "--plto", "x"), "Did you mean '--plot'?"),
+        (("check", "a.yaml", "--json", "--plot", "x.png"), "It is an option of `launch`, `master`."),
+        (("lunch", "--json"), "Did you mean 'launch'?"),
+        (("--json", "launch", "a.yaml"), "It comes after the command: `fmu-mesh launch --json`."),
+    ],
+)
+def test_a_wrong_usage_is_an_object_for_programs_and_a_sentence_for_people(
+    arguments: Sequence[str], words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code = main(arguments)
+
+    out, err = capsys.readouterr()
+    report = json.loads(out)
+    assert (code, report["exit_code"], report["error"]["kind"]) == (2, 2, "ConfigurationError")
+    assert words in err
+    assert words.rstrip("?.").split("'")[0] in f"{report['error']['message']} {report['error']['hint']}"
+
+
+def test_an_fmu_that_cannot_be_inspected_is_an_object_too(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["inspect", str(tmp_path / "Gone.fmu"), "--json"]) == 2
+
+    assert json.loads(capsys.readouterr().out)["error"]["exit_code"] == 2
