@@ -689,3 +689,18 @@ def test_a_class_within_a_function_is_refused(place: Place) -> None:
 
     assert done.wait() == 1
     assert "'make.<locals>.C': it is defined within a function or a class. Define it at the top" in done.errors
+
+
+def test_a_component_is_stepped_by_hand_and_goes_back_to_a_state(place: Place) -> None:
+    config = written(place.folder, {"source": part("Source"), "gain": part("gain")}, ["source.y -> gain.u"])
+    both(place, config)
+    rows = rows_of(place.folder / "m.csv")
+    header = (place.folder / "m.csv").read_text(encoding="utf-8").splitlines()[0].split(",")
+
+    with fmu_mesh.load(config).open() as system:
+        system.step(100)
+        state = system.save()
+        for _ in range(2):
+            system.restore(state)
+            system.step(50)
+            assert tuple(system.get(name) for name in header[1:]) == rows[150][1:]
