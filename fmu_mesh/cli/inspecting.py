@@ -93,7 +93,7 @@ def inspect_fmu(path: Path) -> Inspection:
     """
     reasons: tuple[str, ...] = ()
     try:
-        if path.is_file() and path.suffix != ".fmu" and path.suffix[1:] in KINDS.names():
+        if files.is_file(path) and path.suffix != ".fmu" and path.suffix[1:] in KINDS.names():
             size, other = path.stat().st_size, inspect(path)
             return Inspection(str(path), sha256_of(path), size, runs_here=True, problems=(), description=other)
         try:

@@ -21,13 +21,10 @@ from ..errors import DeadlineExceeded, FmuError, FmuMeshError, Interrupted, Mesh
 from ..system.plan import RECORDER
 from ..wire.runtime import (
     MeshNote,
-    is_alive,
-    launcher_of,
     remove_run_folder,
     remove_stale_folders,
     run_folder,
     run_name,
-    runtime_folder,
     write_note,
 )
 from ..wire.session import LEASE_MS
@@ -96,7 +93,6 @@ class Launcher:
             FmuMeshError: the run ended early, and why.
         """
         remove_stale_folders()
-        _remove_folders_without_note()
         self._folder = run_folder(self._run.mesh, self._run.run)
         try:
             self._file = str(self._run.write(self._folder))
@@ -310,11 +306,3 @@ class Launcher:
             text = f"{_MASTER} was lost: its process received {outcome.signal}"  # and this process has not sent it
             return MeshLost(text, point=outcome.point, time=outcome.time)
         return error
-
-
-def _remove_folders_without_note() -> None:
-    """Remove the folders of launchers that were killed before they wrote the note of their mesh."""
-    for folder in runtime_folder().glob("*.*"):
-        pid = launcher_of(folder)
-        if pid is not None and not (folder / "mesh.json").exists() and not is_alive(pid):
-            remove_run_folder(folder)
