@@ -38,10 +38,13 @@ if TYPE_CHECKING:
         StepFailed,
         UnknownName,
     )
+    from .instances.python.component import Component, component
+    from .instances.python.declarations import Input, Output, Parameter
 
 __all__ = [
     "CallRefused",
     "Check",
+    "Component",
     "ConfigurationError",
     "DeadlineExceeded",
     "FMIAdapter",
@@ -50,6 +53,7 @@ __all__ = [
     "FmuMeshError",
     "FrameGap",
     "InitializationFailed",
+    "Input",
     "Inspection",
     "Interrupted",
     "KeyboardInterrupted",
@@ -57,6 +61,8 @@ __all__ = [
     "LoopNotConverged",
     "Mesh",
     "MeshLost",
+    "Output",
+    "Parameter",
     "ProtocolBroken",
     "Result",
     "Run",
@@ -67,6 +73,7 @@ __all__ = [
     "UnknownName",
     "__version__",
     "attach",
+    "component",
     "inspect",
     "load",
     "meshes",
@@ -77,6 +84,10 @@ _PLACES = {
     "Check": "api.mesh_check",
     "Mesh": "api.mesh_builder",
     "load": "api.mesh_builder",
+    "Component": "instances.python.component",
+    "Input": "instances.python.declarations",
+    "Output": "instances.python.declarations",
+    "Parameter": "instances.python.declarations",
     "Result": "api.result",
     "Run": "api.run_handle",
     "Sample": "api.samples",
@@ -86,6 +97,7 @@ _PLACES = {
     "Inspection": "api.inspection",
     "inspect": "api.inspection",
     "meshes": "api.attaching",
+    "component": "instances.python.component",
 }
 """The modules of the public names; all others are exceptions."""
 

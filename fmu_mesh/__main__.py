@@ -6,6 +6,9 @@ import sys
 def main() -> int:
     """Import the command and run it; returns the exit code."""
     try:
+        from .run.threads import one_thread_from_now_on  # noqa: PLC0415 before numpy is imported
+
+        one_thread_from_now_on()
         from .run.limits import FEWEST_MIB, address_space_problem  # noqa: PLC0415 an interrupt must find us here
         from .wire.last_exit import LastExit  # noqa: PLC0415 as above
 

@@ -135,7 +135,7 @@ def inspect(path: str | Path, *, kind: str | None = None) -> Inspection:
                 reasons = (str(error),)
     except LoadFailed as error:
         raise with_way_out(error, file) from error
-    is_archive = not file.is_dir()
+    is_archive = not files.is_folder(file)
     return Inspection(
         file=str(path),
         sha256=sha256_of(file),

@@ -15,6 +15,7 @@ from ..config.loading import PlainConfig, read_file, read_text
 from ..config.yaml_text import written
 from ..errors import CallRefused, ConfigurationError, LoadFailed
 from ..instances.configuration import examine_data
+from ..instances.python.importing import being_imported, component_section
 from ..instances.registry import KINDS, check_engines, describe
 from ..run.options import with_config_values
 from ..run.preparing import planned
@@ -161,11 +162,12 @@ class Mesh:
         """Names of the instances."""
         return list(self._data.get("instances") or ())
 
-    def add(
+    def add(  # noqa: PLR0913  keys of a section
         self,
         name: str,
         *,
         fmu: str | Path | None = None,
+        component: object = None,
         start_values: Mapping[str, Any] | None = None,
         step_size: float | None = None,
         group: str | None = None,
@@ -182,6 +184,7 @@ class Mesh:
 
         Args:
             name: its name.
+            component: a component in Python, which the processes of a run import from its file.
             fmu: path of an FMU; instances of other kinds have their own key, such as ``mujoco="world.xml"``.
             start_values: by variable; an array as nested lists or as a numpy array.
             step_size: step size of this instance in s, a whole multiple of that of the mesh.
@@ -190,10 +193,12 @@ class Mesh:
 
         Raises:
             CallRefused: there is an instance of this name, or no key says what it is.
+            ConfigurationError: other processes cannot import the component.
         """
         if name in self.instances:
             raise CallRefused(f"mesh '{self.name}' has an instance '{name}' already")
-        keys = {"fmu": fmu, **section, "start_values": start_values, "step_size": step_size, "group": group}
+        own = component_section(component)[0] if component is not None else {}
+        keys = {"fmu": fmu, **own, **section, "start_values": start_values, "step_size": step_size, "group": group}
         given = {key: value for key, value in keys.items() if value is not None}
         if not given.keys() & {*KINDS.names()}:
             raise CallRefused(
@@ -298,6 +303,9 @@ class Mesh:
         Raises:
             ConfigurationError: the configuration, a model or an option is wrong; carries all findings.
         """
+        if (place := being_imported()) is not None:
+            hint = 'Write `if __name__ == "__main__":` before what the program does.'
+            raise ConfigurationError(f"mesh '{self.name}' would run while '{place}' is imported", hint=hint)
         chosen = options_of(options)
         data = with_config_values(self._plain._replace(file=self._shown_file), chosen.config_values)
         loaded, findings = examine_data(data, chosen.start_values)

@@ -42,6 +42,7 @@ class PlanOptions(TypedDict, total=False):
         listen: Zenoh endpoints where others can connect.
         connect: Zenoh endpoints to connect to.
         paused: stay paused at the first point until `Run.resume` or `Run.step`.
+        allow_code: run the Python code that a configuration names although another user owns the file.
         view: show the world of a physics engine in a window.
         video: film that world into this file.
         profile: measure where the time goes; `Result.outcome` has it.
@@ -63,6 +64,7 @@ class PlanOptions(TypedDict, total=False):
     listen: Sequence[str]
     connect: Sequence[str]
     paused: bool
+    allow_code: bool
     view: bool
     video: str | Path | None
     profile: bool | Path | None

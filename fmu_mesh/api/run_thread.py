@@ -18,7 +18,7 @@ from msgspec.structs import replace
 
 from ..errors import CallRefused, FmuMeshError, Interrupted, MeshLost
 from ..recorder.arrays_file import bytes_of_a_row, read_arrays
-from ..run.events import Event, Log, Output, Reachable, Restarted, Status
+from ..run.events import Event, Log, OutputLine, Reachable, Restarted, Status
 from ..run.in_process import InProcessRun
 from ..run.launcher import Launcher
 from ..run.outcome import Outcome
@@ -276,7 +276,7 @@ def _log(event: Event) -> None:
         case Log(line):
             level = _LEVELS.get(line.status, logging.ERROR)
             log.log(level, "%s at point %d: %s", line.instance, line.point, line.message)
-        case Output(process, text):
+        case OutputLine(process, text):
             log.info("%s: %s", process, text)
         case Restarted(error, number, _):
             log.warning("restart %d: %s", number, error.message)

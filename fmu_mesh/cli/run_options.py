@@ -36,6 +36,7 @@ def add_configuration(parser: argparse.ArgumentParser) -> None:
         "listen",
         "connect",
     )
+    add_options(parser, "allow_code")
 
 
 def add_options(

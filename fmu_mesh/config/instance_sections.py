@@ -8,6 +8,7 @@ engines. It knows no kind.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated, Any, ClassVar, Literal, Protocol, Self, TypeVar, cast
 
@@ -86,6 +87,8 @@ class InstanceSection:
         strict: whether what FMI forbids is an error for this instance; None: as the whole configuration says.
         follows_fmi: whether the rules of FMI apply to the model. If so, a start value that FMI forbids is a warning, or
             an error where the configuration is strict; otherwise it is always an error.
+        names_code: whether it names code of the user, which whoever reads the configuration runs.
+        interpreter: the Python that has to run the instance; None: the one that runs fmu-mesh.
     """
 
     __slots__ = ()
@@ -97,6 +100,8 @@ class InstanceSection:
     interpolation: Literal["hold", "linear"] | None = None
     strict: bool | None = None
     follows_fmi: ClassVar[bool] = False
+    names_code: ClassVar[bool] = False
+    interpreter: str | None = None
 
     @property
     def path(self) -> str:
@@ -114,6 +119,10 @@ class InstanceSection:
         All processes of a mesh compare a hash of this; the content of the model is compared separately.
         """
         return _replaced(self, {key_of(self): ""}) if self.path else self
+
+    def located(self, folder: Path) -> Self:  # noqa: ARG002  for those that name other files than their model
+        """The section with absolute paths for all files but the model; ``folder`` is that of the configuration."""
+        return self
 
     def check(self, place: str, description: ModelDescription, findings: Findings) -> None:
         """Add a finding for every key of this section that does not fit the model.

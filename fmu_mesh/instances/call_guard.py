@@ -12,6 +12,7 @@ import ctypes
 import locale
 import os
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -24,6 +25,7 @@ from ..config.mesh import TimeoutsConfig
 from ..errors import FmuError, InitializationFailed, LoadFailed, StepFailed
 from ..rings.ring import Ring
 from ..simtime import TimeGrid
+from ..text import short_path
 from .contract import Instance
 from .instance_wrapper import AroundInstance
 
@@ -37,6 +39,8 @@ __all__ = [
     "current_function",
     "floating_point_changed",
     "kept_state",
+    "lines_shown_of",
+    "not_returned",
     "restore_floating_point",
 ]
 
@@ -53,6 +57,9 @@ _ONE, _HALF_ULP, _QUARTER_ULP, _TINY = DEFAULT_MODE
 
 _functions: dict[int, str] = {}
 """The FMI function that a thread is in, by the identifier of the thread."""
+
+_shown_files: set[str] = set()
+"""Files of users: what does not return from a function of such a file is told with its line."""
 
 _libm = ctypes.CDLL(None)
 _ENVIRONMENT_BYTES: Final = 512
@@ -215,9 +222,9 @@ class CallWatch:
         return _LOOK_S if position is not None else None
 
     def _overrun(self, call: _Call, now: float) -> FmuError:
-        function = current_function(self._caller) or ("doStep" if call.kind is StepFailed else "a call")
+        otherwise = "doStep" if call.kind is StepFailed else "a call"
         return call.kind(
-            f"the FMU has not returned for {now - call.started:.1f} s from {function}{ENDED}",
+            not_returned(self._caller, now - call.started, otherwise),
             instance=call.instance,
             hint=f"If it needs that long, raise `timeouts.{call.setting}` in the configuration.",
         )
@@ -246,6 +253,38 @@ class Unwatched:
 def current_function(thread: int) -> str | None:
     """The FMI function that a thread is in; None if it is in none, or in one of the compiled calls of a step."""
     return _functions.get(thread)
+
+
+def lines_shown_of(file: str | None) -> None:
+    """From now on, a call that does not return from a function in ``file`` is told with its line."""
+    if file is not None:
+        _shown_files.add(file)
+
+
+def not_returned(thread: int, seconds: float, otherwise: str) -> str:
+    """In words where a thread has been for too long.
+
+    Args:
+        thread: its identifier.
+        seconds: for how long, in s.
+        otherwise: the function of an FMU, if it is not known which one.
+    """
+    if (line := _line_of_user(thread)) is not None:
+        return f"the component has not returned for {seconds:.1f} s from {line}{ENDED}"
+    function = current_function(thread) or otherwise
+    return f"the FMU has not returned for {seconds:.1f} s from {function}{ENDED}"
+
+
+def _line_of_user(thread: int) -> str | None:
+    """The function of a component that a thread is in, and the line in the file of the component."""
+    frame = sys._current_frames().get(thread)  # noqa: SLF001 documented, and there is no other way
+    line = function = None
+    while frame is not None:
+        if frame.f_code.co_filename in _shown_files:
+            line = line or f"{short_path(frame.f_code.co_filename)}:{frame.f_lineno}"
+            function = frame.f_code.co_name
+        frame = frame.f_back
+    return f"{function} ({line})" if line is not None else None
 
 
 def call_named(name: str, function: Callable[..., Result], *arguments: Any, **keywords: Any) -> Result:  # noqa: ANN401 those of any function

@@ -6,10 +6,12 @@ The main thread only writes a few attributes; the server thread reads them and t
 from __future__ import annotations
 
 import logging
+import threading
 import time
 from collections.abc import Mapping
 
 from ..errors import FmuMeshError, StepFailed
+from ..instances.call_guard import not_returned
 from ..system.plan import NodePlan
 from ..wire.refusals import Refusals
 from ..wire.views import InstanceStatus
@@ -100,7 +102,7 @@ class Activity:
         if under_way_s <= self._plan.timeouts.step:
             return None
         return StepFailed(
-            f"the FMU has not returned for {under_way_s:.1f} s from doStep; its process is ended",
+            not_returned(threading.main_thread().ident or 0, under_way_s, "doStep"),
             instance=runner.name,
             point=runner.point,
             time=self._plan.grid.time(runner.point),

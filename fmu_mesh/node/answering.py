@@ -29,6 +29,9 @@ from .streams import kind_of
 __all__ = ["Answers", "Job"]
 
 _ANSWER_S = 2.0
+_BEFORE_VALUES = ("waiting for the mesh", "initializing")
+"""States of a node that has its FMUs and no values yet. A mesh can be running for others already."""
+
 _LOOKS = 3
 
 Job = Callable[[], None]
@@ -60,6 +63,7 @@ class Answers:
         self._post = post
         self._log = log
         self._pending: list[_Pending] = []
+        self._early: list[_Pending] = []
 
     def answer(self, name: str, query: zenoh.Query) -> None:
         """Answer for every key of the instance that the query's key expression matches."""
@@ -83,9 +87,11 @@ class Answers:
         if runner is None or not wanted:
             query.drop()
             return
+        if self._activity.state in _BEFORE_VALUES:
+            self._early.append(_Pending(name, query))
+            return
         if self._activity.state != "running":
-            query.reply_err(f"'{name}' has no values now: {self._activity.state}")
-            query.drop()
+            _Pending(name, query).refuse(f"'{name}' has no values now: {self._activity.state}")
             return
         known, step = self._from_rows(runner, wanted)
         self._reply_values(runner, query, known, step)
@@ -102,8 +108,16 @@ class Answers:
         data = sample.payload.to_bytes()
         self._post(partial(self._take_put, runner, str(sample.key_expr), data, attachment))
 
-    def refuse_late(self, now: float) -> None:
-        """Refuse the queries that have waited too long for a point."""
+    def turn(self, now: float) -> None:
+        """Answer queries that waited for the first point; refuse those that have waited too long for a point."""
+        early, self._early = self._early, []
+        for pending in early:
+            if self._activity.state in _BEFORE_VALUES and now - pending.asked <= _ANSWER_S:
+                self._early.append(pending)
+            elif self._activity.state in _BEFORE_VALUES:
+                pending.refuse(f"'{pending.instance}' has no values now: {self._activity.state}")
+            else:
+                self.answer(pending.instance, pending.query)
         for pending in [p for p in self._pending if now - p.asked > _ANSWER_S]:
             self._pending.remove(pending)
             pending.refuse(f"not at a point yet: {self._activity.status(pending.instance).activity}")

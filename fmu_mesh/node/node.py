@@ -161,8 +161,10 @@ class Node:
 
     def report_hang(self, error: FmuError) -> bool:
         """On a watching thread, while an FMU does not return: report to the master; return whether it knows now."""
-        if not self._membership.lost_master:
-            sys.setswitchinterval(_ALONE_S)  # should the FMU return now, the main thread waits until the rows are sent
+        if (unit := self._activity.advancing) is not None and not self._membership.lost_master:
+            unit.meanwhile(self._send_last_rows)  # should the step end now, the main thread waits for this
+        elif self._activity.state == "running" and not self._membership.lost_master:
+            sys.setswitchinterval(_ALONE_S)  # as above
             self._send_last_rows()
         return self.server.report_hang(error, self._patience_s())
 

@@ -151,7 +151,7 @@ class NodeServer:
                 self._tick(now)
 
     def _tick(self, now: float) -> None:
-        self._answers.refuse_late(now)
+        self._answers.turn(now)
         for streams in self._streams:
             if dropped := streams.take_dropped():
                 text = f"{dropped} points were not published: the run is faster than samples can be sent"

@@ -36,6 +36,8 @@ def _run(role: str, plan: str, node: str = "") -> int:
         case "node":
             from .roles import run_node  # noqa: PLC0415 only what the role needs
 
+            # What a component prints is shown at once, not when the buffer is full.
+            sys.stdout.reconfigure(line_buffering=True)  # type: ignore[union-attr]  # it is a text file
             run_node(read_node(file, node))
         case "master":
             from .roles import run_master  # noqa: PLC0415 as above

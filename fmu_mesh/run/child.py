@@ -13,24 +13,35 @@ import threading
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from functools import partial
+from pathlib import Path
 from typing import IO
 
 from ..errors import Interrupted
 from ..wire.runtime import process_state
+from .threads import ONE_THREAD
 
-__all__ = ["Child", "StopWatch", "how_it_ended", "own_command"]
+__all__ = ["Child", "StopWatch", "how_it_ended", "is_other_python", "own_command"]
 
 _SHOWN_LINES = 200
 _LINE_BYTES = 1000
 
 
-def own_command(*arguments: str) -> list[str]:
-    """The program of the processes of a run (`fmu_mesh.run.__main__`) with these arguments, in this Python.
+def own_command(*arguments: str, interpreter: str | None = None) -> list[str]:
+    """The program of the processes of a run (`fmu_mesh.run.__main__`) with these arguments.
 
-    With -P, Python does not look for modules in the current folder. Otherwise a `random.py` of the user would be
-    imported instead of that of the standard library.
+    It runs in this Python, or in ``interpreter``. With -P, Python does not look for modules in the current folder.
+    Otherwise a `random.py` of the user would be imported instead of that of the standard library.
     """
-    return [sys.executable, "-Pm", "fmu_mesh.run", *arguments]
+    return [interpreter or sys.executable, "-Pm", "fmu_mesh.run", *arguments]
+
+
+def is_other_python(interpreter: str) -> bool:
+    """Whether ``interpreter`` is not the Python that runs this process, with the packages that it has.
+
+    The Python of a virtual environment is a link in the folder of the environment.
+    """
+    own, other = Path(sys.executable), Path(interpreter)
+    return (own.parent.resolve(), own.resolve()) != (other.parent.resolve(), other.resolve())
 
 
 class Child:
@@ -68,6 +79,7 @@ class Child:
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             start_new_session=True,
+            env=os.environ | ONE_THREAD,
         )
         assert popen.stdout is not None
         assert popen.stderr is not None

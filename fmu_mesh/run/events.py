@@ -16,7 +16,7 @@ from ..errors import ErrorReport
 from ..wire.views import LogLine, MeshStatus
 from .outcome import Outcome
 
-__all__ = ["Event", "EventWriter", "Log", "Output", "Reachable", "Restarted", "Status", "decode_event"]
+__all__ = ["Event", "EventWriter", "Log", "OutputLine", "Reachable", "Restarted", "Status", "decode_event"]
 
 
 _MOST_WAITING = 10_000
@@ -40,7 +40,7 @@ class Log(msgspec.Struct, frozen=True, tag="log"):
     line: LogLine
 
 
-class Output(msgspec.Struct, frozen=True, tag="output"):
+class OutputLine(msgspec.Struct, frozen=True, tag="output"):
     """A line that a process of the run has written to its standard output or error; the launcher makes this event."""
 
     process: str
@@ -55,7 +55,7 @@ class Restarted(msgspec.Struct, frozen=True, tag="restarted"):
     most: int
 
 
-Event = Reachable | Status | Log | Output | Restarted | Outcome
+Event = Reachable | Status | Log | OutputLine | Restarted | Outcome
 
 _decoder: msgspec.json.Decoder[Event] = msgspec.json.Decoder(Event)
 

@@ -11,7 +11,7 @@ import os
 import queue
 import signal
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 
 import msgspec
@@ -30,7 +30,7 @@ from ..wire.runtime import (
 from ..wire.session import LEASE_MS
 from ..wire.views import GOING_ON
 from .child import Child, StopWatch, how_it_ended, own_command
-from .events import Event, Output, Reachable, Status, decode_event
+from .events import Event, OutputLine, Reachable, Status, decode_event
 from .outcome import Outcome
 from .results import rows_left, what_is_kept
 from .run_plan import RunPlan
@@ -113,23 +113,22 @@ class Launcher:
     # --- start
 
     def _spawn_all(self) -> None:
-        self._spawn(_MASTER, ["master", self._file], self._take_event)
+        self._spawn(_MASTER, own_command("master", self._file), self._take_event)
         section = self._run.loaded.config.ros
         if section is not None and section.profile != "rclpy":
             # The nodes are started when it is ready, so that it misses no sample.
-            self._spawn(_GATEWAY, ["gateway", self._file], self._take_gateway_line)
+            self._spawn(_GATEWAY, own_command("gateway", self._file), self._take_gateway_line)
         else:
             self._spawn_nodes()
 
     def _spawn_nodes(self) -> None:
-        for node in self._plan.nodes:
+        for node, plan in self._plan.nodes.items():
             if node != RECORDER:
-                self._spawn(node, ["node", self._file, node], partial(self._take_output, node), limited=True)
+                command = own_command("node", self._file, node, interpreter=plan.interpreter)
+                self._spawn(node, command, partial(self._take_output, node), limited=True)
 
-    def _spawn(
-        self, name: str, arguments: Sequence[str], on_line: Callable[[bytes], None], *, limited: bool = False
-    ) -> None:
-        process = Child(name, own_command(*arguments), self._happened.put)
+    def _spawn(self, name: str, command: list[str], on_line: Callable[[bytes], None], *, limited: bool = False) -> None:
+        process = Child(name, command, self._happened.put)
         self._processes[name] = process
         process.start(on_line, self._take_output, self._take_exit, limited=limited)
 
@@ -187,7 +186,7 @@ class Launcher:
         self._spawn_nodes()
 
     def _take_output(self, name: str, line: bytes) -> None:
-        self._on_event(Output(name, line.decode(errors="replace").rstrip()))
+        self._on_event(OutputLine(name, line.decode(errors="replace").rstrip()))
 
     def _take_exit(self, name: str, code: int) -> None:
         if not self._signalled:  # afterwards the signal is the reason

@@ -72,6 +72,7 @@ class LocalMesh:
         loaded: LoadedConfig | None = None,
     ) -> None:
         self._seconds = 0.0
+        self._begun = False
         self._ended_by: TerminationRequested | None = None
         self._buffer: RowBuffer | None = None
         self.rows = 0
@@ -144,6 +145,7 @@ class LocalMesh:
             try:
                 system.start(partial(self._guarded, folder=self._folder, watch=watch))
                 started = time.perf_counter()
+                self._begun = True
                 try:
                     with watch.stepping(self._position, plan.system.config.timeouts.step):
                         self._loop(rows)
@@ -163,7 +165,7 @@ class LocalMesh:
 
     def _take_hang(self, error: FmuError) -> None:
         """From the watching thread: the main thread is inside an FMU, so nothing of this object changes any more."""
-        if self._system.stepping:
+        if self._begun:
             error.at(self.point, self._plan.grid.time(self.point))
         self._save_from_outside()
         self._on_hang(error.with_hint(self._kept()))

@@ -8,7 +8,7 @@ the order of calls at a point and the state of the whole system. Knows no files,
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
@@ -26,6 +26,8 @@ from ..system.initialization_plan import Loop, Tear
 from ..system.layout import Layout
 from ..system.plan import InstancePlan, Plan
 from ..variables.value_types import Value
+from .child import is_other_python
+from .threads import one_thread_meanwhile
 
 __all__ = ["LocalSystem", "SavedSystem", "check_one_process", "opening_of"]
 
@@ -52,6 +54,7 @@ class LocalSystem:
         self._members: dict[str, _Member] = {}
         self._steps: tuple[tuple[str, Callable[[int], None]], ...] = ()
         self._kept: dict[int, SavedSystem] = {}
+        self._threads = ExitStack()
 
     def start(self, open_instance: Callable[[str], Guarded]) -> None:
         """Open all instances and initialize them; then they are at point 0.
@@ -62,8 +65,10 @@ class LocalSystem:
         Raises:
             FmuError: an instance cannot be opened or initialized.
         """
+        self._threads.enter_context(one_thread_meanwhile())
         for name in self._plan.order:
             self._members[name] = _Member(self._plan, name, open_instance(name))
+        self._threads.enter_context(one_thread_meanwhile())  # with the libraries that a component has imported
         self._initialize()
         self._steps = tuple((name, member.step_from) for name, member in self._members.items())
 
@@ -133,6 +138,7 @@ class LocalSystem:
         self._kept.clear()
         for member in self._members.values():
             member.instance.close()
+        self._threads.close()
 
     def _free(self, saved: SavedSystem) -> None:
         for name, own in saved.members.items():
@@ -320,11 +326,15 @@ class _Feed(NamedTuple):
 
 
 def check_one_process(plan: Plan) -> None:
-    """Refuse two instances of an FMU that allows one per process; groups do not matter here.
+    """Refuse what cannot run in one process; groups do not matter here.
 
     Raises:
-        ConfigurationError: there are two.
+        ConfigurationError: a component needs another Python, or there are two instances of an FMU that allows one.
     """
+    for node in plan.nodes.values():
+        if node.interpreter is not None and is_other_python(node.interpreter):
+            text = f"'{node.node}' needs the Python '{node.interpreter}', and this process is another one"
+            raise ConfigurationError(text, hint="Run the mesh in processes: `fmu-mesh launch` without --local.")
     first_of: dict[str, str] = {}
     for name, instance in plan.system.instances.items():
         if instance.description.only_once_per_process:

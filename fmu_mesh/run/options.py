@@ -79,6 +79,9 @@ class Options(msgspec.Struct, frozen=True):
     paused: Annotated[
         bool, Flag("--paused", text="stay paused at the first point until `resume`, `step` or `play`")
     ] = False
+    allow_code: Annotated[
+        bool, Flag("--allow-code", text="run the Python code that CONFIG names although another user owns CONFIG")
+    ] = False
     view: Annotated[bool, Flag("--view", text="show the world of the physics engine in a window")] = False
     video: Annotated[
         Path | None, Flag("--video", "FILE.mp4", text="film that world into a file, .mp4 or .gif; needs no screen")

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import os
+import pwd
 from collections.abc import Callable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from pathlib import Path
 from types import MappingProxyType
 
 import msgspec
+from msgspec.structs import replace
 
 from .. import files
 from ..config.findings import Findings
@@ -75,7 +78,9 @@ def planned(
     Raises:
         ConfigurationError: the configuration or an FMU is wrong; carries all findings.
     """
-    loaded = with_options(loaded, options, findings)
+    loaded = _located(with_options(loaded, options, findings))
+    if not options.allow_code:
+        _check_owner(loaded, findings)
     if not len(findings):  # otherwise the world may be what is wrong
         check_showing(loaded.config.instances, options.showing)
     descriptions, unreadable = _descriptions(loaded, findings.places, tell, known)
@@ -105,6 +110,8 @@ def _descriptions(
     for name, section in loaded.config.instances.items():
         key = key_of(section)
         place = f"instances.{name}.{key}"
+        if place in known_places:
+            continue  # such as code that may not run
         if getattr(section, key) == "":
             if not any(f"{other}.".startswith(f"instances.{name}.") for other in known_places):
                 findings.append(loaded.finding(place, "an empty path", expected_model(section)))
@@ -126,6 +133,34 @@ def _descriptions(
             expected = "an FMU without problems, or `strict: false`"
             findings += [loaded.finding(place, " ".join(text.split()), expected) for text in found.problems]
     return descriptions, findings
+
+
+def _located(loaded: LoadedConfig) -> LoadedConfig:
+    """The configuration with absolute paths where a section names other files than its model."""
+    folder = loaded.file.absolute().parent
+    sections = {name: section.located(folder) for name, section in loaded.config.instances.items()}
+    return replace(loaded, config=replace(loaded.config, instances=sections))
+
+
+def _check_owner(loaded: LoadedConfig, findings: Findings) -> None:
+    """Check that the code in a configuration is named by this user, or by root: everybody else could run code as us."""
+    try:
+        owner = loaded.file.stat().st_uid
+    except OSError:
+        return  # there is no file: a program of this user has made the configuration
+    if owner in {os.getuid(), 0}:
+        return
+    for name, section in loaded.config.instances.items():
+        if section.names_code:
+            found = f"Python code, in a file of the user {_user(owner)}"
+            findings.add(f"instances.{name}.{key_of(section)}", found, "a file of your own, or `--allow-code`")
+
+
+def _user(uid: int) -> str:
+    try:
+        return f"'{pwd.getpwuid(uid).pw_name}'"
+    except KeyError:
+        return str(uid)
 
 
 def _expected(section: InstanceSection, path: Path) -> str:

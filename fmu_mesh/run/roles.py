@@ -7,11 +7,12 @@ from __future__ import annotations
 
 import logging
 import os
+import shlex
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 
-from ..errors import FmuError, FmuMeshError, StepFailed
+from ..errors import ConfigurationError, FmuError, FmuMeshError, StepFailed
 from ..instances.call_guard import CallWatch, Guarded
 from ..instances.contract import Instance, KeepsFiles, LogMessage, Opening
 from ..instances.registry import open_instance
@@ -23,11 +24,12 @@ from ..wire.keys import MASTER
 from ..wire.runtime import MeshNote, fmu_folder, write_note
 from ..wire.session import RouterLink, close_session, open_session, own_endpoints
 from ..wire.views import LogLine, MeshStatus
+from .child import is_other_python
 from .events import Event, Log, Reachable, Status
 from .outcome import Outcome
 from .process import RunProcess
 from .results import open_result
-from .run_plan import NodeRun, RunPlan
+from .run_plan import MANUAL, NodeRun, RunPlan
 from .wiring import is_socket, wiring
 
 __all__ = ["run_master", "run_node"]
@@ -39,8 +41,14 @@ def run_node(run: NodeRun) -> None:
     """Be one node of a mesh, until the run ends.
 
     Raises:
+        ConfigurationError: a component of the node needs another Python; says how to start it.
         FmuMeshError: the node could not start, or its run ended early.
     """
+    python = run.plan.interpreter
+    if run.run == MANUAL and python is not None and is_other_python(python):
+        text = f"node '{run.plan.node}' needs the Python '{python}', and this process is another one"
+        command = shlex.join([python, "-m", "fmu_mesh", "node", str(run.config_file), run.plan.node])
+        raise ConfigurationError(text, hint=f"Start it with `{command}`.")
     with RunProcess(run.plan.mesh, run.run) as process:
         _NodeProcess(run, process).run()
 

@@ -23,8 +23,8 @@ def automatic_nodes(
 ) -> dict[str, str]:
     """The names of the nodes that several instances of a cycle share, by instance. Other instances are not in it.
 
-    An instance with a ``group`` of its own stays there. Instances with different hosts never share a node, nor do
-    two of an FMU that allows one instance per process.
+    An instance with a ``group`` of its own stays there. Instances with different hosts or interpreters never share a
+    node, nor do two of an FMU that allows one instance per process.
 
     Args:
         config: the configuration, whatever its own ``group`` says.
@@ -48,13 +48,14 @@ def _together(
     config: Config, cycle: Sequence[str], descriptions: Mapping[str, ModelDescription]
 ) -> Iterable[list[str]]:
     """The members of a cycle in as few nodes as hosts and FMUs allow."""
-    parts: list[tuple[str | None, set[str], list[str]]] = []
+    parts: list[tuple[tuple[str | None, str | None], set[str], list[str]]] = []
     for name in cycle:
-        host, description = config.instances[name].host, descriptions[name]
+        section, description = config.instances[name], descriptions[name]
+        where = (section.host, section.interpreter)
         guid = description.guid if description.only_once_per_process else ""
-        part = next((part for part in parts if part[0] == host and guid not in part[1]), None)
+        part = next((part for part in parts if part[0] == where and guid not in part[1]), None)
         if part is None:
-            part = (host, set(), [])
+            part = (where, set(), [])
             parts.append(part)
         if guid:
             part[1].add(guid)

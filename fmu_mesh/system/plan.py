@@ -130,6 +130,11 @@ class NodePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """The plan of one of its instances."""
         return next(instance for instance in self.instances if instance.name == name)
 
+    @property
+    def interpreter(self) -> str | None:
+        """The Python that has to run this node; None: the one that runs fmu-mesh."""
+        return next((own for item in self.instances if (own := item.section.interpreter) is not None), None)
+
     def peers(self) -> set[str]:
         """Names of the nodes that exchange frames with this one, without the recorder, which is part of the master."""
         nodes = {link.source_node for link in self.links_in} | {link.target_node for link in self.links_out}

@@ -219,6 +219,7 @@ def _step_points(name: str, config: InstanceSection, base: float, findings: Find
 def _check_nodes(config: Config, descriptions: Mapping[str, ModelDescription], findings: Findings) -> None:
     """Check that the instances of each group can share one node."""
     first_of: dict[str, str] = {}
+    first_with_code: dict[str, str] = {}
     only_once: dict[tuple[str, str], str] = {}
     for name, instance in config.instances.items():
         group = instance.group
@@ -235,6 +236,14 @@ def _check_nodes(config: Config, descriptions: Mapping[str, ModelDescription], f
             found = f"{shown(instance.host)}, while '{first}' has {shown(config.instances[first].host)}"
             expected = f"one host for all instances of the group '{group}'"
             findings.add(f"instances.{name}.host", found, expected)
+        if instance.names_code:
+            first = first_with_code.setdefault(group, name)
+            if config.instances[first].interpreter != instance.interpreter:
+                found = (
+                    f"{shown(instance.interpreter)}, while '{first}' has {shown(config.instances[first].interpreter)}"
+                )
+                expected = f"one interpreter for all components of the group '{group}'"
+                findings.add(f"instances.{name}.interpreter", found, expected)
         description = descriptions.get(name)
         if description is not None and description.only_once_per_process:
             other = only_once.setdefault((group, description.guid), name)

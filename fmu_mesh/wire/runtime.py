@@ -240,18 +240,17 @@ def meshes() -> Iterator[MeshNote]:
 
 
 def remove_stale_folders() -> None:
-    """Remove the folders of runs whose launcher is gone and whose processes could not remove them."""
+    """Remove the folders of runs whose process is gone, and which their other processes could not remove."""
     for _ in meshes():
         continue
-    for folder in runtime_folder().glob("*.*"):  # of runs that never wrote a note, such as those in one process
-        pid = launcher_of(folder)
-        if pid is not None and not (folder / "mesh.json").exists() and not is_alive(pid):
-            remove_run_folder(folder)
-    for folder in runtime_folder().glob("*.hand"):
-        tidy_run_folder(folder)
-        for empty in (folder / "fmus", folder):
-            with suppress(OSError):  # a process still uses it
-                empty.rmdir()
+    for folder in runtime_folder().glob("*.*"):
+        if folder.suffix == ".hand":
+            tidy_run_folder(folder)
+            for empty in (folder / "fmus", folder):
+                with suppress(OSError):  # somebody uses it
+                    empty.rmdir()
+        elif (pid := launcher_of(folder)) is not None and not (folder / "mesh.json").exists() and not is_alive(pid):
+            remove_run_folder(folder)  # it was killed before it wrote a note, or runs without one
 
 
 def _read_note(file: Path) -> MeshNote | None:

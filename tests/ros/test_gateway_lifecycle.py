@@ -89,7 +89,7 @@ class Node:
     def change(self, *transitions: int) -> None:
         """Go through these transitions, each of which has to succeed."""
         for transition in transitions:
-            assert self.succeeds(transition), transition
+            assert self.succeeds(transition), f"{transition}: {self.errors}"
 
     def succeeds(self, transition: int) -> bool:
         kind, client = self._change

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import time
 from types import SimpleNamespace
 from typing import Any, cast
+
+import pytest
+import zenoh
 
 from fmu_mesh.node.answering import Answers
 from fmu_mesh.node.stepping import Runner
 from fmu_mesh.rings.ring import Ring
+from fmu_mesh.simtime import TimeGrid
 from fmu_mesh.system.layout import Layout
 from tests.scenarios.scenario import variable
 
@@ -67,3 +72,51 @@ def test_what_the_rows_do_not_hold_is_left_to_the_main_thread() -> None:
     runner = SimpleNamespace(outputs=Ring(Layout.of([("y", "Float64")]), ROWS), step=3)
 
     assert answers._from_rows(cast("Runner", runner), [("key", variable("x", "local"))]) == ([], 3)
+
+
+class Query:
+    """A query for the output, and what it was told."""
+
+    payload = None
+    key_expr = zenoh.KeyExpr("fmu_mesh/lab/unit/out/y")
+
+    def __init__(self) -> None:
+        self.told: list[str] = []
+
+    def reply(self, key: str, value: bytes, **_options: object) -> None:
+        self.told.append(f"{key} {value.decode()}")
+
+    def reply_err(self, reason: str) -> None:
+        self.told.append(reason)
+
+    def drop(self) -> None:
+        self.told.append("dropped")
+
+
+@pytest.mark.parametrize("state", ["waiting for the mesh", "initializing"])
+def test_a_query_before_the_first_point_waits_for_it_and_not_for_ever(state: str) -> None:
+    ring = Ring(Layout.of([("y", "Float64")]), ROWS)
+    ring.put(0, "y", 2.5)
+    description = SimpleNamespace(variables=[Y])
+    runner = SimpleNamespace(
+        name="unit",
+        outputs=ring,
+        step=0,
+        instance=SimpleNamespace(description=description),
+        plan=SimpleNamespace(step_points=1),
+    )
+    activity = SimpleNamespace(state=state, runners={"unit": runner})
+    plan = SimpleNamespace(key_prefix="fmu_mesh", mesh="lab", grid=TimeGrid(0.0, 0.1, 10))
+    answers = Answers(cast("Any", plan), cast("Any", None), cast("Any", activity), cast("Any", None), cast("Any", None))
+    soon, never = Query(), Query()
+
+    answers.answer("unit", cast("Any", never))
+    answers.turn(time.monotonic())
+    assert never.told == []
+    answers.turn(time.monotonic() + 60.0)
+    assert never.told == [f"'unit' has no values now: {state}", "dropped"]
+
+    answers.answer("unit", cast("Any", soon))
+    activity.state = "running"
+    answers.turn(time.monotonic())
+    assert soon.told == ["fmu_mesh/lab/unit/out/y 2.5", "dropped"]

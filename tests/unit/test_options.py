@@ -39,6 +39,7 @@ GIVEN: dict[str, tuple[str | None, Any]] = {
     "listen": ("tcp/127.0.0.1:1", ("tcp/127.0.0.1:1",)),
     "connect": ("tcp/127.0.0.1:2", ("tcp/127.0.0.1:2",)),
     "paused": (None, True),
+    "allow_code": (None, True),
     "view": (None, True),
     "video": ("film.gif", Path("film.gif")),
     "profile": ("p.json", Path("p.json")),

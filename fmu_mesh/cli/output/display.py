@@ -15,7 +15,7 @@ from rich.markup import escape
 
 from ...api.result import summary_of
 from ...errors import ErrorReport, FmuMeshError, from_report
-from ...run.events import Event, Log, Output, Reachable, Restarted, Status
+from ...run.events import Event, Log, OutputLine, Reachable, Restarted, Status
 from ...run.outcome import Outcome
 from ...run.wiring import is_socket, leaves_host
 from ...system.plan import Plan
@@ -84,7 +84,7 @@ class Display:
                 self._status(status)
             case Log(line):
                 self.log(line)
-            case Output(process, text):
+            case OutputLine(process, text):
                 self._output(process, text)
             case Restarted(error, number, most):
                 again = f"The run starts again from its first point (restart {number} of {most})."

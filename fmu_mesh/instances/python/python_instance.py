@@ -1,0 +1,261 @@
+"""One instance of a component in Python; see `fmu_mesh.instances.contract.Instance` for the call sequence.
+
+One step sets the connected inputs as attributes of the component, calls its `step`, and writes its outputs to a row.
+What the code of the user raises ends the instance, with the line of that code in the error.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Final, Literal, NamedTuple
+
+import msgspec
+
+from ...errors import FmuError, FmuMeshError, InitializationFailed, LoadFailed, StepFailed, TerminationRequested
+from ...rings.ring import Ring
+from ...simtime import TimeGrid
+from ...variables.model_description import ModelDescription, Variable
+from ...variables.value_conversion import ValueRefused, to_value
+from ...variables.value_types import Value
+from ..call_guard import lines_shown_of
+from ..contract import LogMessage, Opening
+from .component import Component, declared_variables
+from .component_values import as_attribute, as_value, reader, writer
+from .importing import ImportedComponent
+from .python_section import PythonConfig, class_place_of
+
+__all__ = ["PythonInstance"]
+
+
+_ERRORS: Final = {"loading": LoadFailed, "initialization": InitializationFailed, "stepping": StepFailed}
+
+
+class _State(NamedTuple):
+    """A state: what the component returned, and the values of its variables."""
+
+    own: object
+    values: dict[str, object]
+
+
+class PythonInstance:
+    """A component in Python that is stepped by a mesh.
+
+    Args:
+        opening: its section, the path of its file and its description.
+
+    Raises:
+        LoadFailed: the class cannot be imported or called, or is another one than when the run was planned.
+    """
+
+    def __init__(self, opening: Opening[PythonConfig]) -> None:
+        self.name = opening.name
+        self._description = opening.description
+        # A value may be beyond `min` and `max`, which are for whoever sets it.
+        bare = (msgspec.structs.replace(v, minimum=None, maximum=None) for v in opening.description.variables)
+        self._variables: dict[str, Variable] = {variable.name: variable for variable in bare}
+        self._outputs = [v.name for v in opening.description.variables if v.causality == "output"]
+        self._log = opening.log
+        self._phase: Literal["loading", "initialization", "stepping"] = "loading"
+        self._changed = True
+        self._fresh: dict[str, Any] | None = None
+        self._component: Component | None = None
+        self._imported = ImportedComponent(opening.path, class_place_of(opening.section.python))
+        try:
+            loaded = self._called(self._imported.load)
+            if loaded.guid != opening.description.guid:
+                text = f"'{opening.section.python}' is another component than when the run was planned"
+                raise LoadFailed(text, instance=self.name, hint="Was its file changed meanwhile? Start the run again.")
+            lines_shown_of(self._imported.file)
+            self._component = self._called(lambda: self._imported.cls(**opening.section.arguments))
+        except FmuMeshError:
+            self._imported.close()
+            raise
+        self._declared = declared_variables(self._imported.cls)
+        self._step_component = self._component.step
+        self._values: dict[str, Any] = vars(self._component)
+
+    @property
+    def description(self) -> ModelDescription:
+        """The model description."""
+        return self._description
+
+    def enter_initialization(
+        self,
+        start_time: float,
+        stop_time: float | None,  # noqa: ARG002  as in the Protocol
+        start_values: Mapping[str, Value],
+    ) -> None:
+        """Set ``start_values``."""
+        self._phase = "initialization"
+        self._values["start_time"] = start_time
+        self.set_values({name: to_value(value, self._variables[name]) for name, value in start_values.items()})
+
+    def exit_initialization(self) -> None:
+        """Leave Initialization Mode: `initialize` has been called with the last inputs."""
+        self._initialize()
+        self._fresh = None
+        self._phase = "stepping"
+
+    def set_values(self, values: Mapping[str, Value]) -> None:
+        """Set inputs and parameters by name."""
+        for name, value in values.items():
+            self._values[name] = as_attribute(value, self._variables[name])
+        self._changed = True
+
+    def get_values(self, names: Sequence[str]) -> list[Value]:
+        """Current values by name; in Initialization Mode, outputs are computed from the inputs as they are now."""
+        if self._phase == "initialization" and not set(names).isdisjoint(self._outputs):
+            self._initialize()
+        values = []
+        for name in names:
+            attribute = self._values[name] if name in self._values else self._declared[name].start
+            try:
+                values.append(as_value(attribute, self._variables[name]))
+            except ValueRefused as refused:
+                raise _ERRORS[self._phase](str(refused), instance=self.name, variable=name) from refused
+        return values
+
+    def bind(self, inputs: Ring, outputs: Sequence[Ring], grid: TimeGrid, points: int, step: int = 0) -> None:
+        """Choose the rings of `do_step`, and write the current outputs to row ``step``."""
+        self._start_time, self._base_step_size = grid.start_time, grid.step_size
+        self._points = points
+        self._step_size = points * grid.step_size
+        self._input_mask, self._output_mask = inputs.mask, outputs[0].mask
+        self._reads = [(name, reader(inputs, self._variables[name])) for name in inputs.layout.names]
+        self._writes: list[tuple[str, Callable[[int, object], None]]] = [
+            (name, writer(ring, self._variables[name])) for ring in outputs for name in ring.layout.names
+        ]
+        values = (
+            dict(zip(names, self.get_values(names), strict=True)) if (names := [n for n, _ in self._writes]) else {}
+        )
+        for name, write in self._writes:
+            write(step & self._output_mask, as_attribute(values[name], self._variables[name]))
+
+    def do_step(self, step: int) -> None:
+        """Set the inputs of row ``step``, call `step` of the component, write its outputs to row ``step + 1``.
+
+        Raises:
+            StepFailed: the component raised an exception, or an output has no value or a wrong one.
+            TerminationRequested: the component raised it.
+        """
+        values, slot = self._values, step & self._input_mask
+        for name, read in self._reads:
+            values[name] = read(slot)
+        time = self._start_time + step * self._points * self._base_step_size  # `grid.time`, without a call
+        try:
+            self._step_component(time, self._step_size)
+        except (Exception, SystemExit) as error:
+            raise self._failed(error) from error
+        slot = (step + 1) & self._output_mask
+        for name, write in self._writes:
+            try:
+                write(slot, values[name])
+            except KeyError:
+                raise self._never_assigned(name) from None
+            except ValueRefused as refused:
+                raise StepFailed(str(refused), instance=self.name, variable=name) from refused
+
+    def get_state(self) -> object:
+        """The state of the component, and the values of its variables."""
+        component = self._live()
+        own = self._called(component.get_state)
+        return _State(
+            own, copy.deepcopy({name: vars(component)[name] for name in self._variables if name in self._values})
+        )
+
+    def set_state(self, state: object) -> None:
+        """Restore what `get_state` returned."""
+        assert isinstance(state, _State)
+        component = self._live()
+        self._called(lambda: component.set_state(state.own))
+        self._values.update(copy.deepcopy(state.values))
+        self._phase = "stepping"
+
+    def free_state(self, state: object) -> None:
+        """Nothing to free: a state is Python objects."""
+
+    def serialize_state(self, state: object) -> bytes:  # noqa: ARG002  as in the Protocol
+        """A state has Python objects of any kind, which only this process can use.
+
+        Raises:
+            FmuError: always.
+        """
+        raise FmuError("the state of a component in Python cannot be serialized", instance=self.name)
+
+    def deserialize_state(self, data: bytes) -> object:  # noqa: ARG002  as in the Protocol
+        """See `serialize_state`.
+
+        Raises:
+            FmuError: always.
+        """
+        raise FmuError("the state of a component in Python cannot be serialized", instance=self.name)
+
+    def close(self) -> None:
+        """Call `close` of the component; what it raises is logged, because the run has ended."""
+        component, self._component = self._component, None
+        if component is not None:
+            try:
+                component.close()
+            except (Exception, SystemExit) as error:  # noqa: BLE001 it is code of the user
+                text = f"close: {self._imported.told(error)}"
+                self._log(LogMessage(self.name, "Warning", "component", text, -1))
+        self._imported.close()
+
+    def _initialize(self) -> None:
+        """Call `initialize` if an input has changed since the last call.
+
+        How often that is depends on how outputs are read. The result does not: the attributes are set back to what they
+        were before the first call.
+        """
+        component = self._live()
+        if not self._changed or type(component).initialize is Component.initialize:
+            return
+        self._changed = False
+        given = {name: self._values[name] for name in self._variables if name not in self._outputs}
+        if self._fresh is None:
+            self._fresh = self._copied()
+        else:
+            self._values.clear()
+            self._values.update(self._called(lambda: copy.deepcopy(self._fresh)) or {})
+            self._values.update(given)
+        self._called(component.initialize)
+
+    def _copied(self) -> dict[str, Any]:
+        """A copy of the attributes; one that cannot be copied stands for itself."""
+        copied = {}
+        for name, value in self._values.items():
+            try:
+                copied[name] = copy.deepcopy(value)
+            except Exception:  # noqa: BLE001 it is code of the user
+                copied[name] = value
+        return copied
+
+    def _live(self) -> Component:
+        if self._component is None:
+            msg = f"instance '{self.name}' is closed"
+            raise ValueError(msg)
+        return self._component
+
+    def _called(self, call: Callable[[], Any]) -> Any:  # noqa: ANN401 what the call returns
+        """Call code of the user.
+
+        Raises:
+            FmuError: it raised an exception.
+        """
+        try:
+            return call()
+        except (Exception, SystemExit) as error:
+            raise self._failed(error) from error
+
+    def _failed(self, error: BaseException) -> FmuMeshError:
+        """The error for an exception of the code of the user."""
+        if isinstance(error, TerminationRequested):
+            return TerminationRequested(error.message, instance=self.name)
+        hint = error.hint if isinstance(error, FmuMeshError) else None
+        return _ERRORS[self._phase](self._imported.told(error), instance=self.name, hint=hint)
+
+    def _never_assigned(self, name: str) -> StepFailed:
+        text = "the component has not assigned this output"
+        hint = f"Assign `self.{name}` in `step`, or give the output a `start`."
+        return StepFailed(text, instance=self.name, variable=name, hint=hint)

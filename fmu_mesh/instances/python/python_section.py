@@ -1,0 +1,97 @@
+"""The section of a component in Python in a configuration."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Annotated, Literal, NamedTuple, Self
+
+from msgspec import Meta
+from msgspec.structs import replace
+
+from ...config.base import Base
+from ...config.instance_sections import KIND, Group, Host, InstanceSection, StartValues, StepSize
+from ...variables.model_description import ModelDescription
+from ...variables.value_types import PlainValue
+
+__all__ = ["ClassPlace", "PythonConfig", "class_place_of"]
+
+
+class ClassPlace(NamedTuple):
+    """Where a component class is.
+
+    Attributes:
+        file: the file, as it is written; empty if a module is named.
+        module: the name of an installed module; empty if a file is named.
+        name: the class; empty if none is named.
+    """
+
+    file: str
+    module: str
+    name: str
+
+
+def class_place_of(text: str) -> ClassPlace:
+    """What `controller.py:Controller` or `package.module:Controller` names.
+
+    Example:
+        >>> class_place_of("controller.py:Controller").file, class_place_of("package.module:Controller").module
+        ('controller.py', 'package.module')
+    """
+    place, _, name = text.rpartition(":")
+    if not place:
+        place, name = text, ""
+    is_file = place.endswith(".py") or "/" in place
+    return ClassPlace(place if is_file else "", "" if is_file else place, name)
+
+
+class PythonConfig(Base, InstanceSection, frozen=True, kw_only=True, tag_field=KIND, tag="python"):
+    """A component in Python: a class that derives from `fmu_mesh.Component`."""
+
+    python: Annotated[
+        str,
+        Meta(
+            description="The class: `controller.py:Controller`, relative to this file, or `package.module:Controller`."
+        ),
+    ]
+    interpreter: Annotated[
+        str | None,
+        Meta(description="The Python that runs it, with fmu-mesh installed; default: the one that runs fmu-mesh."),
+    ] = None
+    arguments: Annotated[
+        dict[str, PlainValue | None], Meta(description="The arguments that the class is called with, by name.")
+    ] = {}
+    start_values: StartValues = {}
+    interpolation: Annotated[
+        Literal["hold", "linear"] | None,
+        Meta(description="How a value with a time is used for an unconnected input; default: from the next step."),
+    ] = None
+    step_size: StepSize = None
+    group: Group = None
+    host: Host = None
+
+    names_code = True
+
+    @property
+    def path(self) -> str:
+        """The file of the class; empty for a module."""
+        return class_place_of(self.python).file
+
+    def agreed(self) -> Self:
+        """The section without the file and the interpreter, which may be elsewhere on each host."""
+        target = class_place_of(self.python)
+        return replace(self, python=f"{target.module}:{target.name}", interpreter=None)
+
+    def located(self, folder: Path) -> Self:
+        """The section with the absolute path of the interpreter."""
+        if self.interpreter is None:
+            return self
+        path = Path(self.interpreter).expanduser()
+        found = shutil.which(self.interpreter) if "/" not in self.interpreter else None
+        # Not resolved: the Python of a virtual environment is a link, and where the link is says which environment.
+        return replace(self, interpreter=found or str(folder / path))
+
+    def summary(self, description: ModelDescription) -> str:
+        """The class, and where it runs."""
+        own = f", {self.interpreter}" if self.interpreter is not None else ""
+        return f"class {description.model_name}{own}"

@@ -1,0 +1,106 @@
+"""Units by their usual names, as the variables of a component have them: `rad`, `N.m`, `m/s2`, `kg/(m.s2)`.
+
+The notation is that of Modelica and of most FMUs: `.` multiplies, `/` divides, an exponent follows its unit. Owns which
+names are known. Values are converted by `fmu_mesh.variables.units`.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from functools import cache
+from typing import Final
+
+from ...variables.units import BaseUnit
+
+__all__ = ["base_unit_of"]
+
+_FIELDS: Final = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
+
+_KNOWN: Final[dict[str, BaseUnit]] = {
+    "1": BaseUnit(),
+    **{name: BaseUnit(**{name: 1}) for name in _FIELDS},
+    "g": BaseUnit(kg=1, factor=1e-3),
+    "t": BaseUnit(kg=1, factor=1e3),
+    "min": BaseUnit(s=1, factor=60.0),
+    "h": BaseUnit(s=1, factor=3600.0),
+    "d": BaseUnit(s=1, factor=86400.0),
+    "deg": BaseUnit(rad=1, factor=math.pi / 180.0),
+    "rev": BaseUnit(rad=1, factor=2.0 * math.pi),
+    "rpm": BaseUnit(rad=1, s=-1, factor=math.pi / 30.0),
+    "degC": BaseUnit(K=1, offset=273.15),
+    "degF": BaseUnit(K=1, factor=5.0 / 9.0, offset=459.67 * 5.0 / 9.0),
+    "Hz": BaseUnit(s=-1),
+    "N": BaseUnit(kg=1, m=1, s=-2),
+    "Pa": BaseUnit(kg=1, m=-1, s=-2),
+    "bar": BaseUnit(kg=1, m=-1, s=-2, factor=1e5),
+    "J": BaseUnit(kg=1, m=2, s=-2),
+    "W": BaseUnit(kg=1, m=2, s=-3),
+    "C": BaseUnit(A=1, s=1),
+    "V": BaseUnit(kg=1, m=2, s=-3, A=-1),
+    "Ohm": BaseUnit(kg=1, m=2, s=-3, A=-2),
+    "S": BaseUnit(kg=-1, m=-2, s=3, A=2),
+    "F": BaseUnit(kg=-1, m=-2, s=4, A=2),
+    "H": BaseUnit(kg=1, m=2, s=-2, A=-2),
+    "Wb": BaseUnit(kg=1, m=2, s=-2, A=-1),
+    "T": BaseUnit(kg=1, s=-2, A=-1),
+    "l": BaseUnit(m=3, factor=1e-3),
+    "%": BaseUnit(factor=1e-2),
+}
+_WITH_PREFIX: Final = _KNOWN.keys() - {"1", "kg", "min", "h", "d", "deg", "rev", "rpm", "degC", "degF", "%"}
+_PREFIXES: Final = {"n": 1e-9, "u": 1e-6, "m": 1e-3, "c": 1e-2, "d": 1e-1, "h": 1e2, "k": 1e3, "M": 1e6, "G": 1e9}
+_POWER: Final = re.compile(r"([A-Za-z%]+|1)\^?([+-]?[0-9]+)?")
+
+
+@cache
+def base_unit_of(name: str) -> BaseUnit | None:
+    """The unit with this name in SI base units; None if it is not known.
+
+    A unit that is not known can be connected to one of the same name only.
+
+    Example:
+        >>> base_unit_of("mm/s").factor, str(base_unit_of("N.m"))
+        (0.001, 'kg.m2.s-2')
+    """
+    over, _, under = name.replace(" ", "").partition("/")
+    product = _product(over)
+    if under:
+        if under.startswith("(") and under.endswith(")"):
+            under = under[1:-1]
+        divisor = _product(under)
+        product = None if product is None or divisor is None else _times(product, divisor, -1)
+    return product
+
+
+def _product(text: str) -> BaseUnit | None:
+    factors = [_factor(part) for part in re.split(r"[.*]", text)]
+    product: BaseUnit | None = factors[0]
+    for factor in factors[1:]:
+        product = None if product is None or factor is None else _times(product, factor, 1)
+    return product
+
+
+def _factor(text: str) -> BaseUnit | None:
+    """One unit with its exponent."""
+    match = _POWER.fullmatch(text)
+    unit = _unit(match[1]) if match is not None else None
+    if match is None or unit is None or match[2] is None:
+        return unit
+    return _times(BaseUnit(), unit, int(match[2]))
+
+
+def _unit(name: str) -> BaseUnit | None:
+    if name in _KNOWN:
+        return _KNOWN[name]
+    prefix, rest = name[:1], name[1:]
+    if prefix not in _PREFIXES or rest not in _WITH_PREFIX:
+        return None
+    return _times(BaseUnit(factor=_PREFIXES[prefix]), _KNOWN[rest], 1)
+
+
+def _times(left: BaseUnit, right: BaseUnit, power: int) -> BaseUnit | None:
+    """``left * right ** power``; None for units with an offset, which cannot be multiplied."""
+    if left.offset or right.offset:
+        return None
+    exponents = {field: getattr(left, field) + power * getattr(right, field) for field in _FIELDS}
+    return BaseUnit(**exponents, factor=left.factor * right.factor**power)

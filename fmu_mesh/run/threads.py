@@ -1,0 +1,71 @@
+"""Numeric libraries use one thread in every process of a run.
+
+With several threads, a library adds up in another order, so the last digits of a matrix product differ from host to
+host. Processes that each use all processors would also hinder one another. This module imports nothing, because the
+variables have to be set before numpy is imported.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from threading import Lock
+from typing import Any, Final
+
+__all__ = ["ONE_THREAD", "one_thread_from_now_on", "one_thread_meanwhile"]
+
+ONE_THREAD: Final = dict.fromkeys(
+    (
+        "OMP_NUM_THREADS",
+        "OPENBLAS_NUM_THREADS",
+        "MKL_NUM_THREADS",
+        "BLIS_NUM_THREADS",
+        "NUMEXPR_NUM_THREADS",
+        "VECLIB_MAXIMUM_THREADS",
+    ),
+    "1",
+)
+"""The environment of a process whose numeric libraries use one thread."""
+
+
+def one_thread_from_now_on() -> None:
+    """Let the libraries that this process loads later use one thread, and those of its child processes."""
+    os.environ.update(ONE_THREAD)
+
+
+class _Limits:
+    """The limits that the runs in this process share: they are lifted when the last run ends."""
+
+    def __init__(self) -> None:
+        self._lock = Lock()
+        self._running = 0
+        self._set: list[Any] = []
+
+    def begin(self) -> None:
+        """Limit all libraries that are loaded by now."""
+        from threadpoolctl import threadpool_limits  # noqa: PLC0415 slow, and only a run in this process needs it
+
+        with self._lock:
+            self._running += 1
+            self._set.append(threadpool_limits(1))
+
+    def end(self) -> None:
+        """One of those that have begun is over."""
+        with self._lock:
+            self._running -= 1
+            while self._set and not self._running:
+                self._set.pop().restore_original_limits()
+
+
+_limits = _Limits()
+
+
+@contextmanager
+def one_thread_meanwhile() -> Iterator[None]:
+    """In the block, let the libraries that this process has loaded use one thread; blocks of threads may overlap."""
+    _limits.begin()
+    try:
+        yield
+    finally:
+        _limits.end()
