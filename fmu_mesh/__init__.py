@@ -101,6 +101,8 @@ _PLACES = {
 }
 """The modules of the public names; all others are exceptions."""
 
+_OF_POSIX = ("fcntl", "resource", "pwd", "termios")
+
 
 def __getattr__(name: str) -> object:
     """Import a public name when it is first used, so that a node or a master does not pay for it."""
@@ -109,7 +111,17 @@ def __getattr__(name: str) -> object:
         raise AttributeError(msg)
     from importlib import import_module  # noqa: PLC0415 see above
 
-    value = getattr(import_module(f"{__name__}.{_PLACES.get(name, 'errors')}"), name)
+    try:
+        value = getattr(import_module(f"{__name__}.{_PLACES.get(name, 'errors')}"), name)
+    except ModuleNotFoundError as error:
+        if error.name not in _OF_POSIX:
+            raise
+        from .errors import ConfigurationError  # noqa: PLC0415 as above
+
+        raise ConfigurationError(
+            f"fmu_mesh.{name} needs Linux: this system has no module `{error.name}`",
+            hint="On Windows, the Windows Subsystem for Linux (WSL 2) runs it.",
+        ) from error
     globals()[name] = value
     return value
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import atexit
 import logging
+import sys
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future
@@ -16,7 +17,7 @@ from shutil import rmtree
 import msgspec
 from msgspec.structs import replace
 
-from ..errors import CallRefused, FmuMeshError, Interrupted, MeshLost
+from ..errors import CallRefused, ConfigurationError, FmuMeshError, Interrupted, MeshLost
 from ..recorder.arrays_file import bytes_of_a_row, read_arrays
 from ..run.events import Event, Log, OutputLine, Reachable, Restarted, Status
 from ..run.in_process import InProcessRun
@@ -75,6 +76,8 @@ class RunThread:
     """
 
     def __init__(self, plan: RunPlan, settings: Settings) -> None:
+        if not sys.platform.startswith("linux"):
+            raise ConfigurationError(f"a mesh runs on Linux, and this system is '{sys.platform}'")
         self.plan = plan
         self.future: Future[Result] = Future()
         self.status: MeshStatus | None = None

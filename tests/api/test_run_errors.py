@@ -158,3 +158,21 @@ def test_no_thread_of_a_run_is_left() -> None:
     with steered().start(record="memory") as run:
         run.get("gain.y")
     wait_until(lambda: threading.active_count() <= before, "the end of all threads")
+
+
+def test_another_system_is_told_that_linux_is_needed(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+    program = (
+        "import sys; sys.modules['fcntl'] = None\n"
+        "import fmu_mesh\n"
+        "try:\n"
+        "    fmu_mesh.load\n"
+        "except fmu_mesh.ConfigurationError as error:\n"
+        "    print(error)\n"
+    )
+    done = place.start_command([sys.executable, "-c", program])
+    assert (done.wait(), done.errors) == (0, "")
+    assert done.output.startswith("fmu_mesh.load needs Linux: this system has no module `fcntl`. On Windows, ")
+
+    monkeypatch.setattr(sys, "platform", "darwin")
+    with pytest.raises(fmu_mesh.ConfigurationError, match="a mesh runs on Linux, and this system is 'darwin'"):
+        steered().start(record="memory")
