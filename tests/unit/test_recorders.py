@@ -13,6 +13,7 @@ import pytest
 from fmu_mesh import plugins
 from fmu_mesh.cli.main import main
 from fmu_mesh.errors import ConfigurationError
+from fmu_mesh.files import Kept
 from fmu_mesh.recorder.csv_file import CsvFile
 from fmu_mesh.ros.bags.mcap_file import McapFile
 from fmu_mesh.run.results import rows_left
@@ -141,3 +142,17 @@ def test_a_device_keeps_no_rows(tmp_path: Path) -> None:
     (tmp_path / "recorded").write_bytes(struct.pack("<qq", 2, 3))
 
     assert rows_left(os.devnull, tmp_path) == 0
+
+
+@pytest.mark.parametrize("format_", FORMATS)
+def test_what_follows_the_rows_that_are_known_is_no_more_than_what_is_told(
+    format_: ResultFormat, tmp_path: Path
+) -> None:
+    """The writer was killed after it wrote more than it had noted, perhaps within a row."""
+    path = tmp_path / "killed"
+    whole = b"time,a.x\n0.0,1.0\n0.5,2.0\n"
+    path.write_bytes(whole + b"1.0,")
+
+    assert format_.keep_whole_rows(path, Kept(2, len(whole))) == 2
+
+    assert path.read_bytes() == whole

@@ -5,6 +5,7 @@ Owns which topics a recording has, and how rows become messages. `fmu_mesh.ros.m
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from io import BufferedWriter
 from pathlib import Path
@@ -97,8 +98,12 @@ class McapFile:
         return cls(path, recording.columns, found)
 
     @staticmethod
-    def keep_whole_rows(path: Path, kept: Kept) -> int:  # noqa: ARG004 the contract of a result format
-        """The rows that are known to be whole; a reader of MCAP finds the end of what follows by itself."""
+    def keep_whole_rows(path: Path, kept: Kept) -> int:
+        """Cut a bag off after the rows that are known to be whole; returns their number.
+
+        What follows may be more messages, of which nobody knows to how many rows they belong.
+        """
+        os.truncate(path, kept.size)
         return kept.rows
 
     def __enter__(self) -> Self:
