@@ -255,6 +255,13 @@ NOT_RUN = [
         "sudo bridges/gazebo_classic/setup.sh /opt/gazebo_classic",
         "it takes 15 minutes; .ci/long runs it",
     ),
+    ("docs/installation.md", "pipx install '.[plot]'", "it installs into your home; .ci/run installs the same wheel"),
+    (
+        "docs/installation.md",
+        "uv tool install '.[plot]'",
+        "it installs into your home; .ci/run installs the same wheel",
+    ),
+    ("docs/installation.md", "python3 -m venv .my-venv", "it downloads 150 MB; .ci/run installs the same wheel"),
     (
         "docs/onnx.md",
         "import torch",
@@ -270,13 +277,6 @@ NOT_RUN = [
         "from pathlib import Path",
         "scikit-learn is no requirement here; tests/unit/test_onnx.py reads models of this form",
     ),
-    ("docs/installation.md", "pipx install '.[plot]'", "it installs into your home; .ci/run installs the same wheel"),
-    (
-        "docs/installation.md",
-        "uv tool install '.[plot]'",
-        "it installs into your home; .ci/run installs the same wheel",
-    ),
-    ("docs/installation.md", "python3 -m venv .my-venv", "it downloads 150 MB; .ci/run installs the same wheel"),
     ("docs/performance.md", "make bench", "it takes 20 minutes, and figures of a busy machine mean nothing"),
     (
         "docs/ros-node.md",

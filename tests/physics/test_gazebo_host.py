@@ -375,7 +375,7 @@ def test_velocity_against_the_wind_is_in_the_axes_of_the_link(tmp_path: Path) ->
 def test_a_position_cannot_be_set_and_the_message_says_why(tmp_path: Path) -> None:
     instance = GazeboClassicInstance(write_world(tmp_path, arm()), "world", GazeboClassicConfig(gazebo_classic=""))
 
-    with pytest.raises(InitializationFailed, match="Gazebo starts a world as it is"):
+    with pytest.raises(InitializationFailed, match="cannot be set: Gazebo starts a world with the values of its file"):
         instance.enter_initialization(0.0, 1.0, {"elbow.position": 1.0})
     instance.close()
 
