@@ -83,15 +83,22 @@ class Answers:
                     query.reply(
                         f"{root}/info", msgspec.json.encode(instance_info(self._plan, runner)), encoding=json_encoding
                     )
-        wanted = self._variables_matching(runner, asked) if runner is not None else []
+        pending = _Pending(name, query)
+        self._answer_values(pending, pending.asked)
+
+    def _answer_values(self, pending: _Pending, now: float) -> None:
+        """Answer with the variables that a query matches; keep it for `turn` if there are no values yet."""
+        name, query = pending.instance, pending.query
+        runner = self._activity.runners.get(name)
+        wanted = self._variables_matching(runner, query.key_expr) if runner is not None else []
         if runner is None or not wanted:
             query.drop()
             return
-        if self._activity.state in _BEFORE_VALUES:
-            self._early.append(_Pending(name, query))
+        if self._activity.state in _BEFORE_VALUES and now - pending.asked <= _ANSWER_S:
+            self._early.append(pending)
             return
         if self._activity.state != "running":
-            _Pending(name, query).refuse(f"'{name}' has no values now: {self._activity.state}")
+            pending.refuse(f"'{name}' has no values now: {self._activity.state}")
             return
         known, step = self._from_rows(runner, wanted)
         self._reply_values(runner, query, known, step)
@@ -112,12 +119,7 @@ class Answers:
         """Answer queries that waited for the first point; refuse those that have waited too long for a point."""
         early, self._early = self._early, []
         for pending in early:
-            if self._activity.state in _BEFORE_VALUES and now - pending.asked <= _ANSWER_S:
-                self._early.append(pending)
-            elif self._activity.state in _BEFORE_VALUES:
-                pending.refuse(f"'{pending.instance}' has no values now: {self._activity.state}")
-            else:
-                self.answer(pending.instance, pending.query)
+            self._answer_values(pending, now)
         for pending in [p for p in self._pending if now - p.asked > _ANSWER_S]:
             self._pending.remove(pending)
             pending.refuse(f"not at a point yet: {self._activity.status(pending.instance).activity}")

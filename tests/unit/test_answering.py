@@ -9,6 +9,7 @@ from typing import Any, cast
 import pytest
 import zenoh
 
+from fmu_mesh.node import answering
 from fmu_mesh.node.answering import Answers
 from fmu_mesh.node.stepping import Runner
 from fmu_mesh.rings.ring import Ring
@@ -78,9 +79,9 @@ class Query:
     """A query for the output, and what it was told."""
 
     payload = None
-    key_expr = zenoh.KeyExpr("fmu_mesh/lab/unit/out/y")
 
-    def __init__(self) -> None:
+    def __init__(self, key: str = "out/y") -> None:
+        self.key_expr = zenoh.KeyExpr(f"fmu_mesh/lab/unit/{key}")
         self.told: list[str] = []
 
     def reply(self, key: str, value: bytes, **_options: object) -> None:
@@ -94,7 +95,10 @@ class Query:
 
 
 @pytest.mark.parametrize("state", ["waiting for the mesh", "initializing"])
-def test_a_query_before_the_first_point_waits_for_it_and_not_for_ever(state: str) -> None:
+def test_a_query_before_the_first_point_waits_for_it_and_not_for_ever(
+    state: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(answering, "instance_info", lambda _plan, _runner: 5)
     ring = Ring(Layout.of([("y", "Float64")]), ROWS)
     ring.put(0, "y", 2.5)
     description = SimpleNamespace(variables=[Y])
@@ -105,10 +109,10 @@ def test_a_query_before_the_first_point_waits_for_it_and_not_for_ever(state: str
         instance=SimpleNamespace(description=description),
         plan=SimpleNamespace(step_points=1),
     )
-    activity = SimpleNamespace(state=state, runners={"unit": runner})
+    activity = SimpleNamespace(state=state, runners={"unit": runner}, status=lambda _name: 7)
     plan = SimpleNamespace(key_prefix="fmu_mesh", mesh="lab", grid=TimeGrid(0.0, 0.1, 10))
     answers = Answers(cast("Any", plan), cast("Any", None), cast("Any", activity), cast("Any", None), cast("Any", None))
-    soon, never = Query(), Query()
+    soon, never, everything = Query(), Query(), Query("**")
 
     answers.answer("unit", cast("Any", never))
     answers.turn(time.monotonic())
@@ -117,6 +121,9 @@ def test_a_query_before_the_first_point_waits_for_it_and_not_for_ever(state: str
     assert never.told == [f"'unit' has no values now: {state}", "dropped"]
 
     answers.answer("unit", cast("Any", soon))
+    answers.answer("unit", cast("Any", everything))
     activity.state = "running"
     answers.turn(time.monotonic())
+    root = "fmu_mesh/lab/unit"
+    assert everything.told == [f"{root}/info 5", f"{root}/status 7", f"{root}/out/y 2.5", "dropped"]
     assert soon.told == ["fmu_mesh/lab/unit/out/y 2.5", "dropped"]
