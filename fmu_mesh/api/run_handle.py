@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from concurrent.futures import TimeoutError as NotYet
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self, Unpack
@@ -17,13 +17,9 @@ from ..errors import (
     ConfigurationError,
     DeadlineExceeded,
     FmuMeshError,
-    Interrupted,
-    KeyboardInterrupted,
     MeshLost,
-    from_report,
 )
 from ..wire.client.mesh_client import MeshClient
-from ..wire.client.reaching import Meshes
 from ..wire.client.waiting import rest, wait_for, wait_for_start
 from ..wire.views import (
     Command,
@@ -38,9 +34,11 @@ from ..wire.views import (
     VariableView,
 )
 from .notebook_progress import NotebookProgress
+from .run_ways import TIMEOUT_S, ended_by_keyboard, follow, reach
 from .samples import Sample, Watch, sample_of, targets_of
 
 if TYPE_CHECKING:  # whoever attaches to a mesh needs nothing that plans or starts one
+    from ..ros.bags.playing import Played, PlayOptions
     from ..run.run_plan import RunPlan
     from .plan_options import StartOptions
     from .result import Result
@@ -48,11 +46,7 @@ if TYPE_CHECKING:  # whoever attaches to a mesh needs nothing that plans or star
 
 __all__ = ["TIMEOUT_S", "Run"]
 
-TIMEOUT_S = 5.0
-"""Default deadline of a question in s."""
-
 _LOOK_S = 0.2
-_FOREVER_S = 1e9
 _WAIT_S = 60.0
 
 
@@ -140,6 +134,20 @@ class Run:
         """How far an instance is, and what it is doing."""
         return self._client().instance_status(instance)
 
+    def all_status(self) -> tuple[MeshStatus, dict[str, InstanceStatus]]:
+        """The status of the mesh and of its instances, with one question; instances that do not answer are left out.
+
+        Example:
+            >>> import fmu_mesh
+            >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
+            >>> with mesh.start(record="memory", paused=True) as run:
+            ...     point = run.wait_for("paused").point
+            ...     status, instances = run.all_status()
+            ...     status.state, sorted(instances)
+            ('paused', ['delay', 'pendulum'])
+        """
+        return self._client().all_status()
+
     @property
     def variables(self) -> dict[str, VariableView]:
         """All variables of the mesh by `instance.variable`."""
@@ -219,6 +227,26 @@ class Run:
         with self._client().logs(follow=follow) as lines:
             yield from lines
 
+    def play(self, bag: str | Path, **how: Unpack[PlayOptions]) -> Played:
+        """Send the messages of a recorded bag to inputs of the mesh, each at the point of its stamp.
+
+        The mesh is paused at each of these points, so the result depends on the bag alone.
+
+        Args:
+            bag: an MCAP file, or the folder of a `ros2 bag`.
+            how: see `PlayOptions`.
+
+        Returns:
+            How many values were set, and from which point to which.
+
+        Raises:
+            ConfigurationError: the bag has no message of these topics, or an input takes no such value.
+            DeadlineExceeded: the mesh does not come to the next message.
+        """
+        from ..ros.bags.playing import play_bag  # noqa: PLC0415  not for those who only look
+
+        return play_bag(self._running(), Path(bag), self._own.plan.loaded if self._own is not None else None, **how)
+
     # --- steering
 
     def pause(self) -> CommandAnswer:
@@ -285,6 +313,21 @@ class Run:
 
     # --- the end
 
+    @contextmanager
+    def until_end(self, tell: Callable[[], None] = lambda: None) -> Iterator[threading.Event]:
+        """An event that is set when the mesh ends or is gone; then ``tell`` is called, on another thread.
+
+        Example:
+            >>> import fmu_mesh
+            >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
+            >>> with mesh.start(record="memory", paused=True) as run, run.until_end() as ended:
+            ...     answer = run.stop()
+            ...     ended.wait(10.0)
+            True
+        """
+        with self._client().until_end(tell) as ended:
+            yield ended
+
     def wait(self, timeout: float | None = None) -> Result:
         """Wait for the end of the run.
 
@@ -303,9 +346,7 @@ class Run:
         except KeyboardInterrupt:
             if self._own is None:
                 raise
-            self._own.interrupt()
-        error = self._ended_by_keyboard(future)
-        raise error
+            raise ended_by_keyboard(self._own) from None
 
     async def wait_async(self) -> Result:
         """As `wait`, without blocking the event loop of asyncio; a cancelled wait leaves the run as it is.
@@ -350,31 +391,13 @@ class Run:
                 if self._own is not None and self._own.status is not None:
                     progress.update(self._own.status)
 
-    def _ended_by_keyboard(self, future: Future[Result]) -> FmuMeshError:
-        """The error for a run that Ctrl-C has ended; a second Ctrl-C does not wait for its processes."""
-        assert self._own is not None
-        while True:
-            try:
-                future.result()
-            except KeyboardInterrupt as error:
-                if future.done() and future.exception() is error:
-                    return error if isinstance(error, FmuMeshError) else Interrupted("interrupted")
-                self._own.interrupt()
-                continue
-            except Interrupted as error:
-                named = KeyboardInterrupted(error.message, point=error.point, time=error.time, hint=error.hint)
-                return named.with_result(error.result)
-            except FmuMeshError as error:
-                return error
-            return KeyboardInterrupted("interrupted").with_result(future.result())
-
     def _end(self) -> Future[Result]:
         """The end of the run; that of a mesh that was found is followed on a thread."""
         with self._opening:
             if self._ended is None:
                 future: Future[Result] = Future()
                 self._ended, client = future, self._client()
-                threading.Thread(target=_follow, args=(client, future), name="end", daemon=True).start()
+                threading.Thread(target=follow, args=(client, future), name="end", daemon=True).start()
             return self._ended
 
     def _client(self) -> MeshClient:
@@ -388,7 +411,8 @@ class Run:
             if self._closed:
                 raise CallRefused(f"this handle of mesh '{self.name}' is closed")
             if self._found is None:
-                self._found = self._reach()
+                assert self._own is not None  # otherwise it was found by whoever made this
+                self._found = reach(self._own, self.name, self._way)
             if self._own is not None and self._own.future.done():
                 raise MeshLost(f"the run of mesh '{self.name}' has ended")
             return self._found
@@ -409,41 +433,3 @@ class Run:
     def _steered(self) -> MeshClient:
         """As `_running` for a run that was started here; a mesh that was found takes commands when it takes them."""
         return self._client() if self._own is None else self._running()
-
-    def _reach(self) -> MeshClient:
-        own = self._own
-        assert own is not None
-        if own.in_process:
-            hint = "Start it with processes=True, or step it by hand with `Mesh.open`."
-            raise CallRefused(f"the run of mesh '{self.name}' is in this process, where nobody can reach it", hint=hint)
-        timeout = own.plan.loaded.config.timeouts.start
-        if not own.reached.wait(timeout):
-            raise DeadlineExceeded(f"mesh '{self.name}' cannot be reached within {timeout:g} s")
-        if not own.endpoints:
-            raise MeshLost(f"the run of mesh '{self.name}' has ended")
-        meshes = self._way.enter_context(Meshes(own.endpoints[:1], TIMEOUT_S))
-        with meshes.changes() as wait:
-            end = time.monotonic() + timeout
-            while (client := meshes.appeared(self.name)) is None:
-                if time.monotonic() > end or own.future.done():
-                    raise MeshLost(f"mesh '{self.name}' does not answer")
-                wait(_LOOK_S)
-                meshes.look()
-        return client
-
-
-def _follow(client: MeshClient, future: Future[Result]) -> None:
-    """Follow a mesh that somebody else has started to its end."""
-    from .result import Result  # noqa: PLC0415  see above
-
-    try:
-        file, last = client.info().result_file, None
-        with client.statuses(_FOREVER_S) as statuses:
-            for status in statuses:
-                last = status
-        if last is not None and last.error is not None:
-            future.set_exception(from_report(last.error))
-        else:
-            future.set_result(Result(client.keys.mesh, file=Path(file) if file is not None else None))
-    except BaseException as error:  # noqa: BLE001 whoever waits gets it
-        future.set_exception(error)

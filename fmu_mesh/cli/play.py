@@ -5,11 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from ..errors import ConfigurationError
-from ..instances.configuration import load
-from ..ros.bags.bag import Bag, chosen_topics
-from ..ros.bags.playing import grid_of, play, schedule
-from ..wire.client.reaching import Meshes
+from ..api.attaching import attach
 from .arguments import CommandParser, Parsers, add_quiet, add_reaching, number
 
 __all__ = ["PARSERS"]
@@ -45,38 +41,25 @@ def _add_play(parser: CommandParser) -> None:
 
 
 def _play(arguments: argparse.Namespace) -> int:
-    with Bag(arguments.bag) as bag, Meshes(arguments.connect, arguments.timeout) as meshes:
-        client = meshes.named(arguments.mesh)
-        mesh = client.info()
-        infos = {name: client.instance_info(name) for name in mesh.instances}
-        loaded = load(arguments.config or Path(mesh.config))
-        topics = chosen_topics(loaded, infos, bag, arguments.topic)
-        step_points = {name: round(info.step_size / mesh.step_size) for name, info in infos.items()}
-        samples = bag.samples(topics, arguments.stamps)
-        moments, merged, beyond = schedule(samples, grid_of(mesh), step_points, start=arguments.start)
-        names = ", ".join(topic.name for topic in topics)
-        if not moments:
-            raise _nothing(arguments, names, beyond)
-        count, first = play(client, moments, step_points, arguments.timeout)
-    past = sum(len(moment.values) for moment in moments) - count
-    print(f"played {count} values of {names} from point {first} to point {moments[-1].point}")
+    with attach(arguments.mesh, connect=arguments.connect, timeout=arguments.timeout) as run:
+        played = run.play(
+            arguments.bag,
+            topics=arguments.topic,
+            start=arguments.start,
+            stamps=arguments.stamps,
+            config=arguments.config,
+            timeout=arguments.timeout,
+        )
+    names = ", ".join(played.topics)
+    print(f"played {played.values} values of {names} from point {played.first} to point {played.last}")
     for several, why in (
-        (merged, "were followed by another one for the same point"),
-        (past, "were past already, and followed by another one"),
-        (beyond, "are at or after the end of the simulation"),
+        (played.merged, "were followed by another one for the same point"),
+        (played.past, "were past already, and followed by another one"),
+        (played.beyond, "are at or after the end of the simulation"),
     ):
         if several:
             print(f"{several} values {why}")
     return 0
-
-
-def _nothing(arguments: argparse.Namespace, names: str, beyond: int) -> ConfigurationError:
-    if beyond:
-        return ConfigurationError(
-            f"all {beyond} values of {names} in '{arguments.bag}' are at or after the end of the simulation.",
-            hint="Say when the first one is: --start 0.",
-        )
-    return ConfigurationError(f"there is no message of {names} in '{arguments.bag}'.")
 
 
 PARSERS: Parsers = {"play": _add_play}

@@ -14,10 +14,10 @@ from typing import Final
 
 import msgspec
 
+from ..api.attaching import attach
+from ..api.run_handle import Run
 from ..api.tables import shortened, table, width_of
 from ..errors import DeadlineExceeded, Interrupted
-from ..wire.client.mesh_client import MeshClient
-from ..wire.client.reaching import Meshes
 from ..wire.views import InstanceStatus, MeshStatus
 from .arguments import CommandParser, Parsers, add_json, add_reaching, positive_seconds
 from .output.pages import progress, seconds
@@ -50,13 +50,12 @@ def _add_top(parser: CommandParser) -> None:
 
 
 def _top(arguments: argparse.Namespace) -> int:
-    with Meshes(arguments.connect, arguments.timeout) as meshes:
-        client = meshes.named(arguments.mesh)
+    with attach(arguments.mesh, connect=arguments.connect, timeout=arguments.timeout) as run:
         if arguments.once:
-            _show_once(client.all_status(), as_json=arguments.json)
+            _show_once(run.all_status(), as_json=arguments.json)
             return 0
         try:
-            return _follow(client, arguments.interval, as_json=arguments.json)
+            return _follow(run, arguments.interval, as_json=arguments.json)
         except KeyboardInterrupt:
             return Interrupted.exit_code
 
@@ -69,13 +68,13 @@ def _show_once(look: Look, *, as_json: bool) -> None:
         print("\n".join(page(look, width=width)), flush=True)
 
 
-def _follow(client: MeshClient, interval_s: float, *, as_json: bool) -> int:
+def _follow(run: Run, interval_s: float, *, as_json: bool) -> int:
     """Look again and again until the mesh ends, or `q`; where there is no terminal, one table after the other."""
-    with Screen(drawn=may_draw(sys.stdout) and not as_json) as screen, client.until_end(screen.wake) as ended:
+    with Screen(drawn=may_draw(sys.stdout) and not as_json) as screen, run.until_end(screen.wake) as ended:
         before: Look | None = None
         while not ended.is_set():
             try:
-                look = client.all_status()
+                look = run.all_status()
             except DeadlineExceeded:
                 if ended.is_set():
                     break
@@ -88,7 +87,7 @@ def _follow(client: MeshClient, interval_s: float, *, as_json: bool) -> int:
             if screen.quits_within(interval_s):
                 return 0
     if not as_json:
-        print(f"mesh '{client.keys.mesh}' has ended")
+        print(f"mesh '{run.name}' has ended")
     return 0
 
 

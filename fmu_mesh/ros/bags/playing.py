@@ -10,22 +10,106 @@ import math
 import threading
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Literal, TypedDict, Unpack
 
 import msgspec
 
+from ...config.loading import LoadedConfig
 from ...errors import ConfigurationError, DeadlineExceeded, MeshLost
+from ...instances.configuration import load
 from ...simtime import ENDLESS, TimeGrid
 from ...variables.model_description import Value
 from ...wire.client.mesh_client import MeshClient
 from ...wire.client.readings import Target
 from ...wire.views import Command, MeshInfo
 from ..messages.stamp import nanoseconds
-from .bag import BagSample
+from .bag import Bag, BagSample, chosen_topics
 
-__all__ = ["Moment", "grid_of", "play", "schedule"]
+__all__ = ["Moment", "PlayOptions", "Played", "grid_of", "play", "play_bag", "schedule"]
 
 _LOOK_S = 0.001
 _LONGEST_LOOK_S = 0.05
+_TIMEOUT_S = 60.0
+
+
+class PlayOptions(TypedDict, total=False):
+    """How a bag is played.
+
+    Attributes:
+        topics: `TOPIC[:FIELD]=INSTANCE.VARIABLE` each; default: the topics that the mesh subscribes to.
+        start: simulation time in s of the first message; None: its stamp.
+        stamps: "header": header stamps where messages have them (the default); "log": the times of their recording.
+        config: the configuration file, if that of a mesh that was found is not on this host.
+        timeout: how long in s the mesh may stay at one point before it has reached the next message (60).
+    """
+
+    topics: Sequence[str]
+    start: float | None
+    stamps: Literal["header", "log"]
+    config: str | Path | None
+    timeout: float
+
+
+class Played(msgspec.Struct, frozen=True):
+    """What has been played of a bag.
+
+    Attributes:
+        values: number of values that were set.
+        topics: their topics.
+        first: point of the first value.
+        last: point of the last one.
+        merged: number of values that were followed by another one for the same point.
+        past: number of values for points that were past already, and followed by another one.
+        beyond: number of values at or after the end of the simulation.
+    """
+
+    values: int
+    topics: list[str]
+    first: int
+    last: int
+    merged: int
+    past: int
+    beyond: int
+
+
+def play_bag(client: MeshClient, file: Path, loaded: LoadedConfig | None = None, **how: Unpack[PlayOptions]) -> Played:
+    """Play a bag to a mesh.
+
+    Args:
+        client: the mesh.
+        file: an MCAP file, or the folder of a `ros2 bag`.
+        loaded: the configuration of the mesh; None: it is read from the file that the mesh names.
+        how: see `PlayOptions`; its ``config`` comes first.
+
+    Raises:
+        ConfigurationError: the bag has no message of these topics before the end of the simulation.
+    """
+    mesh = client.info()
+    infos = {name: client.instance_info(name) for name in mesh.instances}
+    step_points = {name: round(info.step_size / mesh.step_size) for name, info in infos.items()}
+    start = how.get("start")
+    if loaded is None or how.get("config") is not None:
+        loaded = load(Path(how.get("config") or mesh.config))
+    with Bag(file) as bag:
+        topics = chosen_topics(loaded, infos, bag, how.get("topics", ()))
+        samples = bag.samples(topics, how.get("stamps", "header"))
+        moments, merged, beyond = schedule(samples, grid_of(mesh), step_points, start=start)
+    names = [topic.name for topic in topics]
+    if not moments:
+        raise _nothing(file, ", ".join(names), beyond)
+    count, first = play(client, moments, step_points, how.get("timeout", _TIMEOUT_S))
+    past = sum(len(moment.values) for moment in moments) - count
+    return Played(count, names, first, moments[-1].point, merged, past, beyond)
+
+
+def _nothing(file: Path, names: str, beyond: int) -> ConfigurationError:
+    if beyond:
+        return ConfigurationError(
+            f"all {beyond} values of {names} in '{file}' are at or after the end of the simulation.",
+            hint="Say when the first one is: --start 0, or start=0.0 in a program.",
+        )
+    return ConfigurationError(f"there is no message of {names} in '{file}'.")
 
 
 class Moment(msgspec.Struct, frozen=True):
