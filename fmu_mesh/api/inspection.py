@@ -148,6 +148,9 @@ def inspect(path: str | Path, *, kind: str | None = None) -> Inspection:
 
 def with_way_out(error: LoadFailed, path: Path) -> LoadFailed:
     """The error for a path that should be a model and is something else, or nothing."""
+    if path.suffix.partition(":")[0] == ".py":
+        hint = "A component is not read without running it: `check` of a configuration imports it, `info` shows it."
+        return error.instead_of_hint(hint)
     if not files.exists(path):
         near = nearest_file(path)
         return error.instead_of_hint(f"Did you mean '{near}'?") if near is not None else error

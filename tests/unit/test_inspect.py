@@ -147,7 +147,12 @@ def test_an_unpacked_fmu_is_shown_too(tmp_path: Path, capsys: pytest.CaptureFixt
 
 
 @pytest.mark.parametrize(
-    ("name", "says"), [("DampedPendulun.fmu", "does not exist. Did you mean"), ("build.py", "is no ZIP archive")]
+    ("name", "says"),
+    [
+        ("DampedPendulun.fmu", "does not exist. Did you mean"),
+        ("build.py", "is no ZIP archive"),
+        ("build.py:Controller", "A component is not read without running it"),
+    ],
 )
 def test_what_is_no_fmu_is_refused(name: str, says: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["inspect", str(FMUS / name)]) == 2
