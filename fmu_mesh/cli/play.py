@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 
 from ..api.attaching import attach
+from ..ros.bags.bag import Bag
 from .arguments import CommandParser, Parsers, add_quiet, add_reaching, number
 
 __all__ = ["PARSERS"]
@@ -41,6 +42,8 @@ def _add_play(parser: CommandParser) -> None:
 
 
 def _play(arguments: argparse.Namespace) -> int:
+    with Bag(arguments.bag):
+        pass  # what is wrong with it is told before anything about meshes
     with attach(arguments.mesh, connect=arguments.connect, timeout=arguments.timeout) as run:
         played = run.play(
             arguments.bag,

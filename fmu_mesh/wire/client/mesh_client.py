@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from itertools import chain
 from typing import Any, TypeVar, cast
@@ -219,7 +219,10 @@ class MeshClient:
         with Follower[Reading](self._session, self.keys) as follower:
             for target in targets:
                 follower.subscribe(target.key, Keeper(target, follower.arrived).keep)
-            yield follower.to_the_last() if follower.there.wait(self._timeout_s) else iter(())
+            there = follower.there.wait(self._timeout_s)
+            if there:
+                self._meet_nodes({target.instance for target in targets})
+            yield follower.to_the_last() if there else iter(())
 
     @contextmanager
     def logs(self, *, follow: bool) -> Iterator[Iterator[LogLine]]:
@@ -237,6 +240,12 @@ class MeshClient:
             there = follow and follower.there.wait(self._timeout_s)
             new = follower.to_the_last() if there else iter(())
             yield chain(kept, (line for line in new if line.number > last))
+
+    def _meet_nodes(self, instances: Iterable[str]) -> None:
+        """Return when the nodes of these instances know the subscribers of this session: an answer comes after them."""
+        with suppress(ConfigurationError, DeadlineExceeded):  # it is about to end
+            for instance in instances:
+                self.instance_status(instance)
 
     # --- names
 
