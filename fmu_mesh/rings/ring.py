@@ -7,22 +7,33 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..system.layout import Layout, Place
-from ..variables.value_types import DTYPES, Value, VariableType, flattened, nested, zero
+from ..variables.value_types import DTYPES, Value, VariableType, flattened, is_text, nested, zero
 
-__all__ = ["Ring", "Rows"]
+__all__ = ["STAMP_BYTES", "Ring", "Rows", "row_bytes"]
 
 Rows = tuple[NDArray[Any], ...]
 """Consecutive rows: one array of shape (rows, elements) for each part of a layout."""
 
 
+STAMP_BYTES: Final = 8
+"""A row begins with its stamp: its number plus 1, or 0 while its values are being written."""
+
+_ALIGNMENT: Final = 8
+
+
+def row_bytes(layout: Layout) -> int:
+    """Size of one row in memory; a String or Binary is not part of it."""
+    return _offsets(layout)[-1]
+
+
 class Ring:
-    """A ring of rows, with one preallocated array for each part of its layout.
+    """A ring of rows in one piece of memory: a row has a stamp, and then its numbers by type; text is beside it.
 
     Example:
         >>> ring = Ring(Layout.of([("y", "Float64")]), rows=4)
@@ -33,24 +44,42 @@ class Ring:
     Args:
         layout: the columns.
         rows: how many rows; a power of two.
+        memory: ``rows * row_bytes(layout)`` bytes, such as shared memory; None: memory of its own.
 
     Attributes:
         parts: arrays of shape (rows, elements), in the order of ``layout.parts``; text as Python objects.
+        stamps: an array with the stamp of each row.
+        offsets: the place of each part in a row, in bytes.
+        address: address of the first row.
+        stride: distance of two rows in bytes.
         mask: ``rows - 1``; the slot of row ``n`` is ``n & mask``.
     """
 
-    def __init__(self, layout: Layout, rows: int) -> None:
+    def __init__(self, layout: Layout, rows: int, memory: memoryview | None = None) -> None:
         if rows < 1 or rows & (rows - 1):
             msg = f"a ring has a power of two of rows, not {rows}"
             raise ValueError(msg)
         self.layout = layout
         self.rows = rows
         self.mask = rows - 1
+        *self.offsets, self.stride = _offsets(layout)
         self._types = tuple(part.type for part in layout.parts)
         self._places: dict[str, Place] = {}
+        flat = np.frombuffer(memory, np.uint8) if memory is not None else np.zeros(rows * self.stride, np.uint8)
+        self.address = int(flat.ctypes.data)
+        self._flat = flat
+        self.stamps = self._array(np.dtype(np.int64), 0, 1)[:, 0]
         self.parts: Rows = tuple(
-            np.full((rows, part.width), zero(part.type), dtype=DTYPES[part.type]) for part in layout.parts
+            np.full((rows, part.width), zero(part.type), dtype=DTYPES[part.type])
+            if is_text(part.type)
+            else self._array(np.dtype(DTYPES[part.type]), offset, part.width)
+            for part, offset in zip(layout.parts, self.offsets, strict=True)
         )
+
+    def _array(self, dtype: np.dtype[Any], offset: int, width: int) -> NDArray[Any]:
+        """The elements of one type: those of a row are neighbours, and the rows are ``stride`` bytes apart."""
+        shape, strides = (self.rows, width), (self.stride, dtype.itemsize)
+        return np.ndarray(shape, dtype, self._flat.data, offset, strides)
 
     def part(self, type_: VariableType) -> NDArray[Any]:
         """The array of one type, of shape (rows, elements); it has no elements if no column has this type."""
@@ -85,28 +114,42 @@ class Ring:
     def reader(self, name: str) -> Callable[[int], Value]:
         """`value` of one column as a function of the row: the fast way for a caller that reads it at every point."""
         part, first, _, shape = self._place(name)
-        mask, (_, width) = self.mask, self.parts[part].shape
+        mask, width, start = self.mask, *self._in_numbers(part)
         if self._types[part] != "Float64" or shape:
             return lambda row: self.value(row, name)
-        memory: Any = (
-            self.parts[part].reshape(-1).data
-        )  # a memory view: indexing it takes half the time of indexing numpy
+        first += start
+        memory: Any = self._flat.view(np.float64).data  # a memory view: it takes half the time of an array
         return lambda row: memory[(row & mask) * width + first]
 
     def writer(self, name: str) -> Callable[[int, Value], None]:
         """`put` of one column as a function of row and value: the fast way for a caller that writes at every point."""
         part, first, _, shape = self._place(name)
-        mask, (_, width) = self.mask, self.parts[part].shape
+        mask, width, start = self.mask, *self._in_numbers(part)
         if self._types[part] != "Float64" or shape:
             return lambda row, value: self.put(row, name, value)
-        memory: Any = self.parts[part].reshape(-1).data
+        first += start
+        memory: Any = self._flat.view(np.float64).data
 
         def write(row: int, value: Value) -> None:
             memory[(row & mask) * width + first] = value
 
         return write
 
+    def _in_numbers(self, part: int) -> tuple[int, int]:
+        """The distance of two rows, and the place of a part in a row, in numbers of eight bytes."""
+        return self.stride // 8, self.offsets[part] // 8
+
     def _place(self, name: str) -> Place:
         if name not in self._places:
             self._places[name] = self.layout.place(name)
         return self._places[name]
+
+
+def _offsets(layout: Layout) -> list[int]:
+    """The place of each part in a row in bytes, and last the size of a row."""
+    offsets, end = [], STAMP_BYTES
+    for part in layout.parts:
+        offsets.append(end)
+        if not is_text(part.type):
+            end += -(-part.width * np.dtype(DTYPES[part.type]).itemsize // _ALIGNMENT) * _ALIGNMENT
+    return [*offsets, end]

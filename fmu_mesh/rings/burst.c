@@ -1,0 +1,741 @@
+/* The burst: a node steps its instances as far as inputs, windows and the grant allow, in one call.
+ *
+ * Everything here is driven by tables that Python fills (fmu_mesh/rings/native.py has the same structures). One value
+ * passes from the row of its source into the input of its target, and the outputs are read into a row of the own ring.
+ *
+ * Rows. Row n of a ring is in slot n & mask. A row begins with its stamp, n + 1. The writer clears the stamp, writes
+ * the values, writes the stamp, and then counts the row (release). A reader looks at the counter (acquire), and at the
+ * stamp before and after it has read: a counter that is wrong, or a row that was overwritten, never becomes a value.
+ *
+ * Waiting. A counter only grows, and has one writer. Who waits for it spins, yields, and then sleeps on its own bell:
+ *
+ *   sleeper:  seen = bell; need = goal; lower wake_at; FENCE; counter >= goal? otherwise futex_wait(bell, seen)
+ *   writer:   counter = value; FENCE; wake_at <= value? then for each need that is met: clear it (compare and swap),
+ *             bell += 1, futex_wake(bell)
+ *
+ * Of the two, at least one sees what the other has written before its fence. Within a burst the writer looks at wake_at
+ * without the fence, which is late by nanoseconds at most; with the fence at the end of a burst and before it waits
+ * itself. Every sleep has a time limit. docs/rings.md explains the protocol; tests/property/test_waiting.py explores it.
+ */
+#define _GNU_SOURCE
+#include <fenv.h>
+#include <limits.h>
+#include <linux/futex.h>
+#include <sched.h>
+#include <stdatomic.h>
+#include <stddef.h>
+#include <stdint.h>
+#include <string.h>
+#include <sys/syscall.h>
+#include <time.h>
+#include <unistd.h>
+
+#define PUBLIC __attribute__((visibility("default")))
+#define NEVER INT64_MAX
+
+/* ---- shared memory */
+
+typedef struct {
+  _Atomic int64_t value;   /* rows of a ring, or a communication point */
+  _Atomic int64_t wake_at; /* the lowest need of a sleeper */
+  int64_t unused[6];
+  _Atomic int64_t needs[]; /* one for each process: the value that it sleeps for; 0: it does not sleep */
+} Counter;
+
+typedef struct {
+  _Atomic uint32_t rung;
+  uint32_t unused[15];
+} Bell;
+
+/* Which process this is among those of the memory. */
+typedef struct {
+  Bell *bells;
+  int64_t processes;
+  int64_t own;
+} Place;
+
+/* ---- tables of one node */
+
+typedef struct { /* the rows of one source, for one delay */
+  Counter *counter;
+  const char *rows;
+  int64_t stride;
+  int64_t mask;
+  int64_t lead;   /* see system/coupling_rule.py */
+  int64_t points; /* base points per step of the source */
+  int64_t known;  /* the counter when it was last read */
+} Gate;
+
+/* Values that are copied. A base is a row, or 0: then the offset is an address. */
+typedef struct {
+  int64_t from_base;
+  int64_t from;
+  int64_t to_base;
+  int64_t to;
+  int64_t count;
+  int32_t from_type;
+  int32_t to_type;
+  int32_t scaled;
+  int32_t negated; /* an alias of FMI 1.0 with the opposite sign */
+  double factor;
+  double offset;
+} Move;
+
+typedef struct { /* a getter or a setter */
+  void *function;
+  const void *references;
+  int64_t count;
+  int64_t base;
+  int64_t values;
+  int64_t size; /* number of values for FMI 3.0; otherwise -1 */
+} Call;
+
+typedef struct {
+  char *rows;
+  int64_t stride;
+  int64_t mask;
+} Output;
+
+enum { BY_PYTHON, FMI1, FMI2, FMI3 };                                    /* Member.kind */
+enum { WAITING, SETTING, STEPPING, GETTING, IN_PYTHON, STEPPED };        /* Member.stage */
+enum { FIXED, OUTPUT, WATCHED, FIRST_GATE, MAX_GATES = 4096 };           /* bases */
+enum { WARNING = 1, OUT_OF_RANGE = 100, STAGE_BITS = 24 };               /* statuses */
+enum { F64, F32, I8, U8, I16, U16, I32, U32, I64, U64, TRUTH };          /* types */
+
+typedef struct {
+  Gate *gates;
+  Move *loads;  /* from the rows of the sources into the row of inputs, and from there into buffers */
+  Call *setters;
+  Call *getters;
+  Move *stores; /* from buffers into the own row */
+  int64_t n_gates, n_loads, n_setters, n_getters, n_stores;
+  int64_t kind;
+  void *component;
+  void *do_step;
+  void *said; /* FMI 3.0: event needed, terminate, early return (one byte each), and at 8 the last time */
+  double start_time, base_step_size, step_size;
+  int64_t points; /* base points per own step */
+  int64_t every;  /* ticks of the unit per own step */
+  int64_t last_step;
+  Output outputs[2]; /* the own ring; and outputs that somebody watches */
+  Counter *counter;  /* rows of the own ring */
+  char **bases;      /* room for the rows of the gates */
+  int64_t step;
+  int64_t stage;
+  int64_t outcome;   /* stage and status of a call that Python has to look at */
+} Member;
+
+typedef struct { /* members that step together, tick by tick: a tick of a single member is its own step */
+  Member *members;
+  int64_t n_members;
+  int64_t tick_points;
+  int64_t last_tick;
+  int64_t tick;
+  int64_t next; /* the member that steps next within the tick */
+  int64_t burst;
+  int64_t stopped;
+  int64_t spent_ns;
+  Counter *blocked_by;
+  int64_t need;
+} Unit;
+
+typedef struct {
+  Counter *progress;
+  int64_t window;
+} Peer;
+
+typedef struct {
+  Place place;
+  Unit *units;
+  int64_t n_units;
+  Peer *peers;
+  int64_t n_peers;
+  Counter *ceiling;  /* the grant of the master */
+  Counter *progress; /* of this node */
+  int64_t last_point;
+  int64_t slice_ns;
+  int64_t wait_ns;   /* how long to sleep where nothing can step; 0: leave at once */
+  int64_t spins;     /* whether it spins before it sleeps */
+  int64_t allowed;
+  int64_t patience;
+  int64_t waited_ns;
+  int64_t restored;  /* how often a model had changed the floating-point mode */
+  int64_t late;      /* sleeps that ended by their time limit although the value was there: lost wake-ups */
+  int64_t unit;      /* whom the result is about */
+  int64_t member;
+  _Atomic int64_t attention; /* Python has something to do */
+} Node;
+
+enum { SLICE, DONE, ATTENTION, BLOCKED, PYTHON, STATUS, FORGED }; /* results of run */
+
+/* ---- waiting */
+
+static int64_t now(void) {
+  struct timespec time;
+  clock_gettime(CLOCK_MONOTONIC, &time);
+  return (int64_t)time.tv_sec * 1000000000 + time.tv_nsec;
+}
+
+static void relax(void) {
+#if defined(__x86_64__)
+  __builtin_ia32_pause();
+#elif defined(__aarch64__)
+  __asm__ volatile("yield");
+#endif
+}
+
+static void lower(_Atomic int64_t *place, int64_t value) {
+  int64_t seen = atomic_load_explicit(place, memory_order_relaxed);
+  while (value < seen && !atomic_compare_exchange_weak(place, &seen, value)) continue;
+}
+
+PUBLIC void ring_bell(Bell *bell) {
+  atomic_fetch_add(&bell->rung, 1);
+  syscall(SYS_futex, &bell->rung, FUTEX_WAKE, INT_MAX, NULL, NULL, 0);
+}
+
+/* Wake everybody whose need is met. */
+static void wake(const Place *place, Counter *counter) {
+  atomic_store(&counter->wake_at, NEVER);
+  int64_t lowest = NEVER, value = atomic_load(&counter->value);
+  for (int64_t process = 0; process < place->processes; process++) {
+    int64_t need = atomic_load(&counter->needs[process]);
+    if (need == 0) continue;
+    if (need > value) {
+      if (need < lowest) lowest = need;
+    } else if (atomic_compare_exchange_strong(&counter->needs[process], &need, 0)) {
+      ring_bell(&place->bells[process]);
+    }
+  }
+  if (lowest != NEVER) lower(&counter->wake_at, lowest);
+}
+
+static inline void wake_if_needed(const Place *place, Counter *counter) {
+  if (atomic_load_explicit(&counter->wake_at, memory_order_relaxed) <=
+      atomic_load_explicit(&counter->value, memory_order_relaxed))
+    wake(place, counter);
+}
+
+static inline void raise_counter(const Place *place, Counter *counter, int64_t value) {
+  atomic_store_explicit(&counter->value, value, memory_order_release);
+  wake_if_needed(place, counter);
+}
+
+static inline int64_t value_of(const Counter *counter) {
+  return atomic_load_explicit(&counter->value, memory_order_acquire);
+}
+
+/* Raise a counter, and wake who needs it: for Python. */
+PUBLIC void counter_raise(const Place *place, Counter *counter, int64_t value) {
+  atomic_store_explicit(&counter->value, value, memory_order_release);
+  atomic_thread_fence(memory_order_seq_cst);
+  wake_if_needed(place, counter);
+}
+
+PUBLIC int64_t counter_value(const Counter *counter) { return value_of(counter); }
+
+PUBLIC void counters_values(Counter *const *counters, int64_t n, int64_t *values) {
+  for (int64_t i = 0; i < n; i++) values[i] = value_of(counters[i]);
+}
+
+/* One value that somebody waits for. */
+typedef struct {
+  Counter *counter;
+  int64_t need;
+} Wish;
+
+static int granted(const Wish *wishes, int64_t n) {
+  for (int64_t i = 0; i < n; i++)
+    if (wishes[i].counter != NULL && value_of(wishes[i].counter) >= wishes[i].need) return 1;
+  return 0;
+}
+
+/* Sleep until a wish is granted, the bell is rung, or the time is over; `seen` is the bell when the caller last looked
+ * for other reasons to stay awake. Returns whether a wish is granted. */
+PUBLIC int64_t sleep_for(const Place *place, uint32_t seen, const Wish *wishes, int64_t n, int64_t limit_ns,
+                         int64_t *late) {
+  Bell *bell = &place->bells[place->own];
+  for (int64_t i = 0; i < n; i++) {
+    Counter *counter = wishes[i].counter;
+    if (counter == NULL) continue;
+    int64_t other = atomic_load_explicit(&counter->needs[place->own], memory_order_relaxed);
+    if (other == 0 || other > wishes[i].need) atomic_store(&counter->needs[place->own], wishes[i].need);
+    lower(&counter->wake_at, wishes[i].need);
+  }
+  atomic_thread_fence(memory_order_seq_cst);
+  int is_granted = granted(wishes, n);
+  if (!is_granted) {
+    struct timespec limit = {limit_ns / 1000000000, limit_ns % 1000000000};
+    int64_t end = now() + limit_ns;
+    syscall(SYS_futex, &bell->rung, FUTEX_WAIT, seen, &limit, NULL, 0);
+    is_granted = granted(wishes, n);
+    if (is_granted && late != NULL && now() >= end && atomic_load(&bell->rung) == seen) *late += 1;
+  }
+  for (int64_t i = 0; i < n; i++)
+    if (wishes[i].counter != NULL) atomic_store(&wishes[i].counter->needs[place->own], 0);
+  return is_granted;
+}
+
+PUBLIC uint32_t bell_seen(const Place *place) { return atomic_load(&place->bells[place->own].rung); }
+
+/* ---- one step of one member */
+
+static volatile const double ONE = 1.0, HALF_ULP = 0x1p-53, QUARTER_ULP = 0x1p-54, TINY = 0x1p-1074;
+
+/* Whether a model has left the mode "round to nearest, subnormal numbers": each other mode changes one of these. */
+static inline int mode_changed(void) {
+  const double one = ONE;
+  return one + HALF_ULP - QUARTER_ULP != one || TINY + TINY == 0.0;
+}
+
+static inline double as_double(const char *from, int type) {
+  switch (type) {
+    case F64: { double v; memcpy(&v, from, 8); return v; }
+    case F32: { float v; memcpy(&v, from, 4); return v; }
+    case I8: return *(const int8_t *)from;
+    case U8: return *(const uint8_t *)from;
+    case I16: { int16_t v; memcpy(&v, from, 2); return v; }
+    case U16: { uint16_t v; memcpy(&v, from, 2); return v; }
+    case I32: { int32_t v; memcpy(&v, from, 4); return v; }
+    case U32: { uint32_t v; memcpy(&v, from, 4); return v; }
+    case I64: { int64_t v; memcpy(&v, from, 8); return (double)v; }
+    case U64: { uint64_t v; memcpy(&v, from, 8); return (double)v; }
+    default: return *(const uint8_t *)from != 0;
+  }
+}
+
+/* An integer as 65 bits: the number, and whether it is above those of int64_t. */
+static inline int64_t as_integer(const char *from, int type, int *large) {
+  *large = 0;
+  switch (type) {
+    case I8: return *(const int8_t *)from;
+    case U8: return *(const uint8_t *)from;
+    case I16: { int16_t v; memcpy(&v, from, 2); return v; }
+    case U16: { uint16_t v; memcpy(&v, from, 2); return v; }
+    case I32: { int32_t v; memcpy(&v, from, 4); return v; }
+    case U32: { uint32_t v; memcpy(&v, from, 4); return v; }
+    case I64: { int64_t v; memcpy(&v, from, 8); return v; }
+    case U64: { uint64_t v; memcpy(&v, from, 8); *large = v > INT64_MAX; return (int64_t)v; }
+    default: return *(const uint8_t *)from != 0;
+  }
+}
+
+static inline int put_integer(char *to, int type, int64_t v, int large) {
+#define FITS(low, high) (!large && v >= (low) && v <= (high))
+  switch (type) {
+    case I8: { int8_t w = (int8_t)v; memcpy(to, &w, 1); return FITS(INT8_MIN, INT8_MAX); }
+    case U8: { uint8_t w = (uint8_t)v; memcpy(to, &w, 1); return FITS(0, UINT8_MAX); }
+    case I16: { int16_t w = (int16_t)v; memcpy(to, &w, 2); return FITS(INT16_MIN, INT16_MAX); }
+    case U16: { uint16_t w = (uint16_t)v; memcpy(to, &w, 2); return FITS(0, UINT16_MAX); }
+    case I32: { int32_t w = (int32_t)v; memcpy(to, &w, 4); return FITS(INT32_MIN, INT32_MAX); }
+    case U32: { uint32_t w = (uint32_t)v; memcpy(to, &w, 4); return FITS(0, UINT32_MAX); }
+    case I64: memcpy(to, &v, 8); return !large;
+    case U64: memcpy(to, &v, 8); return large || v >= 0;
+    default: *(uint8_t *)to = v != 0 || large; return 1;
+  }
+#undef FITS
+}
+
+static inline void put_double(char *to, int type, double v) {
+  if (type == F64) {
+    memcpy(to, &v, 8);
+  } else {
+    float w = (float)v; /* beyond the range: infinite, as in C */
+    memcpy(to, &w, 4);
+  }
+}
+
+static const int SIZES[] = {8, 4, 1, 1, 2, 2, 4, 4, 8, 8, 1};
+
+/* Copy values, with factor and offset (one rounding each) and types. Returns 0, or OUT_OF_RANGE. */
+static int move_values(const Move *move, const char *from, char *to) {
+  const int from_type = move->from_type, to_type = move->to_type;
+  const int64_t from_size = SIZES[from_type], to_size = SIZES[to_type];
+  if (from_type == to_type && !move->scaled && !move->negated) {
+    if (move->count == 1 && from_size == 8)
+      memcpy(to, from, 8);
+    else
+      memcpy(to, from, (size_t)(move->count * from_size));
+    return 0;
+  }
+  for (int64_t i = 0; i < move->count; i++, from += from_size, to += to_size) {
+    if (move->scaled || from_type <= F32 || to_type <= F32) {
+      double value = as_double(from, from_type);
+      if (move->scaled) value = value * move->factor + move->offset;
+      if (move->negated) value = -value;
+      put_double(to, to_type, value);
+      continue;
+    }
+    int large;
+    int64_t value = as_integer(from, from_type, &large);
+    if (move->negated) {
+      if (to_type == TRUTH || from_type == TRUTH)
+        value = value == 0;
+      else if (large || value == INT64_MIN)
+        return OUT_OF_RANGE;
+      else
+        value = -value;
+    }
+    if (!put_integer(to, to_type, value, large)) return OUT_OF_RANGE;
+  }
+  return 0;
+}
+
+static inline int move_all(const Move *moves, int64_t n, char *const *bases) {
+  for (int64_t i = 0; i < n; i++) {
+    const Move *move = &moves[i];
+    int status = move_values(move, bases[move->from_base] + move->from, bases[move->to_base] + move->to);
+    if (status) return status;
+  }
+  return 0;
+}
+
+static inline int call_all(void *component, const Call *calls, int64_t n, char *const *bases) {
+  for (int64_t i = 0; i < n; i++) {
+    const Call *call = &calls[i];
+    void *values = bases[call->base] + call->values;
+    int status =
+        call->size < 0
+            ? ((int (*)(void *, const void *, size_t, void *))call->function)(component, call->references,
+                                                                              (size_t)call->count, values)
+            : ((int (*)(void *, const void *, size_t, void *, size_t))call->function)(
+                  component, call->references, (size_t)call->count, values, (size_t)call->size);
+    if (status > WARNING || status < 0) return status;
+  }
+  return 0;
+}
+
+static inline int call_do_step(Member *member, double time) {
+  switch (member->kind) {
+    case FMI1:
+      return ((int (*)(void *, double, double, char))member->do_step)(member->component, time, member->step_size, 1);
+    case FMI2:
+      return ((int (*)(void *, double, double, int))member->do_step)(member->component, time, member->step_size, 1);
+    default: {
+      char *said = member->said;
+      memset(said, 0, 3);
+      return ((int (*)(void *, double, double, _Bool, void *, void *, void *, void *))member->do_step)(
+          member->component, time, member->step_size, 1, said, said + 1, said + 2, said + 8);
+    }
+  }
+}
+
+/* Set the inputs, take own step `step`, read the outputs. Returns 0, or stage and status of a call. */
+static inline int64_t call_step(Member *member, int64_t step) {
+  char **bases = member->bases;
+  for (int i = 0; i < 2; i++) {
+    const Output *output = &member->outputs[i];
+    bases[OUTPUT + i] = output->rows + ((step + 1) & output->mask) * output->stride;
+  }
+  int status;
+  member->stage = SETTING;
+  if ((status = move_all(member->loads, member->n_loads, bases)) != 0 ||
+      (status = call_all(member->component, member->setters, member->n_setters, bases)) != 0)
+    return (int64_t)SETTING << STAGE_BITS | (status & 0xffffff);
+  member->stage = STEPPING;
+  status = call_do_step(member, member->start_time + (double)(step * member->points) * member->base_step_size);
+  if (status > WARNING || status < 0 || (member->kind == FMI3 && memcmp(member->said, "\0\0\0", 3) != 0))
+    return (int64_t)STEPPING << STAGE_BITS | (status & 0xffffff);
+  member->stage = GETTING;
+  if ((status = call_all(member->component, member->getters, member->n_getters, bases)) != 0 ||
+      (status = move_all(member->stores, member->n_stores, bases)) != 0)
+    return (int64_t)GETTING << STAGE_BITS | (status & 0xffffff);
+  return 0;
+}
+
+/* One step for who counts rows and moves the inputs itself. */
+PUBLIC int64_t member_step(Member *member, int64_t step) {
+  int64_t outcome = call_step(member, step);
+  if (outcome == 0) member->stage = WAITING;
+  return outcome;
+}
+
+/* ---- a node */
+
+static inline _Atomic int64_t *stamp_of(const char *rows, int64_t stride, int64_t mask, int64_t row) {
+  return (_Atomic int64_t *)(uintptr_t)(rows + (row & mask) * stride);
+}
+
+static inline void stamp(Member *member, int64_t row, int64_t value) {
+  const Output *own = &member->outputs[0];
+  atomic_store_explicit(stamp_of(own->rows, own->stride, own->mask, row), value, memory_order_release);
+}
+
+static inline int64_t points_of(const Member *member, int64_t last_point) {
+  if (member->step >= member->last_step) return last_point;
+  int64_t covered = (member->step + 1) * member->points - 1;
+  return covered < last_point ? covered : last_point;
+}
+
+/* The last point for which all outputs of a unit are known. */
+static inline int64_t covered(const Unit *unit, int64_t last_point) {
+  if (unit->n_members == 1) return points_of(unit->members, last_point);
+  return unit->tick < last_point ? unit->tick : last_point;
+}
+
+static void publish(Node *node) {
+  int64_t least = node->last_point;
+  for (int64_t i = 0; i < node->n_units; i++) {
+    int64_t own = covered(&node->units[i], node->last_point);
+    if (own < least) least = own;
+  }
+  if (least > atomic_load_explicit(&node->progress->value, memory_order_relaxed))
+    raise_counter(&node->place, node->progress, least);
+}
+
+/* Before this process waits or leaves: whoever waits for it is awake. */
+static void wake_all(Node *node) {
+  publish(node);
+  atomic_thread_fence(memory_order_seq_cst);
+  wake_if_needed(&node->place, node->progress);
+  for (int64_t i = 0; i < node->n_units; i++)
+    for (int64_t j = 0; j < node->units[i].n_members; j++)
+      wake_if_needed(&node->place, node->units[i].members[j].counter);
+}
+
+/* The point up to which the master and the windows allow steps; whom to wait for if it is not above `point`. */
+static int64_t allow(Node *node, int64_t point, Unit *unit) {
+  int64_t allowed = value_of(node->ceiling);
+  if (allowed > node->last_point) allowed = node->last_point;
+  if (allowed <= point) {
+    unit->blocked_by = node->ceiling;
+    unit->need = point + 1;
+    return allowed;
+  }
+  for (int64_t i = 0; i < node->n_peers; i++) {
+    const Peer *peer = &node->peers[i];
+    int64_t limit = value_of(peer->progress) + peer->window;
+    if (limit < allowed) allowed = limit;
+    if (limit <= point) {
+      unit->blocked_by = peer->progress;
+      unit->need = point + 1 - peer->window;
+      return allowed;
+    }
+  }
+  return allowed;
+}
+
+enum { SPINS = 60, YIELDS = 8, PATIENCE = 3, REST = 30 };
+
+/* For a node with one unit: look a little longer before it sleeps, unless that was in vain the last times. */
+static int soon(Node *node, Counter *counter, int64_t need) {
+  if (!node->spins || node->n_units != 1) return 0;
+  wake_all(node);
+  if (node->patience < 0) {
+    node->patience++;
+    return value_of(counter) >= need;
+  }
+  for (int i = 0; i < SPINS + YIELDS; i++) {
+    if (value_of(counter) >= need) {
+      if (node->patience < PATIENCE) node->patience++;
+      return 1;
+    }
+    if (atomic_load_explicit(&node->attention, memory_order_relaxed)) return 0;
+    if (i < SPINS)
+      relax();
+    else
+      sched_yield();
+  }
+  node->patience = node->patience > 0 ? node->patience - 1 : -REST;
+  return 0;
+}
+
+static inline int blocked(Node *node, Unit *unit, Counter *counter, int64_t need) {
+  if (soon(node, counter, need)) return 0;
+  unit->blocked_by = counter;
+  unit->need = need;
+  return 1;
+}
+
+enum { READY, NOT_READY, NOT_TRUE };
+
+/* Whether the rows of all gates are there; then the bases point to them. */
+static inline int open_gates(Node *node, Unit *unit, Member *member) {
+  const int64_t start = member->step * member->points;
+  for (int64_t i = 0; i < member->n_gates; i++) {
+    Gate *gate = &member->gates[i];
+    int64_t row = start + gate->lead;
+    if (gate->points != 1) row /= gate->points;
+    while (gate->known <= row) {
+      if ((gate->known = value_of(gate->counter)) > row) break;
+      if (blocked(node, unit, gate->counter, row + 1)) return NOT_READY;
+    }
+    member->bases[FIRST_GATE + i] = (char *)(uintptr_t)gate->rows + (row & gate->mask) * gate->stride;
+    if (atomic_load_explicit((_Atomic int64_t *)(void *)member->bases[FIRST_GATE + i], memory_order_acquire) != row + 1)
+      return NOT_TRUE;
+  }
+  return READY;
+}
+
+/* Whether the rows of all gates are still those that were opened. */
+static inline int gates_held(const Member *member) {
+  const int64_t start = member->step * member->points;
+  atomic_thread_fence(memory_order_acquire);
+  for (int64_t i = 0; i < member->n_gates; i++) {
+    const Gate *gate = &member->gates[i];
+    int64_t row = start + gate->lead;
+    if (gate->points != 1) row /= gate->points;
+    if (atomic_load_explicit((_Atomic int64_t *)(void *)member->bases[FIRST_GATE + i], memory_order_relaxed) != row + 1)
+      return 0;
+  }
+  return 1;
+}
+
+static inline void commit(Node *node, Member *member) {
+  stamp(member, member->step + 1, member->step + 2);
+  member->step++;
+  member->stage = WAITING;
+  raise_counter(&node->place, member->counter, member->step + 1);
+}
+
+/* Take own steps of one unit; returns SLICE, or why Python is needed. `*ticks` is the number of complete ticks. */
+static int advance(Node *node, Unit *unit, int64_t *ticks) {
+  const int64_t first = unit->tick;
+  int64_t end = unit->last_tick < first + unit->burst ? unit->last_tick : first + unit->burst;
+  int result = SLICE;
+  for (; unit->tick < end; unit->tick++, unit->next = 0) {
+    const int64_t point = unit->tick * unit->tick_points;
+    while (unit->next == 0 && point >= node->allowed && (node->allowed = allow(node, point, unit)) <= point)
+      if (blocked(node, unit, unit->blocked_by, unit->need)) goto out;
+    for (; unit->next < unit->n_members; unit->next++) {
+      Member *member = &unit->members[unit->next];
+      if (member->every != 1 && (unit->tick + 1) % member->every != 0) continue;
+      if (member->stage != STEPPED) {
+        int state = open_gates(node, unit, member);
+        if (state == NOT_READY) goto out;
+        if (state == NOT_TRUE) {
+          result = FORGED;
+          goto out;
+        }
+        stamp(member, member->step + 1, 0);
+        atomic_thread_fence(memory_order_release); /* the cleared stamp comes before the values */
+        if (member->kind == BY_PYTHON) {
+          if (move_all(member->loads, member->n_loads, member->bases) != 0) {
+            member->outcome = (int64_t)SETTING << STAGE_BITS | OUT_OF_RANGE;
+            result = STATUS;
+          } else {
+            result = gates_held(member) ? PYTHON : FORGED;
+          }
+          member->stage = IN_PYTHON;
+          goto out;
+        }
+        member->outcome = call_step(member, member->step);
+        if (mode_changed()) {
+          fesetenv(FE_DFL_ENV);
+          node->restored++;
+        }
+        if (!gates_held(member)) {
+          result = FORGED;
+          goto out;
+        }
+        if (member->outcome != 0) {
+          result = STATUS;
+          goto out;
+        }
+      }
+      commit(node, member);
+    }
+    if (node->n_units == 1) {
+      int64_t reached = unit->n_members == 1 ? points_of(unit->members, node->last_point) : unit->tick + 1;
+      if (reached > atomic_load_explicit(&node->progress->value, memory_order_relaxed))
+        raise_counter(&node->place, node->progress, reached < node->last_point ? reached : node->last_point);
+    }
+    if (atomic_load_explicit(&node->attention, memory_order_relaxed)) {
+      unit->tick++;
+      unit->next = 0;
+      break;
+    }
+  }
+out:
+  *ticks = unit->tick - first;
+  node->unit = unit - node->units;
+  node->member = unit->next;
+  return result;
+}
+
+/* Sleep until a unit may step, Python has something to do, or the time is over. */
+static int64_t await(Node *node) {
+  uint32_t seen = bell_seen(&node->place);
+  if (atomic_load(&node->attention)) return 0;
+  wake_all(node);
+  Wish wishes[64]; /* of more units, the others look again when one of these may step, or the time is over */
+  int64_t n = 0, limit_ns = node->wait_ns;
+  for (int64_t i = 0; i < node->n_units; i++) {
+    const Unit *unit = &node->units[i];
+    if (unit->stopped || unit->tick >= unit->last_tick) continue;
+    if (n < 64)
+      wishes[n++] = (Wish){unit->blocked_by, unit->need};
+    else if (limit_ns > 1000000)
+      limit_ns = 1000000;
+  }
+  int64_t start = now();
+  int64_t is_granted = sleep_for(&node->place, seen, wishes, n, limit_ns, &node->late);
+  node->waited_ns += now() - start;
+  return is_granted;
+}
+
+/* Step as far as it goes, for about one slice of time. Call it again and again. */
+PUBLIC int64_t node_run(Node *node) {
+  const int64_t start = now();
+  int64_t begin = start;
+  atomic_store_explicit(&node->attention, atomic_load(&node->attention), memory_order_relaxed);
+  for (;;) {
+    int stepped = 0, left = 0;
+    for (int64_t i = 0; i < node->n_units; i++) {
+      Unit *unit = &node->units[i];
+      if (unit->stopped || unit->tick >= unit->last_tick) continue;
+      int64_t ticks = 0;
+      int result = advance(node, unit, &ticks);
+      int64_t end = now(), elapsed = end - begin;
+      begin = end;
+      if (ticks > 0) {
+        stepped = 1;
+        unit->spent_ns += elapsed;
+        if (ticks == unit->burst && elapsed < node->slice_ns)
+          unit->burst = unit->burst < 4096 ? 2 * unit->burst : 4096;
+        else if (elapsed > 2 * node->slice_ns && unit->burst > 1)
+          unit->burst = (ticks < unit->burst ? ticks : unit->burst) / 2 + (ticks < 2);
+      }
+      if (result != SLICE) {
+        wake_all(node);
+        return result;
+      }
+      left += unit->tick < unit->last_tick;
+      if (atomic_load_explicit(&node->attention, memory_order_relaxed) || begin - start > 2 * node->slice_ns) {
+        wake_all(node);
+        return ATTENTION;
+      }
+    }
+    if (left == 0) {
+      wake_all(node);
+      return DONE;
+    }
+    if (!stepped) {
+      if (node->wait_ns == 0 || !await(node)) {
+        wake_all(node);
+        return BLOCKED;
+      }
+      begin = now();
+    }
+    if (begin - start > node->slice_ns) {
+      wake_all(node);
+      return SLICE;
+    }
+  }
+}
+
+/* From any thread: let the node leave its burst. */
+PUBLIC void node_attend(Node *node) {
+  atomic_store(&node->attention, 1);
+  ring_bell(&node->place.bells[node->place.own]);
+}
+
+PUBLIC void node_attended(Node *node) { atomic_store(&node->attention, 0); }
+
+/* Sizes of the structures, which Python compares with its own. */
+PUBLIC int64_t structure_sizes(int64_t *sizes) {
+  const int64_t own[] = {sizeof(Place), sizeof(Gate), sizeof(Move), sizeof(Call), sizeof(Output),
+                         sizeof(Member), sizeof(Unit), sizeof(Peer), sizeof(Node), sizeof(Wish)};
+  memcpy(sizes, own, sizeof own);
+  return sizeof own / sizeof own[0];
+}

@@ -1,0 +1,323 @@
+"""The tables of `burst.c` in Python: the same structures, and the functions of the library.
+
+Owns no memory but that of the tables; who makes a table keeps what its addresses point to. `library` is None where the
+library is missing, and then nothing else of this module may be used.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Sequence
+from ctypes import POINTER, Structure, c_double, c_int32, c_int64, c_uint32, c_void_p
+from enum import IntEnum
+from typing import Any, Final, NamedTuple
+
+from ..variables.value_types import VariableType
+from .library import load_library
+
+__all__ = [
+    "NEVER",
+    "NUMBER_TYPES",
+    "OUT_OF_RANGE",
+    "STAGE_BITS",
+    "Base",
+    "Call",
+    "Gate",
+    "Kind",
+    "Member",
+    "Move",
+    "NativeStep",
+    "Node",
+    "Output",
+    "Peer",
+    "Place",
+    "Result",
+    "Stage",
+    "Unit",
+    "Wish",
+    "library",
+    "table",
+]
+
+NEVER: Final = 2**63 - 1
+STAGE_BITS: Final = 24
+OUT_OF_RANGE: Final = 100
+"""The status of a call where a value does not fit into the type of the model."""
+
+
+class Kind(IntEnum):
+    """How a member takes its step."""
+
+    BY_PYTHON = 0
+    FMI1 = 1
+    FMI2 = 2
+    FMI3 = 3
+
+
+class Stage(IntEnum):
+    """What a member is doing."""
+
+    WAITING = 0
+    SETTING = 1
+    STEPPING = 2
+    GETTING = 3
+    IN_PYTHON = 4
+    STEPPED = 5
+
+
+class Base(IntEnum):
+    """What an offset of a table is relative to; row ``n`` of the gates is ``FIRST_GATE + n``."""
+
+    FIXED = 0
+    OUTPUT = 1
+    WATCHED = 2
+    FIRST_GATE = 3
+
+
+class Result(IntEnum):
+    """Why `node_run` returned."""
+
+    SLICE = 0
+    DONE = 1
+    ATTENTION = 2
+    BLOCKED = 3
+    PYTHON = 4
+    STATUS = 5
+    FORGED = 6
+
+
+NUMBER_TYPES: Final[dict[VariableType, int]] = {
+    "Float64": 0,
+    "Float32": 1,
+    "Int8": 2,
+    "UInt8": 3,
+    "Int16": 4,
+    "UInt16": 5,
+    "Int32": 6,
+    "UInt32": 7,
+    "Int64": 8,
+    "Enumeration": 8,
+    "UInt64": 9,
+    "Boolean": 10,
+}
+"""The types of `Move`. An Enumeration is 64 bits in a ring."""
+
+
+class Place(Structure):
+    """Which process this is among those of the memory."""
+
+    _fields_ = (("bells", c_void_p), ("processes", c_int64), ("own", c_int64))
+
+
+class Gate(Structure):
+    """The rows of one source, for one delay."""
+
+    _fields_ = (
+        ("counter", c_void_p),
+        ("rows", c_void_p),
+        ("stride", c_int64),
+        ("mask", c_int64),
+        ("lead", c_int64),
+        ("points", c_int64),
+        ("known", c_int64),
+    )
+
+
+class Move(Structure):
+    """Values that are copied from one base to another, with factor, offset and type."""
+
+    _fields_ = (
+        ("from_base", c_int64),
+        ("from_", c_int64),
+        ("to_base", c_int64),
+        ("to", c_int64),
+        ("count", c_int64),
+        ("from_type", c_int32),
+        ("to_type", c_int32),
+        ("scaled", c_int32),
+        ("negated", c_int32),
+        ("factor", c_double),
+        ("offset", c_double),
+    )
+
+
+class Call(Structure):
+    """A getter or a setter of an FMU; ``size`` is -1 where it takes no number of values."""
+
+    _fields_ = (
+        ("function", c_void_p),
+        ("references", c_void_p),
+        ("count", c_int64),
+        ("base", c_int64),
+        ("values", c_int64),
+        ("size", c_int64),
+    )
+
+
+class Output(Structure):
+    """A ring that a member writes."""
+
+    _fields_ = (("rows", c_void_p), ("stride", c_int64), ("mask", c_int64))
+
+
+class Member(Structure):
+    """One instance: how it gets its inputs, steps, and gives its outputs."""
+
+    _fields_ = (
+        ("gates", POINTER(Gate)),
+        ("loads", POINTER(Move)),
+        ("setters", POINTER(Call)),
+        ("getters", POINTER(Call)),
+        ("stores", POINTER(Move)),
+        ("n_gates", c_int64),
+        ("n_loads", c_int64),
+        ("n_setters", c_int64),
+        ("n_getters", c_int64),
+        ("n_stores", c_int64),
+        ("kind", c_int64),
+        ("component", c_void_p),
+        ("do_step", c_void_p),
+        ("said", c_void_p),
+        ("start_time", c_double),
+        ("base_step_size", c_double),
+        ("step_size", c_double),
+        ("points", c_int64),
+        ("every", c_int64),
+        ("last_step", c_int64),
+        ("outputs", Output * 2),
+        ("counter", c_void_p),
+        ("bases", POINTER(c_void_p)),
+        ("step", c_int64),
+        ("stage", c_int64),
+        ("outcome", c_int64),
+    )
+
+
+class Unit(Structure):
+    """Members that step together."""
+
+    _fields_ = (
+        ("members", POINTER(Member)),
+        ("n_members", c_int64),
+        ("tick_points", c_int64),
+        ("last_tick", c_int64),
+        ("tick", c_int64),
+        ("next", c_int64),
+        ("burst", c_int64),
+        ("stopped", c_int64),
+        ("spent_ns", c_int64),
+        ("blocked_by", c_void_p),
+        ("need", c_int64),
+    )
+
+
+class Peer(Structure):
+    """A process that may be some points behind, and no more."""
+
+    _fields_ = (("progress", c_void_p), ("window", c_int64))
+
+
+class Node(Structure):
+    """All units of a process."""
+
+    _fields_ = (
+        ("place", Place),
+        ("units", POINTER(Unit)),
+        ("n_units", c_int64),
+        ("peers", POINTER(Peer)),
+        ("n_peers", c_int64),
+        ("ceiling", c_void_p),
+        ("progress", c_void_p),
+        ("last_point", c_int64),
+        ("slice_ns", c_int64),
+        ("wait_ns", c_int64),
+        ("spins", c_int64),
+        ("allowed", c_int64),
+        ("patience", c_int64),
+        ("waited_ns", c_int64),
+        ("restored", c_int64),
+        ("late", c_int64),
+        ("unit", c_int64),
+        ("member", c_int64),
+        ("attention", c_int64),
+    )
+
+
+class Wish(Structure):
+    """One value of a counter that somebody waits for."""
+
+    _fields_ = (("counter", c_void_p), ("need", c_int64))
+
+
+class NativeStep(NamedTuple):
+    """How an FMU takes a step without Python: the tables of `call_step`.
+
+    Attributes:
+        kind: how its function of the step is called.
+        component: address of the instance.
+        do_step: address of this function.
+        said: address of its other results (FMI 3.0), or 0.
+        loads: from the row of inputs to buffers of other types.
+        setters: read the row of inputs, or buffers.
+        getters: write the rows of `Base.OUTPUT` and `Base.WATCHED`, or buffers.
+        stores: from buffers to these rows.
+        kept: what the addresses point to.
+    """
+
+    kind: Kind
+    component: int
+    do_step: int
+    said: int
+    loads: Sequence[Move]
+    setters: Sequence[Call]
+    getters: Sequence[Call]
+    stores: Sequence[Move]
+    kept: Sequence[object]
+
+
+def table(kind: Any, items: Sequence[Any]) -> Any:  # noqa: ANN401 ctypes has no type for an array of any structure
+    """The items as a C array, which may be empty."""
+    return (kind * max(len(items), 1))(*items)
+
+
+_STRUCTURES: Final = (Place, Gate, Move, Call, Output, Member, Unit, Peer, Node, Wish)
+
+
+class _Library:
+    """The functions of `burst.c`. Those that may take long release the interpreter's lock."""
+
+    def __init__(self, path: str) -> None:
+        quick, slow = ctypes.PyDLL(path), ctypes.CDLL(path)
+        self.run = slow.node_run
+        self.run.argtypes, self.run.restype = (c_void_p,), c_int64
+        self.sleep_for = slow.sleep_for
+        self.sleep_for.argtypes = (c_void_p, c_uint32, c_void_p, c_int64, c_int64, c_void_p)
+        self.sleep_for.restype = c_int64
+        self.member_step = slow.member_step
+        self.member_step.argtypes, self.member_step.restype = (c_void_p, c_int64), c_int64
+        self.attend = quick.node_attend
+        self.attend.argtypes, self.attend.restype = (c_void_p,), None
+        self.attended = quick.node_attended
+        self.attended.argtypes, self.attended.restype = (c_void_p,), None
+        self.ring_bell = quick.ring_bell
+        self.ring_bell.argtypes, self.ring_bell.restype = (c_void_p,), None
+        self.bell_seen = quick.bell_seen
+        self.bell_seen.argtypes, self.bell_seen.restype = (c_void_p,), c_uint32
+        self.counter_raise = quick.counter_raise
+        self.counter_raise.argtypes, self.counter_raise.restype = (c_void_p, c_void_p, c_int64), None
+        self.counter_value = quick.counter_value
+        self.counter_value.argtypes, self.counter_value.restype = (c_void_p,), c_int64
+        sizes = (c_int64 * len(_STRUCTURES))()
+        quick.structure_sizes.restype = c_int64
+        count = quick.structure_sizes(sizes)
+        if count != len(_STRUCTURES) or list(sizes) != [ctypes.sizeof(structure) for structure in _STRUCTURES]:
+            msg = f"{path} was built from other structures"
+            raise OSError(msg)
+
+
+def _load() -> _Library | None:
+    path = load_library()
+    return _Library(path) if path is not None else None
+
+
+library: Final = _load()
