@@ -36,7 +36,7 @@
 /* ---- shared memory */
 
 typedef struct {
-  _Atomic int64_t value;   /* rows of a ring, or a communication point */
+  _Atomic int64_t value;   /* rows of a ring, points that are known of a node, or points that are granted */
   _Atomic int64_t wake_at; /* the lowest need of a sleeper */
   int64_t unused[6];
   _Atomic int64_t needs[]; /* one for each process: the value that it sleeps for; 0: it does not sleep */
@@ -479,8 +479,8 @@ static void publish(Node *node) {
     int64_t own = covered(&node->units[i], node->last_point);
     if (own < least) least = own;
   }
-  if (least > atomic_load_explicit(&node->progress->value, memory_order_relaxed))
-    raise_counter(&node->place, node->progress, least);
+  if (least >= atomic_load_explicit(&node->progress->value, memory_order_relaxed))
+    raise_counter(&node->place, node->progress, least + 1);
 }
 
 /* Before this process waits or leaves: whoever waits for it is awake. */
@@ -504,11 +504,11 @@ static int64_t allow(Node *node, int64_t point, Unit *unit) {
   }
   for (int64_t i = 0; i < node->n_peers; i++) {
     const Peer *peer = &node->peers[i];
-    int64_t limit = value_of(peer->progress) + peer->window;
+    int64_t limit = value_of(peer->progress) - 1 + peer->window;
     if (limit < allowed) allowed = limit;
     if (limit <= point) {
       unit->blocked_by = peer->progress;
-      unit->need = point + 1 - peer->window;
+      unit->need = point + 2 - peer->window;
       return allowed;
     }
   }
@@ -637,8 +637,9 @@ static int advance(Node *node, Unit *unit, int64_t *ticks) {
     }
     if (node->n_units == 1) {
       int64_t reached = unit->n_members == 1 ? points_of(unit->members, node->last_point) : unit->tick + 1;
-      if (reached > atomic_load_explicit(&node->progress->value, memory_order_relaxed))
-        raise_counter(&node->place, node->progress, reached < node->last_point ? reached : node->last_point);
+      if (reached > node->last_point) reached = node->last_point;
+      if (reached >= atomic_load_explicit(&node->progress->value, memory_order_relaxed))
+        raise_counter(&node->place, node->progress, reached + 1);
     }
     if (atomic_load_explicit(&node->attention, memory_order_relaxed)) {
       unit->tick++;
