@@ -154,7 +154,8 @@ typedef struct {
   Counter *progress; /* of this node */
   int64_t last_point;
   int64_t slice_ns;
-  int64_t wait_ns;   /* how long to sleep where nothing can step; 0: leave at once */
+  int64_t wait_ns;   /* how long to sleep where nothing can step */
+  int64_t eager;     /* whether to leave, not to sleep, after a step: its rows have to be sent */
   int64_t spins;     /* whether it spins before it sleeps */
   int64_t allowed;
   int64_t patience;
@@ -655,12 +656,12 @@ out:
 }
 
 /* Sleep until a unit may step, Python has something to do, or the time is over. */
-static int64_t await(Node *node) {
+static int64_t await(Node *node, int64_t limit_ns) {
   uint32_t seen = bell_seen(&node->place);
   if (atomic_load(&node->attention)) return 0;
   wake_all(node);
   Wish wishes[64]; /* of more units, the others look again when one of these may step, or the time is over */
-  int64_t n = 0, limit_ns = node->wait_ns;
+  int64_t n = 0;
   for (int64_t i = 0; i < node->n_units; i++) {
     const Unit *unit = &node->units[i];
     if (unit->stopped || unit->tick >= unit->last_tick) continue;
@@ -679,7 +680,7 @@ static int64_t await(Node *node) {
 PUBLIC int64_t node_run(Node *node) {
   const int64_t start = now();
   int64_t begin = start;
-  atomic_store_explicit(&node->attention, atomic_load(&node->attention), memory_order_relaxed);
+  int any = 0;
   for (;;) {
     int stepped = 0, left = 0;
     for (int64_t i = 0; i < node->n_units; i++) {
@@ -690,7 +691,7 @@ PUBLIC int64_t node_run(Node *node) {
       int64_t end = now(), elapsed = end - begin;
       begin = end;
       if (ticks > 0) {
-        stepped = 1;
+        stepped = any = 1;
         unit->spent_ns += elapsed;
         if (ticks == unit->burst && elapsed < node->slice_ns)
           unit->burst = unit->burst < 4096 ? 2 * unit->burst : 4096;
@@ -712,7 +713,9 @@ PUBLIC int64_t node_run(Node *node) {
       return DONE;
     }
     if (!stepped) {
-      if (node->wait_ns == 0 || !await(node)) {
+      /* After a step only a little: its rows may be streamed, or sent. */
+      int64_t limit_ns = !any ? node->wait_ns : node->eager ? 0 : node->slice_ns - (begin - start);
+      if (limit_ns <= 0 || !await(node, limit_ns)) {
         wake_all(node);
         return BLOCKED;
       }

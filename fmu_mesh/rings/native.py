@@ -231,6 +231,7 @@ class Node(Structure):
         ("last_point", c_int64),
         ("slice_ns", c_int64),
         ("wait_ns", c_int64),
+        ("eager", c_int64),
         ("spins", c_int64),
         ("allowed", c_int64),
         ("patience", c_int64),
