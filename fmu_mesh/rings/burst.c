@@ -14,8 +14,8 @@
  *             bell += 1, futex_wake(bell)
  *
  * Of the two, at least one sees what the other has written before its fence. Within a burst the writer looks at wake_at
- * without the fence, which is late by nanoseconds at most; with the fence at the end of a burst and before it waits
- * itself. Every sleep has a time limit. docs/rings.md explains the protocol; tests/property/test_waiting.py explores it.
+ * without the fence: a sleeper that it misses is seen after the next step. With the fence it looks at the end of a burst
+ * and before it waits itself. Every sleep has a time limit. docs/rings.md explains the protocol; tests/property/test_waiting.py explores it.
  */
 #define _GNU_SOURCE
 #include <fenv.h>
@@ -186,7 +186,7 @@ static void relax(void) {
 }
 
 static void lower(_Atomic int64_t *place, int64_t value) {
-  int64_t seen = atomic_load_explicit(place, memory_order_relaxed);
+  int64_t seen = atomic_load(place);
   while (value < seen && !atomic_compare_exchange_weak(place, &seen, value)) continue;
 }
 
@@ -195,20 +195,24 @@ PUBLIC void ring_bell(Bell *bell) {
   syscall(SYS_futex, &bell->rung, FUTEX_WAKE, INT_MAX, NULL, NULL, 0);
 }
 
-/* Wake everybody whose need is met. */
+/* Wake everybody whose need is met; again if the value has grown meanwhile. */
 static void wake(const Place *place, Counter *counter) {
-  atomic_store(&counter->wake_at, NEVER);
-  int64_t lowest = NEVER, value = atomic_load(&counter->value);
-  for (int64_t process = 0; process < place->processes; process++) {
-    int64_t need = atomic_load(&counter->needs[process]);
-    if (need == 0) continue;
-    if (need > value) {
-      if (need < lowest) lowest = need;
-    } else if (atomic_compare_exchange_strong(&counter->needs[process], &need, 0)) {
-      ring_bell(&place->bells[process]);
+  int64_t lowest;
+  do {
+    atomic_store(&counter->wake_at, NEVER);
+    int64_t value = atomic_load(&counter->value);
+    lowest = NEVER;
+    for (int64_t process = 0; process < place->processes; process++) {
+      int64_t need = atomic_load(&counter->needs[process]);
+      if (need == 0) continue;
+      if (need > value) {
+        if (need < lowest) lowest = need;
+      } else if (atomic_compare_exchange_strong(&counter->needs[process], &need, 0)) {
+        ring_bell(&place->bells[process]);
+      }
     }
-  }
-  if (lowest != NEVER) lower(&counter->wake_at, lowest);
+    if (lowest != NEVER) lower(&counter->wake_at, lowest);
+  } while (lowest != NEVER && atomic_load(&counter->value) >= lowest);
 }
 
 static inline void wake_if_needed(const Place *place, Counter *counter) {
@@ -228,6 +232,7 @@ static inline int64_t value_of(const Counter *counter) {
 
 /* Raise a counter, and wake who needs it: for Python. */
 PUBLIC void counter_raise(const Place *place, Counter *counter, int64_t value) {
+  if (value <= atomic_load(&counter->value)) return;
   atomic_store_explicit(&counter->value, value, memory_order_release);
   atomic_thread_fence(memory_order_seq_cst);
   wake_if_needed(place, counter);
@@ -505,7 +510,9 @@ static int64_t allow(Node *node, int64_t point, Unit *unit) {
   }
   for (int64_t i = 0; i < node->n_peers; i++) {
     const Peer *peer = &node->peers[i];
-    int64_t limit = value_of(peer->progress) - 1 + peer->window;
+    int64_t known = value_of(peer->progress);
+    if (known > node->last_point + 1) known = node->last_point + 1;
+    int64_t limit = known - 1 + peer->window;
     if (limit < allowed) allowed = limit;
     if (limit <= point) {
       unit->blocked_by = peer->progress;
@@ -673,7 +680,7 @@ static int64_t await(Node *node, int64_t limit_ns) {
   int64_t start = now();
   int64_t is_granted = sleep_for(&node->place, seen, wishes, n, limit_ns, &node->late);
   node->waited_ns += now() - start;
-  return is_granted;
+  return is_granted || bell_seen(&node->place) != seen;
 }
 
 /* Step as far as it goes, for about one slice of time. Call it again and again. */

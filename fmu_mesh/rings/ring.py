@@ -70,6 +70,18 @@ class Ring:
         shape, strides = (self.rows, width), (self.stride, dtype.itemsize)
         return np.ndarray(shape, dtype, self._flat.data, offset, strides)
 
+    def place_in_row(self, part: int, element: int) -> int:
+        """Where an element of a part lies in a row, in bytes."""
+        return self.offsets[part] + element * self.parts[part].itemsize
+
+    def stamp(self, row: int) -> None:
+        """Mark a row as complete."""
+        self.stamps[row & self.mask] = row + 1
+
+    def has_row(self, row: int) -> bool:
+        """Whether a row is complete, and has not been overwritten."""
+        return bool(self.stamps[row & self.mask] == row + 1)
+
     def part(self, type_: VariableType) -> NDArray[Any]:
         """The array of one type, of shape (rows, elements); it has no elements if no column has this type."""
         if type_ in self._types:
