@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import ctypes
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from threading import Lock
 from time import perf_counter
-from typing import Any, Final
+from typing import Final
 
 from ..errors import ProtocolBroken, TerminationRequested
 from ..instances.call_guard import floating_point_changed, restore_floating_point

@@ -16,6 +16,7 @@ from ..rings.transfer import Transfer
 from ..simtime import TimeGrid
 from ..system.layout import Layout
 from ..system.plan import InstancePlan
+from .links import OutLink
 
 __all__ = ["Position", "Runner", "Source", "sources_of"]
 
@@ -65,12 +66,11 @@ class Runner:
 
     Attributes:
         sources: where its inputs come from.
+        out_links: send its rows to those who do not read its ring.
         watched: a ring with further outputs, which somebody watches.
     """
 
-    def __init__(
-        self, plan: InstancePlan, instance: Instance, grid: TimeGrid, outputs: Ring, counter: Counter
-    ) -> None:
+    def __init__(self, plan: InstancePlan, instance: Instance, grid: TimeGrid, outputs: Ring, counter: Counter) -> None:
         self.plan = plan
         self.name = plan.name
         self.instance = instance
@@ -78,6 +78,7 @@ class Runner:
         self.outputs = outputs
         self.counter = counter
         self.sources: list[Source] = []
+        self.out_links: list[OutLink] = []
         self.watched: Ring | None = None
         self.last_step = grid.last_point // plan.step_points
         self.grid = grid
@@ -96,6 +97,24 @@ class Runner:
         """The outputs after Initialization Mode are complete: row 0."""
         self.outputs.stamp(0)
         self.counter.raise_to(1)
+
+    def stop(self) -> None:
+        """This instance takes no more steps: its outputs hold to the end."""
+        self.last_step = self.step
+        self._changed()
+
+    def flush(self, *, lazy: bool = True) -> None:
+        """Send all rows that were not sent yet; those for the recorder only if ``lazy``."""
+        end = self.step + 1
+        for link in self.out_links:
+            if lazy or not link.to_recorder:
+                link.flush(end)
+
+    def send_last(self, end: int) -> None:
+        """The run ends early: send the recorder the remaining rows before own step ``end``, and that no more come."""
+        for link in self.out_links:
+            if link.to_recorder:
+                link.send_last(end)
 
     def follow(self, position: Position, changed: Callable[[], None]) -> None:
         """From now on, ``position`` is where this runner is; ``changed`` is called when it steps in another way."""

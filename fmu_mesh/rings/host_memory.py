@@ -25,10 +25,13 @@ from ..system.memory_map import MemoryMap, RingPlace
 from . import native
 from .ring import Ring
 
-__all__ = ["Counter", "HostMemory", "Offer", "Wish", "can_share"]
+__all__ = ["ONE_CORE", "Counter", "HostMemory", "Offer", "Wish", "can_share"]
 
 _NAME: Final = "fmu_mesh"
 _TOKEN_BYTES: Final = 16
+
+ONE_CORE: Final = not hasattr(os, "sched_getaffinity") or len(os.sched_getaffinity(0)) == 1
+"""Whether the process that somebody waits for cannot run meanwhile."""
 
 Wish = tuple["Counter", int]
 """A counter, and the value that somebody waits for."""
@@ -75,7 +78,9 @@ class HostMemory:
         number = map_.number_of(process)
         self.place = native.Place(self.address + map_.bells, len(map_.processes), number)
         self.grant = self.counter(map_.grant)
-        self.progress = {name: self.counter(offset) for name, offset in zip(map_.processes, map_.progress, strict=False)}
+        self.progress = {
+            name: self.counter(offset) for name, offset in zip(map_.processes, map_.progress, strict=False)
+        }
         self._lock = threading.Condition()
         self._rung = False
 

@@ -1,7 +1,7 @@
-"""Moving values from a row of a source into the row of inputs of a target, with the factor and the offset of a connection.
+"""Moving values from a row of a source into the row of inputs of a target, with factor and offset of a connection.
 
-Which row a step reads is `fmu_mesh.system.coupling_rule`. The burst moves numbers by tables (`moves`); the same moves in
-Python are `step`, which is also the only way for text.
+Which row a step reads is `fmu_mesh.system.coupling_rule`. The burst moves numbers by tables (`moves`); the same moves
+in Python are `step`, which is also the only way for text.
 """
 
 from __future__ import annotations

@@ -161,7 +161,12 @@ def run_master(run: RunPlan, emit: Callable[[Event], None]) -> Outcome:
             if RECORDER in plan.nodes:
                 result = open_result(run.loaded, plan.system, process.folder if process.is_child else None)
                 with Recorder(
-                    plan.nodes[RECORDER], session, result, lambda: master.has_begun, launch=process.launch
+                    plan.nodes[RECORDER],
+                    session,
+                    result,
+                    lambda: master.has_begun,
+                    launch=process.launch,
+                    memory=master.memory_for(RECORDER),
                 ) as recorder:
                     master.run()
             else:

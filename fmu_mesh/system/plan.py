@@ -22,8 +22,8 @@ from .graph import cycle_through, feedback_edges, strongly_connected, topologica
 from .initialization_plan import InitializationPlan, Loop, plan_initialization
 from .layout import Layout, row_bytes, rows_for
 from .linear_inputs import LinearInput, linear_inputs
-from .system import Connection, ResolvedSystem, SystemInstance
 from .memory_map import MemoryMap, RingPlace, map_memory
+from .system import Connection, ResolvedSystem, SystemInstance
 from .window import recorder_window, window_of
 
 __all__ = ["MASTER", "RECORDER", "Feed", "InstancePlan", "Link", "NodePlan", "Plan", "make_plan"]
@@ -308,7 +308,10 @@ def _nodes(plan: Plan) -> dict[str, NodePlan]:
             progress_stride=windows[node] // 4 if windows[node] >= 4 * longest_step else 1,
             windows=tuple(windows.items()),
             memory=memory,
-            rings=tuple(places[name] for name in dict.fromkeys([*members, *(link.source for link in links_in if not link.initial_only)])),
+            rings=tuple(
+                places[name]
+                for name in dict.fromkeys([*members, *(link.source for link in links_in if not link.initial_only)])
+            ),
             timeouts=config.timeouts,
             instances=tuple(_instance_plan(plan, system.instances[name], outputs[name]) for name in members),
             units=tuple(dict.fromkeys(within[name] for name in members)),
