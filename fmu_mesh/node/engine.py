@@ -298,15 +298,13 @@ class PlainEngine(Engine):
         """See `Engine`."""
         started = perf_counter()
         seen = self._memory.seen()
-        stepped = advanced = True
-        any_step = False
-        while advanced and not self._attention and perf_counter() - started < _SLICE_S:
-            advanced = False
-            for number in range(len(self.units)):
-                advanced = self._advance(number, started) or advanced
-            any_step = any_step or advanced
+        stepped = False
+        while not self._attention:
+            advanced = [self._advance(number, started) for number in range(len(self.units))]
             self._progress.raise_to(self.covered + 1)
-        stepped = any_step
+            stepped = stepped or any(advanced)
+            if not any(advanced) or perf_counter() - started > _SLICE_S:
+                break
         if not stepped and not self._attention and wait_s > 0 and not eager:
             began = perf_counter()
             self._memory.sleep(seen, wait_s)
