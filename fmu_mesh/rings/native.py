@@ -184,11 +184,20 @@ class Said(Structure):
         ("step", c_int64),
     )
 
+    @property
+    def addresses(self) -> tuple[int, int, int, int]:
+        """Of the results of a step in FMI 3.0: `event_needed`, `terminate`, `early` and `last_time`."""
+        first = ctypes.addressof(self)
+        return first, first + 1, first + 2, first + 8
+
     def note(self, *, step: int | None = None, time: float | None = None, quiet_until: float | None = None) -> None:
         """Change what is given."""
-        self.step = self.step if step is None else step
-        self.time = self.time if time is None else time
-        self.quiet_until = self.quiet_until if quiet_until is None else quiet_until
+        if step is not None:
+            self.step = step
+        if time is not None:
+            self.time = time
+        if quiet_until is not None:
+            self.quiet_until = quiet_until
 
     def clear(self) -> None:
         """Before a step in FMI 3.0: nothing is said yet."""
