@@ -1,6 +1,7 @@
 """The program of one process of a run: `python -Pm fmu_mesh.run node PLAN NODE`, or `master PLAN`, or `gateway PLAN`.
 
-`fmu_mesh.run.launcher` starts it. PLAN is the file of a run plan. The process ends with the process that started it.
+PLAN is the file of a run plan. The launcher lets the fork server start it, which is `forks DESCRIPTOR`; a node that
+needs another Python is started by exec. The process ends with the process that started it.
 """
 
 import sys
@@ -17,8 +18,7 @@ def main() -> int:
         from .limits import RUN_MIB  # noqa: PLC0415 as above
         from .program import exit_code_of  # noqa: PLC0415 as above
 
-        role, file, *node = sys.argv[1:]
-        return last_exit.with_code(exit_code_of(lambda: _run(role, file, *node), RUN_MIB))
+        return last_exit.with_code(exit_code_of(lambda: _run(*sys.argv[1:]), RUN_MIB))
     except KeyboardInterrupt:
         return Interrupted.exit_code
 
@@ -27,14 +27,26 @@ def _run(role: str, plan: str, node: str = "") -> int:
     """Take a role in the run."""
     from pathlib import Path  # noqa: PLC0415 as above
 
+    from setproctitle import setproctitle  # noqa: PLC0415 as above
+
     from ..errors import FmuMeshError  # noqa: PLC0415 as above
     from .events import EventWriter  # noqa: PLC0415 as above
     from .run_plan import read_node, read_run  # noqa: PLC0415 as above
 
     file = Path(plan)
     match role:
+        case "forks":
+            from .fork_server import serve  # noqa: PLC0415 only what the role needs
+            from .process import die_with_parent  # noqa: PLC0415 as above
+
+            setproctitle("fmu-mesh fork server")
+            die_with_parent()
+            forked = serve(int(plan))
+            return 0 if forked is None else _run(*forked)
         case "node":
-            from .roles import run_node  # noqa: PLC0415 only what the role needs
+            from .roles import run_node  # noqa: PLC0415 as above
+
+            setproctitle(f"fmu-mesh node {node}")
 
             # What a component prints is shown at once, not when the buffer is full.
             sys.stdout.reconfigure(line_buffering=True)  # type: ignore[union-attr]  # it is a text file
@@ -42,14 +54,18 @@ def _run(role: str, plan: str, node: str = "") -> int:
         case "master":
             from .roles import run_master  # noqa: PLC0415 as above
 
+            run = read_run(file)
+            setproctitle(f"fmu-mesh master {run.mesh}")
             try:
-                run_master(read_run(file), EventWriter())
+                run_master(run, EventWriter())
             except FmuMeshError as error:
                 raise error.already_reported()  # noqa: B904 the launcher has the event and shows it
         case _:
             from .gateway_role import run_gateway  # noqa: PLC0415 as above
 
-            run_gateway(read_run(file), EventWriter())
+            run = read_run(file)
+            setproctitle(f"fmu-mesh gateway {run.mesh}")
+            run_gateway(run, EventWriter())
     return 0
 
 
