@@ -245,7 +245,7 @@ class _Server:
             if not ready:
                 self._end_all(signal.SIGKILL)
         if self._asked is not None:
-            raise Interrupted(f"{self._asked} was received")
+            raise Interrupted(f"{self._asked} was received").already_reported()  # the launcher tells it by the code
         return None
 
     def _take_request(self) -> tuple[str, ...] | None:
