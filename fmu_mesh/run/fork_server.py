@@ -21,9 +21,8 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from importlib import import_module
 from types import FrameType
 from typing import IO, Final
 
@@ -35,8 +34,8 @@ from .child import own_command, own_environment
 
 __all__ = ["ForkServer", "Forked", "fork_server", "serve", "started_ahead"]
 
-_MODULES: Final = ("fmu_mesh.run.roles", "fmu_mesh.instances.fmi.opening", "setproctitle")
-"""What is imported before the first fork. None of them starts a thread; a test checks that."""
+Job = Callable[[], None]
+"""What a process does, from its start to its end."""
 
 _ROOM: Final = "-" * 64
 """An argument that makes room for the titles of the processes: a title is not longer than the command."""
@@ -198,29 +197,34 @@ class Forked:
         return self._code if self._code is not None else MeshLost.exit_code
 
 
-def serve(control: int) -> tuple[str, ...] | None:
-    """Be the fork server. Returns in each forked process, with its arguments; in the server at its end, with None.
+def serve(control: int, job: Callable[..., Job]) -> Job | None:
+    """Be the fork server. Returns in each forked process, with its job; in the server at its end, with None.
 
     Args:
         control: the descriptor of the server's end of the pair of sockets.
+        job: returns the job of a request from its arguments. It is called in the server: what it opens or reads, all
+            processes have that are forked later.
 
     Raises:
         ConfigurationError: the system starts no more processes.
         Interrupted: the server was asked to end.
     """
-    for name in _MODULES:
-        import_module(name)
+    from ..instances.registry import preload  # noqa: PLC0415 only the server needs it
+    from . import roles  # noqa: F401, PLC0415 as above
+
+    preload()
     gc.collect()
     gc.freeze()  # otherwise the next collection in a forked process would copy the memory that it shares
-    return _Server(control).run()
+    return _Server(control, job).run()
 
 
 class _Server:
     """The fork server itself."""
 
-    def __init__(self, control: int) -> None:
+    def __init__(self, control: int, job: Callable[..., Job]) -> None:
         os.set_inheritable(control, False)  # noqa: FBT003 it takes no keyword
         self._control = socket.socket(fileno=control)
+        self._job = job
         self._reading, self._writing = os.pipe()
         os.set_blocking(self._reading, False)
         os.set_blocking(self._writing, False)
@@ -230,7 +234,7 @@ class _Server:
         self._asked: str | None = None
         self._deadline: float | None = None
 
-    def run(self) -> tuple[str, ...] | None:
+    def run(self) -> Job | None:
         """Serve; see `serve`."""
         self._before = {number: signal.signal(number, _ignore) for number in _SIGNALS}
         signal.set_wakeup_fd(self._writing, warn_on_full_buffer=False)
@@ -240,16 +244,16 @@ class _Server:
             ready, _, _ = select.select([self._reading, *requests], [], [], left_s)
             if self._reading in ready:
                 self._take_signals()
-            if self._control in ready and (arguments := self._take_request()) is not None:
-                return arguments
+            if self._control in ready and (job := self._take_request()) is not None:
+                return job
             if not ready:
                 self._end_all(signal.SIGKILL)
         if self._asked is not None:
             raise Interrupted(f"{self._asked} was received").already_reported()  # the launcher tells it by the code
         return None
 
-    def _take_request(self) -> tuple[str, ...] | None:
-        """Fork a process; returns its arguments there, and None in the server."""
+    def _take_request(self) -> Job | None:
+        """Fork a process; returns its job there, and None in the server."""
         from setproctitle import setproctitle  # noqa: PLC0415 the launcher does without it
 
         data, descriptors, _, _ = socket.recv_fds(self._control, _REQUEST_BYTES, 2)
@@ -258,6 +262,7 @@ class _Server:
             return None
         request = msgspec.msgpack.decode(data, type=_Request)
         setproctitle(f"fmu-mesh fork server {request.mesh}")
+        job = self._job(*request.arguments)
         # A signal for the server must not run the handler of the server in the new process.
         signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)
         server = os.getpid()
@@ -268,7 +273,7 @@ class _Server:
             raise ConfigurationError(text, hint="Is the limit of processes (`ulimit -u`) too low?") from error
         if pid == 0:
             self._become(request, descriptors, server)
-            return request.arguments
+            return job
         self._numbers[pid] = request.number
         self._tell(_News(request.number, pid))
         for descriptor in descriptors:
