@@ -306,7 +306,7 @@ class PlainEngine(Engine):
             stepped = stepped or any(advanced)
             if not any(advanced) or perf_counter() - started > _SLICE_S:
                 break
-        if not stepped and not self._attention and wait_s > 0 and not eager:
+        if not stepped and not self._attention:
             began = perf_counter()
             self._memory.sleep(seen, wait_s)
             self.waited_s += perf_counter() - began
