@@ -310,7 +310,7 @@ class PlainEngine(Engine):
         for runner in self.runners:
             runner.follow(self._positions[runner.name], lambda: None)
 
-    def run(self, wait_s: float, *, eager: bool) -> bool:
+    def run(self, wait_s: float, *, eager: bool) -> bool:  # noqa: ARG002  it never waits after a step
         """See `Engine`."""
         started = perf_counter()
         seen = self._memory.seen()
