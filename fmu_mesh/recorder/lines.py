@@ -9,7 +9,7 @@ import base64
 import ctypes
 import math
 from collections.abc import Sequence
-from ctypes import c_int64, c_uint64, c_void_p
+from ctypes import c_int64, c_void_p
 from functools import cache
 from itertools import chain
 from typing import Any, Final, Protocol
@@ -28,6 +28,9 @@ _VALUE_BYTES: Final = 25
 _END_BYTES: Final = 40
 _LEAST_POWER, _MOST_POWER, _EXPONENTS = -293, 325, 2047
 """The sizes of the tables in `csv_rows.c`."""
+
+_COLUMN_FIELDS = 6
+"""A column in `csv_rows.c`: its address, stride, type; and three fields of its own."""
 
 
 class Lines(Protocol):
@@ -113,33 +116,17 @@ def _text(value: Value) -> str:
             return orjson.dumps(value).decode()
 
 
-class _Column(ctypes.Structure):
-    """A column in `csv_rows.c`."""
-
-    _fields_ = (
-        ("values", c_void_p),
-        ("stride", c_int64),
-        ("type", c_int64),
-        ("bits", c_uint64),
-        ("text", c_void_p),
-        ("size", c_int64),
-    )
-
-
 class _Native:
-    """The functions of `csv_rows.c`, and their tables."""
+    """The function of `csv_rows.c`: ``rows(columns, number of columns, rows, tables, text)``; and its tables."""
 
     def __init__(self, path: str) -> None:
-        functions = ctypes.CDLL(path)
-        self.rows = functions.csv_rows
-        self.rows.argtypes, self.rows.restype = (c_void_p, c_int64, c_int64, c_void_p, c_void_p), c_int64
+        library = ctypes.CDLL(path)
+        self.rows = ctypes.CFUNCTYPE(c_int64, c_void_p, c_int64, c_int64, c_void_p, c_void_p)(("csv_rows", library))
         powers = (_power(n) for n in range(_LEAST_POWER, _MOST_POWER + 1))
         halves = [half for power in powers for half in divmod(power, 2**64)]
         self._tables = np.array(halves + [0, 0] * _EXPONENTS, dtype=np.uint64)
         self.tables: int = self._tables.ctypes.data
-        functions.csv_prepare.argtypes = (c_void_p,)
-        functions.csv_prepare.restype = None
-        functions.csv_prepare(self.tables)
+        ctypes.CFUNCTYPE(None, c_void_p)(("csv_prepare", library))(self.tables)
 
 
 def _power(exponent: int) -> int:
@@ -170,10 +157,12 @@ class NativeLines:
         self.size = 0
         self._native = native
         self._dtypes = [np.dtype(DTYPES[type_]) for type_ in all_types]
-        self._columns = (_Column * len(all_types))(*(_Column(type=NUMBER_TYPES[type_]) for type_ in all_types))
+        self._columns = np.zeros((len(all_types), _COLUMN_FIELDS), np.int64)
+        self._columns_address: int = self._columns.ctypes.data
+        self._columns[:, 2] = [NUMBER_TYPES[type_] for type_ in all_types]
         self._rows, self._limit = rows, size
         self._text = np.empty(size + rows * len(all_types) * _VALUE_BYTES + _END_BYTES, np.uint8)
-        self._address: int = self._text.ctypes.data
+        self._text_address: int = self._text.ctypes.data
 
     def append(self, columns: Sequence[NDArray[Any]]) -> None:
         """Append a line for each row."""
@@ -182,11 +171,10 @@ class NativeLines:
         if any(array.shape != (rows,) for array in arrays) or self.size >= self._limit or rows > self._rows:
             msg = f"{rows} rows after {self.size} bytes, in columns of shape {[array.shape for array in arrays]}"
             raise ValueError(msg)  # the library would read or write beyond the end of an array
-        for place, array in zip(self._columns, arrays, strict=True):
-            place.values = array.ctypes.data
-            place.stride = array.strides[0]
-        place = self._address + self.size
-        self.size += self._native.rows(self._columns, len(arrays), rows, self._native.tables, place)
+        self._columns[:, 0] = [array.ctypes.data for array in arrays]
+        self._columns[:, 1] = [array.strides[0] for array in arrays]
+        end = self._text_address + self.size
+        self.size += self._native.rows(self._columns_address, len(arrays), rows, self._native.tables, end)
 
     def take(self) -> memoryview:
         """The text so far."""
