@@ -5,11 +5,12 @@
     wait until every node has registered; answer them all        (ready/ack)
     wait until every node is at point 0                          (Initialization Mode is over)
     until every node is at the last point, or at the one where an FMU asked to end the simulation:
-        grant = min(progress + window)                           (less if the wall clock or a pause limits it)
-        publish the grant if it grew; wait for progress
+        grant what all can step in about 50 ms                   (less if the wall clock or a pause limits it)
+        wait for progress
     tell the nodes to finish; wait for their reports
 
-The master never sees a value. Its work per grant depends on the number of nodes only.
+The master never sees a value. Grants and progress are counters in the memory of the host, and the nodes there keep the
+windows among themselves; a node that does not share this memory gets grants and tells its progress by messages.
 """
 
 from __future__ import annotations
@@ -33,13 +34,13 @@ from ..errors import (
     TerminationRequested,
     from_report,
 )
-from ..system.plan import RECORDER, Plan
+from ..rings.host_memory import HostMemory, Offer, Wish, can_share
+from ..system.plan import MASTER, RECORDER, Plan
 from ..wire.inbox import Inbox
-from ..wire.keys import MASTER, Keys, RunKeys
+from ..wire.keys import Keys, RunKeys
 from ..wire.messages import FINISH, GRANT, PROGRESS, NodeReport, decode_json
 from ..wire.refusals import payload_of
 from ..wire.session import RouterLink, tokens
-from ..wire.shared_memory import SharedInbox, available
 from ..wire.time_profile import TIME_LINE_ENTRIES, MeshProfile
 from ..wire.values import json_encoding
 from ..wire.views import GOING_ON, Command, CommandAnswer, MeshInfo, MeshState, MeshStatus
@@ -110,6 +111,8 @@ class Master:
         # The progress of a slower instance is the point up to which its outputs hold: its next own point minus one.
         self._most_ahead = 2 * max(item.step_points for item in plan.system.instances.values()) - 2
         self._windows = [plan.nodes[node].window for node in self._nodes]
+        self._sharing: list[int] = []
+        self._told = 0
         self._most_instances = max(len(node.instances) for node in plan.nodes.values())
         self._progress = [-1] * len(self._nodes)
         self._slowest = -1
@@ -126,17 +129,23 @@ class Master:
         self._clock = RunClock()
         self._published = 0.0
         self._moved = time.monotonic()
-        shares = config.zenoh.shared_memory and available()
-        # Polling before sleeping is useful only if nodes wait for every single grant.
-        self._inbox = Inbox(SharedInbox(dict.fromkeys(self._nodes, 0), spins=plan.window == 1) if shares else None)
-        senders = {self._run_keys.progress(node): node for node in self._nodes}
-        capacity = (plan.window + 64) * len(self._nodes) + 1024
-        self._inbox.open(session, self._run_keys, MASTER, senders, capacity)
+        self._shares = config.zenoh.shared_memory and can_share()
+        memory_of = HostMemory.create if self._shares else HostMemory.private
+        self._memory = memory_of(next(iter(plan.nodes.values())).memory, MASTER)
+        self._inbox = Inbox(self._memory)
+        self._inbox.open(session, self._run_keys, MASTER, {self._run_keys.progress(node): node for node in self._nodes})
         self._followers = Followers(self._inbox, lambda: self._state in ("running", "paused"))
-        self._members = Members(plan, session, self._run_keys, self._inbox, self._lose, settings.launch)
+        self._members = Members(plan, session, self._run_keys, self._offer(), self._lose, settings.launch)
         self._send = self._members.send
         self._server = MasterServer(session, self._keys, self._inbox, events, self.last_status, plan.system.instances)
         self._publish_status = self._server.publish_status
+
+    def memory_for(self, participant: str) -> HostMemory | None:
+        """The memory of the host for a participant in this process; None if nothing is shared."""
+        return self._memory.participant(participant) if self._shares else None
+
+    def _offer(self) -> Offer | None:
+        return self._memory.offer if self._shares else None
 
     def claim(self) -> None:
         """Become the visible master of this mesh; from now on queries wait until `run` answers them.
@@ -196,6 +205,7 @@ class Master:
         self._server.close()
         self._members.close()
         self._inbox.close()
+        self._memory.close()
 
     @property
     def has_begun(self) -> bool:
@@ -232,6 +242,7 @@ class Master:
                 raise self._members.absence()
             self._turn(0.25)
         self._members.welcome(TIME_LINE_ENTRIES // len(self._nodes) if self._watch is not None else 0)
+        self._sharing = [self._numbers[node] for node in self._members.shared]
 
     def _grant_to_the_end(self) -> None:
         if self._settings.paused:
@@ -258,38 +269,43 @@ class Master:
         self._clock.stop()
 
     def _publish_grant(self) -> float:
-        """Publish the grant if it can be increased; return how long to wait until the next check, in s."""
-        credit = min(map(operator.add, self._progress, self._windows))
+        """Raise the grant if it can be increased; return how long to wait until the next check, in s."""
         ahead = min(self._progress[number] for number in self._stepping)
-        credit = min(credit, ahead + self._reach.points(ahead, time.monotonic()))
-        grant = min(credit, self._last_point)
+        grant = min(ahead + self._reach.points(ahead, time.monotonic()), self._last_point)
         if self._hold is not None:
             grant = min(grant, self._hold)
         paced, pause = self._pacer.limit(grant, self._slowest)
-        grant = min(grant, paced)
+        grant = max(self._grant, min(grant, paced))
         if self._watch is not None:
-            self._watch.look(self._holder(credit, grant))
+            self._watch.look(self._holder(grant, paced))
         if grant > self._grant:
             now = time.monotonic()
             if self._slowest >= self._grant:  # they had nothing to do until now, because of the wall clock
                 self._moved = now
             self._grant = grant
-            self._members.grant(grant)
-        self._send_grant_as_sign_of_life()
+            self._memory.grant.raise_to(grant)
+        self._tell_grant()
         return min(pause, STATUS_S, self._heartbeat_s)
 
-    def _send_grant_as_sign_of_life(self) -> None:
-        """Send the same grant again: nodes that wait for a slow FMU elsewhere then know that the master lives."""
+    def _tell_grant(self) -> None:
+        """Send the grant to nodes that cannot read it, and to all as a sign that the master lives."""
         now = time.monotonic()
-        if now - self._published >= self._heartbeat_s:
+        is_due = now - self._published >= self._heartbeat_s
+        if len(self._sharing) < len(self._nodes):
+            credit = min(map(operator.add, self._progress, self._windows))
+            granted = max(self._told, min(self._grant, credit))
+            if granted > self._told:
+                self._told = granted
+                is_due = True
+        if is_due:
             self._published = now
-            self._send(GRANT, self._grant)
+            self._send(GRANT, self._told)
 
-    def _holder(self, credit: int, grant: int) -> str | None:
-        """What limits the grant at present, for a profile."""
+    def _holder(self, grant: int, paced: int) -> str | None:
+        """What limits the steps at present, for a profile."""
         if grant == self._last_point:
             return None
-        if grant < credit:
+        if grant in (self._hold, paced):
             return PAUSE if grant == self._hold else CLOCK
         return self._nodes[min(range(len(self._nodes)), key=lambda n: self._progress[n] + self._windows[n])]
 
@@ -310,7 +326,7 @@ class Master:
                 ]
                 raise DeadlineExceeded(f"{what} {spoken(*missing)} within {timeout_s:g} s")
             if self._state == "initializing":
-                self._send_grant_as_sign_of_life()
+                self._tell_grant()
             self._turn(min(0.1, self._heartbeat_s))
 
     def _turn(self, timeout_s: float) -> None:
@@ -319,10 +335,12 @@ class Master:
         Raises:
             FmuMeshError: a node failed or was lost.
         """
-        message, moved = self._inbox.wait(timeout_s), False
+        message, moved = self._inbox.wait(timeout_s, self._wishes()), False
         while message is not None:
             moved = self._take_progress(*message) or moved
             message = self._inbox.poll()
+        for number in self._sharing:
+            moved = self._progressed(number, self._memory.progress[self._nodes[number]].value - 1) or moved
         if moved:  # whichever it is: the slowest node may wait for another slow one
             self._slowest = min(self._progress)
             self._moved = time.monotonic()
@@ -335,14 +353,33 @@ class Master:
         if kind != PROGRESS:
             self._inbox.refusals.add(spoken(node), f"a message of kind {kind} is not one that the master accepts")
             return False
-        if not self._may_be_at(node, point):
-            self._fail(self._broken(node, f"is at point {point}"))
-            return False
         number = self._numbers[node]
+        if number in self._sharing or not self._progressed(number, point):
+            return False
+        self._memory.progress[node].raise_to(point + 1)
+        return True
+
+    def _progressed(self, number: int, point: int) -> bool:
+        """Store the progress of a node; return whether it has increased."""
+        if not self._may_be_at(self._nodes[number], point):
+            self._fail(self._broken(self._nodes[number], f"is at point {point}"))
+            return False
         if point <= self._progress[number]:
             return False
         self._progress[number] = point
         return True
+
+    def _wishes(self) -> list[Wish]:
+        """Wake up when the slowest node of this host has come so far that there is something to do."""
+        if not self._sharing:
+            return []
+        numbers = self._sharing if self._grant >= self._last_point else [*{*self._sharing} & {*self._stepping}]
+        slowest = min(numbers or self._sharing, key=self._progress.__getitem__)
+        reached = self._progress[slowest]
+        goal = self._grant if self._grant >= self._last_point else (reached + self._grant) // 2
+        if reached >= self._grant or self._state == "stopping":
+            return [] if reached >= 0 else [(self._memory.progress[self._nodes[slowest]], 1)]
+        return [(self._memory.progress[self._nodes[slowest]], max(goal, reached + 1) + 1)]
 
     def _fail(self, error: FmuMeshError) -> None:
         if self._failure is None:
@@ -462,9 +499,8 @@ class Master:
     # --- views
 
     def _info(self) -> MeshInfo:
-        return mesh_info(
-            self._plan, self._run_keys.run, self._settings.config_file, self._settings.endpoints, self._members.shared
-        )
+        shared = (*self._members.shared, MASTER) if self._members.shared else ()
+        return mesh_info(self._plan, self._run_keys.run, self._settings.config_file, self._settings.endpoints, shared)
 
     def last_status(self) -> MeshStatus:
         """The state of the run right now."""

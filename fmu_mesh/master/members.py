@@ -13,15 +13,15 @@ import msgspec
 import zenoh
 
 from ..errors import DeadlineExceeded, FmuMeshError, MessageRefused
+from ..rings.host_memory import Offer
 from ..system.digest import difference
 from ..system.plan import RECORDER, Plan
 from ..wire.inbox import Inbox
-from ..wire.keys import MASTER, RunKeys, batched
+from ..wire.keys import RunKeys, batched
 from ..wire.membership import Admission, NodeReady, Registration, Welcome
-from ..wire.messages import GRANT, HEADER, decode_json, encode_abort
+from ..wire.messages import HEADER, decode_json, encode_abort
 from ..wire.refusals import payload_of
 from ..wire.session import tokens, undeclare_all
-from ..wire.shared_memory import SharedOutlet
 
 __all__ = ["Followers", "Members", "spoken"]
 
@@ -35,12 +35,12 @@ class Members:
         plan: the plan of the whole mesh.
         session: the session of this process; the caller closes it.
         keys: the keys of the run.
-        inbox: the inbox of the master.
+        offer: the memory that processes of this host share; None if there is none.
         on_lost: called with the name of a node whose process is gone.
         launch: the launcher that started this process; None if it was started manually.
 
     Attributes:
-        shared: the participants that get all messages through shared memory: names of nodes, `@mesh` for the master.
+        shared: the nodes that use the shared memory, and the recorder.
 
     Call sequence: `register`, `ready` and `token_changed` for messages that arrive; `welcome` when `complete` is true;
     then `send`. `abort` may be called at any time, `close` at the end.
@@ -51,7 +51,7 @@ class Members:
         plan: Plan,
         session: zenoh.Session,
         keys: RunKeys,
-        inbox: Inbox,
+        offer: Offer | None,
         on_lost: Callable[[str], None],
         launch: str | None = None,
     ) -> None:
@@ -60,14 +60,13 @@ class Members:
         self._keys = keys
         self._timeouts = plan.system.config.timeouts
         self._nodes = list(plan.nodes)
-        self._inbox = inbox
+        self._offer = offer
         self._on_lost = on_lost
         self._launch = launch
         self._admitted: dict[str, Registration] = {}
         self._refused: list[str] = []
         self._ready: dict[str, tuple[NodeReady, zenoh.Query]] = {}
         self._welcomed = False
-        self._outlets: dict[str, SharedOutlet] = {}
         self.shared: tuple[str, ...] = ()
         self._grant_keys = {
             node: key for key, part in zip(keys.grants(self._nodes), batched(self._nodes), strict=True) for node in part
@@ -76,8 +75,6 @@ class Members:
             session.declare_publisher(key, congestion_control=zenoh.CongestionControl.BLOCK, express=True)
             for key in keys.grants(self._nodes)
         ]
-        self._senders: list[Callable[[bytes], None]] = [publisher.put for publisher in self._grants]
-        self._stepping = self._senders
 
     def register(self, query: zenoh.Query) -> None:
         """Admit a node, or refuse one that is not part of this run; the run is not affected.
@@ -90,7 +87,7 @@ class Members:
             reason = self._reason_against(registration)
             if reason is None:
                 self._admitted[registration.node] = registration
-                admission = Admission(self._keys.run, self._grant_keys[registration.node])
+                admission = Admission(self._keys.run, self._grant_keys[registration.node], self._offer)
                 query.reply(query.key_expr, msgspec.json.encode(admission))
             else:
                 self._refused.append(reason)
@@ -126,9 +123,6 @@ class Members:
         if node not in self._admitted or node in self._ready:
             raise MessageRefused("its sender has not registered")
         ready = decode_json(data, NodeReady)
-        outlet = SharedOutlet.open(ready.offer, MASTER, spoken(node), self._inbox.stash, self._timeouts.step)
-        if outlet is not None and self._inbox.offer is not None:
-            self._outlets[node] = outlet
         self._ready[node] = (ready, query)
 
     def token_changed(self, sample: zenoh.Sample) -> None:
@@ -155,44 +149,27 @@ class Members:
         return DeadlineExceeded(f"not ready within {self._timeouts.start:g} s: {spoken(*missing)}", hint=hint)
 
     def welcome(self, profile_entries: int) -> None:
-        """Answer all nodes, and tell them who gets messages through shared memory: the master does if all nodes do.
+        """Answer all nodes, and tell them who shares the memory.
 
         Args:
             profile_entries: how many bursts and waits each node stores for a profile; 0: nothing is measured.
         """
-        shared = [node for node in self._nodes if node in self._outlets and self._ready[node][0].shared]
-        self._stepping = [self._outlets[node].put for node in shared if node != RECORDER]
-        rest = [node for node in self._nodes if node not in shared]
-        if rest:
-            publishers = zip(self._grants, batched(self._nodes), strict=True)
-            self._stepping += [publisher.put for publisher, nodes in publishers if not set(nodes).isdisjoint(rest)]
-        self._senders = self._stepping + [self._outlets[node].put for node in shared if node == RECORDER]
-        offer = self._inbox.offer if len(self._outlets) == len(self._nodes) else None
-        if offer is not None:
-            self._inbox.share()
-            shared.append(MASTER)
-        self.shared = tuple(shared)
+        self.shared = tuple(node for node in self._nodes if self._ready[node][0].shared)
         self._welcomed = True
         for _, query in self._ready.values():
-            query.reply(query.key_expr, msgspec.json.encode(Welcome(profile_entries, self.shared, offer)))
+            query.reply(query.key_expr, msgspec.json.encode(Welcome(profile_entries, self.shared)))
             query.drop()
 
     def send(self, kind: int, point: int) -> None:
         """Send a message to all nodes."""
         message = HEADER.pack(kind, 0, 0, point)
-        for send in self._senders:
-            send(message)
-
-    def grant(self, point: int) -> None:
-        """Send a grant to all nodes but not to the recorder, which does not need it and would be woken up."""
-        message = HEADER.pack(GRANT, 0, 0, point)
-        for send in self._stepping:
-            send(message)
+        for publisher in self._grants:
+            publisher.put(message)
 
     def abort(self, error: FmuMeshError) -> None:
         """Tell the nodes why the run ends, and wait so that they can end themselves."""
-        for send in self._senders:
-            send(encode_abort(error.report()))
+        for publisher in self._grants:
+            publisher.put(encode_abort(error.report()))
         if not self._welcomed:
             for _, query in self._ready.values():  # they still wait for admission
                 query.reply_err(str(error))

@@ -46,16 +46,15 @@ class RunClock:
 class Reach:
     """How many points the grant may be ahead of the slowest instance.
 
-    A pause takes effect at the grant. So more than 1024 points are granted only if they take less than 50 ms at the
-    present speed.
+    A pause takes effect at the grant. So more than the window, and more than 1024 points, are granted only if they take
+    less than 50 ms at the present speed.
 
     Args:
-        window: largest number of points.
+        window: of the mesh, in points.
     """
 
     def __init__(self, window: int) -> None:
-        self._window = window
-        self._points = min(window, STEADY_POINTS)
+        self._least = self._points = min(window, STEADY_POINTS)
         self._slowest = 0
         self._since = 0.0
 
@@ -65,9 +64,9 @@ class Reach:
         The speed is unknown at the start. It is measured every 10 ms, and when all points of the last answer are used.
         """
         gone, elapsed = slowest - self._slowest, now - self._since
-        if self._window > STEADY_POINTS and (elapsed >= _SPEED_S or gone >= self._points):
+        if elapsed >= _SPEED_S or gone >= self._points:
             wanted = gone * _STEADY_S / max(elapsed, _TICK_S)
-            self._points = min(self._window, max(STEADY_POINTS, int(wanted)))
+            self._points = max(self._least, int(wanted))
             self._slowest, self._since = slowest, now
         return self._points
 

@@ -15,7 +15,8 @@ from ..instances.call_guard import not_returned
 from ..system.plan import NodePlan
 from ..wire.refusals import Refusals
 from ..wire.views import InstanceStatus
-from .stepping import Runner, Unit
+from .engine import Engine
+from .stepping import Runner
 
 __all__ = ["Activity"]
 
@@ -27,9 +28,6 @@ class Activity:
 
     Attributes:
         state: in one or two words, for `status`.
-        waiting: whether the main thread waits for a message.
-        waited_s: how long it has waited since the first point.
-        advancing: the unit that the main thread steps, if it does.
         runners: the instances, once all are loaded.
 
     Args:
@@ -39,14 +37,16 @@ class Activity:
 
     def __init__(self, plan: NodePlan, refusals: Refusals) -> None:
         self.state = "starting"
-        self.waiting = False
-        self.waited_s = 0.0
         self.runners: Mapping[str, Runner] = {}
         self._plan = plan
         self._refusals = refusals
         self._started: float | None = None
-        self.advancing: Unit | None = None
+        self._engine: Engine | None = None
         self._under_way: tuple[str, int, float] | None = None
+
+    def steps_with(self, engine: Engine) -> None:
+        """The engine of this node, once there is one."""
+        self._engine = engine
 
     def started(self) -> None:
         """The instances are at their first point."""
@@ -76,8 +76,8 @@ class Activity:
             activity=self._in_words(runner),
             point=point,
             time=self._plan.grid.time(point),
-            step_time=runner.step_seconds / step if step else 0.0,
-            wait_time=self.waited_s,
+            step_time=self._spent_s(runner) / step if step else 0.0,
+            wait_time=self._engine.waited_s if self._engine is not None else 0.0,
             restarts=self._plan.restarts,
             refused=self._refusals.count,
             running_time=time.monotonic() - self._started if self._started is not None else 0.0,
@@ -90,15 +90,16 @@ class Activity:
         sent: other nodes may wait for them, and they must not be lost if this process dies. Other calls of an FMU are
         watched by `fmu_mesh.instances.call_guard.CallWatch`.
         """
-        if (unit := self.advancing) is None or self.state != "running":
+        engine = self._engine
+        if engine is None or self.state != "running" or (runner := engine.current) is None:
             self._under_way = None
             return None
-        runner = unit.current
         under_way_s = now - self._since(runner, now)
         if under_way_s > 0.0:
-            unit.meanwhile(self._send)
+            with engine.sending:
+                self._send()
         else:
-            unit.hurry()
+            engine.attend()
         if under_way_s <= self._plan.timeouts.step:
             return None
         return StepFailed(
@@ -119,14 +120,20 @@ class Activity:
     def _in_words(self, runner: Runner) -> str:
         if self.state != "running":
             return self.state
-        if self.waiting:
-            return f"waiting at point {runner.point} for {runner.lacking()}"
-        unit = self.advancing
-        current = unit.current if unit is not None else runner
+        current = self._engine.current if self._engine is not None else None
+        if current is None:
+            return f"waiting at point {runner.point} for {runner.waits_for}"
         if current is not runner:
             return f"waiting at point {runner.point} for its turn: '{current.name}' is in doStep"
         now = time.monotonic()
         return f"in doStep at point {runner.point} for {now - self._since(runner, now):.1f} s"
+
+    def _spent_s(self, runner: Runner) -> float:
+        """How long the unit of a runner was stepped, in s."""
+        engine = self._engine
+        if engine is None:
+            return 0.0
+        return next(spent for unit, spent in zip(engine.units, engine.spent_s, strict=True) if runner in unit)
 
     def _since(self, runner: Runner, now: float) -> float:
         """When this thread first saw the running step of a runner; the stepping loop measures no time for this."""

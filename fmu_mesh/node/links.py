@@ -8,45 +8,47 @@ from ..errors import FmuMeshError
 from ..rings.ring import Ring
 from ..system.layout import Layout
 from ..system.plan import RECORDER, Link
-from ..system.window import lazy_frame_rows
 from ..variables.value_types import Value
+from ..wire.frames import picks
 from ..wire.messages import FRAME, HEADER, INITIAL, LAST
 from ..wire.rows import encode_frames, encode_rows
 
 __all__ = ["OutLink"]
 
-_FRAME_BYTES = 32 * 1024
-_FRAME_POINTS = 1024
-_LAZY_FRAME_BYTES = 128 * 1024
+_FRAME_BYTES = 128 * 1024
 
 
 class OutLink:
-    """Sends the rows of one instance to one node; a frame holds all rows since the last one.
+    """Sends rows of one instance to one node; a frame holds all rows since the last one.
+
+    Args:
+        link: the link.
+        layout: the columns of its frames; none where the target reads the ring itself.
+        outputs: the ring.
+        put: sends a message.
 
     Attributes:
         sent: own steps sent so far; the next frame starts at this step.
-        capacity: rows after which a frame is full.
-        lazy: whether no step needs these rows, so that they may be sent a little later than others.
     """
 
-    def __init__(self, link: Link, outputs: Ring, put: Callable[[bytes], None], window: int) -> None:
+    def __init__(self, link: Link, layout: Layout, outputs: Ring, put: Callable[[bytes], None]) -> None:
         self.link = link
         self.sent = 0
-        self.lazy = link.target_node == RECORDER
-        if self.lazy:
-            rows, size = lazy_frame_rows(window), _LAZY_FRAME_BYTES
-        else:
-            # A quarter of the window: the consumer can step on these rows while the next grant is on its way.
-            rows, size = min(_FRAME_POINTS, max(1, window // (4 * link.step_points))), _FRAME_BYTES
-        self.capacity = max(1, min(rows, size // max(link.layout.row_size, 1)))
+        self.to_recorder = link.target_node == RECORDER
+        self._rows = max(1, _FRAME_BYTES // max(layout.row_size, 1))
         self._outputs = outputs
         self._put = put
-        self._picks = _picks(outputs.layout, link.layout)
+        self._picks = picks(outputs.layout, layout)
+
+    @property
+    def has_frames(self) -> bool:
+        """Whether it sends rows at all."""
+        return bool(self._picks)
 
     def flush(self, end: int) -> None:
         """Send the rows of own steps ``sent .. end - 1``."""
         first = self.sent
-        if first >= end:
+        if first >= end or not self._picks:
             return
         ring = self._outputs
         if end - first > ring.rows:
@@ -55,7 +57,7 @@ class OutLink:
             raise FmuMeshError(text, instance=self.link.source, point=first * self.link.step_points)
         while first < end:
             start = first & ring.mask
-            cut = min(end - first, ring.rows - start)
+            cut = min(end - first, ring.rows - start, self._rows)
             end_slot = start + cut
             rows = tuple(
                 ring.parts[part][start:end_slot] if picked is None else ring.parts[part][start:end_slot, picked]
@@ -78,15 +80,3 @@ class OutLink:
             if name in values:
                 row.put(0, name, values[name])
         self._put(encode_rows(INITIAL, self.link.index, tag, row.parts))
-
-
-def _picks(have: Layout, want: Layout) -> list[tuple[int, list[int] | None]]:
-    """For each wanted part: its number in the ring, and the elements to pick, or None if all are wanted."""
-    types = [part.type for part in have.parts]
-    picks: list[tuple[int, list[int] | None]] = []
-    for part in want.parts:
-        number = types.index(part.type)
-        places = [have.place(column.name) for column in part.columns]
-        elements = [element for place in places for element in range(place.first, place.first + place.size)]
-        picks.append((number, None if len(elements) == have.parts[number].width else elements))
-    return picks

@@ -3,12 +3,11 @@
 One step of a node, in pseudocode::
 
     while an instance has steps left:
-        for unit in units:                      # in the order of the plan
-            step as far as k < grant and the inputs allow, for at most one burst (about 1 ms)
-            send the frames that are full, or whose burst is over
-        handle the messages that arrived: frames go into the input rings, a higher grant is stored
-        if nothing was stepped:
-            send all frames, send the progress to the master, wait for the next message
+        let the engine step for about 1 ms, or wait:      # fmu_mesh.node.engine
+            for unit in units:                            # in the order of the plan
+                step as far as the grant, the windows and the rows of the sources allow
+        send new rows as frames to the nodes that do not read the rings
+        handle the messages that arrived: frames go into mirrors of rings, a higher grant is stored
 
 Owns the life of the process between `ready` and `done`. The FMUs are only called here, on the main thread; queries are
 served by `fmu_mesh.node.node_server` from snapshots.
@@ -17,9 +16,9 @@ served by `fmu_mesh.node.node_server` from snapshots.
 from __future__ import annotations
 
 import logging
-import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
+from functools import partial
 
 import zenoh
 
@@ -36,11 +35,12 @@ from ..errors import (
     from_report,
 )
 from ..instances.contract import Instance
-from ..system.plan import NodePlan
-from ..wire.frames import FrameReceiver
+from ..rings.host_memory import ONE_CORE, Counter, HostMemory
+from ..rings.ring import Ring
+from ..system.plan import RECORDER, Link, NodePlan
+from ..wire.frames import FrameReceiver, of_text
 from ..wire.inbox import Inbox, Message
-from ..wire.keys import MASTER
-from ..wire.membership import Membership, shared_inbox
+from ..wire.membership import Membership, Welcome
 from ..wire.messages import (
     ABORT,
     FINISH,
@@ -54,13 +54,14 @@ from ..wire.messages import (
 )
 from ..wire.session import RouterLink
 from .activity import Activity
+from .engine import Engine, make_engine
 from .initialization import Initialization
 from .inputs import TimedInputs
 from .links import OutLink
 from .node_server import NodeServer
-from .stepping import LAZY_S, RemoteFeed, Runner, Unit, connect_feeds
+from .stepping import Runner, sources_of
 from .streams import PRIORITY
-from .time_measurement import Calls, Profiler
+from .time_measurement import Profiler
 
 __all__ = ["Node"]
 
@@ -69,11 +70,11 @@ log = logging.getLogger(__name__)
 _LOOK_S = 0.5
 _TELL_S = 0.1
 _LAST_WORD_S = 0.3
-_ALONE_S = 60.0
 _NO_MASTER_S = 1.0
 """How long in s the report of a failure waits for a master that was never seen."""
 
-_NO_FEEDS: tuple[None, list[RemoteFeed]] = (None, [])
+_LAZY_S = 0.05
+"""How long in s rows that no step needs may wait for more rows: each frame wakes a process, which needs a core."""
 
 
 class Node:
@@ -106,23 +107,21 @@ class Node:
         self._plan = plan
         self._session = session
         self._open_instance = open_instance
-        self._grant = 0
         self._finished = False
         self.failure_is_known = False
         self._heard = time.monotonic()
-        self._lazy_flushed = 0.0
-        self._lazy_pending = False
-        self._waited_long = False
+        self._lazy_sent = 0.0
         self._progress_sent = -1
         self._progress_told_at = 0.0
         self._runners: dict[str, Runner] = {}
-        self._units: list[Unit] = []
-        self._remote: dict[int, tuple[FrameReceiver, list[RemoteFeed]]] = {}
+        self._receivers: dict[int, FrameReceiver | Link] = {}
+        self._own_memory = HostMemory.private(plan.memory, plan.node)
+        self._memory = self._own_memory
+        self._engine: Engine | None = None
         self._initialization = Initialization(plan, self._wait_for_initial_value)
-        self._inbox = Inbox(shared_inbox(plan, spins=True))
+        self._inbox = Inbox(self._own_memory)
         self._membership = Membership(plan, session, self._inbox, launch, router)
         self._profiler: Profiler | None = None
-        self._calls = Calls(self._inbox.poll, self._sort_in)
         self._activity = Activity(plan, self._inbox.refusals)
         self.server = NodeServer(plan, session, self._inbox, self._activity, self._membership.report, on_hang)
 
@@ -135,10 +134,8 @@ class Node:
         try:
             self._membership.register(self.server.open, self._master_token_went)
             self._load()
-            self._meet()
-            self._connect()
-            self._initialize()
-            self._step_to_the_end()
+            self._connect(self._meet())
+            self._step_to_the_end(self._initialize())
             self.server.close()  # the last samples, while the master is there to route them to clients
             for runner in self._runners.values():
                 runner.instance.close()  # before the report, so that the report can contain its error
@@ -154,6 +151,7 @@ class Node:
             self.server.close()
             self._membership.close()
             self._inbox.close()
+            self._memory.close()
 
     def interrupt(self, reason: str) -> None:
         """From any thread: end the run with `Interrupted` at the next point or during the current wait."""
@@ -161,32 +159,38 @@ class Node:
 
     def report_hang(self, error: FmuError) -> bool:
         """On a watching thread, while an FMU does not return: report to the master; return whether it knows now."""
-        if (unit := self._activity.advancing) is not None and not self._membership.lost_master:
-            unit.meanwhile(self._send_last_rows)  # should the step end now, the main thread waits for this
-        elif self._activity.state == "running" and not self._membership.lost_master:
-            sys.setswitchinterval(_ALONE_S)  # as above
-            self._send_last_rows()
+        if not self._membership.lost_master:
+            if self._engine is None:
+                self._send_last_rows()
+            else:
+                with self._engine.sending:  # should the step end now, the main thread waits for this
+                    self._send_last_rows()
         return self.server.report_hang(error, self._patience_s())
 
     # --- before the first point
 
     def _load(self) -> None:
-        """Instantiate the FMUs, and connect rings, feeds and links."""
+        """Instantiate the FMUs."""
         plan = self._plan
         self._activity.state = "loading"
+        instances = {}
         for item in plan.instances:
             instance = self._open_instance(item.name)
             if item.section.interpolation is not None:
                 instance = TimedInputs(instance, item.section.interpolation)
-            self._runners[item.name] = Runner(item, instance, plan.grid, plan.ring_rows)
-        self._remote = connect_feeds(plan, self._runners)
-        self._units = [Unit([self._runners[name] for name in names]) for names in plan.units]
-
-    def _meet(self) -> None:
-        """Join the mesh: afterwards all other nodes are ready."""
+            instances[item.name] = instance
         self._activity.state = "waiting for the mesh"
+        self._membership.keys(plan.timeouts.start)
+        self._memory = self._membership.open_memory() or self._own_memory
+        for place in plan.rings:
+            if place.instance in instances:
+                ring, counter = self._memory.ring(place), self._memory.counter(place.counter)
+                item = plan.instance(place.instance)
+                self._runners[place.instance] = Runner(item, instances[place.instance], plan.grid, ring, counter)
+
+    def _meet(self) -> Welcome:
+        """Join the mesh: afterwards all other nodes are ready."""
         try:
-            self._membership.keys(self._plan.timeouts.start)
             self.server.serve(self._runners)
             welcome = self._membership.join()
         except MeshLost as error:
@@ -195,30 +199,64 @@ class Node:
             raise self._membership.without_master() from error
         self._heard = time.monotonic()
         if welcome.profile:
-            self._profiler = Profiler(self._plan.node, welcome.profile, self._plan.window)
+            self._profiler = Profiler(self._plan.node, welcome.profile)
+        return welcome
 
-    def _connect(self) -> None:
-        """Create the senders to the other nodes and to the master."""
+    def _connect(self, welcome: Welcome) -> None:
+        """Connect the runners with the rings of their sources, and make links for what no ring carries."""
         plan, membership = self._plan, self._membership
         keys = membership.keys(plan.timeouts.start)
+        shares = {*welcome.shared, RECORDER} if self._memory is not self._own_memory else set()
         for link in plan.links_out:
             runner = self._runners[link.source]
-            put = membership.sender(link.target_node, keys.frames(link.source, link.target_node))
-            if link.initial_only:
-                self._initialization.out_links.append(OutLink(link, runner.outputs, put, plan.window))
-            elif self._profiler is not None:
-                runner.out_links.append(self._profiler.link(link, runner.outputs, put))
-            else:
-                runner.out_links.append(OutLink(link, runner.outputs, put, plan.window))
-        self._calls = self._calls._replace(put_progress=membership.sender(MASTER, keys.progress(plan.node)))
-        if self._profiler is not None:
-            self._units = self._profiler.measured_units(self._units)
-            self._calls = self._profiler.measured_calls(self._calls)
+            put = membership.sender(keys.frames(link.source, link.target_node))
+            layout = of_text(link.layout) if link.target_node in shares else link.layout
+            links = self._initialization.out_links if link.initial_only else runner.out_links
+            links.append(OutLink(link, layout, runner.outputs, put))
+        rings = self._rings_of_sources(shares)
+        step_points = {place.instance: place.step_points for place in plan.rings}
+        for runner in self._runners.values():
+            runner.sources += sources_of(runner, rings, step_points)
+        self._put_progress = membership.sender(keys.progress(plan.node))
 
-    def _initialize(self) -> None:
+    def _rings_of_sources(self, shares: Collection[str]) -> dict[str, list[tuple[Ring, Counter, bool | None]]]:
+        """Where the rows of each source are: in a ring that others share, or in a mirror that its frames fill."""
+        plan = self._plan
+        rings: dict[str, list[tuple[Ring, Counter, bool | None]]] = {
+            name: [(runner.outputs, runner.counter, None)] for name, runner in self._runners.items()
+        }
+        places = {place.instance: place for place in plan.rings}
+        for link in plan.links_in:
+            self._receivers[link.index] = link
+            if link.initial_only:
+                continue
+            place = places[link.source]
+            shared = link.source_node in shares
+            layout = of_text(link.layout) if shared else link.layout
+            found = rings.setdefault(link.source, [])
+            if shared:
+                found.append((self._memory.ring(place), self._memory.counter(place.counter), False))
+            if layout.columns:
+                mirror, counter = self._own_memory.ring(place), self._own_memory.counter(place.counter)
+                found.append((mirror, counter, True if shared else None))
+                fits = partial(self._fits, link.source)
+                who = f"node '{plan.node}'"
+                self._receivers[link.index] = FrameReceiver(link, layout, who, mirror, counter, fits)
+        return rings
+
+    def _fits(self, source: str, end: int) -> bool:
+        """Whether rows of a mirror before own step ``end`` overwrite no row that a step still needs."""
+        return all(
+            end - own.transfer.rule.row_for(runner.step) <= own.transfer.source.rows
+            for runner in self._runners.values()
+            for own in runner.sources
+            if own.instance == source
+        )
+
+    def _initialize(self) -> Engine:
         """Initialization Mode: set, get and exchange values level by level; then the outputs are those of point 0."""
         self._activity.state = "initializing"
-        grid = self._plan.grid
+        plan, grid = self._plan, self._plan.grid
         for runner in self._runners.values():
             stop_time = grid.told_stop_time(runner.plan.step_points)
             runner.instance.enter_initialization(grid.start_time, stop_time, runner.plan.start_values)
@@ -226,112 +264,102 @@ class Node:
         for runner in self._runners.values():
             runner.instance.exit_initialization()
             runner.bind()
+        units = [[self._runners[name] for name in names] for names in plan.units]
+        shared = self._memory is not self._own_memory
+        self._engine = engine = make_engine(plan, units, self._memory, shared=shared, spins=not ONE_CORE)
+        self._inbox.move_to(self._memory, engine.attend)
+        self._activity.steps_with(engine)
+        for runner in self._runners.values():
+            runner.begin()
             runner.flush()
         self.server.started()
-        self._tell_progress()
+        self._memory.progress[plan.node].raise_to(engine.covered + 1)
+        self._tell_progress(engine)
+        return engine
 
     def _wait_for_initial_value(self, left_s: float) -> None:
         if (message := self._inbox.wait(left_s)) is not None:
-            self._calls.take(message)
+            self._sort_in(message)
 
     # --- from point to point
 
-    def _step_to_the_end(self) -> None:
+    def _step_to_the_end(self, engine: Engine) -> None:
         """The loop of the module's docstring."""
         self._activity.state = "running"
-        poll, take = self._calls.poll, self._calls.take
+        eager = any(link.has_frames for runner in self._runners.values() for link in runner.out_links)
         if self._profiler is not None:
-            self._profiler.start()
+            self._profiler.start(engine)
         while not self._finished:
-            stepped = False
-            for unit in tuple(self._units):
-                self._activity.advancing = unit
-                try:
-                    stepped = unit.advance(self._grant) or stepped
-                except TerminationRequested as asked:
-                    self._end_early(unit, asked)
-            self._activity.advancing = None
-            taken = False
-            while (message := poll()) is not None:
-                take(message)
-                taken = True
+            try:
+                stepped = engine.run(_LOOK_S, eager=eager)
+            except TerminationRequested as asked:
+                stepped = True
+                self._end_early(asked)
+            if self._profiler is not None:
+                self._profiler.look(engine)
+            with engine.sending:
+                self._send_rows(stepped=stepped)
             if stepped:
-                self._tell_progress()
                 self.server.stepped()
-            elif not taken:
-                self._flush_before_waiting()
-                self._tell_progress()
-                self._wait()
+            while (message := self._inbox.poll()) is not None:
+                self._sort_in(message)
+            self._tell_progress(engine)
+            now = time.monotonic()
+            if now - self._heard > self._plan.timeouts.step:
+                text = f"the master has said nothing for {now - self._heard:.1f} s"
+                raise DeadlineExceeded(text, hint="Is its process stopped, or its host gone?")
 
-    def _end_early(self, unit: Unit, asked: TerminationRequested) -> None:
+    def _end_early(self, asked: TerminationRequested) -> None:
         """An FMU asks to end the simulation: its unit stops stepping, and the master ends the run at its point."""
-        self._units.remove(unit)
-        point = self._runners[asked.instance or ""].covered
-        for runner in unit.runners:
-            runner.last_step = runner.step
-            runner.flush()
+        assert self._engine is not None
+        runner = self._runners[asked.instance or ""]
+        point = runner.covered
+        # The master has to know it before the progress of this node, which is beyond the grant then.
         self._tell_end(asked.at(point, self._plan.grid.time(point)), self._plan.timeouts.stop)
+        for member in next(unit for unit in self._engine.units if runner in unit):
+            member.stop()
+            member.flush()
+        self._memory.progress[self._plan.node].raise_to(self._engine.covered + 1)
 
-    def _flush_before_waiting(self) -> None:
-        """Send rows that a consumer may wait for; rows that are only recorded every 50 ms, and at the end."""
+    def _send_rows(self, *, stepped: bool) -> None:
+        """Send rows that a consumer may wait for; those for the recorder every 50 ms, and where nothing happens."""
         now = time.monotonic()
-        done = self._covered() == self._plan.grid.last_point
-        lazy = done or self._waited_long or now - self._lazy_flushed > LAZY_S
+        lazy = not stepped or now - self._lazy_sent > _LAZY_S
         if lazy:
-            self._lazy_flushed = now
+            self._lazy_sent = now
         for runner in self._runners.values():
             runner.flush(lazy=lazy)
-        self._lazy_pending = not lazy
-
-    def _wait(self) -> None:
-        """Wait for one message; no instance can step before it arrives."""
-        started = time.monotonic()
-        self._activity.waiting = True
-        message = self._inbox.wait(LAZY_S if self._lazy_pending else _LOOK_S)
-        self._activity.waiting = False
-        self._waited_long = message is None
-        if self._profiler is not None:
-            self._profiler.waited(time.monotonic() - started, running=self._grant > 0)
-        if message is not None:
-            self._calls.take(message)
-        now = time.monotonic()
-        self._activity.waited_s += now - started
-        if now - self._heard > self._plan.timeouts.step:
-            text = f"the master has said nothing for {now - self._heard:.1f} s"
-            raise DeadlineExceeded(text, hint="Is its process stopped, or its host gone?")
 
     def _sort_in(self, message: Message) -> None:
-        """Put a frame into the rings, or store a new grant; any other message is refused."""
+        """Put a frame into its mirror, or store a new grant; any other message is refused."""
         self._inbox.hand_on(message, self._take_from_master, self._take_from_node)
 
     def _take_from_node(self, message: Message) -> None:
         sender, kind, number, count, point, data = message
-        receiver, feeds = self._remote.get(number, _NO_FEEDS)
-        if receiver is None or receiver.link.source_node != sender:
+        receiver = self._receivers.get(number)
+        link = receiver.link if isinstance(receiver, FrameReceiver) else receiver
+        if link is None or link.source_node != sender:
             raise MessageRefused(f"there is no link {number} from it to this node")
-        if kind == FRAME:
-            new = receiver.take(point, count, data)
-            if new is not None:
-                first, rows = new
-                for feed in feeds:
-                    feed.transfer.from_rows(first, rows)
-                    feed.ready = feed.transfer.ready(receiver.received)
+        if kind == FRAME and isinstance(receiver, FrameReceiver):
+            receiver.take(point, count, data)
         elif kind == INITIAL:
-            self._initialization.take(receiver.link, point, data)
+            self._initialization.take(link, point, data)
         else:
             raise MessageRefused(f"a message of kind {kind} is not one that a node sends")
 
     def _take_from_master(self, message: Message) -> None:
         _, kind, _, _, point, data = message
         if kind == GRANT:
+            self._heard = time.monotonic()
+            if self._memory is not self._own_memory:
+                return  # the grant itself is in the shared memory; this is a sign of life
             most = self._progress_sent + self._plan.window
             if point > most:
                 raise ProtocolBroken(
                     f"the master grants point {point} to node '{self._plan.node}', which may be granted {most} at most",
                     hint="Does another process send messages with its name?",
                 )
-            self._heard = time.monotonic()
-            self._grant = max(self._grant, min(point, self._plan.grid.last_point))
+            self._memory.grant.raise_to(min(point, self._plan.grid.last_point))
         elif kind == FINISH:
             self._finished = True
         elif kind == ABORT:
@@ -339,24 +367,21 @@ class Node:
         else:
             raise MessageRefused(f"a message of kind {kind} is not one that the master sends")
 
-    def _covered(self) -> int:
-        return min(runner.covered for runner in self._runners.values())
-
-    def _tell_progress(self) -> None:
-        """Send the progress of this node to the master, if the grant may depend on it or a status needs it.
+    def _tell_progress(self, engine: Engine) -> None:
+        """Send the progress of this node to a master that cannot read it, if the grant may depend on it.
 
         A node that waits for another node sends nothing: the progress that it has not sent is less than a quarter of
         the window, so the other node can still step.
         """
-        covered = self._covered()
-        if covered == self._progress_sent:
+        covered = engine.covered
+        if self._memory is not self._own_memory or covered == self._progress_sent:
             return
         now = time.monotonic()
         due = covered - self._progress_sent >= self._plan.progress_stride or now - self._progress_told_at > _TELL_S
-        if due or covered >= self._grant:
+        if due or covered >= self._memory.grant.value:
             self._progress_sent = covered
             self._progress_told_at = now
-            self._calls.put_progress(HEADER.pack(PROGRESS, 0, 0, covered))
+            self._put_progress(HEADER.pack(PROGRESS, 0, 0, covered))
 
     # --- the end
 
@@ -377,7 +402,7 @@ class Node:
         deadline = time.monotonic() + _LAST_WORD_S
         while not self._finished and (left := deadline - time.monotonic()) > 0:
             if (message := self._inbox.wait(left)) is not None:
-                self._calls.take(message)
+                self._sort_in(message)
         if not self._finished:
             raise error
 
@@ -401,7 +426,6 @@ class Node:
 
     def _report_failure(self, error: FmuMeshError) -> bool:
         """Report the failure to the master, unless the master is gone; return whether it knows now."""
-        self._activity.advancing = None
         self._activity.state = "failed"
         if self._membership.lost_master:
             return True

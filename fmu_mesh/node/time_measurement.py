@@ -1,42 +1,19 @@
 """Measures how a node spends its time, and what it waits for.
 
-Without a profile none of this runs. If the master asks for a profile, measured units, links and calls replace those of
-the node before the first point.
+Without a profile none of this runs. If the master asks for one, the node lets a `Profiler` look at its engine after
+every burst.
 """
 
 from __future__ import annotations
 
 import os
 import socket
-from collections.abc import Callable, Iterable, Sequence
 from time import perf_counter
-from typing import NamedTuple, ParamSpec, TypeVar
 
-from ..rings.ring import Ring
-from ..system.plan import Link
-from ..wire.inbox import Message
 from ..wire.time_profile import GRANT, Burst, NodeProfile, UnitProfile, Wait
-from .links import OutLink
-from .stepping import Runner, Unit
+from .engine import Engine
 
-__all__ = ["Calls", "Profiler"]
-
-P = ParamSpec("P")
-T = TypeVar("T")
-
-
-class Calls(NamedTuple):
-    """The calls of a node that a profile measures.
-
-    Attributes:
-        poll: returns the next message if there is one.
-        take: takes a message.
-        put_progress: sends the progress to the master.
-    """
-
-    poll: Callable[[], Message | None]
-    take: Callable[[Message], None]
-    put_progress: Callable[[bytes], None] = lambda _data: None
+__all__ = ["Profiler"]
 
 
 class Profiler:
@@ -45,91 +22,55 @@ class Profiler:
     Args:
         node: name of the node.
         entries: largest number of bursts and waits that are stored; the sums contain all of them.
-        window: window of the node's plan, from which the capacity of links follows.
 
-    Call `link`, `measured_units` and `measured_calls` before Initialization Mode and `start` after it, then step; at
-    the end call `profile`.
+    Call `start` before the first burst and `look` after each; at the end call `profile`.
     """
 
-    def __init__(self, node: str, entries: int, window: int) -> None:
+    def __init__(self, node: str, entries: int) -> None:
         self._node = node
         self._entries = entries
-        self._window = window
-        self._units: list[_MeasuredUnit] = []
-        self._started = self._ended = perf_counter()
-        self._received_s = 0.0
+        self._started = self._ended = self._looked = perf_counter()
+        self._spent_s: list[float] = []
+        self._steps: list[int] = []
+        self._names: list[tuple[str, ...]] = []
+        self._counts: list[int] = []
+        self._waited_s = 0.0
         self._wait_s: dict[str, float] = {}
         self._bursts: list[Burst] = []
         self._waits: list[Wait] = []
         self._cut = 0
         self._transport_s = 0.0
-        self.sent_s = 0.0
 
-    def link(self, link: Link, outputs: Ring, put: Callable[[bytes], None]) -> OutLink:
-        """A link whose sending is measured."""
-        return _MeasuredLink(self, link, outputs, put, self._window)
-
-    def measured_calls(self, calls: Calls) -> Calls:
-        """The same calls, which are measured."""
-        return Calls(self._receiving(calls.poll), self._receiving(calls.take), self._sending(calls.put_progress))
-
-    def measured_units(self, units: Iterable[Unit]) -> list[Unit]:
-        """The measured forms of ``units``."""
-        self._units = [_MeasuredUnit(unit.runners, number, self) for number, unit in enumerate(units)]
-        return [*self._units]
-
-    def start(self) -> None:
+    def start(self, engine: Engine) -> None:
         """The node is at point 0."""
-        self._started = self._ended = perf_counter()
-        self.sent_s = self._received_s = self._transport_s = 0.0
+        self._started = self._ended = self._looked = perf_counter()
+        self._names = [tuple(runner.name for runner in unit) for unit in engine.units]
+        self._counts = [0] * len(engine.units)
+        self._note(engine)
 
-    def _sending(self, call: Callable[P, T]) -> Callable[P, T]:
-        """The same call, whose time is spent on sending."""
-
-        def measured(*args: P.args, **kwargs: P.kwargs) -> T:
-            started = perf_counter()
-            try:
-                return call(*args, **kwargs)
-            finally:
-                self.sent_s += perf_counter() - started
-
-        return measured
-
-    def _receiving(self, call: Callable[P, T]) -> Callable[P, T]:
-        """The same call, whose time is spent on receiving."""
-
-        def measured(*args: P.args, **kwargs: P.kwargs) -> T:
-            started = perf_counter()
-            try:
-                return call(*args, **kwargs)
-            finally:
-                self._received_s += perf_counter() - started
-
-        return measured
-
-    def stepped(self, burst: Burst) -> None:
-        """Add a burst; sending and receiving after the last burst are not part of the run."""
-        self._ended = burst.end
-        self._transport_s = self.sent_s + self._received_s
-        if len(self._bursts) + len(self._waits) < self._entries:
-            self._bursts.append(burst)
-        else:
-            self._cut += 1
-
-    def waited(self, seconds: float, *, running: bool) -> None:
-        """Add a wait that has just ended, before its message is handled; ``running``: whether there was a grant."""
-        if not running:  # other nodes are not at point 0 yet: the run begins with the first grant
-            self.start()
+    def look(self, engine: Engine) -> None:
+        """After a burst: where the time since the last look went. What is left over is the transport."""
+        now = perf_counter()
+        waited_s = engine.waited_s - self._waited_s
+        if not any(runner.step for runner in engine.runners):  # the run begins with the first step
+            self.start(engine)
             return
-        ended = perf_counter()
-        reason = self._behind()
-        if reason is None:
-            return
-        self._wait_s[reason] = self._wait_s.get(reason, 0.0) + seconds
-        if len(self._bursts) + len(self._waits) < self._entries:
-            self._waits.append(Wait(ended - seconds, ended, reason))
-        else:
-            self._cut += 1
+        begin, busy_s = self._looked, 0.0
+        for number, (unit, spent_s) in enumerate(zip(engine.units, engine.spent_s, strict=True)):
+            steps, lasted_s = unit[0].step - self._steps[number], spent_s - self._spent_s[number]
+            if steps > 0:
+                self._counts[number] += 1
+                self._store(Burst(begin + busy_s, begin + busy_s + lasted_s, number, steps, 0.0))
+                self._ended = now
+            busy_s += lasted_s
+        if waited_s > 0.0 and any(runner.step < runner.last_step for runner in engine.runners):
+            reason = engine.awaited or GRANT
+            self._wait_s[reason] = self._wait_s.get(reason, 0.0) + waited_s
+            self._store(Wait(begin + busy_s, begin + busy_s + waited_s, reason))
+        if self._ended == now:
+            self._transport_s += max(0.0, now - begin - busy_s - waited_s)
+        self._looked = now
+        self._note(engine)
 
     def profile(self) -> NodeProfile:
         """What was measured."""
@@ -139,7 +80,12 @@ class Profiler:
             pid=os.getpid(),
             started=self._started,
             ended=self._ended,
-            units=tuple(unit.profile() for unit in self._units),
+            units=tuple(
+                UnitProfile(names, steps, count, spent_s)
+                for names, steps, count, spent_s in zip(
+                    self._names, self._steps, self._counts, self._spent_s, strict=True
+                )
+            ),
             transport_s=self._transport_s,
             wait_s=self._wait_s,
             bursts=tuple(self._bursts),
@@ -147,59 +93,15 @@ class Profiler:
             cut=self._cut,
         )
 
-    def _behind(self) -> str | None:
-        """The instance of another node for which this node waits, `GRANT`, or None after the last point."""
-        unfinished = False
-        for unit in self._units:
-            for runner in unit.runners:
-                if runner.step < runner.last_step:
-                    unfinished = True
-                    for feed in runner.remote_feeds:
-                        if feed.ready <= runner.step:
-                            return feed.receiver.link.source
-        return GRANT if unfinished else None
+    def _note(self, engine: Engine) -> None:
+        self._waited_s = engine.waited_s
+        self._spent_s = list(engine.spent_s)
+        self._steps = [unit[0].step for unit in engine.units]
 
-
-class _MeasuredUnit(Unit):
-    """A unit that reports its bursts to the profiler."""
-
-    def __init__(self, runners: Sequence[Runner], number: int, profiler: Profiler) -> None:
-        super().__init__(runners)
-        self._number = number
-        self._profiler = profiler
-        self._bursts = 0
-        self._compute_s = 0.0
-
-    def advance(self, grant: int) -> bool:
-        profiler, runner = self._profiler, self.runners[0]
-        before, first = profiler.sent_s, runner.step
-        started = perf_counter()
-        if not super().advance(grant):
-            return False
-        ended = perf_counter()
-        sent_s = profiler.sent_s - before
-        self._bursts += 1
-        self._compute_s += ended - started - sent_s
-        profiler.stepped(Burst(started, ended, self._number, runner.step - first, sent_s))
-        return True
-
-    def profile(self) -> UnitProfile:
-        """What was measured."""
-        names = tuple(runner.name for runner in self.runners)
-        return UnitProfile(names, self.runners[0].step, self._bursts, self._compute_s)
-
-
-class _MeasuredLink(OutLink):
-    """A link that reports the time of sending to the profiler."""
-
-    def __init__(
-        self, profiler: Profiler, link: Link, outputs: Ring, put: Callable[[bytes], None], window: int
-    ) -> None:
-        super().__init__(link, outputs, put, window)
-        self._profiler = profiler
-
-    def flush(self, end: int) -> None:
-        if self.sent < end:
-            started = perf_counter()
-            super().flush(end)
-            self._profiler.sent_s += perf_counter() - started
+    def _store(self, entry: Burst | Wait) -> None:
+        if len(self._bursts) + len(self._waits) >= self._entries:
+            self._cut += 1
+        elif isinstance(entry, Burst):
+            self._bursts.append(entry)
+        else:
+            self._waits.append(entry)

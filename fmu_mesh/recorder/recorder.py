@@ -1,7 +1,7 @@
-"""The recorder: receives frames like a node, and writes rows as soon as they are complete.
+"""The recorder: reads the rings of all recorded instances, and writes rows as soon as they are complete.
 
-It has its own thread in the master's process, and its own inbox, liveliness token and progress. The grant waits for
-rows that are not written yet. So no row is dropped, and memory is bounded.
+It has its own thread in the master's process, and its own inbox, liveliness token and progress. No node may be further
+ahead of the rows that are not written yet than the window of the recorder. So no row is dropped, and memory is bounded.
 """
 
 from __future__ import annotations
@@ -10,24 +10,26 @@ import logging
 import os
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from contextlib import suppress
 from functools import partial
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import zenoh
 from numpy.typing import NDArray
 
-from ..errors import DeadlineExceeded, FmuMeshError, MeshLost, MessageRefused, from_report
+from ..errors import DeadlineExceeded, FmuMeshError, MeshLost, MessageRefused, ProtocolBroken, from_report
 from ..files import unwritable
+from ..rings.host_memory import Counter, HostMemory, Wish
+from ..rings.ring import Ring
 from ..system.plan import RECORDER, Link, NodePlan
 from ..system.recording import ResultFile
-from ..wire.frames import FrameReceiver
+from ..variables.value_types import is_text
+from ..wire.frames import FrameReceiver, of_text
 from ..wire.inbox import Inbox, Message
-from ..wire.keys import MASTER
-from ..wire.membership import Membership, shared_inbox
+from ..wire.membership import Membership
 from ..wire.messages import (
     ABORT,
     FINISH,
@@ -48,11 +50,9 @@ log = logging.getLogger(__name__)
 _LOOK_S = 0.2
 _WRITE_ROWS = 4096
 _REST_S = 0.005
-"""How long in s the recorder pauses while thousands of rows arrive: each frame that wakes the recorder takes a
-processor from a node that steps, and writing many rows at once takes less time."""
+"""How long in s the recorder pauses while rows come: each time it wakes up it takes a processor from a node that steps,
+and writing many rows at once takes less time."""
 
-_LEAST_REST_S = 0.0005
-_REST_ROWS = 256
 _LAST_S = 0.5
 """How long in s the recorder waits for the last rows of the nodes when a run ends early."""
 
@@ -73,7 +73,7 @@ class Recorder:
     Use it as a context manager: the thread runs inside; afterwards the file has all complete rows.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913  one participant and its surroundings
         self,
         plan: NodePlan,
         session: zenoh.Session,
@@ -81,20 +81,18 @@ class Recorder:
         has_begun: Callable[[], bool] = lambda: True,
         *,
         launch: str | None = None,
+        memory: HostMemory | None = None,
     ) -> None:
         self._plan = plan
         self._session = session
-        self._sources = {
-            link.index: _Source(FrameReceiver(link, "the recorder", plan.ring_rows, partial(self._fits, link)))
-            for link in plan.links_in
-        }
-        by_name = {source.name: source for source in self._sources.values()}
-        self._columns = [by_name[instance].column(variable) for instance, variable in plan.recorded]
+        self._own_memory = HostMemory.private(plan.memory, RECORDER)
+        self._memory = memory if memory is not None else self._own_memory
+        self._sources: dict[int, _Source] = {}
+        self._columns: list[Callable[[int, int], NDArray[Any]]] = []
+        self._rows = plan.rings[0].rows
         self._file = file
         self._has_begun = has_begun
         self._written = 0
-        self._rested = 0
-        self._rested_at = 0.0
         self._leaving = threading.Event()
         self._progress_sent = -1
         self._progress_told_at = 0.0
@@ -103,8 +101,8 @@ class Recorder:
         self._writing = threading.Lock()
         self._flushed = time.monotonic()
         self._flushed_rows = 0
-        self._inbox = Inbox(shared_inbox(plan, spins=False))  # no process waits for it, but others need the processor
-        self._membership = Membership(plan, session, self._inbox, launch)
+        self._inbox = Inbox(self._memory)
+        self._membership = Membership(plan, session, self._inbox, launch, memory=memory)
         self._put_progress: Callable[[bytes], None]
         self._turns: _Turns
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
@@ -172,46 +170,52 @@ class Recorder:
 
     def _meet(self) -> None:
         welcome = self._membership.join()
-        self._turns = _Turns(len({link.source_node for link in self._plan.links_in}.intersection(welcome.shared)))
-        progress = self._membership.keys(self._plan.timeouts.start).progress(RECORDER)
-        self._put_progress = self._membership.sender(MASTER, progress)
+        shares = {*welcome.shared} if self._memory is not self._own_memory else set()
+        self._turns = _Turns(len({link.source_node for link in self._plan.links_in}.intersection(shares)))
+        self._sources = {link.index: self._source(link, shares) for link in self._plan.links_in}
+        by_name = {source.link.source: source for source in self._sources.values()}
+        self._columns = [by_name[instance].column(variable) for instance, variable in self._plan.recorded]
+        self._put_progress = self._membership.sender(
+            self._membership.keys(self._plan.timeouts.start).progress(RECORDER)
+        )
+
+    def _source(self, link: Link, shares: Collection[str]) -> _Source:
+        """Where the rows of an instance are: in its ring, or in a mirror that frames fill."""
+        place = next(place for place in self._plan.rings if place.instance == link.source)
+        is_shared = link.source_node in shares
+        numbers = mirror = receiver = None
+        if is_shared:
+            numbers = _Rows(self._memory.ring(place), self._memory.counter(place.counter))
+        layout = of_text(link.layout) if is_shared else link.layout
+        if layout.columns:
+            mirror = _Rows(self._own_memory.ring(place), self._own_memory.counter(place.counter))
+            receiver = FrameReceiver(link, layout, "the recorder", *mirror, partial(self._fits, link))
+        return _Source(link, numbers, mirror, receiver)
 
     def _record(self) -> None:
-        """Receive rows, write them when there are many or when no message is left, and send the progress."""
-        heard = self._rested_at = time.monotonic()
+        """Write rows when there are many, or every few milliseconds, and tell the progress."""
+        heard = time.monotonic()
         while not self._finished:
             message = self._inbox.poll()
             if message is None:
                 self._write_complete_rows()
                 self._tell_progress()
-                self._rest()
-                message = self._inbox.wait(_LOOK_S)
+                self._turns.next()
+                message = self._inbox.wait(_REST_S if self._complete() >= self._written else _LOOK_S, self._wishes())
             if message is not None:
                 heard = time.monotonic()
                 self._take(message)
-                if self._complete() - self._written >= _WRITE_ROWS:
-                    self._write_complete_rows()
-                    self._tell_progress()
             elif time.monotonic() - heard > self._plan.timeouts.step:
                 raise DeadlineExceeded("the recorder received nothing from the master")
         while self._leaving.is_set() and (message := self._inbox.poll()) is not None:
             self._take(message)  # messages that arrived before the end, above all its reason
 
-    def _rest(self) -> None:
-        """Pause, so that several frames arrive, if many rows have come since the last pause.
-
-        At most for a quarter of the remaining time of the run at its present speed, so that its end is not delayed.
-        """
-        written, now = self._written, time.monotonic()
-        came = written - self._rested
-        if came < _REST_ROWS:
-            return
-        left_s = (self._plan.grid.last_point - written) * (now - self._rested_at) / came
-        rest_s = min(_REST_S, left_s / 4)
-        if rest_s >= _LEAST_REST_S:
-            self._rested, self._rested_at = written, now
-            self._turns.next()
-            self._leaving.wait(rest_s)
+    def _wishes(self) -> list[Wish]:
+        """Wake up when a quarter of the window can be written, or all that is left."""
+        last_point = self._plan.grid.last_point
+        slowest = min(self._sources.values(), key=lambda source: source.covered(last_point))
+        rows = min(self._written + self._plan.window // 4, last_point) // slowest.link.step_points + 1
+        return [(counter, rows) for counter in slowest.counters if counter.value < rows]
 
     def _take(self, message: Message) -> None:
         self._inbox.hand_on(message, self._take_from_master, self._take_from_node)
@@ -219,9 +223,9 @@ class Recorder:
     def _take_from_node(self, message: Message) -> None:
         sender, kind, number, count, point, data = message
         source = self._sources.get(number)
-        if source is None or source.receiver.link.source_node != sender:
+        if source is None or source.link.source_node != sender:
             raise MessageRefused(f"there is no link {number} from it to the recorder")
-        if kind == FRAME:
+        if kind == FRAME and source.receiver is not None:
             source.receiver.take(point, count, data)
         elif kind == LAST:
             source.end()
@@ -241,11 +245,11 @@ class Recorder:
 
     def _fits(self, link: Link, end: int) -> bool:
         """Whether rows of a source before its own step ``end`` overwrite no rows that are not written yet."""
-        return end - self._written // link.step_points <= self._plan.ring_rows
+        return end - self._written // link.step_points <= self._rows
 
     def _complete(self) -> int:
         """The last point whose row is complete, or -1."""
-        return min(source.covered(self._plan.grid.last_point) for source in self._sources.values())
+        return min((source.covered(self._plan.grid.last_point) for source in self._sources.values()), default=-1)
 
     def _write_complete_rows(self) -> None:
         with self._writing:
@@ -260,10 +264,16 @@ class Recorder:
         if rows <= self._written or not (self._written or self._has_begun()):
             return
         while (first := self._written) < rows:
-            end = min(rows, first - first % self._plan.ring_rows + self._plan.ring_rows)  # read without wrap-around
-            columns = [column(first, end) for column in self._columns]
-            self._file.write(self._plan.grid.times(first, end), columns)
+            end = min(rows, first - first % self._rows + self._rows, first + _WRITE_ROWS)  # read without wrap-around
+            self._check(first, end)
+            self._file.write(self._plan.grid.times(first, end), [column(first, end) for column in self._columns])
+            self._check(first, end)
             self._written = end
+
+    def _check(self, first: int, end: int) -> None:
+        """The rows from which points are written are complete, and nobody has overwritten them."""
+        for source in self._sources.values():
+            source.check(first, end)
 
     def _take_last_rows(self, cause: FmuMeshError) -> None:
         """When a run ends early, wait for the last frames; the rows that they complete are written at the end.
@@ -293,9 +303,12 @@ class Recorder:
         return any(not source.ended and source.covered(last_point) < end for source in sources)
 
     def _tell_progress(self) -> None:
-        """Send the progress to the master, if the grant may depend on it or a status needs it."""
-        complete = self._complete()
-        now = time.monotonic()
+        """Tell how many points are written; the first one before, because nothing is written until all are there."""
+        known = max(self._written, min(self._complete() + 1, 1))
+        if self._memory is not self._own_memory:
+            self._memory.progress[RECORDER].raise_to(known)
+            return
+        complete, now = known - 1, time.monotonic()
         due = complete - self._progress_sent >= self._plan.progress_stride or now - self._progress_told_at > _TELL_S
         if complete > self._progress_sent and (due or complete == self._plan.grid.last_point):
             self._progress_sent = complete
@@ -326,13 +339,35 @@ class _Ended(FmuMeshError):
         super().__init__(cause.message)
 
 
-class _Source:
-    """Rows of one instance that wait for rows of the others; ``ended``: no more rows will come."""
+class _Rows(NamedTuple):
+    """Rows of a source: in its ring, or in a mirror of it."""
 
-    def __init__(self, receiver: FrameReceiver) -> None:
+    ring: Ring
+    counter: Counter
+
+
+class _Source:
+    """Rows of one instance that wait for rows of the others.
+
+    Args:
+        link: what is recorded of it.
+        numbers: its ring; None if the recorder cannot read it.
+        mirror: the mirror for what comes in frames; None if nothing does.
+        receiver: fills the mirror.
+
+    Attributes:
+        ended: whether no more rows will come.
+    """
+
+    def __init__(self, link: Link, numbers: _Rows | None, mirror: _Rows | None, receiver: FrameReceiver | None) -> None:
+        self.link = link
+        self.name = link.source
         self.receiver = receiver
-        self.name = receiver.link.source
         self.ended = False
+        self._numbers = numbers
+        self._mirror = mirror
+        self._rows = [rows for rows in (numbers, mirror) if rows is not None]
+        self.counters = [rows.counter for rows in self._rows]
 
     def end(self) -> None:
         """Note that no more rows will come."""
@@ -340,14 +375,35 @@ class _Source:
 
     def covered(self, last_point: int) -> int:
         """The last point for which the value is known; it holds until the next own point."""
-        received, points = self.receiver.received, self.receiver.link.step_points
+        received, points = min(counter.value for counter in self.counters), self.link.step_points
         if received * points > last_point:
             return last_point
         return received * points - 1
 
+    def check(self, first: int, end: int) -> None:
+        """The rows for the points first to end - 1 are complete.
+
+        Raises:
+            ProtocolBroken: one is not.
+        """
+        low, high = first // self.link.step_points, (end - 1) // self.link.step_points + 1
+        wanted = np.arange(low + 1, high + 1)
+        for ring, _ in self._rows:
+            wrong = ring.stamps[(wanted - 1) & ring.mask] != wanted
+            if wrong.any():
+                raise ProtocolBroken(
+                    f"a row of '{self.name}' for the recorder is not the one that was written",
+                    instance=self.name,
+                    point=(low + int(wrong.argmax())) * self.link.step_points,
+                    hint="Does another process write to the memory of this run?",
+                )
+
     def column(self, variable: str) -> Callable[[int, int], NDArray[Any]]:
         """A function that returns the values of a variable at the points first to end - 1, without wrap-around."""
-        ring, step_points = self.receiver.kept, self.receiver.link.step_points
+        has_text = is_text(self.link.layout.column(variable).type)
+        rows = self._mirror if has_text or self._numbers is None else self._numbers
+        assert rows is not None
+        ring, step_points = rows.ring, self.link.step_points
         place = ring.layout.place(variable)
         values, mask = ring.parts[place.part][:, place.first], ring.mask
 

@@ -14,8 +14,8 @@
  *             bell += 1, futex_wake(bell)
  *
  * Of the two, at least one sees what the other has written before its fence. Within a burst the writer looks at wake_at
- * without the fence, which is late by nanoseconds at most; with the fence at the end of a burst and before it waits
- * itself. Every sleep has a time limit. docs/rings.md explains the protocol; tests/property/test_waiting.py explores it.
+ * without the fence: a sleeper that it misses is seen after the next step. With the fence it looks at the end of a burst
+ * and before it waits itself. Every sleep has a time limit. docs/rings.md explains the protocol; tests/property/test_waiting.py explores it.
  */
 #define _GNU_SOURCE
 #include <fenv.h>
@@ -36,7 +36,7 @@
 /* ---- shared memory */
 
 typedef struct {
-  _Atomic int64_t value;   /* rows of a ring, or a communication point */
+  _Atomic int64_t value;   /* rows of a ring, points that are known of a node, or points that are granted */
   _Atomic int64_t wake_at; /* the lowest need of a sleeper */
   int64_t unused[6];
   _Atomic int64_t needs[]; /* one for each process: the value that it sleeps for; 0: it does not sleep */
@@ -96,6 +96,15 @@ typedef struct {
   int64_t mask;
 } Output;
 
+typedef struct { /* what a model says in a step besides its status, and how far it is: Python looks at it between steps */
+  uint8_t event_needed, terminate, early; /* FMI 3.0: not 0 if it is so */
+  int32_t call;       /* the getter or setter that returned a status above warning */
+  double last_time;   /* of an early return (FMI 3.0) */
+  double quiet_until; /* a step that ends here or later is taken by Python */
+  double time;        /* of the model */
+  int64_t step;       /* own steps done */
+} Said;
+
 enum { BY_PYTHON, FMI1, FMI2, FMI3 };                                    /* Member.kind */
 enum { WAITING, SETTING, STEPPING, GETTING, IN_PYTHON, STEPPED };        /* Member.stage */
 enum { FIXED, OUTPUT, WATCHED, FIRST_GATE, MAX_GATES = 4096 };           /* bases */
@@ -112,7 +121,7 @@ typedef struct {
   int64_t kind;
   void *component;
   void *do_step;
-  void *said; /* FMI 3.0: event needed, terminate, early return (one byte each), and at 8 the last time */
+  Said *said; /* of an FMU */
   double start_time, base_step_size, step_size;
   int64_t points; /* base points per own step */
   int64_t every;  /* ticks of the unit per own step */
@@ -154,7 +163,8 @@ typedef struct {
   Counter *progress; /* of this node */
   int64_t last_point;
   int64_t slice_ns;
-  int64_t wait_ns;   /* how long to sleep where nothing can step; 0: leave at once */
+  int64_t wait_ns;   /* how long to sleep where nothing can step */
+  int64_t eager;     /* whether to leave, not to sleep, after a step: its rows have to be sent */
   int64_t spins;     /* whether it spins before it sleeps */
   int64_t allowed;
   int64_t patience;
@@ -185,7 +195,7 @@ static void relax(void) {
 }
 
 static void lower(_Atomic int64_t *place, int64_t value) {
-  int64_t seen = atomic_load_explicit(place, memory_order_relaxed);
+  int64_t seen = atomic_load(place);
   while (value < seen && !atomic_compare_exchange_weak(place, &seen, value)) continue;
 }
 
@@ -194,20 +204,24 @@ PUBLIC void ring_bell(Bell *bell) {
   syscall(SYS_futex, &bell->rung, FUTEX_WAKE, INT_MAX, NULL, NULL, 0);
 }
 
-/* Wake everybody whose need is met. */
+/* Wake everybody whose need is met; again if the value has grown meanwhile. */
 static void wake(const Place *place, Counter *counter) {
-  atomic_store(&counter->wake_at, NEVER);
-  int64_t lowest = NEVER, value = atomic_load(&counter->value);
-  for (int64_t process = 0; process < place->processes; process++) {
-    int64_t need = atomic_load(&counter->needs[process]);
-    if (need == 0) continue;
-    if (need > value) {
-      if (need < lowest) lowest = need;
-    } else if (atomic_compare_exchange_strong(&counter->needs[process], &need, 0)) {
-      ring_bell(&place->bells[process]);
+  int64_t lowest;
+  do {
+    atomic_store(&counter->wake_at, NEVER);
+    int64_t value = atomic_load(&counter->value);
+    lowest = NEVER;
+    for (int64_t process = 0; process < place->processes; process++) {
+      int64_t need = atomic_load(&counter->needs[process]);
+      if (need == 0) continue;
+      if (need > value) {
+        if (need < lowest) lowest = need;
+      } else if (atomic_compare_exchange_strong(&counter->needs[process], &need, 0)) {
+        ring_bell(&place->bells[process]);
+      }
     }
-  }
-  if (lowest != NEVER) lower(&counter->wake_at, lowest);
+    if (lowest != NEVER) lower(&counter->wake_at, lowest);
+  } while (lowest != NEVER && atomic_load(&counter->value) >= lowest);
 }
 
 static inline void wake_if_needed(const Place *place, Counter *counter) {
@@ -227,6 +241,7 @@ static inline int64_t value_of(const Counter *counter) {
 
 /* Raise a counter, and wake who needs it: for Python. */
 PUBLIC void counter_raise(const Place *place, Counter *counter, int64_t value) {
+  if (value <= atomic_load(&counter->value)) return;
   atomic_store_explicit(&counter->value, value, memory_order_release);
   atomic_thread_fence(memory_order_seq_cst);
   wake_if_needed(place, counter);
@@ -390,17 +405,21 @@ static inline int move_all(const Move *moves, int64_t n, char *const *bases) {
   return 0;
 }
 
-static inline int call_all(void *component, const Call *calls, int64_t n, char *const *bases) {
+static inline int call_all(const Member *member, const Call *calls, int64_t n) {
+  void *component = member->component;
   for (int64_t i = 0; i < n; i++) {
     const Call *call = &calls[i];
-    void *values = bases[call->base] + call->values;
+    void *values = member->bases[call->base] + call->values;
     int status =
         call->size < 0
             ? ((int (*)(void *, const void *, size_t, void *))call->function)(component, call->references,
                                                                               (size_t)call->count, values)
             : ((int (*)(void *, const void *, size_t, void *, size_t))call->function)(
                   component, call->references, (size_t)call->count, values, (size_t)call->size);
-    if (status > WARNING || status < 0) return status;
+    if (status > WARNING || status < 0) {
+      member->said->call = (int32_t)i;
+      return status;
+    }
   }
   return 0;
 }
@@ -412,32 +431,46 @@ static inline int call_do_step(Member *member, double time) {
     case FMI2:
       return ((int (*)(void *, double, double, int))member->do_step)(member->component, time, member->step_size, 1);
     default: {
-      char *said = member->said;
-      memset(said, 0, 3);
+      Said *said = member->said;
+      said->event_needed = said->terminate = said->early = 0;
       return ((int (*)(void *, double, double, _Bool, void *, void *, void *, void *))member->do_step)(
-          member->component, time, member->step_size, 1, said, said + 1, said + 2, said + 8);
+          member->component, time, member->step_size, 1, &said->event_needed, &said->terminate, &said->early,
+          &said->last_time);
     }
   }
 }
 
-/* Set the inputs, take own step `step`, read the outputs. Returns 0, or stage and status of a call. */
+/* The time in s at which own step `step` begins: one multiplication, as in Python. */
+static inline double time_of(const Member *member, int64_t step) {
+  return member->start_time + (double)(step * member->points) * member->base_step_size;
+}
+
+/* Set the inputs, take own step `step`, read the outputs. Returns 0, or stage and status of a call; or the stage
+ * IN_PYTHON for a step that is Python's: then its inputs are in their row, and the model has not been called. */
 static inline int64_t call_step(Member *member, int64_t step) {
   char **bases = member->bases;
+  Said *said = member->said;
   for (int i = 0; i < 2; i++) {
     const Output *output = &member->outputs[i];
     bases[OUTPUT + i] = output->rows + ((step + 1) & output->mask) * output->stride;
   }
+  const double end = time_of(member, step + 1);
   int status;
   member->stage = SETTING;
-  if ((status = move_all(member->loads, member->n_loads, bases)) != 0 ||
-      (status = call_all(member->component, member->setters, member->n_setters, bases)) != 0)
+  if ((status = move_all(member->loads, member->n_loads, bases)) != 0)
+    return (int64_t)SETTING << STAGE_BITS | status;
+  if (!(said->quiet_until > end)) return (int64_t)IN_PYTHON << STAGE_BITS;
+  if ((status = call_all(member, member->setters, member->n_setters)) != 0)
     return (int64_t)SETTING << STAGE_BITS | (status & 0xffffff);
   member->stage = STEPPING;
-  status = call_do_step(member, member->start_time + (double)(step * member->points) * member->base_step_size);
-  if (status > WARNING || status < 0 || (member->kind == FMI3 && memcmp(member->said, "\0\0\0", 3) != 0))
+  status = call_do_step(member, time_of(member, step));
+  if (status > WARNING || status < 0 ||
+      (member->kind == FMI3 && (said->event_needed || said->terminate || said->early)))
     return (int64_t)STEPPING << STAGE_BITS | (status & 0xffffff);
+  said->time = end;
+  said->step = step + 1;
   member->stage = GETTING;
-  if ((status = call_all(member->component, member->getters, member->n_getters, bases)) != 0 ||
+  if ((status = call_all(member, member->getters, member->n_getters)) != 0 ||
       (status = move_all(member->stores, member->n_stores, bases)) != 0)
     return (int64_t)GETTING << STAGE_BITS | (status & 0xffffff);
   return 0;
@@ -479,8 +512,8 @@ static void publish(Node *node) {
     int64_t own = covered(&node->units[i], node->last_point);
     if (own < least) least = own;
   }
-  if (least > atomic_load_explicit(&node->progress->value, memory_order_relaxed))
-    raise_counter(&node->place, node->progress, least);
+  if (least >= atomic_load_explicit(&node->progress->value, memory_order_relaxed))
+    raise_counter(&node->place, node->progress, least + 1);
 }
 
 /* Before this process waits or leaves: whoever waits for it is awake. */
@@ -504,18 +537,22 @@ static int64_t allow(Node *node, int64_t point, Unit *unit) {
   }
   for (int64_t i = 0; i < node->n_peers; i++) {
     const Peer *peer = &node->peers[i];
-    int64_t limit = value_of(peer->progress) + peer->window;
+    int64_t known = value_of(peer->progress);
+    if (known > node->last_point + 1) known = node->last_point + 1;
+    int64_t limit = known - 1 + peer->window;
     if (limit < allowed) allowed = limit;
     if (limit <= point) {
       unit->blocked_by = peer->progress;
-      unit->need = point + 1 - peer->window;
+      unit->need = point + 2 - peer->window;
       return allowed;
     }
   }
   return allowed;
 }
 
-enum { SPINS = 60, YIELDS = 8, PATIENCE = 3, REST = 30 };
+/* A sleeper on another core takes up to this time to wake up. Who waits for it for a shorter time falls asleep itself, and
+ * both wake each other for ever. */
+enum { SPINS = 60, YIELD_NS = 50000, PATIENCE = 3, REST = 30 };
 
 /* For a node with one unit: look a little longer before it sleeps, unless that was in vain the last times. */
 static int soon(Node *node, Counter *counter, int64_t need) {
@@ -525,16 +562,22 @@ static int soon(Node *node, Counter *counter, int64_t need) {
     node->patience++;
     return value_of(counter) >= need;
   }
-  for (int i = 0; i < SPINS + YIELDS; i++) {
+  int64_t end = 0;
+  for (int i = 0;; i++) {
     if (value_of(counter) >= need) {
       if (node->patience < PATIENCE) node->patience++;
       return 1;
     }
     if (atomic_load_explicit(&node->attention, memory_order_relaxed)) return 0;
-    if (i < SPINS)
+    if (i < SPINS) {
       relax();
-    else
-      sched_yield();
+      continue;
+    }
+    sched_yield();
+    if (i == SPINS)
+      end = now() + YIELD_NS;
+    else if (now() > end)
+      break;
   }
   node->patience = node->patience > 0 ? node->patience - 1 : -REST;
   return 0;
@@ -637,8 +680,9 @@ static int advance(Node *node, Unit *unit, int64_t *ticks) {
     }
     if (node->n_units == 1) {
       int64_t reached = unit->n_members == 1 ? points_of(unit->members, node->last_point) : unit->tick + 1;
-      if (reached > atomic_load_explicit(&node->progress->value, memory_order_relaxed))
-        raise_counter(&node->place, node->progress, reached < node->last_point ? reached : node->last_point);
+      if (reached > node->last_point) reached = node->last_point;
+      if (reached >= atomic_load_explicit(&node->progress->value, memory_order_relaxed))
+        raise_counter(&node->place, node->progress, reached + 1);
     }
     if (atomic_load_explicit(&node->attention, memory_order_relaxed)) {
       unit->tick++;
@@ -654,12 +698,12 @@ out:
 }
 
 /* Sleep until a unit may step, Python has something to do, or the time is over. */
-static int64_t await(Node *node) {
+static int64_t await(Node *node, int64_t limit_ns) {
   uint32_t seen = bell_seen(&node->place);
   if (atomic_load(&node->attention)) return 0;
   wake_all(node);
   Wish wishes[64]; /* of more units, the others look again when one of these may step, or the time is over */
-  int64_t n = 0, limit_ns = node->wait_ns;
+  int64_t n = 0;
   for (int64_t i = 0; i < node->n_units; i++) {
     const Unit *unit = &node->units[i];
     if (unit->stopped || unit->tick >= unit->last_tick) continue;
@@ -671,14 +715,14 @@ static int64_t await(Node *node) {
   int64_t start = now();
   int64_t is_granted = sleep_for(&node->place, seen, wishes, n, limit_ns, &node->late);
   node->waited_ns += now() - start;
-  return is_granted;
+  return is_granted || bell_seen(&node->place) != seen;
 }
 
 /* Step as far as it goes, for about one slice of time. Call it again and again. */
 PUBLIC int64_t node_run(Node *node) {
   const int64_t start = now();
   int64_t begin = start;
-  atomic_store_explicit(&node->attention, atomic_load(&node->attention), memory_order_relaxed);
+  int any = 0;
   for (;;) {
     int stepped = 0, left = 0;
     for (int64_t i = 0; i < node->n_units; i++) {
@@ -689,7 +733,7 @@ PUBLIC int64_t node_run(Node *node) {
       int64_t end = now(), elapsed = end - begin;
       begin = end;
       if (ticks > 0) {
-        stepped = 1;
+        stepped = any = 1;
         unit->spent_ns += elapsed;
         if (ticks == unit->burst && elapsed < node->slice_ns)
           unit->burst = unit->burst < 4096 ? 2 * unit->burst : 4096;
@@ -711,7 +755,9 @@ PUBLIC int64_t node_run(Node *node) {
       return DONE;
     }
     if (!stepped) {
-      if (node->wait_ns == 0 || !await(node)) {
+      /* After a step only a little: its rows may be streamed, or sent. */
+      int64_t limit_ns = !any ? node->wait_ns : node->eager ? 0 : node->slice_ns - (begin - start);
+      if (limit_ns <= 0 || !await(node, limit_ns)) {
         wake_all(node);
         return BLOCKED;
       }
@@ -735,7 +781,7 @@ PUBLIC void node_attended(Node *node) { atomic_store(&node->attention, 0); }
 /* Sizes of the structures, which Python compares with its own. */
 PUBLIC int64_t structure_sizes(int64_t *sizes) {
   const int64_t own[] = {sizeof(Place), sizeof(Gate), sizeof(Move), sizeof(Call), sizeof(Output),
-                         sizeof(Member), sizeof(Unit), sizeof(Peer), sizeof(Node), sizeof(Wish)};
+                         sizeof(Member), sizeof(Unit), sizeof(Peer), sizeof(Node), sizeof(Wish), sizeof(Said)};
   memcpy(sizes, own, sizeof own);
   return sizeof own / sizeof own[0];
 }

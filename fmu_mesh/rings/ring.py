@@ -7,29 +7,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..system.layout import Layout, Place
+from ..system.layout import Layout, Place, row_offsets
 from ..variables.value_types import DTYPES, Value, VariableType, flattened, is_text, nested, zero
 
-__all__ = ["STAMP_BYTES", "Ring", "Rows", "row_bytes"]
+__all__ = ["Ring", "Rows"]
 
 Rows = tuple[NDArray[Any], ...]
 """Consecutive rows: one array of shape (rows, elements) for each part of a layout."""
-
-
-STAMP_BYTES: Final = 8
-"""A row begins with its stamp: its number plus 1, or 0 while its values are being written."""
-
-_ALIGNMENT: Final = 8
-
-
-def row_bytes(layout: Layout) -> int:
-    """Size of one row in memory; a String or Binary is not part of it."""
-    return _offsets(layout)[-1]
 
 
 class Ring:
@@ -44,7 +33,7 @@ class Ring:
     Args:
         layout: the columns.
         rows: how many rows; a power of two.
-        memory: ``rows * row_bytes(layout)`` bytes, such as shared memory; None: memory of its own.
+        memory: as many bytes as the rows have, such as shared memory; None: memory of its own.
 
     Attributes:
         parts: arrays of shape (rows, elements), in the order of ``layout.parts``; text as Python objects.
@@ -62,7 +51,7 @@ class Ring:
         self.layout = layout
         self.rows = rows
         self.mask = rows - 1
-        *self.offsets, self.stride = _offsets(layout)
+        *self.offsets, self.stride = row_offsets(layout)
         self._types = tuple(part.type for part in layout.parts)
         self._places: dict[str, Place] = {}
         flat = np.frombuffer(memory, np.uint8) if memory is not None else np.zeros(rows * self.stride, np.uint8)
@@ -80,6 +69,18 @@ class Ring:
         """The elements of one type: those of a row are neighbours, and the rows are ``stride`` bytes apart."""
         shape, strides = (self.rows, width), (self.stride, dtype.itemsize)
         return np.ndarray(shape, dtype, self._flat.data, offset, strides)
+
+    def place_in_row(self, part: int, element: int) -> int:
+        """Where an element of a part lies in a row, in bytes."""
+        return self.offsets[part] + element * self.parts[part].itemsize
+
+    def stamp(self, row: int) -> None:
+        """Mark a row as complete."""
+        self.stamps[row & self.mask] = row + 1
+
+    def has_row(self, row: int) -> bool:
+        """Whether a row is complete, and has not been overwritten."""
+        return bool(self.stamps[row & self.mask] == row + 1)
 
     def part(self, type_: VariableType) -> NDArray[Any]:
         """The array of one type, of shape (rows, elements); it has no elements if no column has this type."""
@@ -143,13 +144,3 @@ class Ring:
         if name not in self._places:
             self._places[name] = self.layout.place(name)
         return self._places[name]
-
-
-def _offsets(layout: Layout) -> list[int]:
-    """The place of each part in a row in bytes, and last the size of a row."""
-    offsets, end = [], STAMP_BYTES
-    for part in layout.parts:
-        offsets.append(end)
-        if not is_text(part.type):
-            end += -(-part.width * np.dtype(DTYPES[part.type]).itemsize // _ALIGNMENT) * _ALIGNMENT
-    return [*offsets, end]

@@ -1,21 +1,22 @@
-"""Moving values from rows of a source to rows of a target, with the factor and the offset of a connection.
+"""Moving values from a row of a source into the row of inputs of a target, with factor and offset of a connection.
 
-Which row a step reads is `fmu_mesh.system.coupling_rule`. Frames from another node and rings of the same process go
-the same way.
+Which row a step reads is `fmu_mesh.system.coupling_rule`. The burst moves numbers by tables (`moves`); the same moves
+in Python are `step`, which is also the only way for text.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..system.coupling_rule import CouplingRule
-from ..system.layout import Layout
 from ..system.plan import Feed
-from .ring import Ring, Rows
+from ..variables.value_types import is_text
+from .native import NUMBER_TYPES, Base, Move
+from .ring import Ring
 
 __all__ = ["Transfer"]
 
@@ -23,88 +24,86 @@ Index = slice | NDArray[np.intp]
 
 
 class Transfer:
-    """Copies the columns of one feed into the input ring of its target.
+    """The columns of one feed.
 
     Args:
         feed: the source, the delay and the columns.
-        source_layout: columns of the source's rows, in a ring or in a frame.
-        inputs: the input ring of the target.
+        source: the ring of the source.
+        inputs: the row of inputs of the target.
         source_points: base points per step of the source.
         target_points: base points per step of the target.
+        text: True takes the columns with text only, False those with numbers; None takes all.
+
+    Attributes:
+        rule: which row of the source a step needs.
+        columns: the columns that are moved.
     """
 
-    def __init__(
-        self, feed: Feed, source_layout: Layout, inputs: Ring, *, source_points: int, target_points: int
+    def __init__(  # noqa: PLR0913  the two ends of a connection
+        self,
+        feed: Feed,
+        source: Ring,
+        inputs: Ring,
+        *,
+        source_points: int,
+        target_points: int,
+        text: bool | None = None,
     ) -> None:
         self.feed = feed
+        self.source = source
+        self.rule = CouplingRule(feed.delay, source_points, target_points)
+        self.columns = [
+            column for column in feed.columns if text is None or is_text(source.layout.column(column[0]).type) == text
+        ]
         self._inputs = inputs
-        self._rule = CouplingRule(feed.delay, source_points, target_points)
-        self._same_rate = source_points == target_points
-        self._copies = _copies(feed, source_layout, inputs)
+        self._copies = _copies(self.columns, source, inputs)
 
-    def ready(self, rows: int) -> int:
-        """See `CouplingRule.steps_ready`."""
-        return self._rule.steps_ready(rows)
-
-    def from_rows(self, first: int, rows: Rows) -> None:
-        """Feed all steps of the target that ``rows`` of the source feed; the first of them is row ``first``."""
-        low, high = self.ready(first), self.ready(first + len(rows[0]))
-        if low >= high:
-            return
-        if self._same_rate:
-            skip = self._rule.row_for(low) - first
-            picked: Index = slice(skip, skip + high - low)
-        else:
-            picked = self._rule.row_for(np.arange(low, high)) - first
-        self._write(low, high, tuple(part[picked] for part in rows))
-
-    def from_ring(self, source: Ring, low: int, high: int) -> None:
-        """Feed own steps ``low .. high - 1`` of the target from the rows of ``source``."""
-        slots = self._rule.row_for(np.arange(low, high)) & source.mask
-        self._write(low, high, tuple(part[slots] for part in source.parts))
-
-    def stepper(self, source: Ring) -> Callable[[int], None]:
-        """A function that feeds one own step of the target from ``source``; faster than `from_ring` for a single row.
-
-        Single numbers of one type go through memory views: the bits are the same, and a copy takes a fraction of the
-        time.
-        """
-        if self._same_rate and all(copy.is_one_number(source) for copy in self._copies):
-            lead = self._rule.row_for(0)
-            steppers = [copy.stepper(source, lead, self._inputs.mask) for copy in self._copies]
-            if len(steppers) == 1:
-                return steppers[0]
-
-            def step_each(step: int) -> None:
-                for feed in steppers:
-                    feed(step)
-
-            return step_each
-        row_for = self._rule.row_for
-
-        def step_rows(step: int) -> None:
-            slot = row_for(step) & source.mask
-            target = step & self._inputs.mask
-            for copy in self._copies:
-                values = source.parts[copy.source_part][slot]
-                copy.part[target, copy.columns] = copy.convert(values[copy.source_columns])
-
-        return step_rows
-
-    def _write(self, low: int, high: int, rows: Rows) -> None:
-        """Write rows of own steps ``low .. high - 1``, in two pieces where the ring wraps."""
-        size, mask = self._inputs.rows, self._inputs.mask
-        start = low & mask
-        cut = min(high - low, size - start)
+    def step(self, step: int) -> None:
+        """Move the values for own step ``step`` of the target."""
+        slot = self.rule.row_for(step) & self.source.mask
         for copy in self._copies:
-            values = copy.convert(rows[copy.source_part][:, copy.source_columns])
-            copy.part[start : start + cut, copy.columns] = values[:cut]
-            if cut < high - low:
-                copy.part[: high - low - cut, copy.columns] = values[cut:]
+            copy.part[0, copy.columns] = copy.convert(self.source.parts[copy.source_part][slot][copy.source_columns])
+
+    def step_text(self, step: int) -> None:
+        """As `step`, for the columns with text."""
+        slot = self.rule.row_for(step) & self.source.mask
+        for copy in self._copies:
+            if copy.part.dtype == np.object_:
+                copy.part[0, copy.columns] = self.source.parts[copy.source_part][slot][copy.source_columns]
+
+    @property
+    def has_text(self) -> bool:
+        """Whether there is a column with text."""
+        return any(copy.part.dtype == np.object_ for copy in self._copies)
+
+    def moves(self, base: int) -> list[Move]:
+        """The moves of the numbers, from the row ``base`` of the burst."""
+        moves = []
+        for source_name, target_name, factor, offset in self.columns:
+            have, want = self.source.layout.place(source_name), self._inputs.layout.place(target_name)
+            from_type = self.source.layout.parts[have.part].type
+            to_type = self._inputs.layout.parts[want.part].type
+            if is_text(from_type):
+                continue
+            moves.append(
+                Move(
+                    from_base=base,
+                    from_=self.source.place_in_row(have.part, have.first),
+                    to_base=Base.FIXED,
+                    to=self._inputs.address + self._inputs.place_in_row(want.part, want.first),
+                    count=want.size,
+                    from_type=NUMBER_TYPES[from_type],
+                    to_type=NUMBER_TYPES[to_type],
+                    scaled=(factor, offset) != (1.0, 0.0),
+                    factor=factor,
+                    offset=offset,
+                )
+            )
+        return moves
 
 
 class _Copy:
-    """Columns of one part of the source rows for columns of one part of the target ring."""
+    """Columns of one part of the source rows for columns of one part of the row of inputs."""
 
     def __init__(
         self, source_part: int, source_columns: Index, part: NDArray[Any], columns: Index, scale: tuple[Any, Any] | None
@@ -114,37 +113,6 @@ class _Copy:
         self.part = part
         self.columns = columns
         self.scale = scale
-
-    def is_one_number(self, source: Ring) -> bool:
-        """Whether this copies one number that Python does not change; a Float32 would become a Float64 on the way."""
-        if not (isinstance(self.source_columns, slice) and isinstance(self.columns, slice)):
-            return False
-        single = self.columns.stop - self.columns.start == 1
-        dtype = source.parts[self.source_part].dtype
-        return single and dtype == self.part.dtype and dtype not in (np.float32, np.object_)
-
-    def stepper(self, source: Ring, lead: int, mask: int) -> Callable[[int], None]:
-        """As `Transfer.stepper`, if `is_one_number`; step n reads row ``n + lead``."""
-        have, want = source.parts[self.source_part], self.part
-        values, inputs = have.reshape(-1).data, want.reshape(-1).data
-        assert isinstance(self.source_columns, slice)
-        assert isinstance(self.columns, slice)
-        first, width, source_mask = self.source_columns.start, have.shape[1], source.mask
-        own_first, own_width = self.columns.start, want.shape[1]
-        if self.scale is None:
-
-            def step_one(step: int) -> None:
-                inputs[(step & mask) * own_width + own_first] = values[((step + lead) & source_mask) * width + first]
-
-            return step_one
-        factor, offset = float(self.scale[0][0]), float(self.scale[1][0])
-
-        def step_scaled(step: int) -> None:
-            inputs[(step & mask) * own_width + own_first] = (
-                values[((step + lead) & source_mask) * width + first] * factor + offset
-            )
-
-        return step_scaled
 
     def convert(self, values: NDArray[Any]) -> NDArray[Any]:
         """``values * factor + offset`` in Float64, with one rounding each; for a Float32 the result is rounded again.
@@ -161,21 +129,21 @@ class _Copy:
         return scaled
 
 
-def _copies(feed: Feed, source: Layout, inputs: Ring) -> list[_Copy]:
+def _copies(columns: Sequence[tuple[str, str, float, float]], source: Ring, inputs: Ring) -> list[_Copy]:
     """Group the columns by part of source and target, and by whether they are scaled.
 
     An unscaled column is not multiplied by 1.0, so it keeps every bit, also of a NaN.
     """
     groups: dict[tuple[int, int, bool], list[tuple[int, int, float, float]]] = {}
-    for source_name, target_name, factor, offset in feed.columns:
-        have, want = source.place(source_name), inputs.layout.place(target_name)
+    for source_name, target_name, factor, offset in columns:
+        have, want = source.layout.place(source_name), inputs.layout.place(target_name)
         scaled = (factor, offset) != (1.0, 0.0)
         group = groups.setdefault((have.part, want.part, scaled), [])
         group += [(have.first + place, want.first + place, factor, offset) for place in range(want.size)]
     copies = []
-    for (source_part, target_part, scaled), columns in groups.items():
-        scale = (np.array([c[2] for c in columns]), np.array([c[3] for c in columns])) if scaled else None
-        sources, targets = _index([c[0] for c in columns]), _index([c[1] for c in columns])
+    for (source_part, target_part, scaled), items in groups.items():
+        scale = (np.array([c[2] for c in items]), np.array([c[3] for c in items])) if scaled else None
+        sources, targets = _index([c[0] for c in items]), _index([c[1] for c in items])
         copies.append(_Copy(source_part, sources, inputs.parts[target_part], targets, scale))
     return copies
 

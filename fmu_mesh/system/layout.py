@@ -15,10 +15,14 @@ import numpy as np
 from ..variables.model_description import Variable
 from ..variables.value_types import DTYPES, TYPES, VariableType, element_names, is_text, split_element
 
-__all__ = ["Column", "Layout", "Part", "Place", "rows_for"]
+__all__ = ["Column", "Layout", "Part", "Place", "row_bytes", "row_offsets", "rows_for"]
 
 _TEXT_BYTES = 64
 """Assumed size of a String or Binary without a maximum size, to plan memory and frames."""
+
+
+_STAMP_BYTES = 8
+_ALIGNMENT = 8
 
 
 class Column(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -131,6 +135,24 @@ class Layout(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 def rows_for(window: int) -> int:
     """Number of rows of a ring in which a node can be ``window`` points ahead without overwriting a row in use."""
     return 1 << (window + 3).bit_length()
+
+
+def row_offsets(layout: Layout) -> list[int]:
+    """The place of each part in a row of a ring in bytes, and last the size of a row.
+
+    A row begins with its stamp: its number plus 1, or 0 while its values are being written. Text lies beside the row.
+    """
+    offsets, end = [], _STAMP_BYTES
+    for part in layout.parts:
+        offsets.append(end)
+        if not is_text(part.type):
+            end += -(-part.width * _itemsize(part.type) // _ALIGNMENT) * _ALIGNMENT
+    return [*offsets, end]
+
+
+def row_bytes(layout: Layout) -> int:
+    """Size of a row of a ring in bytes."""
+    return row_offsets(layout)[-1]
 
 
 def _itemsize(type_: VariableType) -> int:

@@ -20,15 +20,19 @@ from ..variables.value_types import PlainValue
 from .digest import digest_of
 from .graph import cycle_through, feedback_edges, strongly_connected, topological_order
 from .initialization_plan import InitializationPlan, Loop, plan_initialization
-from .layout import Layout, rows_for
+from .layout import Layout, row_bytes, rows_for
 from .linear_inputs import LinearInput, linear_inputs
+from .memory_map import MemoryMap, RingPlace, map_memory
 from .system import Connection, ResolvedSystem, SystemInstance
-from .window import LAZY_ROWS, recorder_window, window_of
+from .window import recorder_window, window_of
 
-__all__ = ["RECORDER", "Feed", "InstancePlan", "Link", "NodePlan", "Plan", "make_plan"]
+__all__ = ["MASTER", "RECORDER", "Feed", "InstancePlan", "Link", "NodePlan", "Plan", "make_plan"]
 
 RECORDER = "@record"
 """Name of the recorder in place of the name of a node. No instance can have it."""
+
+MASTER = "@mesh"
+"""Name of the master in place of the name of a node."""
 
 
 class Feed(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -97,7 +101,9 @@ class NodePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         window: number of points that this node may be behind the grant.
         progress_stride: number of points between two progress messages to the master: a quarter of the window, or 1 if
             a single step is that long.
-        ring_rows: number of rows of every ring; a power of two.
+        windows: number of points that each node, and last the recorder, may be behind the others, by name.
+        memory: where everything lies in the memory that processes of one host share.
+        rings: the output rings of its instances, and of all instances that it has values from.
         loops: the algebraic loops at the start that have instances of this node.
         initialization: how these loops are iterated.
         links_in: links that end here.
@@ -113,7 +119,9 @@ class NodePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     grid: TimeGrid
     window: int
     progress_stride: int
-    ring_rows: int
+    windows: tuple[tuple[str, int], ...]
+    memory: MemoryMap
+    rings: tuple[RingPlace, ...]
     timeouts: TimeoutsConfig
     instances: tuple[InstancePlan, ...]
     units: tuple[tuple[str, ...], ...]
@@ -271,23 +279,50 @@ def _algebraic_loop(loop: list[str], connections: tuple[Connection, ...], file: 
 
 
 def _nodes(plan: Plan) -> dict[str, NodePlan]:
-    system = plan.system
+    system, config = plan.system, plan.system.config
     outputs = {name: _output_layout(plan, name) for name in system.instances}
     node_names = list(dict.fromkeys(instance.node for instance in system.instances.values()))
     links = _links(plan)
+    windows = dict.fromkeys(node_names, plan.window)
+    if system.recorded:
+        rows = [row_bytes(link.layout) for link in links if link.target_node == RECORDER]
+        windows[RECORDER] = recorder_window(plan.window, rows)
+    longest_step = max(instance.step_points for instance in system.instances.values())
+    rings = {name: (own.node, own.step_points, outputs[name]) for name, own in system.instances.items()}
+    # A source may be two own steps beyond the grant (the step it takes, and the step for which it holds its value).
+    # A target may be one own step behind the progress it has told.
+    ring_rows = rows_for(max(windows.values()) + 3 * longest_step)
+    memory, places = map_memory([*windows, MASTER], rings, ring_rows)
     nodes = {}
-    for node in node_names:
+    for node in windows:
         members = [name for name in plan.order if plan.node_of(name) == node]
         within = _units(plan, node, members)
-        nodes[node] = _node(
-            plan,
-            node,
+        links_in = tuple(link for link in links if link.target_node == node)
+        nodes[node] = NodePlan(
+            mesh=config.mesh,
+            node=node,
+            digest="",
+            key_prefix=config.zenoh.key_prefix,
+            grid=plan.grid,
+            window=windows[node],
+            progress_stride=windows[node] // 4 if windows[node] >= 4 * longest_step else 1,
+            windows=tuple(windows.items()),
+            memory=memory,
+            rings=tuple(
+                places[name]
+                for name in dict.fromkeys([*members, *(link.source for link in links_in if not link.initial_only)])
+            ),
+            timeouts=config.timeouts,
             instances=tuple(_instance_plan(plan, system.instances[name], outputs[name]) for name in members),
             units=tuple(dict.fromkeys(within[name] for name in members)),
-            links=links,
+            links_in=links_in,
+            links_out=tuple(link for link in links if link.source_node == node),
+            loops=tuple(loop for loop in plan.initialization.loops if node in loop.nodes),
+            initialization=config.initialization,
+            recorded=system.recorded if node == RECORDER else (),
+            limits=config.limits,
+            shared_memory=config.zenoh.shared_memory,
         )
-    if system.recorded:
-        nodes[RECORDER] = _node(plan, RECORDER, instances=(), units=(), links=links)
     return nodes
 
 
@@ -303,43 +338,6 @@ def _units(plan: Plan, node: str, members: list[str]) -> dict[str, tuple[str, ..
             unit = tuple(name for name in plan.order if name in cycle)
             units.update(dict.fromkeys(unit, unit))
     return units
-
-
-def _node(
-    plan: Plan,
-    node: str,
-    *,
-    instances: tuple[InstancePlan, ...],
-    units: tuple[tuple[str, ...], ...],
-    links: tuple[Link, ...],
-) -> NodePlan:
-    config = plan.system.config
-    window = plan.window
-    if node == RECORDER:
-        window = recorder_window(window, [link.layout.row_size for link in links if link.target_node == RECORDER])
-    longest_step = max(instance.step_points for instance in plan.system.instances.values())
-    return NodePlan(
-        mesh=config.mesh,
-        node=node,
-        digest="",
-        key_prefix=config.zenoh.key_prefix,
-        grid=plan.grid,
-        window=window,
-        progress_stride=window // 4 if window >= 4 * longest_step else 1,
-        # A source may be two own steps beyond the grant (the step it takes, and the step for which it holds its value).
-        # A target may be one own step behind the progress it has reported.
-        ring_rows=rows_for(max(window, LAZY_ROWS) + 3 * longest_step),
-        timeouts=config.timeouts,
-        instances=instances,
-        units=units,
-        links_in=tuple(link for link in links if link.target_node == node),
-        links_out=tuple(link for link in links if link.source_node == node),
-        loops=tuple(loop for loop in plan.initialization.loops if node in loop.nodes),
-        initialization=config.initialization,
-        recorded=plan.system.recorded if node == RECORDER else (),
-        limits=config.limits,
-        shared_memory=config.zenoh.shared_memory,
-    )
 
 
 def _output_layout(plan: Plan, name: str) -> Layout:

@@ -9,10 +9,7 @@ from .system import ResolvedSystem
 
 __all__ = [
     "AUTO_WINDOW_POINTS",
-    "FRAME_OVERHEAD",
-    "LAZY_ROWS",
     "STEADY_POINTS",
-    "lazy_frame_rows",
     "recorder_window",
     "window_of",
 ]
@@ -20,21 +17,13 @@ __all__ = [
 RECORDER_WINDOW = 32768
 """Largest number of points that the recorder may be behind. It sleeps while rows accumulate."""
 
-_LEAST_RECORDER_WINDOW = 8192
+_LEAST_RECORDER_WINDOW = 64
 _RECORDER_BYTES = 16 * 2**20
-
-FRAME_OVERHEAD = 32
-"""Bytes of a message besides its rows. A message may have a single row."""
-
-LAZY_ROWS = 2048
-"""Smallest number of rows of a ring, so that half of them can wait for the recorder even with a small window."""
-
-_LAZY_FRAME_ROWS = 4096
 
 AUTO_WINDOW_POINTS = 16384
 AUTO_WINDOW_BYTES = 16 * 2**20
 AUTO_WINDOW_ROWS = 65536
-"""Limit for all instances together. Without a compiled call, each row also needs a pointer."""
+"""Limit for all instances together."""
 
 STEADY_POINTS = 1024
 """Points that the grant may be ahead at any speed; more only for fast instances."""
@@ -47,17 +36,8 @@ def recorder_window(window: int, row_sizes: Sequence[int]) -> int:
         window: window of the mesh in points.
         row_sizes: row sizes of all recorded instances in bytes.
     """
-    row_bytes = sum(row_sizes) + FRAME_OVERHEAD * len(row_sizes)
-    return max(window, _LEAST_RECORDER_WINDOW, min(RECORDER_WINDOW, _RECORDER_BYTES // max(row_bytes, 1)))
-
-
-def lazy_frame_rows(window: int) -> int:
-    """Number of rows that a node collects before it sends a frame to the recorder.
-
-    Args:
-        window: window of the mesh in points.
-    """
-    return min(_LAZY_FRAME_ROWS, max(LAZY_ROWS // 2, window // 4))
+    most = min(RECORDER_WINDOW, _RECORDER_BYTES // max(sum(row_sizes), 1))
+    return max(window, _LEAST_RECORDER_WINDOW, most)
 
 
 def window_of(system: ResolvedSystem) -> int:

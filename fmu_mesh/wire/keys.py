@@ -9,6 +9,8 @@ from typing import Literal
 
 import msgspec
 
+from ..system.plan import MASTER
+
 __all__ = ["MASTER", "RUN_ID_BYTES", "Keys", "RunKeys", "VariableKind", "batched", "escape", "unescape"]
 
 VariableKind = Literal["out", "in", "param", "local"]
@@ -16,9 +18,6 @@ VariableKind = Literal["out", "in", "param", "local"]
 _UNSAFE = re.compile(r"[/*$?#%]|^@|[\x00-\x20\x7f]")
 _ESCAPED = re.compile(r"%([0-9A-F]{2})")
 _GRANT_CHUNKS = 16
-
-MASTER = "@mesh"
-"""Name of the master in place of a node name."""
 
 RUN_ID_BYTES = 8
 """Hexadecimal digits of a run's id. So the id never begins with `@`: wildcards do not match such a chunk."""

@@ -4,8 +4,7 @@ There are three steps; each is a query with an answer:
 
 * **register** with the master, which admits the node and answers with the run's id, or refuses it. The node declares
   nothing before, so a process that is not part of the run does not affect it.
-* **hello** to every node that sends frames to this one: a source that answers knows the subscription of this node. The
-  answer also says whether the source can open the shared memory of this node.
+* **hello** to every node that sends frames to this one: a source that answers knows the subscription of this node.
 * **ready** to the master, which answers when all nodes are ready.
 """
 
@@ -22,20 +21,18 @@ import msgspec
 import zenoh
 
 from ..errors import DeadlineExceeded, FmuMeshError, MeshLost, MessageRefused
-from ..system.plan import NodePlan
-from ..system.window import FRAME_OVERHEAD
+from ..rings.host_memory import HostMemory, Offer
+from ..system.plan import MASTER, NodePlan
 from .inbox import Inbox
-from .keys import MASTER, RUN_ID_BYTES, Keys, RunKeys
+from .keys import RUN_ID_BYTES, Keys, RunKeys
 from .messages import NodeReport, decode_json
 from .refusals import payload_of
 from .session import Question, RouterLink, ask, tokens
-from .shared_memory import Offer, SharedInbox, SharedOutlet, available
 
-__all__ = ["Admission", "Membership", "NodeReady", "Registration", "Welcome", "shared_inbox"]
+__all__ = ["Admission", "Membership", "NodeReady", "Registration", "Welcome"]
 
 T = TypeVar("T")
 
-_SHARED = b"shared"
 _GRACE_S = 1.0
 
 
@@ -59,28 +56,27 @@ class Admission(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     Attributes:
         run: the id of the run.
         grants: the key of the master's messages to this node.
+        offer: the memory that processes on the master's host share; None if there is none.
     """
 
     run: Annotated[str, msgspec.Meta(pattern=f"^[0-9a-f]{{{2 * RUN_ID_BYTES}}}$")]
     grants: str
+    offer: Offer | None = None
 
 
 class Hello(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a node sends to its sources: its name, and where its shared memory is."""
+    """What a node sends to its sources."""
 
     node: str
-    offer: Offer | None = None
 
 
 class NodeReady(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What a node reports when its links work.
 
     Attributes:
-        offer: its shared memory.
-        shared: whether all its sources can open it.
+        shared: whether it has opened the shared memory.
     """
 
-    offer: Offer | None = None
     shared: bool = False
 
 
@@ -89,24 +85,11 @@ class Welcome(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     Attributes:
         profile: how many bursts and waits the node stores for a profile; 0: nothing is measured.
-        shared: the participants that get all messages through shared memory: names of nodes, `@mesh` for the master.
-        offer: the shared memory of the master, if it is among them.
+        shared: the nodes that use the shared memory. The recorder always does if there is any.
     """
 
     profile: int = 0
     shared: tuple[str, ...] = ()
-    offer: Offer | None = None
-
-
-def shared_inbox(plan: NodePlan, *, spins: bool) -> SharedInbox | None:
-    """Shared memory with space for all messages that the senders of this node may send ahead; None if there is none."""
-    if not plan.shared_memory or not available():
-        return None
-    senders = {MASTER: 0}
-    for link in plan.links_in:
-        own = plan.ring_rows * (link.layout.row_size + FRAME_OVERHEAD)
-        senders[link.source_node] = senders.get(link.source_node, 0) + own
-    return SharedInbox(senders, spins=spins)
 
 
 class Membership:
@@ -115,24 +98,27 @@ class Membership:
     Args:
         plan: what the participant has to do.
         session: the session of this process; the caller closes it.
-        inbox: its inbox, made with `shared_inbox`; opened by `join`.
+        inbox: its inbox; opened by `join`.
         launch: the launcher that started this process; None if it was started manually.
         router: the link to the router that connects this process to the others, if there is one.
+        memory: the shared memory, for a participant in the process of the master.
 
     Attributes:
         given_up: whether `give_up` was called.
+        memory: the shared memory, once `open_memory` has opened it; None if this process does not share any.
         lost_master: whether the master was found to be gone.
 
     Call sequence: `register`, then `join` once, then `sender` for each receiver, and `close` at the end.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913, PLR0917  one participant and its surroundings
         self,
         plan: NodePlan,
         session: zenoh.Session,
         inbox: Inbox,
         launch: str | None = None,
         router: RouterLink | None = None,
+        memory: HostMemory | None = None,
     ) -> None:
         self._plan = plan
         self._router = router or RouterLink(session)
@@ -144,8 +130,7 @@ class Membership:
         self._admission: Admission | None = None
         self._refusal: FmuMeshError | None = None
         self._answered = threading.Event()
-        self._outlets: dict[str, SharedOutlet] = {}
-        self._shared: frozenset[str] = frozenset()
+        self.memory = memory
         self._stack = ExitStack()
         self._master_went = False
         self.given_up = False
@@ -231,6 +216,16 @@ class Membership:
         question = Question(key, "the master", timeout_s, msgspec.json.encode(report), priority=priority)
         ask(self._session, question, over)
 
+    def open_memory(self) -> HostMemory | None:
+        """The memory that the processes of the master's host share; None if this process cannot, or must not, open it.
+
+        Call it after `keys` and before `join`.
+        """
+        offer = self._admission.offer if self._admission is not None else None
+        if self.memory is None and offer is not None and self._plan.shared_memory:
+            self.memory = HostMemory.opened(offer, self._plan.memory, self._plan.node)
+        return self.memory
+
     def join(self) -> Welcome:
         """Wait until the links with all other nodes work in both directions, then tell the master.
 
@@ -243,33 +238,19 @@ class Membership:
         keys = self.keys(deadline_s + _GRACE_S)
         assert self._admission is not None
         senders = {keys.frames(link.source, plan.node): link.source_node for link in plan.links_in}
-        capacity = sum(plan.window + 8 for _ in plan.links_in) + 4096
-        inbox.open(self._session, keys, plan.node, {**senders, self._admission.grants: MASTER}, capacity)
-        hello = msgspec.json.encode(Hello(plan.node, inbox.offer))
-        shared = inbox.offer is not None
+        inbox.open(self._session, keys, plan.node, {**senders, self._admission.grants: MASTER})
+        hello = msgspec.json.encode(Hello(plan.node))
         for node in dict.fromkeys(link.source_node for link in plan.links_in):
             question = Question(keys.hello(node), f"node '{node}'", deadline_s, hello)
-            answer = ask(self._session, question, self._has_nothing_to_join)
-            shared = shared and answer == _SHARED
-        ready = msgspec.json.encode(NodeReady(inbox.offer, shared))
+            ask(self._session, question, self._has_nothing_to_join)
+        ready = msgspec.json.encode(NodeReady(shared=self.memory is not None))
         question = Question(keys.ready(plan.node), "the master", deadline_s, ready, answer_s=2 * deadline_s)
         answer = ask(self._session, question, self._has_nothing_to_join)
-        welcome = _understood(answer, Welcome)
         self._router.look()
-        self._shared = frozenset(welcome.shared)
-        if welcome.offer is not None and self._outlet(welcome.offer, MASTER, "the master") is None:
-            raise FmuMeshError(
-                "the shared memory of the master cannot be reached, though the master reaches ours",
-                hint="Set `zenoh: {shared_memory: false}`.",
-            )
-        if plan.node in self._shared:
-            inbox.share()
-        return welcome
+        return _understood(answer, Welcome)
 
-    def sender(self, target: str, key: str) -> Callable[[bytes], None]:
-        """A function that sends a message to a target: through shared memory, or as a publication on ``key``."""
-        if target in self._shared:
-            return self._outlets[target].put
+    def sender(self, key: str) -> Callable[[bytes], None]:
+        """A function that publishes a message on ``key``."""
         publisher = self._session.declare_publisher(key, congestion_control=zenoh.CongestionControl.BLOCK, express=True)
         self._stack.callback(publisher.undeclare)
         return publisher.put
@@ -302,13 +283,12 @@ class Membership:
         stack.callback(self._session.liveliness().declare_token(keys.node(plan.node)).undeclare)
 
     def _answer_hello(self, query: zenoh.Query) -> None:
-        """On a thread of Zenoh: answer a target whether its shared memory can be opened from here."""
+        """On a thread of Zenoh: answer a target; its subscription is known here."""
         with self._inbox.refusals.guard(str(query.key_expr), query):
             hello = decode_json(payload_of(query), Hello)
             if hello.node not in {link.target_node for link in self._plan.links_out}:
                 raise MessageRefused("its sender receives nothing from this node")
-            outlet = self._outlet(hello.offer, hello.node, f"node '{hello.node}'")
-            query.reply(query.key_expr, _SHARED if outlet is not None else b"")
+            query.reply(query.key_expr, b"")
             query.drop()
 
     def _has_nothing_to_join(self) -> bool:
@@ -316,12 +296,6 @@ class Membership:
             self._master_went = False
             self.given_up = self.master_is_gone
         return self.given_up
-
-    def _outlet(self, offer: Offer | None, target: str, spoken: str) -> SharedOutlet | None:
-        outlet = SharedOutlet.open(offer, self._plan.node, spoken, self._inbox.stash, self._plan.timeouts.step)
-        if outlet is not None:
-            self._outlets[target] = outlet
-        return outlet
 
 
 def _understood(answer: bytes, kind: type[T]) -> T:

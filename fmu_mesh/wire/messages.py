@@ -26,7 +26,6 @@ __all__ = [
     "LAST",
     "MAX_MESSAGE_SIZE",
     "PROGRESS",
-    "WAKE",
     "NodeReport",
     "decode_abort",
     "decode_json",
@@ -40,7 +39,6 @@ GRANT: Final = 3
 PROGRESS: Final = 4
 FINISH: Final = 5
 ABORT: Final = 6
-WAKE: Final = 7
 LAST: Final = 8
 
 MAX_MESSAGE_SIZE: Final = 64 * 2**20

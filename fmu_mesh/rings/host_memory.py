@@ -1,0 +1,221 @@
+"""Memory with the rings and counters of a run: shared by the processes of one host, or private to one process.
+
+Shared memory is anonymous: the master makes it, processes that it starts inherit its descriptor, and others of the same
+user open it through `/proc`. So there is no file, and nothing is left behind if a process is killed. Nobody can shrink
+it. A random token proves that an offer means the memory of this host.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import fcntl
+import mmap
+import os
+import secrets
+import threading
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final, Self
+
+import msgspec
+import numpy as np
+
+from ..system.memory_map import MemoryMap, RingPlace
+from . import native
+from .ring import Ring
+
+__all__ = ["ONE_CORE", "Counter", "HostMemory", "Offer", "Wish", "can_share"]
+
+_NAME: Final = "fmu_mesh"
+_TOKEN_BYTES: Final = 16
+
+ONE_CORE: Final = not hasattr(os, "sched_getaffinity") or len(os.sched_getaffinity(0)) == 1
+"""Whether the process that somebody waits for cannot run meanwhile."""
+
+Wish = tuple["Counter", int]
+"""A counter, and the value that somebody waits for."""
+
+
+class Offer(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Where shared memory is.
+
+    Attributes:
+        pid: a process that has it open.
+        descriptor: its file descriptor there.
+        token: hexadecimal; the first bytes of the memory.
+    """
+
+    pid: int
+    descriptor: int
+    token: str
+
+
+def can_share() -> bool:
+    """Whether processes can share memory here: Linux, and the library with the burst."""
+    return native.library is not None and hasattr(os, "memfd_create") and Path("/proc/self/fd").is_dir()
+
+
+class HostMemory:
+    """One piece of memory, as one participant uses it.
+
+    Args:
+        memory: the memory, as long as ``map_`` says.
+        map_: what lies where.
+        process: which participant this is.
+        descriptor: of shared memory; closed by `close`.
+
+    Make it with `create`, `opened` or `private`.
+    """
+
+    def __init__(self, memory: mmap.mmap, map_: MemoryMap, process: str, descriptor: int | None = None) -> None:
+        self.map = map_
+        self.process = process
+        self._memory = memory
+        self._descriptor = descriptor
+        self._view = memoryview(memory)
+        self.address = ctypes.addressof(ctypes.c_char.from_buffer(memory))
+        number = map_.number_of(process)
+        self.place = native.Place(self.address + map_.bells, len(map_.processes), number)
+        self.grant = self.counter(map_.grant)
+        self.progress = {
+            name: self.counter(offset) for name, offset in zip(map_.processes, map_.progress, strict=False)
+        }
+        self._lock = threading.Condition()
+        self._rung = False
+
+    @classmethod
+    def create(cls, map_: MemoryMap, process: str) -> Self:
+        """Make shared memory.
+
+        Raises:
+            OSError: the system has none.
+        """
+        descriptor = os.memfd_create(_NAME, os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
+        os.ftruncate(descriptor, map_.size)
+        fcntl.fcntl(descriptor, fcntl.F_ADD_SEALS, fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL)
+        memory = mmap.mmap(descriptor, map_.size, mmap.MAP_SHARED)
+        memory[:_TOKEN_BYTES] = secrets.token_bytes(_TOKEN_BYTES)
+        made = cls(memory, map_, process, descriptor)
+        made._prepare()
+        return made
+
+    @classmethod
+    def private(cls, map_: MemoryMap, process: str) -> Self:
+        """Make memory for this process alone; pages that nobody touches take no space."""
+        memory = mmap.mmap(-1, map_.size, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+        made = cls(memory, map_, process)
+        made._prepare()
+        return made
+
+    @classmethod
+    def opened(cls, offer: Offer, map_: MemoryMap, process: str) -> Self | None:
+        """The memory of an offer; None if it cannot be reached from here: another host, or another user."""
+        if not can_share():
+            return None
+        try:
+            descriptor = os.open(f"/proc/{offer.pid}/fd/{offer.descriptor}", os.O_RDWR | os.O_CLOEXEC)
+        except OSError:
+            return None
+        try:
+            if os.fstat(descriptor).st_size != map_.size:
+                return None
+            seals = fcntl.fcntl(descriptor, fcntl.F_GET_SEALS)
+            memory = mmap.mmap(descriptor, map_.size, mmap.MAP_SHARED)
+            if not seals & fcntl.F_SEAL_SHRINK or memory[:_TOKEN_BYTES].hex() != offer.token:
+                return None
+            return cls(memory, map_, process)
+        except OSError:
+            return None
+        finally:
+            os.close(descriptor)
+
+    @property
+    def offer(self) -> Offer:
+        """Where others find this shared memory."""
+        assert self._descriptor is not None
+        return Offer(os.getpid(), self._descriptor, self._memory[:_TOKEN_BYTES].hex())
+
+    def participant(self, process: str) -> HostMemory:
+        """The same memory for another participant of this process."""
+        return HostMemory(self._memory, self.map, process)
+
+    def counter(self, offset: int) -> Counter:
+        """The counter at an offset."""
+        return Counter(self, offset)
+
+    def ring(self, place: RingPlace) -> Ring:
+        """The ring of an instance; text is beside it, in this process."""
+        return Ring(place.layout, place.rows, self._view[place.offset :])
+
+    # --- waiting
+
+    def seen(self) -> int:
+        """What `sleep` needs: ask for it, then look for reasons to stay awake, then sleep."""
+        if native.library is not None:
+            return int(native.library.bell_seen(ctypes.byref(self.place)))
+        with self._lock:
+            self._rung = False
+        return 0
+
+    def sleep(self, seen: int, timeout_s: float, wishes: Sequence[Wish] = ()) -> None:
+        """Wait until a wish is granted, the bell of this participant was rung since ``seen``, or the time is over."""
+        if native.library is not None:
+            items = native.table(native.Wish, [native.Wish(counter.address, need) for counter, need in wishes])
+            limit_ns = max(0, int(timeout_s * 1e9))
+            native.library.sleep_for(ctypes.byref(self.place), seen, items, len(wishes), limit_ns, None)
+            return
+        end = time.monotonic() + timeout_s
+        with self._lock:
+            while not self._rung and not any(counter.value >= need for counter, need in wishes):
+                left = end - time.monotonic()
+                if left <= 0 or not self._lock.wait(left):
+                    return
+
+    def ring_bell(self) -> None:
+        """From any thread: wake this participant."""
+        if native.library is not None:
+            native.library.ring_bell(self.place.bells + 64 * self.place.own)
+            return
+        with self._lock:
+            self._rung = True
+            self._lock.notify_all()
+
+    def close(self) -> None:
+        """Close the descriptor: from now on no other process can open this memory."""
+        if self._descriptor is not None:
+            os.close(self._descriptor)
+            self._descriptor = None
+
+    def _prepare(self) -> None:
+        """Nobody sleeps: no counter wakes anybody."""
+        for counter in (self.map.grant, *self.map.progress, *self.map.rings):
+            np.frombuffer(self._memory, np.int64, 1, counter + 8)[:] = native.NEVER
+
+
+class Counter:
+    """A number in a `HostMemory` that only grows and has one writer.
+
+    Args:
+        memory: the memory.
+        offset: where it lies.
+    """
+
+    def __init__(self, memory: HostMemory, offset: int) -> None:
+        self.address = memory.address + offset
+        self._memory = memory
+        self._plain = np.frombuffer(memory._memory, np.int64, 1, offset)  # noqa: SLF001  the same module
+
+    @property
+    def value(self) -> int:
+        """The number; what its writer wrote before it can be read."""
+        if native.library is not None:
+            return int(native.library.counter_value(self.address))
+        return int(self._plain[0])
+
+    def raise_to(self, value: int) -> None:
+        """Set the number, and wake who waits for it."""
+        if native.library is not None:
+            native.library.counter_raise(ctypes.byref(self._memory.place), self.address, value)
+        else:
+            self._plain[0] = value

@@ -1,0 +1,102 @@
+"""Where everything lies in the memory that the processes of a run share on one host.
+
+The map is a pure function of the plan. It has a bell for each process, and counters: the grant of the master, the
+progress of each node, and the rows of each instance; then the rings. `fmu_mesh.rings.host_memory` makes the memory.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import msgspec
+
+from .layout import Layout, row_bytes
+
+__all__ = ["MemoryMap", "RingPlace", "map_memory"]
+
+_LINE = 64
+"""Size of a cache line in bytes. Two processes that write do not share one."""
+
+_TOKEN_LINES = 1
+
+
+class RingPlace(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The output ring of one instance.
+
+    Attributes:
+        step_points: base points per own step.
+        rows: number of rows, a power of two.
+        counter: offset of the counter of complete rows, in bytes.
+        offset: offset of the first row, in bytes.
+    """
+
+    instance: str
+    node: str
+    step_points: int
+    layout: Layout
+    rows: int
+    counter: int
+    offset: int
+
+
+class MemoryMap(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The offsets in bytes of what all processes use.
+
+    Attributes:
+        processes: names of the nodes, the recorder and the master; a process has the number of its place here.
+        size: of the memory.
+        bells: offset of the first bell; each takes 64 bytes.
+        grant: the counter of granted points.
+        progress: the counters of known points, in the order of ``processes``; the master has none.
+        rings: the counters of complete rows of all instances.
+    """
+
+    processes: tuple[str, ...]
+    size: int
+    bells: int
+    grant: int
+    progress: tuple[int, ...]
+    rings: tuple[int, ...]
+
+    def number_of(self, process: str) -> int:
+        """The number of a process."""
+        return self.processes.index(process)
+
+    def progress_of(self, process: str) -> int:
+        """The offset of its counter of known points."""
+        return self.progress[self.number_of(process)]
+
+
+def map_memory(
+    processes: Sequence[str], rings: Mapping[str, tuple[str, int, Layout]], rows: int
+) -> tuple[MemoryMap, dict[str, RingPlace]]:
+    """The map, and the place of each ring by instance.
+
+    Args:
+        processes: the names of all nodes, then the master.
+        rings: node, base points per own step and outputs of each instance.
+        rows: number of rows of each ring.
+    """
+    ends = _Places(_TOKEN_LINES * _LINE)
+    counter = _LINE + 8 * len(processes)
+    bells = ends.take(_LINE * len(processes))
+    grant = ends.take(counter)
+    progress = tuple(ends.take(counter) for _ in processes[:-1])
+    counters = {name: ends.take(counter) for name in rings}
+    places = {
+        name: RingPlace(name, node, points, layout, rows, counters[name], ends.take(rows * row_bytes(layout)))
+        for name, (node, points, layout) in rings.items()
+    }
+    return MemoryMap(tuple(processes), ends.end, bells, grant, progress, tuple(counters.values())), places
+
+
+class _Places:
+    """Takes one piece after the other, each at the start of a cache line."""
+
+    def __init__(self, start: int) -> None:
+        self.end = start
+
+    def take(self, size: int) -> int:
+        first = self.end
+        self.end += -(-size // _LINE) * _LINE
+        return first
