@@ -17,16 +17,17 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any, Final, TypeVar
+from typing import Any, Final, TypeVar, cast
 
 import msgspec
 
 from ..config.mesh import TimeoutsConfig
 from ..errors import FmuError, InitializationFailed, LoadFailed, StepFailed
+from ..rings.native import NativeStep
 from ..rings.ring import Ring
 from ..simtime import TimeGrid
 from ..text import short_path
-from .contract import Instance
+from .contract import Instance, StepsNatively
 from .instance_wrapper import AroundInstance
 
 __all__ = [
@@ -251,7 +252,7 @@ class Unwatched:
 
 
 def current_function(thread: int) -> str | None:
-    """The FMI function that a thread is in; None if it is in none, or in one of the compiled calls of a step."""
+    """The FMI function that a thread is in; None if it is in none, or in a step that the library takes."""
     return _functions.get(thread)
 
 
@@ -298,7 +299,7 @@ def call_named(name: str, function: Callable[..., Result], *arguments: Any, **ke
 
 
 class Guarded(AroundInstance[Instance]):
-    """An instance whose calls have a deadline and leave the state of the process unchanged; `do_step` is as it was.
+    """An instance whose calls have a deadline and leave the state of the process unchanged; steps are as they were.
 
     Args:
         name: instance name.
@@ -325,6 +326,15 @@ class Guarded(AroundInstance[Instance]):
         """Let `do_step` work on these rings."""
         super().bind(inputs, outputs, grid, points, step)
         self._running = True
+
+    @property
+    def native(self) -> NativeStep | None:
+        """See `StepsNatively`; None if the inner instance has no such steps."""
+        return self._instance.native if isinstance(self._instance, StepsNatively) else None
+
+    def finish(self, step: int, outcome: int) -> None:
+        """See `StepsNatively`; only called if there is `native`."""
+        cast("StepsNatively", self._instance).finish(step, outcome)
 
     def close(self) -> None:
         """Terminate if allowed, free the instance and remove its files; one deadline for all of it."""

@@ -15,12 +15,13 @@ import msgspec
 
 from ..config.instance_sections import InstanceSection
 from ..config.mesh import LimitsConfig
+from ..rings.native import NativeStep
 from ..rings.ring import Ring
 from ..simtime import TimeGrid
 from ..system.linear_inputs import LinearInput
 from ..variables.model_description import ModelDescription, Value
 
-__all__ = ["Instance", "KeepsFiles", "KeepsState", "Kind", "LogMessage", "Opening", "Showing"]
+__all__ = ["Instance", "KeepsFiles", "KeepsState", "Kind", "LogMessage", "Opening", "Showing", "StepsNatively"]
 
 Section = TypeVar("Section", bound=InstanceSection)
 
@@ -199,7 +200,8 @@ class Instance(Protocol):
 
         Args:
             inputs: `do_step` reads from it the connected inputs, which are the columns of its layout.
-            outputs: `do_step` writes to them the outputs of their layouts; all have the same number of rows.
+            outputs: one or two rings; `do_step` writes to them the outputs of their layouts. Both have the same number
+                of rows.
             grid: the communication points of the run.
             points: how many points of ``grid`` one own step takes; own step ``n`` starts at point ``n * points``.
             step: the number of the next own step.
@@ -225,6 +227,25 @@ class KeepsFiles(Protocol):
 
     def remove_files(self) -> None:
         """Remove the files. Called from another thread, just before the process is ended."""
+        ...
+
+
+@runtime_checkable
+class StepsNatively(Protocol):
+    """An instance whose steps a node may take without Python (`fmu_mesh.rings.native`), instead of `do_step`."""
+
+    @property
+    def native(self) -> NativeStep | None:
+        """The tables of a step on the rings of the last `bind`; None if `do_step` takes the steps."""
+        ...
+
+    def finish(self, step: int, outcome: int) -> None:
+        """Complete own step ``step`` as `do_step` does, after the library has returned ``outcome``, which is not 0.
+
+        Raises:
+            FmuError: the step has failed.
+            TerminationRequested: see `Instance.do_step`.
+        """
         ...
 
 

@@ -314,14 +314,15 @@ class Node:
         assert self._engine is not None
         runner = self._runners[asked.instance or ""]
         point = runner.covered
+        # The master has to know it before the progress of this node, which is beyond the grant then.
+        self._tell_end(asked.at(point, self._plan.grid.time(point)), self._plan.timeouts.stop)
         for member in next(unit for unit in self._engine.units if runner in unit):
             member.stop()
             member.flush()
         self._memory.progress[self._plan.node].raise_to(self._engine.covered + 1)
-        self._tell_end(asked.at(point, self._plan.grid.time(point)), self._plan.timeouts.stop)
 
     def _send_rows(self, *, stepped: bool) -> None:
-        """Send rows that a consumer may wait for; those that are only recorded every 50 ms, or where nothing happens."""
+        """Send rows that a consumer may wait for; those for the recorder every 50 ms, and where nothing happens."""
         now = time.monotonic()
         lazy = not stepped or now - self._lazy_sent > _LAZY_S
         if lazy:

@@ -97,6 +97,15 @@ typedef struct {
   int64_t mask;
 } Output;
 
+typedef struct { /* what a model says in a step besides its status, and how far it is: Python looks at it between steps */
+  uint8_t event_needed, terminate, early; /* FMI 3.0: not 0 if it is so */
+  int32_t call;       /* the getter or setter that returned a status above warning */
+  double last_time;   /* of an early return (FMI 3.0) */
+  double quiet_until; /* a step that ends here or later is taken by Python */
+  double time;        /* of the model */
+  int64_t step;       /* own steps done */
+} Said;
+
 enum { BY_PYTHON, FMI1, FMI2, FMI3 };                                    /* Member.kind */
 enum { WAITING, SETTING, STEPPING, GETTING, IN_PYTHON, STEPPED };        /* Member.stage */
 enum { FIXED, OUTPUT, WATCHED, FIRST_GATE, MAX_GATES = 4096 };           /* bases */
@@ -113,7 +122,7 @@ typedef struct {
   int64_t kind;
   void *component;
   void *do_step;
-  void *said; /* FMI 3.0: event needed, terminate, early return (one byte each), and at 8 the last time */
+  Said *said; /* of an FMU */
   double start_time, base_step_size, step_size;
   int64_t points; /* base points per own step */
   int64_t every;  /* ticks of the unit per own step */
@@ -401,17 +410,21 @@ static inline int move_all(const Move *moves, int64_t n, char *const *bases) {
   return 0;
 }
 
-static inline int call_all(void *component, const Call *calls, int64_t n, char *const *bases) {
+static inline int call_all(const Member *member, const Call *calls, int64_t n) {
+  void *component = member->component;
   for (int64_t i = 0; i < n; i++) {
     const Call *call = &calls[i];
-    void *values = bases[call->base] + call->values;
+    void *values = member->bases[call->base] + call->values;
     int status =
         call->size < 0
             ? ((int (*)(void *, const void *, size_t, void *))call->function)(component, call->references,
                                                                               (size_t)call->count, values)
             : ((int (*)(void *, const void *, size_t, void *, size_t))call->function)(
                   component, call->references, (size_t)call->count, values, (size_t)call->size);
-    if (status > WARNING || status < 0) return status;
+    if (status > WARNING || status < 0) {
+      member->said->call = (int32_t)i;
+      return status;
+    }
   }
   return 0;
 }
@@ -423,32 +436,46 @@ static inline int call_do_step(Member *member, double time) {
     case FMI2:
       return ((int (*)(void *, double, double, int))member->do_step)(member->component, time, member->step_size, 1);
     default: {
-      char *said = member->said;
-      memset(said, 0, 3);
+      Said *said = member->said;
+      said->event_needed = said->terminate = said->early = 0;
       return ((int (*)(void *, double, double, _Bool, void *, void *, void *, void *))member->do_step)(
-          member->component, time, member->step_size, 1, said, said + 1, said + 2, said + 8);
+          member->component, time, member->step_size, 1, &said->event_needed, &said->terminate, &said->early,
+          &said->last_time);
     }
   }
 }
 
-/* Set the inputs, take own step `step`, read the outputs. Returns 0, or stage and status of a call. */
+/* The time in s at which own step `step` begins: one multiplication, as in Python. */
+static inline double time_of(const Member *member, int64_t step) {
+  return member->start_time + (double)(step * member->points) * member->base_step_size;
+}
+
+/* Set the inputs, take own step `step`, read the outputs. Returns 0, or stage and status of a call; or the stage
+ * IN_PYTHON for a step that is Python's: then its inputs are in their row, and the model has not been called. */
 static inline int64_t call_step(Member *member, int64_t step) {
   char **bases = member->bases;
+  Said *said = member->said;
   for (int i = 0; i < 2; i++) {
     const Output *output = &member->outputs[i];
     bases[OUTPUT + i] = output->rows + ((step + 1) & output->mask) * output->stride;
   }
+  const double end = time_of(member, step + 1);
   int status;
   member->stage = SETTING;
-  if ((status = move_all(member->loads, member->n_loads, bases)) != 0 ||
-      (status = call_all(member->component, member->setters, member->n_setters, bases)) != 0)
+  if ((status = move_all(member->loads, member->n_loads, bases)) != 0)
+    return (int64_t)SETTING << STAGE_BITS | status;
+  if (!(said->quiet_until > end)) return (int64_t)IN_PYTHON << STAGE_BITS;
+  if ((status = call_all(member, member->setters, member->n_setters)) != 0)
     return (int64_t)SETTING << STAGE_BITS | (status & 0xffffff);
   member->stage = STEPPING;
-  status = call_do_step(member, member->start_time + (double)(step * member->points) * member->base_step_size);
-  if (status > WARNING || status < 0 || (member->kind == FMI3 && memcmp(member->said, "\0\0\0", 3) != 0))
+  status = call_do_step(member, time_of(member, step));
+  if (status > WARNING || status < 0 ||
+      (member->kind == FMI3 && (said->event_needed || said->terminate || said->early)))
     return (int64_t)STEPPING << STAGE_BITS | (status & 0xffffff);
+  said->time = end;
+  said->step = step + 1;
   member->stage = GETTING;
-  if ((status = call_all(member->component, member->getters, member->n_getters, bases)) != 0 ||
+  if ((status = call_all(member, member->getters, member->n_getters)) != 0 ||
       (status = move_all(member->stores, member->n_stores, bases)) != 0)
     return (int64_t)GETTING << STAGE_BITS | (status & 0xffffff);
   return 0;
@@ -751,7 +778,7 @@ PUBLIC void node_attended(Node *node) { atomic_store(&node->attention, 0); }
 /* Sizes of the structures, which Python compares with its own. */
 PUBLIC int64_t structure_sizes(int64_t *sizes) {
   const int64_t own[] = {sizeof(Place), sizeof(Gate), sizeof(Move), sizeof(Call), sizeof(Output),
-                         sizeof(Member), sizeof(Unit), sizeof(Peer), sizeof(Node), sizeof(Wish)};
+                         sizeof(Member), sizeof(Unit), sizeof(Peer), sizeof(Node), sizeof(Wish), sizeof(Said)};
   memcpy(sizes, own, sizeof own);
   return sizeof own / sizeof own[0];
 }

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Sequence
-from ctypes import POINTER, Structure, c_double, c_int32, c_int64, c_uint32, c_void_p
+from ctypes import POINTER, Structure, c_bool, c_double, c_int32, c_int64, c_uint32, c_void_p
 from enum import IntEnum
 from typing import Any, Final, NamedTuple
 
@@ -32,6 +32,7 @@ __all__ = [
     "Peer",
     "Place",
     "Result",
+    "Said",
     "Stage",
     "Unit",
     "Wish",
@@ -160,6 +161,54 @@ class Output(Structure):
     _fields_ = (("rows", c_void_p), ("stride", c_int64), ("mask", c_int64))
 
 
+class Said(Structure):
+    """What a model says in a step besides its status, and how far it is.
+
+    Attributes:
+        event_needed, terminate, early: the results of a step in FMI 3.0 (4.2.1).
+        call: the getter or setter that returned a status above warning.
+        last_time: the time of an early return in s.
+        quiet_until: a step that ends at this time (s) or later is taken by Python.
+        time: of the model, in s; only after a step without anything special.
+        step: own steps done.
+    """
+
+    _fields_ = (
+        ("event_needed", c_bool),
+        ("terminate", c_bool),
+        ("early", c_bool),
+        ("call", c_int32),
+        ("last_time", c_double),
+        ("quiet_until", c_double),
+        ("time", c_double),
+        ("step", c_int64),
+    )
+
+    @property
+    def addresses(self) -> tuple[int, int, int, int]:
+        """Of the results of a step in FMI 3.0: `event_needed`, `terminate`, `early` and `last_time`."""
+        first = ctypes.addressof(self)
+        return first, first + 1, first + 2, first + 8
+
+    def note(self, *, step: int | None = None, time: float | None = None, quiet_until: float | None = None) -> None:
+        """Change what is given."""
+        if step is not None:
+            self.step = step
+        if time is not None:
+            self.time = time
+        if quiet_until is not None:
+            self.quiet_until = quiet_until
+
+    def clear(self) -> None:
+        """Before a step in FMI 3.0: nothing is said yet."""
+        self.event_needed = self.terminate = self.early = False
+
+    @property
+    def anything(self) -> bool:
+        """Whether the last step has said anything."""
+        return bool(self.event_needed or self.terminate or self.early)
+
+
 class Member(Structure):
     """One instance: how it gets its inputs, steps, and gives its outputs."""
 
@@ -257,7 +306,7 @@ class NativeStep(NamedTuple):
         kind: how its function of the step is called.
         component: address of the instance.
         do_step: address of this function.
-        said: address of its other results (FMI 3.0), or 0.
+        said: address of its `Said`.
         loads: from the row of inputs to buffers of other types.
         setters: read the row of inputs, or buffers.
         getters: write the rows of `Base.OUTPUT` and `Base.WATCHED`, or buffers.
@@ -281,7 +330,7 @@ def table(kind: Any, items: Sequence[Any]) -> Any:  # noqa: ANN401 ctypes has no
     return (kind * max(len(items), 1))(*items)
 
 
-_STRUCTURES: Final = (Place, Gate, Move, Call, Output, Member, Unit, Peer, Node, Wish)
+_STRUCTURES: Final = (Place, Gate, Move, Call, Output, Member, Unit, Peer, Node, Wish, Said)
 
 
 class _Library:

@@ -14,10 +14,12 @@ import pytest
 
 from fmu_mesh.errors import StepFailed, TerminationRequested
 from fmu_mesh.instances.fmi import FmuInstance, open_instance, read_description, stepped
+from fmu_mesh.instances.fmi.calls import cffi_function
 from fmu_mesh.instances.fmi.co_simulation.discarded_steps import DISCARD, SMALLEST, take_sub_steps
 from fmu_mesh.instances.fmi.co_simulation.extrapolation import LinearInputs
 from fmu_mesh.instances.fmi.co_simulation.fmi3_steps import Fmi3Steps
 from fmu_mesh.instances.fmi.step_options import SolverSettings, StepOptions
+from fmu_mesh.rings.native import Said
 from fmu_mesh.rings.ring import Ring
 from fmu_mesh.simtime import TimeGrid
 from fmu_mesh.system.layout import Layout
@@ -42,16 +44,16 @@ def running(
     options: StepOptions = StepOptions(),  # noqa: B008 a frozen Struct
     **start_values: Value,
 ) -> Iterator[FmuInstance]:
-    """An instance at point 0, with all its inputs and outputs in rings of 64 rows."""
+    """An instance at point 0, with all its inputs in one row, and all its outputs in a ring of 64 rows."""
     description = read_description(fmu, kind=kind)
     with closing(open_instance(fmu, "m", description, folder, options=options)) as instance:
         instance.enter_initialization(0.0, 100.0, start_values)
         instance.exit_initialization()
-        rings = [Ring(Layout.of(description.with_causality(causality)), 64) for causality in ("input", "output")]
+        inputs = Ring(Layout.of(description.with_causality("input")), 1)
+        outputs = Ring(Layout.of(description.with_causality("output")), 64)
         for variable in description.with_causality("input"):
-            for row in range(64):
-                rings[0].put(row, variable.name, cast("Value", variable.start))
-        instance.bind(rings[0], (rings[1],), TimeGrid(0.0, step_size, 400), 1)
+            inputs.put(0, variable.name, cast("Value", variable.start))
+        instance.bind(inputs, (outputs,), TimeGrid(0.0, step_size, 400), 1)
         yield instance
 
 
@@ -155,11 +157,12 @@ def test_the_rest_of_a_step_after_an_early_return_ends_where_the_step_does() -> 
     function = ctypes.CFUNCTYPE(
         ctypes.c_int, ctypes.c_void_p, ctypes.c_double, ctypes.c_double, ctypes.c_bool, *[ctypes.c_void_p] * 4
     )(stepped)
-    fmu = SimpleNamespace(component=1, dll=SimpleNamespace(fmi3DoStep=function))
+    do_step = cffi_function(function, "int (*)(void *, double, double, _Bool, void *, void *, void *, void *)")
+    fmu = SimpleNamespace(component=1)
     description = ModelDescription("m", "m", "3.0", "co_simulation", "", (), can_handle_variable_step_size=True)
     assert 0.04 + (0.11 - 0.04) > 0.11
 
-    assert Fmi3Steps(fmu, description).step(0.0, 0.11, 0.11)
+    assert Fmi3Steps(fmu, do_step, description, Said()).step(0.0, 0.11, 0.11)
 
     assert calls[0] == (0.0, 0.11)
     assert calls[1][0] == 0.04

@@ -58,7 +58,7 @@ def of(name: str) -> pytest.MarkDecorator:
 def through(instance: FmuInstance, pairs: dict[str, str], rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Bind rings with these (input, output) variables, and step once per row of inputs; returns the rows of outputs."""
     variables = {variable.name: variable for variable in instance.description.variables}
-    inputs = Ring(Layout.of(variables[name] for name in pairs), 4)
+    inputs = Ring(Layout.of(variables[name] for name in pairs), 1)
     outputs = Ring(Layout.of(variables[name] for name in dict.fromkeys(pairs.values())), 4)
     instance.bind(inputs, [outputs], GRID, 1)
     got = []

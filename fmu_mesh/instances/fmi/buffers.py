@@ -8,14 +8,21 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Sequence
-from typing import Any, Protocol
+from itertools import groupby
+from typing import Any, Final, Protocol
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from ...variables.value_types import VariableType
+from ...rings.native import NUMBER_TYPES, Base, Move
+from ...variables.value_types import DTYPES, VariableType
 
 __all__ = ["BinaryBuffer", "Buffer", "NumberBuffer", "StringBuffer"]
+
+_TYPE_IN_MOVE: Final = {
+    np.dtype(DTYPES[type_]): number for type_, number in NUMBER_TYPES.items() if type_ not in ("Boolean", "Enumeration")
+}
+"""The types of `Move` by the C type of a number."""
 
 
 class Buffer(Protocol):
@@ -49,6 +56,7 @@ class NumberBuffer:
         self, type_: VariableType, dtype: DTypeLike, count: int, signs: NDArray[np.int8] | None = None
     ) -> None:
         self._memory: NDArray[Any] = np.zeros(count, dtype=dtype)
+        self._type = type_
         self._is_boolean = type_ == "Boolean"
         self._signs = signs
         self.address: int = self._memory.ctypes.data
@@ -59,14 +67,14 @@ class NumberBuffer:
         Raises:
             OverflowError: the C type cannot hold one of them, or its opposite.
         """
-        if self._signs is None:
-            self._memory[:] = elements
-            if not self._is_boolean and (self._memory != elements).any() and self._memory.dtype.kind == "i":
-                raise OverflowError(f"a value is out of the range of {self._memory.dtype}")
-        elif self._is_boolean:
+        if self._is_boolean and self._signs is not None:
             self._memory[:] = np.asarray(elements, dtype=np.bool_) ^ (self._signs < 0)
-        else:
-            self._memory[:] = self._signed(np.asarray(elements, dtype=self._memory.dtype))
+            return
+        self._memory[:] = elements
+        if not self._is_boolean and (self._memory != elements).any() and self._memory.dtype.kind == "i":
+            raise OverflowError(f"a value is out of the range of {self._memory.dtype}")
+        if self._signs is not None:
+            self._memory[:] = self._signed(self._memory)
 
     def values(self) -> NDArray[Any]:
         """The numbers in the memory; a Boolean is true for every number but 0."""
@@ -74,6 +82,30 @@ class NumberBuffer:
             truth: NDArray[np.bool_] = self._memory != 0
             return truth if self._signs is None else truth ^ (self._signs < 0)
         return self._memory if self._signs is None else self._signed(self._memory)
+
+    def moves(self, base: Base, place: int, *, load: bool) -> list[Move]:
+        """What `load`, or `values`, does: as moves of the library, one for each run of elements with the same sign.
+
+        Args:
+            base: a row of a ring.
+            place: of the elements in this row, in bytes.
+            load: from the row to the memory; False: from the memory to the row.
+        """
+        made, first = [], 0
+        signs = [1] * self._memory.size if self._signs is None else self._signs.tolist()
+        row_item = np.dtype(DTYPES[self._type]).itemsize
+        row_type, own_type = NUMBER_TYPES[self._type], _TYPE_IN_MOVE[self._memory.dtype]
+        for sign, run in groupby(signs):
+            count = len(list(run))
+            ends = [
+                (base, place + first * row_item, row_type),
+                (Base.FIXED, self.address + first * self._memory.itemsize, own_type),
+            ]
+            (from_base, from_, from_type), (to_base, to, to_type) = ends if load else reversed(ends)
+            move = Move(from_base, from_, to_base, to, count, from_type, to_type, negated=sign < 0, factor=1.0)
+            made.append(move)
+            first += count
+        return made
 
     def _signed(self, numbers: NDArray[Any]) -> NDArray[Any]:
         assert self._signs is not None

@@ -16,7 +16,6 @@ from cffi import FFI
 from ..call_guard import call_named
 
 __all__ = [
-    "DirectCall",
     "FmpyCalls",
     "Function",
     "Pointer",
@@ -101,10 +100,6 @@ class RowPointers(dict[int, Pointer]):
         """Make the pointer to a row."""
         made = self[row] = pointer(self.address + row * self.row_size)
         return made
-
-
-DirectCall: TypeAlias = tuple[Function, Pointer, int, RowPointers, int]
-"""A getter or setter on ring memory: function, value references and their number, rows, number of values per row."""
 
 
 def address_of(made: Function | Pointer) -> int:

@@ -5,6 +5,7 @@ A version of FMI and a kind of FMU add the calls: how an instance is made, initi
 
 from __future__ import annotations
 
+import math
 import shutil
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
@@ -14,6 +15,7 @@ from typing import Any, Literal
 from fmpy.fmi1 import FMICallException
 
 from ...errors import InitializationFailed, LoadFailed, StepFailed
+from ...rings.native import Said
 from ...variables.model_description import ModelDescription
 from ...variables.value_conversion import to_value
 from ...variables.value_types import Value
@@ -73,7 +75,7 @@ class FmuInstance(KeepsFmuState, FmuValues):
         self._options = options
         self._log = log
         self._last_messages: list[str] = []
-        self._step = -1
+        self._said = Said(step=-1, quiet_until=math.inf)
         self._state: Literal["instantiated", "initialization", "stepping", "failed", "closed"] = "instantiated"
         self._live = False
         self._keep = []
@@ -95,7 +97,7 @@ class FmuInstance(KeepsFmuState, FmuValues):
         except Exception as error:
             self._state = "failed"
             self.close()
-            raise LoadFailed(f"'{path}' cannot be instantiated: {error}{self._said()}", instance=name) from error
+            raise LoadFailed(f"'{path}' cannot be instantiated: {error}{self._message()}", instance=name) from error
 
     @property
     def description(self) -> ModelDescription:
@@ -152,7 +154,7 @@ class FmuInstance(KeepsFmuState, FmuValues):
         name = STATUS_NAMES[status] if 0 <= status < len(STATUS_NAMES) else str(status)
         if status > OK:
             self._last_messages = [*self._last_messages[-2:], text]
-        self._log(LogMessage(self.name, name, category.decode(errors="replace"), text, self._step))
+        self._log(LogMessage(self.name, name, category.decode(errors="replace"), text, self._said.step))
 
     # --- what a version of FMI adds
 
@@ -186,10 +188,10 @@ class FmuInstance(KeepsFmuState, FmuValues):
         return self._options.tolerance or self._description.default_experiment.tolerance
 
     def _bookkeeping(self) -> Bookkeeping:
-        return Bookkeeping(self._step)
+        return Bookkeeping(self._said.step)
 
     def _restore(self, kept: Bookkeeping) -> None:
-        self._step = kept.step
+        self._said.note(step=kept.step)
         self._state = "stepping"
 
     def _describe(self, description: ModelDescription) -> None:
@@ -209,16 +211,16 @@ class FmuInstance(KeepsFmuState, FmuValues):
 
     def _not_initialized(self, function: str, status: int) -> InitializationFailed:
         self._state = "failed"
-        return InitializationFailed(f"{function} returned {STATUS_NAMES[status]}{self._said()}", instance=self.name)
+        return InitializationFailed(f"{function} returned {STATUS_NAMES[status]}{self._message()}", instance=self.name)
 
     def _failed(
         self, what: str, variable: str | None = None, hint: str | None = None
     ) -> StepFailed | InitializationFailed:
         kind = StepFailed if self._state == "stepping" else InitializationFailed
         self._state = "failed"
-        return kind(f"{what}{self._said()}", instance=self.name, variable=variable, hint=hint)
+        return kind(f"{what}{self._message()}", instance=self.name, variable=variable, hint=hint)
 
-    def _said(self) -> str:
+    def _message(self) -> str:
         messages, self._last_messages = self._last_messages, []
         return f"; the FMU says: {' | '.join(messages)}." if messages else "; the FMU gave no message."
 

@@ -9,9 +9,12 @@ from __future__ import annotations
 import ctypes
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, NamedTuple
+
+from numpy.typing import NDArray
 
 from ...errors import InitializationFailed, StepFailed
+from ...rings.native import Base, Call, Said
 from ...rings.ring import Ring
 from ...simtime import TimeGrid
 from ...system.layout import Part
@@ -19,15 +22,57 @@ from ...variables.model_description import ModelDescription, Variable
 from ...variables.value_types import Value, VariableType, flattened, nested
 from ..call_guard import call_named
 from .buffers import Buffer
-from .calls import DirectCall, Function, Pointer, RowPointers, cffi_function, memory
+from .calls import Function, Pointer, RowPointers, address_of, cffi_function, memory
 
-__all__ = ["OK", "STATUS_NAMES", "WARNING", "FmuValues", "Verb"]
+__all__ = ["OK", "STATUS_NAMES", "WARNING", "FmuValues", "PartCall", "Verb"]
 
 OK: Final = 0
 WARNING: Final = 1
 STATUS_NAMES: Final = ("ok", "warning", "discard", "error", "fatal", "pending")
 
 Verb = Literal["Get", "Set"]
+
+_DOING: Final[dict[Verb, str]] = {"Set": "setting the inputs", "Get": "reading the outputs"}
+_OWN_ROWS: Final = (Base.OUTPUT, Base.WATCHED)
+
+
+class PartCall(NamedTuple):
+    """The call that moves one part of a row between a ring and the FMU.
+
+    Attributes:
+        type: the type of the part.
+        variables: its variables.
+        array: the memory of the ring, of shape (rows, elements).
+        base: what `place` is relative to, in the tables of the library.
+        place: of the elements in the row, in bytes; for `Base.FIXED` the address of those of row 0.
+        size: number of elements.
+        buffer: what the function of the FMU works on; None: on the ring itself.
+        function: the getter or setter.
+        references: its value references.
+        rows: pointers to the elements in the ring.
+    """
+
+    type: VariableType
+    variables: Sequence[Variable]
+    array: NDArray[Any]
+    base: Base
+    place: int
+    size: int
+    buffer: Buffer | None
+    function: Function
+    references: Pointer
+    rows: RowPointers
+
+    @property
+    def names(self) -> list[str]:
+        """The names of the variables."""
+        return [variable.name for variable in self.variables]
+
+    def in_table(self, *, sized: bool) -> Call:
+        """The call for the library; ``sized``: the function also takes the number of values (FMI 3.0, 2.2.7)."""
+        base, values = (self.base, self.place) if self.buffer is None else (Base.FIXED, self.buffer.address)
+        size = self.size if sized else -1
+        return Call(address_of(self.function), address_of(self.references), len(self.variables), base, values, size)
 
 
 class FmuValues(ABC):
@@ -43,7 +88,8 @@ class FmuValues(ABC):
     _description: ModelDescription
     _variables: Mapping[str, Variable]
     _keep: list[object]
-    _step: int
+    _said: Said
+    """How far the instance is."""
 
     def set_values(self, values: Mapping[str, Value]) -> None:
         """Set variables by name."""
@@ -75,20 +121,16 @@ class FmuValues(ABC):
         self._base_step_size = grid.step_size
         self._points = points
         self._step_size = points * grid.step_size
-        self._step = step
+        self._said.note(step=step)
         self._input_mask = inputs.mask
         self._output_mask = outputs[0].mask
         self._keep = [inputs, *outputs]
-        self._direct_setters: list[DirectCall] = []
-        self._direct_getters: list[DirectCall] = []
-        self._setters: list[Callable[[int], None]] = []
-        self._getters: list[Callable[[int], None]] = []
-        for number, part in enumerate(inputs.layout.parts):
-            self._prepare("Set", part, inputs.parts[number])
-        for ring in outputs:
-            for number, part in enumerate(ring.layout.parts):
-                self._prepare("Get", part, ring.parts[number])
-        self._read_outputs(step & self._output_mask)
+        self._setters = self._part_calls("Set", inputs, Base.FIXED)
+        getters = [
+            call for base, ring in zip(_OWN_ROWS, outputs, strict=False) for call in self._part_calls("Get", ring, base)
+        ]
+        self._getters = sorted(getters, key=_is_buffered)
+        self._read_outputs(step)
 
     # --- what a version of FMI adds
 
@@ -130,49 +172,65 @@ class FmuValues(ABC):
 
     # --- shared by all versions
 
-    def _prepare(self, verb: Verb, part: Part, array: Any) -> None:  # noqa: ANN401 an array of any dtype
-        """Prepare the call that copies one part of a row between ``array``, the memory of a ring, and the FMU."""
-        variables = [self._variables[column.name] for column in part.columns]
-        if self._is_direct(part):
-            rows = RowPointers(array.ctypes.data, array.strides[0])
-            function = cffi_function(self._function(verb, part.type), self._direct_declaration)
-            calls = self._direct_setters if verb == "Set" else self._direct_getters
-            calls.append((function, memory(_references(variables)), len(variables), rows, part.width))
-            return
-        buffer = self._buffer(part.type, variables)
-        names = [variable.name for variable in variables]
+    def _time_of(self, step: int) -> float:
+        """The time in s at which own step ``step`` begins: one multiplication, as in `TimeGrid.time`."""
+        return self._start_time + step * self._points * self._base_step_size
 
-        def set_row(slot: int) -> None:
-            self._load(buffer, array[slot], names)
-            self._transfer("Set", part.type, variables, buffer)
+    def _part_calls(self, verb: Verb, ring: Ring, base: Base) -> list[PartCall]:
+        """The calls that move a row of a ring; those that need no buffer are first."""
+        calls = []
+        for number, part in enumerate(ring.layout.parts):
+            variables = [self._variables[column.name] for column in part.columns]
+            array, offset = ring.parts[number], ring.offsets[number]
+            calls.append(
+                PartCall(
+                    type=part.type,
+                    variables=variables,
+                    array=array,
+                    base=base,
+                    place=ring.address + offset if base == Base.FIXED else offset,
+                    size=part.width,
+                    buffer=None if self._is_direct(part) else self._buffer(part.type, variables),
+                    function=cffi_function(self._function(verb, part.type), self._direct_declaration),
+                    references=memory(_references(variables)),
+                    rows=RowPointers(array.ctypes.data, array.strides[0]),
+                )
+            )
+        return sorted(calls, key=_is_buffered)
 
-        def get_row(slot: int) -> None:
-            self._transfer("Get", part.type, variables, buffer)
-            array[slot] = self._elements(buffer, names)
+    def _set_inputs(self, step: int) -> None:
+        """Set the inputs of row ``step``, call by call."""
+        self._set_row(step & self._input_mask, self._setters)
 
-        if verb == "Set":
-            self._setters.append(set_row)
-        else:
-            self._getters.append(get_row)
+    def _set_row(self, slot: int, setters: Sequence[PartCall]) -> None:
+        for part in setters:
+            if part.buffer is None:
+                self._call_part("Set", part, slot)
+            else:
+                self._load(part.buffer, part.array[slot], part.names)
+                self._transfer("Set", part.type, part.variables, part.buffer)
 
-    def _set_inputs(self, slot: int) -> None:
-        self._set_row(slot, self._direct_setters, self._setters)
+    def _read_outputs(self, step: int) -> None:
+        """Write the outputs to row ``step``, call by call."""
+        slot = step & self._output_mask
+        for part in self._getters:
+            if part.buffer is None:
+                self._call_part("Get", part, slot)
+            else:
+                self._transfer("Get", part.type, part.variables, part.buffer)
+                part.array[slot] = self._elements(part.buffer, part.names)
 
-    def _set_row(self, slot: int, direct: Sequence[DirectCall], setters: Sequence[Callable[[int], None]]) -> None:
-        for function, references, count, rows, size in direct:
-            status = self._call_direct(function, references, count, rows[slot], size)
-            if status > WARNING:
-                raise self._failed(f"setting the inputs returned {STATUS_NAMES[status]}")
-        for set_row in setters:
-            set_row(slot)
+    def _call_part(self, verb: Verb, part: PartCall, slot: int) -> None:
+        """Call a function of the FMU on the memory of a ring."""
+        status = self._call_direct(part.function, part.references, len(part.variables), part.rows[slot], part.size)
+        if status > WARNING:
+            raise self._part_failed(verb, part, status)
 
-    def _read_outputs(self, slot: int) -> None:
-        for function, references, count, rows, size in self._direct_getters:
-            status = self._call_direct(function, references, count, rows[slot], size)
-            if status > WARNING:
-                raise self._failed(f"reading the outputs returned {STATUS_NAMES[status]}")
-        for get_row in self._getters:
-            get_row(slot)
+    def _part_failed(self, verb: Verb, part: PartCall, status: int) -> StepFailed | InitializationFailed:
+        """The error for a getter or setter of a row that has returned a status above warning."""
+        if part.buffer is None:
+            return self._failed(f"{_DOING[verb]} returned {STATUS_NAMES[status]}")
+        return self._transfer_failed(verb, part.type, part.variables, status)
 
     def _transfer(self, verb: Verb, type_: VariableType, variables: Sequence[Variable], buffer: Buffer) -> None:
         """Call the getter or setter of a type for some variables, once."""
@@ -181,13 +239,18 @@ class FmuValues(ABC):
         name = self._function_name(verb, type_)
         status = call_named(name, self._call, self._function(verb, type_), references, buffer, size)
         if status > WARNING:
-            names = [variable.name for variable in variables]
-            odd = next((v for v in variables if verb == "Set" and not v.settable_before_start), None)
-            hint = None
-            if odd is not None:
-                hint = f"FMI does not allow setting '{odd.name}', {odd.role}: leave its start value out."
-            what = f"{name} of {', '.join(names)} returned {STATUS_NAMES[status]}"
-            raise self._failed(what, variable=names[0] if len(names) == 1 else None, hint=hint)
+            raise self._transfer_failed(verb, type_, variables, status)
+
+    def _transfer_failed(
+        self, verb: Verb, type_: VariableType, variables: Sequence[Variable], status: int
+    ) -> StepFailed | InitializationFailed:
+        names = [variable.name for variable in variables]
+        odd = next((v for v in variables if verb == "Set" and not v.settable_before_start), None)
+        hint = None
+        if odd is not None:
+            hint = f"FMI does not allow setting '{odd.name}', {odd.role}: leave its start value out."
+        what = f"{self._function_name(verb, type_)} of {', '.join(names)} returned {STATUS_NAMES[status]}"
+        return self._failed(what, variable=names[0] if len(names) == 1 else None, hint=hint)
 
     def _load(self, buffer: Buffer, elements: Any, names: Sequence[str]) -> None:  # noqa: ANN401 a list or an array
         try:
@@ -207,6 +270,10 @@ class FmuValues(ABC):
         for name in names:
             groups.setdefault(self._variables[name].type, []).append(name)
         return groups
+
+
+def _is_buffered(part: PartCall) -> bool:
+    return part.buffer is not None
 
 
 def _references(variables: Sequence[Variable]) -> ctypes.Array[ctypes.c_uint]:

@@ -10,11 +10,13 @@ from collections.abc import Mapping
 
 from fmpy.fmi1 import FMU1Slave
 
+from ....rings.native import Kind
 from ...call_guard import call_named
 from ..calls import cffi_function
 from ..fmi_versions import Fmi1Values
 from ..fmu_values import STATUS_NAMES, WARNING
 from .discarded_steps import DISCARD, PENDING, SMALLER_STEPS, SMALLEST, StepStatus, discarded, take_sub_steps
+from .native_instance import NativeInstance
 
 __all__ = ["Fmi1Instance"]
 
@@ -28,27 +30,13 @@ _NEW, _REPEATED = b"\x01", b"\x00"
 """`newStep` of fmiDoStep."""
 
 
-class Fmi1Instance(Fmi1Values):
+class Fmi1Instance(NativeInstance, Fmi1Values):
     """One instance of an FMI 1.0 co-simulation FMU."""
 
+    _kind = Kind.FMI1
     _library = FMU1Slave
     _function_names: Mapping[str, str] = {"instantiate": "fmiInstantiateSlave", "freeInstance": "fmiFreeSlaveInstance"}
     _derivatives: Mapping[str, float] = {}
-
-    def do_step(self, step: int) -> None:
-        """Set the inputs of row ``step``, advance to own step ``step + 1``, write the outputs to row ``step + 1``."""
-        component = self._self
-        slot = step & self._input_mask
-        for function, references, count, rows, _ in self._direct_setters:
-            status = function(component, references, count, rows[slot])
-            if status > WARNING:
-                raise self._failed(f"setting the inputs returned {STATUS_NAMES[status]}")
-        for set_row in self._setters:
-            set_row(slot)
-        time = self._start_time + step * self._points * self._base_step_size  # `grid.time`, without a call
-        self.advance(time, self._step_size)
-        self._step = step + 1
-        self._read_outputs((step + 1) & self._output_mask)
 
     def advance(self, time: float, step_size: float) -> None:
         """One step of ``step_size`` from ``time`` (both in s) without rings, for callers with their own time base."""
@@ -66,6 +54,15 @@ class Fmi1Instance(Fmi1Values):
         dll = self._fmu.dll
         self._do_step = cffi_function(getattr(dll, self._symbol("DoStep")), _DO_STEP)
         self._step_status = StepStatus(dll, self._component, self._symbol(""))
+
+    def _needs_python(self) -> bool:
+        return bool(self._options.linear_inputs)
+
+    def _take_step(self, step: int) -> None:
+        self.advance(self._time_of(step), self._step_size)
+
+    def _complete(self, step: int, status: int) -> None:
+        self._finish(self._time_of(step), self._step_size, status)
 
     def _finish(self, time: float, step_size: float, status: int) -> None:
         """Complete a step whose ``status`` is above warning.

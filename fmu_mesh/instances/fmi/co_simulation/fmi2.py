@@ -1,59 +1,39 @@
-"""FMI 2.0 co-simulation behind the `Instance` Protocol.
-
-Where values are numbers and a step is one call, all calls of a step are one compiled call (`compiled_step`).
-"""
+"""FMI 2.0 co-simulation behind the `Instance` Protocol."""
 
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Mapping
 
 from fmpy.fmi1 import FMICallException
 from fmpy.fmi2 import FMU2Slave, fmi2Terminated
 
 from ....errors import TerminationRequested
-from ....rings.ring import Ring
-from ....simtime import TimeGrid
+from ....rings.native import Kind
 from ....variables.value_types import Value
-from ..calls import Function, cffi_function
+from ..calls import cffi_function
 from ..fmi_versions import Fmi2Values
 from ..fmu_values import STATUS_NAMES, WARNING
 from ..model_exchange.solver import resolvable
 from ..state import Bookkeeping
-from .compiled_step import DOING, GETTING, STATUS_BITS, STEPPING, CompiledStep, compile_step, fmi2_step
 from .discarded_steps import DISCARD, PENDING, RETRY, SMALLER_STEPS, SMALLEST, RetriedSteps, StepStatus, discarded
+from .native_instance import NativeInstance
 
 __all__ = ["Fmi2Instance"]
 
 _DO_STEP = "int (*)(void *, double, double, int)"
 
 
-class Fmi2Instance(Fmi2Values):
+class Fmi2Instance(NativeInstance, Fmi2Values):
     """One instance of an FMI 2.0 co-simulation FMU."""
 
+    _kind = Kind.FMI2
     _library = FMU2Slave
     _retrying: RetriedSteps | None = None
     _derivatives: Mapping[str, float] = {}
     _terminated = False
     """Whether the FMU has asked to end the simulation with the step that is complete now."""
-
-    def bind(self, inputs: Ring, outputs: Sequence[Ring], grid: TimeGrid, points: int, step: int = 0) -> None:
-        """Let `do_step` work on these rings, ``points`` of ``grid`` each; write the current outputs as row ``step``."""
-        super().bind(inputs, outputs, grid, points, step)
-        is_more = self._options.retry_discarded_steps or self._options.linear_inputs or self._terminated
-        self._compiled = None if is_more or self._setters or self._getters else self._compile()
-        self._use_compiled(self._compiled)
-
-    def do_step(self, step: int) -> None:
-        """Set the inputs of row ``step``, advance to own step ``step + 1``, write the outputs to row ``step + 1``."""
-        compiled, input_mask, output_mask = self._in_step
-        if compiled is None:
-            self._step_by_calls(step)
-            return
-        time = self._start_time + step * self._points * self._base_step_size  # `grid.time`, without a call
-        if outcome := compiled(step & input_mask, time, (step + 1) & output_mask):
-            self._finish_compiled(outcome, step, time)
-        self._step = step + 1
 
     def advance(self, time: float, step_size: float) -> None:
         """One step of ``step_size`` from ``time`` (both in s) without rings, for callers with their own time base."""
@@ -75,43 +55,28 @@ class Fmi2Instance(Fmi2Values):
 
     def _instantiated(self) -> None:
         dll = self._fmu.dll
-        self._plain_do_step = cffi_function(dll.fmi2DoStep, _DO_STEP)
+        self._do_step = cffi_function(dll.fmi2DoStep, _DO_STEP)
         self._step_status = StepStatus(dll, self._component, "fmi2")
         if self._options.retry_discarded_steps:
-            self._retrying = RetriedSteps(self._fmu, self._plain_do_step, self._waited, self._asks_to_end, self._failed)
-        self._do_step: Function = self._retrying or self._plain_do_step
+            self._retrying = RetriedSteps(self._fmu, self._do_step, self._waited, self._asks_to_end, self._failed)
 
-    def _compile(self) -> CompiledStep | None:
-        step = fmi2_step(self._plain_do_step, self._step_size)
-        return compile_step(self._self, self._direct_setters, step, self._direct_getters)
-
-    def _use_compiled(self, compiled: CompiledStep | None) -> None:
-        self._in_step = (None if compiled is None else compiled.call, self._input_mask, self._output_mask)
+    def _needs_python(self) -> bool:
+        return bool(self._options.retry_discarded_steps or self._options.linear_inputs)
 
     def _step_by_calls(self, step: int) -> None:
-        """`do_step` with one call for each function."""
         self._check_not_terminated()
-        self._set_inputs(step & self._input_mask)
+        super()._step_by_calls(step)
+
+    def _take_step(self, step: int) -> None:
         if self._derivatives:
             self._set_derivatives(self._derivatives)
-        time = self._start_time + step * self._points * self._base_step_size
-        status = self._do_step(self._self, time, self._step_size, 1)
+        take = self._retrying or self._do_step
+        status = take(self._self, self._time_of(step), self._step_size, 1)
         if status > WARNING:
-            self._finish(status, time + self._step_size)
-        self._step = step + 1
-        self._read_outputs((step + 1) & self._output_mask)
+            self._complete(step, status)
 
-    def _finish_compiled(self, outcome: int, step: int, time: float) -> None:
-        """Continue after a status above warning, as in `_step_by_calls`."""
-        stage, status = divmod(outcome, 1 << STATUS_BITS)
-        if stage == STEPPING:
-            self._finish(status, time + self._step_size)
-            self._step = step + 1
-            self._read_outputs((step + 1) & self._output_mask)
-            return
-        if stage == GETTING:
-            self._step = step + 1
-        raise self._failed(f"{DOING[stage]} returned {STATUS_NAMES[status]}")
+    def _complete(self, step: int, status: int) -> None:
+        self._finish(status, self._time_of(step) + self._step_size)
 
     def _set_derivatives(self, derivatives: Mapping[str, float]) -> None:
         references = [self._variables[name].value_reference for name in derivatives]
@@ -140,7 +105,7 @@ class Fmi2Instance(Fmi2Values):
             self._terminated = last_time is not None and not resolvable(last_time, end)
             if not self._terminated:
                 raise self._end_requested()
-            self._use_compiled(None)  # `_step_by_calls` refuses the next step; the compiled call has no such check
+            self._said.note(quiet_until=-math.inf)  # `_step_by_calls` refuses the next step
             return
         if self._retrying is not None:
             raise self._failed(discarded("fmi2DoStep", None, SMALLEST), hint=SMALLER_STEPS)
@@ -177,9 +142,8 @@ class Fmi2Instance(Fmi2Values):
 
     def _restore(self, kept: Bookkeeping) -> None:
         super()._restore(kept)
-        if self._terminated:
-            self._terminated = False
-            self._use_compiled(self._compiled)
+        self._terminated = False
+        self._said.note(quiet_until=math.inf)
 
     def _free(self) -> None:
         if self._retrying is not None:

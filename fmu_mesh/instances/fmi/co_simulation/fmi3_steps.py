@@ -13,20 +13,19 @@ co-simulation; it knows neither variables nor rings.
 
 from __future__ import annotations
 
-import ctypes
 import math
 from collections.abc import Callable
 from typing import Any, Final
 
 from fmpy.fmi1 import FMICallException
 
+from ....rings.native import Said
 from ....simtime import step_within
 from ....variables.model_description import ModelDescription
-from ..calls import cffi_function, pointer
+from ..calls import Function, pointer
 from ..clocks import Clocks
 from ..fmu_values import WARNING
 from ..model_exchange.solver import SolverFailed, resolvable
-from .compiled_step import StepCall, fmi3_step
 from .discarded_steps import DISCARD, SMALLEST
 
 __all__ = ["Fmi3Steps"]
@@ -34,39 +33,45 @@ __all__ = ["Fmi3Steps"]
 MOST_RETURNS: Final = 1000
 """After this many returns of fmi3DoStep, or events, at the same time, an FMU makes no progress."""
 
-_DO_STEP = "int (*)(void *, double, double, _Bool, void *, void *, void *, void *)"
-
 
 class Fmi3Steps:
     """Steps of one instance.
 
     Args:
         fmu: FMPy's object, instantiated with event mode if the description has it.
+        do_step: fmi3DoStep.
         description: its model description.
+        said: what a step says besides its status. Up to `quiet_until`, a step is a single call of fmi3DoStep, unless
+            it says otherwise.
 
     Attributes:
         terminated: whether the FMU has asked to end the simulation; no step may be taken then.
         clocks: its clocks.
-        quiet_until: up to this time in s, a step is a single call of fmi3DoStep, unless its results say otherwise.
 
     Call sequence: `start` in Initialization Mode, `exit_initialization` after it, then `step`, and `event` wherever
-    values are set in event mode. A caller that calls fmi3DoStep itself (`compiled`) continues with `finish` if needed.
+    values are set in event mode. A caller that calls fmi3DoStep itself continues with `finish` if needed.
 
     Raises:
         FMICallException: by every method: the FMU did not return OK.
         SolverFailed: its events do not converge, or it makes no progress.
     """
 
-    def __init__(self, fmu: Any, description: ModelDescription) -> None:  # noqa: ANN401 FMPy is untyped
+    def __init__(
+        self,
+        fmu: Any,  # noqa: ANN401 FMPy is untyped
+        do_step: Function,
+        description: ModelDescription,
+        said: Said,
+    ) -> None:
         self.terminated = False
         self.clocks = Clocks(fmu, description.clocks)
         self._fmu = fmu
         self._self = pointer(fmu.component)
         self._has_event_mode = description.has_event_mode
         self._varies = description.can_handle_variable_step_size
-        self._do_step = cffi_function(fmu.dll.fmi3DoStep, _DO_STEP)
-        self._results = _Results()
-        self._pointers = [pointer(address) for address in self._results.addresses]
+        self._do_step = do_step
+        self._said = said
+        self._results = [pointer(address) for address in said.addresses]
         self._next_event = math.inf
         self._event_time = -math.inf
         self._look_ahead()
@@ -105,10 +110,6 @@ class Fmi3Steps:
         self._update(time)
         self._look_ahead()
 
-    def compiled(self, step_size: float) -> StepCall:
-        """fmi3DoStep by ``step_size`` (s) as a part of one compiled call."""
-        return fmi3_step(self._do_step, step_size, self._pointers, self._results.addresses[0])
-
     def step(self, start: float, step_size: float, end: float) -> float:
         """Take the step from ``start`` by ``step_size`` to ``end`` (s).
 
@@ -116,15 +117,15 @@ class Fmi3Steps:
             The time reached in s: ``end``, or an earlier time at which the FMU asked to end the simulation.
         """
         status = None
-        if self.quiet_until > end:
+        if self._said.quiet_until > end:
             status = self._attempt(start, step_size)
-            if status <= WARNING and not self._results.any[0]:
+            if status <= WARNING and not self._said.anything:
                 return end
         return self.finish(status, start, step_size, end)
 
     def finish(self, status: int | None, start: float, step_size: float, end: float) -> float:
         """As `step`, after fmi3DoStep from ``start`` by ``step_size`` (s) has returned ``status``; None: not called."""
-        results = self._results
+        said = self._said
         time, largest, stuck = start, step_size, 0
         while not self.terminated and resolvable(time, end):
             if self._is_due(time):
@@ -139,22 +140,22 @@ class Fmi3Steps:
                 continue
             self._check(status, retried=largest < step_size)
             status = None
-            before, time = time, results.last_time.value if results.early else target
+            before, time = time, said.last_time if said.early else target
             stuck = 0 if time > before else stuck + 1
             if stuck > MOST_RETURNS:
                 raise SolverFailed(f"fmi3DoStep returned early {MOST_RETURNS} times at t = {time:.12g} s")
-            self.terminated = results.terminate
-            if not self.terminated and (results.event_needed or self._is_due(time)):
+            self.terminated = said.terminate
+            if not self.terminated and (said.event_needed or self._is_due(time)):
                 self._handle_event(time)
         self._look_ahead()
         return time
 
     def _look_ahead(self) -> None:
-        self.quiet_until = -math.inf if self.terminated or self.clocks else self._next_event
+        self._said.note(quiet_until=-math.inf if self.terminated or self.clocks else self._next_event)
 
     def _attempt(self, time: float, size: float) -> int:
-        self._results.any[0] = 0
-        return self._do_step(self._self, time, size, True, *self._pointers)  # noqa: FBT003 a C function
+        self._said.clear()
+        return self._do_step(self._self, time, size, True, *self._results)  # noqa: FBT003 a C function
 
     def _check(self, status: int, *, retried: bool) -> None:
         if status == DISCARD and retried:
@@ -197,35 +198,3 @@ class Fmi3Steps:
         self._next_event = next_event if defined else math.inf
         self.clocks.update_intervals(time)
         self._fmu.enterStepMode()
-
-
-class _Results:
-    """The results of fmi3DoStep besides its status (FMI 3.0, 4.2.1).
-
-    Attributes:
-        any: the flags as one number, which is 0 if none is set: one comparison instead of three.
-        last_time: the time of an early return in s.
-        addresses: of eventHandlingNeeded, terminateSimulation, earlyReturn and lastSuccessfulTime.
-    """
-
-    def __init__(self) -> None:
-        self._flags = (ctypes.c_bool * 4)()
-        self.any = memoryview(self._flags).cast("B").cast("I")
-        self.last_time = ctypes.c_double()
-        first = ctypes.addressof(self._flags)
-        self.addresses = (first, first + 1, first + 2, ctypes.addressof(self.last_time))
-
-    @property
-    def event_needed(self) -> bool:
-        """The FMU has an event to be handled."""
-        return self._flags[0]
-
-    @property
-    def terminate(self) -> bool:
-        """The FMU asks to end the simulation."""
-        return self._flags[1]
-
-    @property
-    def early(self) -> bool:
-        """The FMU has returned before the end of the step."""
-        return self._flags[2]

@@ -56,12 +56,10 @@ class ContinuousInstance(FmuInstance):
 
     def do_step(self, step: int) -> None:
         """Set the inputs of row ``step``, advance to own step ``step + 1``, write the outputs to row ``step + 1``."""
-        start = self._start_time + step * self._points * self._base_step_size
-        end = self._start_time + (step + 1) * self._points * self._base_step_size
-        self._checked(lambda: self._take_inputs(step & self._input_mask, start))
-        self._advance(end)
-        self._step = step + 1
-        self._read_outputs((step + 1) & self._output_mask)
+        self._checked(lambda: self._take_inputs(step, self._time_of(step)))
+        self._advance(self._time_of(step + 1))
+        self._said.note(step=step + 1)
+        self._read_outputs(step + 1)
 
     def advance(self, time: float, step_size: float) -> None:
         """One step of ``step_size`` from ``time`` (both in s) without rings, for callers with their own time base."""
@@ -109,7 +107,7 @@ class ContinuousInstance(FmuInstance):
         time, next_event = loop.place
         self._checked(loop.restart)
         return Bookkeeping(
-            self._step,
+            self._said.step,
             time,
             next_event if math.isfinite(next_event) else None,
             self._row,
@@ -154,8 +152,9 @@ class ContinuousInstance(FmuInstance):
         if loop.terminated or not self._checked(lambda: loop.advance(end)):
             raise TerminationRequested("the FMU asked to end the simulation", instance=self.name)
 
-    def _take_inputs(self, slot: int, time: float) -> None:
-        """Set the inputs of a row in event mode, if they have changed or change within a step."""
+    def _take_inputs(self, step: int, time: float) -> None:
+        """Set the inputs of row ``step`` in event mode, if they have changed or change within a step."""
+        slot = step & self._input_mask
         loop = self._event_loop()
         assert self._inputs is not None
         row: _RowBytes = tuple(
@@ -166,7 +165,7 @@ class ContinuousInstance(FmuInstance):
         self._row = row
         line = self._line(slot, time)
         self._is_linear = line is not None
-        loop.set_inputs(lambda: self._set_inputs(slot), line)
+        loop.set_inputs(lambda: self._set_inputs(step), line)
 
     def _line(self, slot: int, start: float) -> Callable[[float], None] | None:
         """Sets the linear inputs at a time within the step that starts at ``start`` (s); None if no input changes."""

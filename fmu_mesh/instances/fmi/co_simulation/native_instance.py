@@ -1,0 +1,169 @@
+"""A co-simulation FMU whose step is one call of the library: inputs, doStep and outputs by tables (`burst.c`).
+
+Owns the tables, and the steps that the library does not take or does not complete: those are taken call by call. A
+version of FMI adds how a step is taken and what its statuses mean.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from abc import abstractmethod
+from collections.abc import Callable, Sequence
+from typing import Final
+
+from ....rings import native
+from ....rings.native import OUT_OF_RANGE, STAGE_BITS, Kind, Member, Move, NativeStep, Output, Stage
+from ....rings.ring import Ring
+from ....simtime import TimeGrid
+from ..buffers import NumberBuffer
+from ..calls import Function, Pointer, address_of, cffi_function, pointer
+from ..fmu_instance import FmuInstance
+from ..fmu_values import PartCall
+
+__all__ = ["NativeInstance"]
+
+_MEMBER_STEP: Final = "int64_t (*)(void *, int64_t)"
+
+
+class NativeInstance(FmuInstance):
+    """The part of co-simulation that all versions share; to be named before the base class of the version.
+
+    `StepsNatively` without text, and where a step is nothing but setters, doStep and getters.
+    """
+
+    _kind: Kind
+    _do_step: Function
+    """The function of the FMU, as cffi calls it."""
+
+    _native: NativeStep | None = None
+
+    @property
+    def native(self) -> NativeStep | None:
+        """See `StepsNatively`."""
+        return self._native
+
+    def bind(self, inputs: Ring, outputs: Sequence[Ring], grid: TimeGrid, points: int, step: int = 0) -> None:
+        """Let `do_step` work on these rings, ``points`` of ``grid`` each; write the current outputs as row ``step``."""
+        super().bind(inputs, outputs, grid, points, step)
+        self._native = None
+        self._in_step: tuple[Callable[[Pointer, int], int], Pointer] = _left_to_python, None
+        # A setter of the library has one address to read from; in a ring with more rows, it changes in every step.
+        if native.library is None or inputs.rows > 1 or self._needs_python():
+            return
+        buffers = [part.buffer for part in (*self._setters, *self._getters) if part.buffer is not None]
+        if not all(isinstance(buffer, NumberBuffer) for buffer in buffers):
+            return
+        self._native = self._tables()
+        self._keep += self._native.kept
+        member = self._member(self._native, outputs)
+        self._keep.append(member)
+        take = cffi_function(native.library.member_step, _MEMBER_STEP)
+        self._in_step = take, pointer(ctypes.addressof(member))
+
+    def do_step(self, step: int) -> None:
+        """Set the inputs of row ``step``, advance to own step ``step + 1``, write the outputs to row ``step + 1``."""
+        take, member = self._in_step
+        if outcome := take(member, step):
+            self.finish(step, outcome)
+
+    def finish(self, step: int, outcome: int) -> None:
+        """See `StepsNatively`."""
+        stage, status = divmod(outcome, 1 << STAGE_BITS)
+        match stage:
+            case Stage.IN_PYTHON:
+                self._step_by_calls(step)
+            case Stage.STEPPING:
+                self._complete(step, status)
+                self._said.note(step=step + 1)
+                self._read_outputs(step + 1)
+            case Stage.SETTING:
+                self._fail_to_set(step, status)
+            case _:
+                self._fail_to_get(status)
+
+    @abstractmethod
+    def _needs_python(self) -> bool:
+        """Whether the steps have a part that the library does not know."""
+
+    @abstractmethod
+    def _take_step(self, step: int) -> None:
+        """Take own step ``step`` with a call of the FMU; the inputs are set."""
+
+    @abstractmethod
+    def _complete(self, step: int, status: int) -> None:
+        """Complete own step ``step`` after the FMU has returned ``status``, or has said that there is more to do."""
+
+    def _step_by_calls(self, step: int) -> None:
+        """`do_step` with one call for each function."""
+        self._set_inputs(step)
+        self._take_step(step)
+        self._said.note(step=step + 1)
+        self._read_outputs(step + 1)
+
+    def _tables(self) -> NativeStep:
+        sized = self._kind == Kind.FMI3
+        return NativeStep(
+            kind=self._kind,
+            component=self._component,
+            do_step=address_of(self._do_step),
+            said=ctypes.addressof(self._said),
+            loads=[move for part in self._setters for move in _moves(part, load=True)],
+            setters=[part.in_table(sized=sized) for part in self._setters],
+            getters=[part.in_table(sized=sized) for part in self._getters],
+            stores=[move for part in self._getters for move in _moves(part, load=False)],
+            kept=(self._said, *self._setters, *self._getters),
+        )
+
+    def _member(self, tables: NativeStep, outputs: Sequence[Ring]) -> Member:
+        """The member that takes the steps in this process."""
+        own = [Output(ring.address, ring.stride, ring.mask) for ring in outputs]
+        return Member(
+            loads=native.table(Move, tables.loads),
+            setters=native.table(native.Call, tables.setters),
+            getters=native.table(native.Call, tables.getters),
+            stores=native.table(Move, tables.stores),
+            n_loads=len(tables.loads),
+            n_setters=len(tables.setters),
+            n_getters=len(tables.getters),
+            n_stores=len(tables.stores),
+            kind=tables.kind,
+            component=tables.component,
+            do_step=tables.do_step,
+            said=tables.said,
+            start_time=self._start_time,
+            base_step_size=self._base_step_size,
+            step_size=self._step_size,
+            points=self._points,
+            outputs=(Output * 2)(*own),
+            bases=(ctypes.c_void_p * native.Base.FIRST_GATE)(),
+        )
+
+    def _fail_to_set(self, step: int, status: int) -> None:
+        """Raise the error for inputs that the library could not set."""
+        if status != OUT_OF_RANGE:
+            raise self._part_failed("Set", self._setters[self._said.call], status)
+        slot = step & self._input_mask
+        for part in self._setters:
+            if part.buffer is not None:
+                self._load(part.buffer, part.array[slot], part.names)
+        raise self._failed("setting the inputs: a value is out of the range of the type of its input")
+
+    def _fail_to_get(self, status: int) -> None:
+        """Raise the error for outputs that the library could not get."""
+        if status != OUT_OF_RANGE:
+            raise self._part_failed("Get", self._getters[self._said.call], status)
+        for part in self._getters:
+            if part.buffer is not None:
+                self._elements(part.buffer, part.names)
+        raise self._failed("reading the outputs: a value is out of the range of the type of its output")
+
+
+def _left_to_python(_member: Pointer, _step: int) -> int:
+    """In the place of the function of the library."""
+    return Stage.IN_PYTHON << STAGE_BITS
+
+
+def _moves(part: PartCall, *, load: bool) -> list[Move]:
+    if not isinstance(part.buffer, NumberBuffer):
+        return []
+    return part.buffer.moves(part.base, part.place, load=load)
