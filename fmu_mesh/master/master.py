@@ -499,9 +499,8 @@ class Master:
     # --- views
 
     def _info(self) -> MeshInfo:
-        return mesh_info(
-            self._plan, self._run_keys.run, self._settings.config_file, self._settings.endpoints, self._members.shared
-        )
+        shared = (*self._members.shared, MASTER) if self._members.shared else ()
+        return mesh_info(self._plan, self._run_keys.run, self._settings.config_file, self._settings.endpoints, shared)
 
     def last_status(self) -> MeshStatus:
         """The state of the run right now."""

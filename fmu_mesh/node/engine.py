@@ -12,10 +12,11 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from threading import Lock
 from time import perf_counter
-from typing import Final
+from typing import Final, cast
 
 from ..errors import ProtocolBroken, TerminationRequested
 from ..instances.call_guard import floating_point_changed, restore_floating_point
+from ..instances.contract import StepsNatively
 from ..rings import native
 from ..rings.host_memory import HostMemory
 from ..rings.native import Base, Kind, Result, Stage, table
@@ -191,7 +192,7 @@ class BurstEngine(Engine):
         changed()
 
     def _fill(self, runner: Runner, member: native.Member) -> None:
-        own = getattr(runner.instance, "native", None)
+        own = runner.instance.native if isinstance(runner.instance, StepsNatively) else None
         if own is not None and any(source.transfer.has_text for source in runner.sources):
             own = None
         gates, loads = [], []
@@ -249,7 +250,7 @@ class BurstEngine(Engine):
         step = member.step
         try:
             if result == Result.STATUS:
-                runner.instance.finish(step, member.outcome)  # type: ignore[attr-defined]  # it has steps in C
+                cast("StepsNatively", runner.instance).finish(step, member.outcome)
             else:
                 for source in runner.sources:
                     source.transfer.step_text(step)

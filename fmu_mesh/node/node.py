@@ -325,7 +325,7 @@ class Node:
         self._memory.progress[self._plan.node].raise_to(self._engine.covered + 1)
 
     def _send_rows(self, *, stepped: bool) -> None:
-        """Send rows that a consumer may wait for; those that are only recorded every 50 ms, or where nothing happens."""
+        """Send rows that a consumer may wait for; those for the recorder every 50 ms, and where nothing happens."""
         now = time.monotonic()
         lazy = not stepped or now - self._lazy_sent > _LAZY_S
         if lazy:

@@ -73,7 +73,7 @@ class Recorder:
     Use it as a context manager: the thread runs inside; afterwards the file has all complete rows.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913  one participant and its surroundings
         self,
         plan: NodePlan,
         session: zenoh.Session,

@@ -111,7 +111,7 @@ class Membership:
     Call sequence: `register`, then `join` once, then `sender` for each receiver, and `close` at the end.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913, PLR0917  one participant and its surroundings
         self,
         plan: NodePlan,
         session: zenoh.Session,

@@ -128,8 +128,8 @@ class MeshInfo(msgspec.Struct, frozen=True):
 
     Attributes:
         run: the id of the run, which all its internal keys contain.
-        shared_memory: nodes that get their messages through shared memory, and `@mesh` if the master does; all others
-            get them through Zenoh. Empty until all nodes are ready.
+        shared_memory: the processes that exchange values, grants and progress through the memory of the master's host;
+            all others do it through Zenoh. Empty until all nodes are ready.
     """
 
     mesh: str
