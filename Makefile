@@ -11,7 +11,7 @@ RESULT := results/pendulum_delay
 # worksteal, a worker that has finished the short ones takes some of them.
 PYTEST_ARGS ?= --numprocesses 4 --dist worksteal
 
-.PHONY: help demo test coverage check docs bench fmus clean
+.PHONY: help demo test coverage check docs bench fmus library clean
 
 help: ## show this list
 	@sed -n 's/^\([a-z]*\):[^#]*## \(.*\)/  make \1	\2/p' Makefile
@@ -51,6 +51,9 @@ bench: $(VENV)/.installed-test ## us and the peers on this machine: one table (a
 
 fmus: $(VENV)/.installed-plot ## rebuild the example FMUs from fmus/src (needs a C compiler)
 	@$(BIN)/python fmus/build.py
+
+library: $(VENV)/.installed-library ## rebuild the library of C from its sources (installs a compiler into .venv)
+	@$(BIN)/python build_library.py
 
 clean: ## remove results, builds and caches, but not .venv
 	rm -rf results build dist .coverage .coverage.* .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache

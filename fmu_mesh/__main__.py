@@ -1,6 +1,7 @@
 """The command `fmu-mesh`, and `python -m fmu_mesh`. Ctrl-C gives its exit code even during the imports."""
 
 import sys
+from contextlib import AbstractContextManager, nullcontext
 
 
 def main() -> int:
@@ -16,14 +17,24 @@ def main() -> int:
         if (problem := address_space_problem(FEWEST_MIB)) is not None:
             print(f"fmu-mesh: {problem}", file=sys.stderr)
             return problem.exit_code
-        from .cli.main import main as command  # noqa: PLC0415 as above
+        with _prepared(sys.argv[1:]):
+            from .cli.main import main as command  # noqa: PLC0415 as above
 
-        return last_exit.with_code(command())  # it imports the module of the command
+            return last_exit.with_code(command())  # it imports the module of the command
     except KeyboardInterrupt:
         from .errors import Interrupted  # noqa: PLC0415 as above
 
         print("fmu-mesh: interrupted", file=sys.stderr)
         return Interrupted.exit_code
+
+
+def _prepared(arguments: list[str]) -> AbstractContextManager[None]:
+    """While the command is imported, start what takes as long and can be done at the same time."""
+    if arguments[:1] != ["launch"] or not {"--local", "--help", "-h"}.isdisjoint(arguments):
+        return nullcontext()
+    from .run.fork_server import started_ahead  # noqa: PLC0415 as above
+
+    return started_ahead()
 
 
 if __name__ == "__main__":

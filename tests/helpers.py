@@ -200,8 +200,11 @@ class Place:
         config.insert_json5("connect/endpoints", json.dumps(self.note().endpoints))
         return zenoh.open(config)
 
-    def processes(self) -> list[psutil.Process]:
-        """All processes that run here, children of children included: they inherit the environment of this place."""
+    def processes(self, role: str | None = None) -> list[psutil.Process]:
+        """All processes that run here, or those with a role: `master`, `gateway`, `node`, or `fork` for the server.
+
+        Children of children are included: they inherit the environment of this place.
+        """
         here = []
         for process in psutil.process_iter():
             try:
@@ -209,7 +212,7 @@ class Place:
                     here.append(process)
             except (psutil.NoSuchProcess, psutil.AccessDenied):
                 continue
-        return here
+        return [process for process in here if role is None or _title(process)[:1] == [role]]
 
     def left(self) -> list[str]:
         """In words what is there: processes, and files, folders and sockets of runs."""
@@ -329,7 +332,7 @@ class Launched:
         return wait_until(lambda: next((line for line in self._errors if text in line), None), f"'{text}'")
 
     def child(self, role: str) -> psutil.Process:
-        """The process of the master (``master``) or of a node by its name, as soon as it runs."""
+        """The process of the master, the gateway, the server (``fork``), or of a node by its name, once it runs."""
         return wait_until(lambda: self._child(role), f"the process of {role}")
 
     def close(self) -> None:
@@ -340,9 +343,9 @@ class Launched:
         self._join()
 
     def _child(self, role: str) -> psutil.Process | None:
-        for process in psutil.Process(self.pid).children():
-            command = _command(process)
-            if role in command[3:6:2] or (role == "master" and "master" in command[3:4]):
+        for process in psutil.Process(self.pid).children(recursive=True):
+            title = _title(process)
+            if title[:1] == [role] or title[:2] == ["node", role]:
                 return process
         return None
 
@@ -361,6 +364,12 @@ def _stacks(pid: int) -> str:
         return subprocess.run(command, capture_output=True, text=True, timeout=30, check=False).stdout
     except (OSError, subprocess.TimeoutExpired) as error:
         return f"process {pid}: {error}"
+
+
+def _title(process: psutil.Process) -> list[str]:
+    """The words of the title of a process of a run, as in `fmu-mesh node pendulum`, without the first one."""
+    words = " ".join(_command(process)).split()
+    return words[1:] if words[:1] == ["fmu-mesh"] else []
 
 
 def _command(process: psutil.Process) -> list[str]:

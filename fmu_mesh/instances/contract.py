@@ -150,6 +150,23 @@ class Kind(ABC, Generic[Section]):
         """
         return
 
+    def preload(self) -> None:
+        """Import what `open` needs, so that the processes of a run share it; nothing is imported by default.
+
+        Called in a process with one thread, which forks them: an import must start no thread.
+        """
+        return
+
+    def prepare(self, opening: Opening[Section]) -> None:  # noqa: ARG002  for those who can prepare something
+        """Do once what every `open` of a model needs, such as unpacking it; nothing is prepared by default.
+
+        Called in the process of `preload`. It must load no library of the model.
+
+        Raises:
+            LoadFailed: it cannot be done; `open` says so again.
+        """
+        return
+
     @abstractmethod
     def open(self, opening: Opening[Section]) -> Instance:
         """Open an instance; the caller closes it.

@@ -34,6 +34,8 @@ __all__ = [
     "describe",
     "expected_model",
     "open_instance",
+    "preload",
+    "prepare",
 ]
 
 GROUP = "fmu_mesh.instances"
@@ -118,6 +120,20 @@ def content(path: Path, section: InstanceSection) -> str:
 def expected_model(section: InstanceSection) -> str:
     """In words, what the file of the model of an instance should be."""
     return _kind_of(section).expected
+
+
+def preload() -> None:
+    """Import what the instances of most meshes need; see `Kind.preload`."""
+    _kind(_USUAL).preload()
+
+
+def prepare(opening: Opening[Any]) -> None:
+    """Do once what every `open_instance` of a model needs; see `Kind.prepare`.
+
+    Raises:
+        LoadFailed: it cannot be done; `open_instance` says so again.
+    """
+    _kind_of(opening.section).prepare(opening)
 
 
 def open_instance(opening: Opening[Any]) -> Instance:

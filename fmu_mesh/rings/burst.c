@@ -550,7 +550,9 @@ static int64_t allow(Node *node, int64_t point, Unit *unit) {
   return allowed;
 }
 
-enum { SPINS = 60, YIELDS = 8, PATIENCE = 3, REST = 30 };
+/* A sleeper on another core takes up to this time to wake up. Who waits for it for a shorter time falls asleep itself, and
+ * both wake each other for ever. */
+enum { SPINS = 60, YIELD_NS = 50000, PATIENCE = 3, REST = 30 };
 
 /* For a node with one unit: look a little longer before it sleeps, unless that was in vain the last times. */
 static int soon(Node *node, Counter *counter, int64_t need) {
@@ -560,16 +562,22 @@ static int soon(Node *node, Counter *counter, int64_t need) {
     node->patience++;
     return value_of(counter) >= need;
   }
-  for (int i = 0; i < SPINS + YIELDS; i++) {
+  int64_t end = 0;
+  for (int i = 0;; i++) {
     if (value_of(counter) >= need) {
       if (node->patience < PATIENCE) node->patience++;
       return 1;
     }
     if (atomic_load_explicit(&node->attention, memory_order_relaxed)) return 0;
-    if (i < SPINS)
+    if (i < SPINS) {
       relax();
-    else
-      sched_yield();
+      continue;
+    }
+    sched_yield();
+    if (i == SPINS)
+      end = now() + YIELD_NS;
+    else if (now() > end)
+      break;
   }
   node->patience = node->patience > 0 ? node->patience - 1 : -REST;
   return 0;

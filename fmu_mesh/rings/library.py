@@ -1,15 +1,82 @@
-"""Finds the library that `burst.c` is built into."""
+"""Finds the library of C that steps a mesh, and refuses one that was built from other sources.
+
+The library for Linux on x86_64 is beside this module, in a clone and in a wheel. `build_library.py`, at the root of a
+clone, builds it. It contains the SHA-256 of each of its sources, and the sources that are beside it must be these.
+"""
 
 from __future__ import annotations
 
+import ctypes
+import hashlib
+import os
 import platform
 import sys
 from pathlib import Path
+from typing import Final
 
-__all__ = ["load_library"]
+from ..errors import ConfigurationError
+
+__all__ = ["LIBRARY_VARIABLE", "load_library", "why_no_library"]
+
+LIBRARY_VARIABLE: Final = "FMU_MESH_LIBRARY"
+"""An environment variable: `none` runs without the library; a path is that of another library."""
+
+TRIED_ON: Final = ("linux-x86_64",)
+"""The platforms whose library is used by default: those on which all tests have run."""
+
+_PACKAGE: Final = Path(__file__).resolve().parents[1]
 
 
 def load_library() -> str | None:
-    """The path of the library for this platform; None if there is none."""
-    path = Path(__file__).with_name(f"burst-{sys.platform}-{platform.machine()}.so")
-    return str(path) if path.exists() else None
+    """The path of the library for this platform; None if there is none, or if the system refuses to load it.
+
+    Raises:
+        ConfigurationError: the library was built from other sources than those beside it, or the environment names one
+            that cannot be loaded.
+    """
+    return _found()[0]
+
+
+def why_no_library() -> str | None:
+    """A sentence that says why `load_library` gives None; None if there is a library."""
+    return _found()[1]
+
+
+def _found() -> tuple[str | None, str | None]:
+    chosen = os.environ.get(LIBRARY_VARIABLE)
+    if chosen == "none":
+        return None, f"The environment variable {LIBRARY_VARIABLE} is none."
+    if chosen:
+        path = Path(chosen).resolve()
+    else:
+        here = f"{sys.platform}-{platform.machine()}"
+        if here not in TRIED_ON:
+            return None, f"The library is for {', '.join(TRIED_ON)}, and this is {here}."
+        path = Path(__file__).with_name(f"burst-{here}.so")
+    try:
+        loaded = ctypes.CDLL(str(path))
+    except OSError as error:
+        if chosen:
+            raise ConfigurationError(f"{LIBRARY_VARIABLE} names a library that cannot be loaded: {error}") from error
+        return None, f"The library cannot be loaded: {error}."
+    for line in _sources_of(loaded, path).splitlines():
+        digest, _, name = line.partition("  ")
+        source = _PACKAGE / name
+        if source.is_file() and hashlib.sha256(source.read_bytes()).hexdigest() != digest:
+            raise _unusable(f"{path} was built from another version of {source}")
+    return str(path), None
+
+
+def _sources_of(loaded: ctypes.CDLL, path: Path) -> str:
+    """What the library was built from: a line for each file, as `sha256sum` writes it."""
+    try:
+        first = ctypes.c_char.in_dll(loaded, "fmu_mesh_sources")
+    except ValueError as error:
+        raise _unusable(f"{path} does not say what it was built from") from error
+    return ctypes.string_at(ctypes.addressof(first)).decode()
+
+
+def _unusable(message: str) -> ConfigurationError:
+    return ConfigurationError(
+        message, hint="In a clone, `make library` builds it; an installation has to be installed again."
+    )

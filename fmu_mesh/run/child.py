@@ -14,13 +14,22 @@ from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import IO
+from typing import IO, Protocol
 
 from ..errors import Interrupted
 from ..wire.runtime import process_state
 from .threads import ONE_THREAD
 
-__all__ = ["Child", "StopWatch", "how_it_ended", "is_other_python", "own_command"]
+__all__ = [
+    "Child",
+    "Process",
+    "StopWatch",
+    "executed",
+    "how_it_ended",
+    "is_other_python",
+    "own_command",
+    "own_environment",
+]
 
 _SHOWN_LINES = 200
 _LINE_BYTES = 1000
@@ -35,6 +44,27 @@ def own_command(*arguments: str, interpreter: str | None = None) -> list[str]:
     return [interpreter or sys.executable, "-Pm", "fmu_mesh.run", *arguments]
 
 
+def own_environment() -> dict[str, str]:
+    """The environment of the processes of a run."""
+    # Without the last one, setproctitle would overwrite what `/proc/PID/environ` shows.
+    return os.environ | ONE_THREAD | {"SPT_NOENV": "1"}
+
+
+def executed(*arguments: str, interpreter: str | None = None) -> subprocess.Popen[bytes]:
+    """Start a process of a run by exec, with the arguments of `own_command`.
+
+    It has a session of its own, so that Ctrl-C reaches only the launcher.
+    """
+    return subprocess.Popen(
+        own_command(*arguments, interpreter=interpreter),
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        start_new_session=True,
+        env=own_environment(),
+    )
+
+
 def is_other_python(interpreter: str) -> bool:
     """Whether ``interpreter`` is not the Python that runs this process, with the packages that it has.
 
@@ -44,24 +74,59 @@ def is_other_python(interpreter: str) -> bool:
     return (own.parent.resolve(), own.resolve()) != (other.parent.resolve(), other.resolve())
 
 
+class Process(Protocol):
+    """A process that was started by exec (`subprocess.Popen`) or by the fork server (`Forked`)."""
+
+    @property
+    def pid(self) -> int | None:
+        """Its process id; None before it has started. It leads a process group of this number."""
+        ...
+
+    @property
+    def stdin(self) -> IO[bytes] | None:
+        """The writing end of its standard input, if it has one of its own."""
+        ...
+
+    @property
+    def stdout(self) -> IO[bytes] | None:
+        """The reading end of its standard output, which is a pipe."""
+        ...
+
+    @property
+    def stderr(self) -> IO[bytes] | None:
+        """The same of its standard error."""
+        ...
+
+    def poll(self) -> int | None:
+        """None if it has not ended."""
+        ...
+
+    def wait(self) -> int:
+        """Wait for its end; returns its exit code."""
+        ...
+
+    def send_signal(self, number: int, /) -> None:
+        """Send a signal if it still runs."""
+        ...
+
+
 class Child:
-    """One child process.
+    """One process that the launcher watches.
 
     Args:
-        name: the name that the callbacks of `start` get.
-        command: the program and its arguments.
+        name: the name that the callbacks of `watch` get.
+        process: the process, in a session of its own.
         post: calls a function on the launcher's thread.
     """
 
-    def __init__(self, name: str, command: list[str], post: Callable[[Callable[[], None]], None]) -> None:
+    def __init__(self, name: str, process: Process, post: Callable[[Callable[[], None]], None]) -> None:
         self.name = name
-        self._command = command
+        self._process = process
         self._post = post
-        self._popen: subprocess.Popen[bytes] | None = None
         self._threads: list[threading.Thread] = []
         self._left_others = False
 
-    def start(
+    def watch(
         self,
         on_line: Callable[[bytes], None],
         on_error_line: Callable[[str, bytes], None],
@@ -69,26 +134,17 @@ class Child:
         *,
         limited: bool = False,
     ) -> None:
-        """Start it in a session of its own, so that Ctrl-C reaches only the launcher.
+        """Pass on what it writes, and its exit code.
 
         If ``limited``, only the beginning of its output is passed on, because an FMU may write without end.
         """
-        self._popen = popen = subprocess.Popen(
-            self._command,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            start_new_session=True,
-            env=os.environ | ONE_THREAD,
-        )
-        assert popen.stdout is not None
-        assert popen.stderr is not None
+        output, errors = self._process.stdout, self._process.stderr
+        assert output is not None
+        assert errors is not None
         read = self._read_beginning if limited else self._read
         readers = [
-            threading.Thread(target=read, args=(popen.stdout, on_line), daemon=True),
-            threading.Thread(
-                target=read, args=(popen.stderr, lambda line: on_error_line(self.name, line)), daemon=True
-            ),
+            threading.Thread(target=read, args=(output, on_line), daemon=True),
+            threading.Thread(target=read, args=(errors, lambda line: on_error_line(self.name, line)), daemon=True),
         ]
         waiter = threading.Thread(target=self._wait, args=(readers, on_exit), daemon=True)
         self._threads = [*readers, waiter]
@@ -98,17 +154,17 @@ class Child:
     @property
     def running(self) -> bool:
         """Whether it has not ended yet."""
-        return self._popen is not None and self._popen.poll() is None
+        return self._process.poll() is None
 
     @property
     def stopped(self) -> bool:
         """Whether it is stopped by SIGSTOP; being held by a debugger does not count."""
-        return self._popen is not None and self.running and process_state(self._popen.pid) == "T"
+        pid = self._process.pid
+        return pid is not None and self.running and process_state(pid) == "T"
 
     def signal(self, number: signal.Signals) -> None:
         """Send a signal if it still runs."""
-        if self._popen is not None and self.running:
-            self._popen.send_signal(number)
+        self._process.send_signal(number)
 
     def close(self) -> None:
         """Kill the processes it has left behind, wait for the readers and close the pipes; call it after the end."""
@@ -116,14 +172,16 @@ class Child:
             self._signal_others(signal.SIGKILL)
         for thread in self._threads:
             thread.join(1.0)
-        if self._popen is not None and self._popen.stdin is not None:
-            self._popen.stdin.close()
+        if self._process.stdin is not None:
+            self._process.stdin.close()
 
     def _signal_others(self, number: int) -> None:
         """Send a signal to the processes that it has started and left behind; an FMU may start some."""
-        assert self._popen is not None
+        pid = self._process.pid
+        if pid is None:
+            return
         with suppress(ProcessLookupError, PermissionError):
-            os.killpg(self._popen.pid, number)
+            os.killpg(pid, number)
             self._left_others = True
 
     # Each reader closes its pipe, because a process that was left behind may keep the other end open.
@@ -145,8 +203,7 @@ class Child:
                     self._post(partial(on_line, b"(it writes a lot; nothing more of it is shown)"))
 
     def _wait(self, readers: Sequence[threading.Thread], on_exit: Callable[[str, int], None]) -> None:
-        assert self._popen is not None
-        code = self._popen.wait()
+        code = self._process.wait()
         self._signal_others(signal.SIGTERM)
         for reader in readers:
             reader.join(1.0)

@@ -1,8 +1,9 @@
 """The launcher: starts one process per node and one for the master, and watches them until all have ended.
 
-Every process should run until the master has reported the outcome. If a process ends before, the run ends with
-`MeshLost` and the name of the process. A request to end goes to the master, which tells the nodes. Whatever happens, no
-process and no file of the run is left at the end.
+The fork server starts them (`fmu_mesh.run.fork_server`); a node that needs another Python is started by exec. Every
+process should run until the master has reported the outcome. If a process ends before, the run ends with `MeshLost` and
+the name of the process. A request to end goes to the master, which tells the nodes. Whatever happens, no process and no
+file of the run is left at the end.
 """
 
 from __future__ import annotations
@@ -29,8 +30,9 @@ from ..wire.runtime import (
 )
 from ..wire.session import LEASE_MS
 from ..wire.views import GOING_ON
-from .child import Child, StopWatch, how_it_ended, own_command
+from .child import Child, Process, StopWatch, executed, how_it_ended, is_other_python
 from .events import Event, OutputLine, Reachable, Status, decode_event
+from .fork_server import ForkServer, fork_server
 from .outcome import Outcome
 from .results import rows_left, what_is_kept
 from .run_plan import RunPlan
@@ -39,6 +41,7 @@ __all__ = ["Launcher"]
 
 _MASTER = "the master"
 _GATEWAY = "the gateway to ROS"
+_SERVER = "the fork server"
 _REPORT_S = 1.5
 _TOLD_S = 8.0
 _INTERRUPT_S = 0.9
@@ -70,6 +73,7 @@ class Launcher:
         self._timeouts = run.loaded.config.timeouts
         self._on_event = on_event
         self._happened: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
+        self._server: ForkServer | None = None
         self._processes: dict[str, Child] = {}
         self._lost: list[tuple[str, int, float]] = []
         self._gateway_ready = False
@@ -113,24 +117,33 @@ class Launcher:
     # --- start
 
     def _spawn_all(self) -> None:
-        self._spawn(_MASTER, own_command("master", self._file), self._take_event)
+        self._server = server = fork_server()
+        self._watch(_SERVER, server.process, partial(self._take_output, _SERVER))
+        self._watch(_MASTER, self._fork("master"), self._take_event)
         section = self._run.loaded.config.ros
         if section is not None and section.profile != "rclpy":
             # The nodes are started when it is ready, so that it misses no sample.
-            self._spawn(_GATEWAY, own_command("gateway", self._file), self._take_gateway_line)
+            self._watch(_GATEWAY, self._fork("gateway"), self._take_gateway_line)
         else:
             self._spawn_nodes()
 
     def _spawn_nodes(self) -> None:
         for node, plan in self._plan.nodes.items():
-            if node != RECORDER:
-                command = own_command("node", self._file, node, interpreter=plan.interpreter)
-                self._spawn(node, command, partial(self._take_output, node), limited=True)
+            if node == RECORDER:
+                continue
+            if plan.interpreter is not None and is_other_python(plan.interpreter):
+                process: Process = executed("node", self._file, node, interpreter=plan.interpreter)
+            else:
+                process = self._fork("node", node)
+            self._watch(node, process, partial(self._take_output, node), limited=True)
 
-    def _spawn(self, name: str, command: list[str], on_line: Callable[[bytes], None], *, limited: bool = False) -> None:
-        process = Child(name, command, self._happened.put)
-        self._processes[name] = process
-        process.start(on_line, self._take_output, self._take_exit, limited=limited)
+    def _fork(self, role: str, *arguments: str) -> Process:
+        assert self._server is not None
+        return self._server.fork(self._run.mesh, role, self._file, *arguments)
+
+    def _watch(self, name: str, process: Process, on_line: Callable[[bytes], None], *, limited: bool = False) -> None:
+        self._processes[name] = child = Child(name, process, self._happened.put)
+        child.watch(on_line, self._take_output, self._take_exit, limited=limited)
 
     # --- what happens; all of it on the thread that called `run`
 
@@ -191,7 +204,9 @@ class Launcher:
     def _take_exit(self, name: str, code: int) -> None:
         if not self._signalled:  # afterwards the signal is the reason
             self._how[name] = how_it_ended(code)
-        if self._ending:
+            if name == _SERVER and code != 0:  # also when the master has reported what that means for it
+                self._lost.insert(0, (name, code, time.monotonic()))
+        if self._ending or name == _SERVER:
             return
         if self._outcome is None and (code != 0 or name == _MASTER):
             self._lost.append((name, code, time.monotonic()))
@@ -228,6 +243,8 @@ class Launcher:
     def _end_all(self) -> None:
         """Wait for the processes that end by themselves, then send SIGTERM, then SIGKILL."""
         self._ending = True
+        if self._server is not None:
+            self._server.finish()
         patience = _KILL_S if self._outcome is not None else 0.1
         if self._outcome is not None and self._outcome.error is None:  # the gateway may still have samples for ROS
             patience = self._timeouts.stop
@@ -240,14 +257,22 @@ class Launcher:
                 self._signalled = True
                 for process in running:
                     process.signal(step)
-            deadline = time.monotonic() + (patience if step is None else grace_s)
-            while any(process.running for process in running) and time.monotonic() < deadline:
-                try:
-                    self._happened.get(timeout=0.05)()
-                except queue.Empty:
-                    continue
+            self._wait_for_end(running, patience if step is None else grace_s)
+        self._close_all()
+
+    def _wait_for_end(self, running: list[Child], timeout_s: float) -> None:
+        deadline = time.monotonic() + timeout_s
+        while any(process.running for process in running) and time.monotonic() < deadline:
+            try:
+                self._happened.get(timeout=0.05)()
+            except queue.Empty:
+                continue
+
+    def _close_all(self) -> None:
         for process in self._processes.values():
             process.close()
+        if self._server is not None:
+            self._server.close()
         while not self._happened.empty():
             self._happened.get()()
 
@@ -258,8 +283,8 @@ class Launcher:
             FmuMeshError: it did not; as the master says, or as this process saw it if the master could not say it.
         """
         outcome, file, rows = self._outcome, self._plan.system.result_file, self._rows or 0
-        gateway_lost = any(name == _GATEWAY for name, _, _ in self._lost)  # the master knows nothing of it
-        if outcome is None or gateway_lost:
+        unknown = any(name in (_GATEWAY, _SERVER) for name, _, _ in self._lost)  # to the master
+        if outcome is None or unknown:
             error = self._own_account()
         elif outcome.error is None:
             self.outcome = outcome
@@ -283,11 +308,11 @@ class Launcher:
         if self._interrupted_at is not None:
             return Interrupted("interrupted")
         # A node that ends with this code only says that another process is missing.
-        named = [loss for loss in self._lost if loss[0] == _MASTER or loss[1] != MeshLost.exit_code]
+        named = [loss for loss in self._lost if loss[0] in (_MASTER, _SERVER) or loss[1] != MeshLost.exit_code]
         if not named:
             return MeshLost("the master was lost: its process does not answer any more")
         name, code, _ = named[0]
-        if name in (_MASTER, _GATEWAY):
+        if name in (_MASTER, _GATEWAY, _SERVER):
             hint = "Was it stopped for some seconds? Then the mesh lets go of it." if not code else None
             return MeshLost(f"{name} was lost: its process {self._how[name]}", hint=hint)
         instances = ", ".join(item.name for item in self._plan.nodes[name].instances)

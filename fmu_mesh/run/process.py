@@ -27,7 +27,7 @@ from ..wire.runtime import (
 )
 from .run_plan import MANUAL
 
-__all__ = ["GRACE_S", "Interruption", "RunProcess", "ended_by_signals"]
+__all__ = ["GRACE_S", "Interruption", "RunProcess", "die_with_parent", "ended_by_signals"]
 
 GRACE_S = 1.0
 """How long the main thread may take to end the process before another thread does."""
@@ -101,7 +101,7 @@ class RunProcess:
 
     def __enter__(self) -> Self:
         if self.is_child:
-            _die_with_parent()
+            die_with_parent()
         self.stack.enter_context(ended_by_signals(self.interruption.request, self.clean_up, watch_stdin=self.is_child))
         self.stack.callback(leave_run_folder, self.folder)
         return self
@@ -202,7 +202,7 @@ def _exit(reason: str, *, reported: bool) -> None:
     os._exit(130)
 
 
-def _die_with_parent() -> None:
+def die_with_parent() -> None:
     """Ask the kernel to terminate this process when its parent dies; standard input tells if it died before."""
     if sys.platform.startswith("linux"):
         ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)

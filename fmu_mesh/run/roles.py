@@ -9,19 +9,20 @@ import logging
 import os
 import shlex
 from collections.abc import Callable
-from contextlib import closing
+from contextlib import closing, suppress
 from pathlib import Path
+from typing import Any
 
 from ..errors import ConfigurationError, FmuError, FmuMeshError, StepFailed
 from ..instances.call_guard import CallWatch, Guarded
 from ..instances.contract import Instance, KeepsFiles, LogMessage, Opening
-from ..instances.registry import open_instance
+from ..instances.registry import open_instance, prepare
 from ..master.master import Master, MasterSettings
 from ..node.node import Node
 from ..recorder.recorder import Recorder
 from ..system.plan import RECORDER
 from ..wire.keys import MASTER
-from ..wire.runtime import MeshNote, fmu_folder, write_note
+from ..wire.runtime import MeshNote, fmu_folder, run_folder, write_note
 from ..wire.session import RouterLink, close_session, open_session, own_endpoints
 from ..wire.views import LogLine, MeshStatus
 from .child import is_other_python
@@ -32,7 +33,7 @@ from .results import open_result
 from .run_plan import MANUAL, NodeRun, RunPlan
 from .wiring import is_socket, wiring
 
-__all__ = ["run_master", "run_node"]
+__all__ = ["prepare_node", "run_master", "run_node"]
 
 log = logging.getLogger(__name__)
 
@@ -87,19 +88,7 @@ class _NodeProcess:
             raise
 
     def _open(self, name: str) -> Guarded:
-        item, model = self._plan.instance(name), self._run.models[name]
-        opening = Opening(
-            name=name,
-            path=Path(item.fmu),
-            section=item.section,
-            description=model.description,
-            folder=fmu_folder(self._process.folder),
-            content=model.content,
-            limits=self._plan.limits,
-            linear_inputs=item.linear_inputs,
-            log=self._log,
-            showing=self._run.showing,
-        )
+        opening = _opening(self._run, name, self._process.folder, self._log)
 
         def instantiate() -> Instance:
             instance = open_instance(opening)
@@ -130,6 +119,33 @@ class _NodeProcess:
         if not (self._process.is_child and known):
             log.error("%s", error)
         self._process.end_now(StepFailed.exit_code)
+
+
+def _opening(
+    run: NodeRun, name: str, folder: Path, log: Callable[[LogMessage], None] = lambda _message: None
+) -> Opening[Any]:
+    """How an instance is opened in this process, in the folder of the run."""
+    item, model = run.plan.instance(name), run.models[name]
+    return Opening(
+        name=name,
+        path=Path(item.fmu),
+        section=item.section,
+        description=model.description,
+        folder=fmu_folder(folder),
+        content=model.content,
+        limits=run.plan.limits,
+        linear_inputs=item.linear_inputs,
+        log=log,
+        showing=run.showing,
+    )
+
+
+def prepare_node(run: NodeRun) -> None:
+    """Before the process of a node is forked: do once what several nodes need, such as extracting the FMU of all."""
+    folder = run_folder(run.plan.mesh, run.run)
+    for item in run.plan.instances:
+        with suppress(FmuMeshError):  # the node says it
+            prepare(_opening(run, item.name, folder))
 
 
 def run_master(run: RunPlan, emit: Callable[[Event], None]) -> Outcome:

@@ -80,6 +80,9 @@ def test_interrupt_kernel_ends_the_run_and_the_kernel_goes_on(kernel: Kernel, pl
     [error] = [content for kind, content in told if kind == "error"]
     assert error["ename"] == "KeyboardInterrupted"
     assert "point " in error["evalue"]
-    wait_until(lambda: not [p for p in place.processes() if "fmu_mesh.run" in p.cmdline()], "the end of all processes")
+    wait_until(
+        lambda: not (place.processes("node") or place.processes("master") or place.processes("fork")),
+        "the end of all processes",
+    )
     again = "print(len(mesh.run(record='memory', stop_time=0.1).times))"
     assert ("stream", {"name": "stdout", "text": "11\n"}) in list(kernel.messages(again))

@@ -56,7 +56,7 @@ def test_an_fmu_that_hangs_is_named(faulty: Path, *, processes: bool) -> None:
 def test_a_killed_node_is_named(place: Place) -> None:
     with steered().start(record="memory") as run:
         run.get("gain.y")
-        [node] = [process for process in place.processes() if "node" in process.cmdline()]
+        [node] = place.processes("node")
         node.kill()
         with pytest.raises(fmu_mesh.MeshLost, match="node 'gain' was lost: its process was ended by SIGKILL") as caught:
             run.wait(DEADLINE_S)
@@ -75,7 +75,7 @@ def test_a_killed_node_is_started_again_if_asked(place: Place) -> None:
         record="memory", restarts=1, on_event=lambda event: numbers.append(getattr(event, "number", 0))
     ) as run:
         run.get("gain.y")
-        [node] = [process for process in place.processes() if "node" in process.cmdline()]
+        [node] = place.processes("node")
         node.kill()
         result = run.wait(DEADLINE_S)
     assert len(result.times) == 101

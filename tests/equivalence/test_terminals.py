@@ -104,9 +104,8 @@ def test_top_puts_the_terminal_back_as_it_was(place: Place, how: str | signal.Si
         if how == "end":
             place.run("stop", "pair")
         elif how == "error":
-            for process in place.processes():
-                if "master" in process.cmdline():
-                    process.suspend()
+            for process in place.processes("master"):
+                process.suspend()
         elif isinstance(how, signal.Signals):
             top.signal(how)
         else:

@@ -92,7 +92,7 @@ def resting(place: Place, ros: Ros, config: Path) -> Iterator[tuple[Launched, ps
     with place.session() as session:
         wait_until(lambda: commanded(session, "step", 150), "a mesh that has started")
         wait_until(lambda: len(ros.floats("angle")) == 151, "samples")
-        [gateway] = [process for process in place.processes() if "gateway" in process.cmdline()]
+        [gateway] = place.processes("gateway")
         yield mesh, gateway, session
 
 
@@ -189,7 +189,7 @@ def test_the_clock_stands_while_the_mesh_is_paused_and_goes_on_by_the_points_of_
 def test_a_gateway_that_dies_ends_the_run_with_its_name_and_what_was_recorded(place: Place, ros: Ros) -> None:
     mesh = place.start("launch", configured(place, ros, factor=1, stop_time=60.0), "--no-progress")
     wait_until(lambda: len(ros.floats("angle")) > 20, "samples")
-    [gateway] = [process for process in place.processes() if "gateway" in process.cmdline()]
+    [gateway] = place.processes("gateway")
 
     gateway.kill()
 
@@ -204,7 +204,7 @@ def test_a_gateway_that_was_stopped_until_the_mesh_let_go_of_it_ends_the_run_wit
 ) -> None:
     mesh = place.start("launch", configured(place, ros, factor=1, stop_time=600.0), "--no-progress")
     wait_until(lambda: len(ros.floats("angle")) > 20, "samples")
-    [gateway] = [process for process in place.processes() if "gateway" in process.cmdline()]
+    [gateway] = place.processes("gateway")
     links = len(mesh.child("master").net_connections(kind="unix"))
     gateway.suspend()
     wait_until(lambda: len(mesh.child("master").net_connections(kind="unix")) < links, "the end of its link")

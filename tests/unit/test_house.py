@@ -26,7 +26,7 @@ ROOT = Path(__file__).parents[2]
 MODULES = sorted(
     module.name
     for module in pkgutil.walk_packages(fmu_mesh.__path__, "fmu_mesh.")
-    if not module.name.endswith("__main__")
+    if not module.name.endswith("__main__") and "-" not in module.name  # a library of C is no module
 )
 
 

@@ -18,7 +18,7 @@ import fmu_mesh
 ROOT = Path(__file__).resolve().parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 EXTRAS = PROJECT["optional-dependencies"]
-FOR_DEVELOPERS = {"check", "dev", "docs", "package", "test", "test-ros"}
+FOR_DEVELOPERS = {"check", "dev", "docs", "library", "package", "test", "test-ros"}
 
 
 def text(path: str) -> str:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal, Self
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, Self
 
 from msgspec import Meta
 from msgspec.structs import replace
@@ -20,6 +20,9 @@ from ...config.mesh import LimitsConfig
 from ...variables.model_description import ModelDescription
 from ..contract import Instance, Kind, Opening
 from .step_options import SolverSettings, StepOptions
+
+if TYPE_CHECKING:
+    from .archive.archive import Terms
 
 __all__ = ["KIND_OF_FMUS", "FmuConfig", "SolverConfig"]
 
@@ -169,9 +172,18 @@ class FmuKind(Kind[FmuConfig]):
 
         return content_of(path)
 
+    def preload(self) -> None:
+        """Import FMPy, and all that calls FMUs."""
+        from . import opening  # noqa: F401, PLC0415  as above
+
+    def prepare(self, opening: Opening[FmuConfig]) -> None:
+        """Extract the FMU."""
+        from .archive.sources import prepare  # noqa: PLC0415  as above
+
+        prepare(opening.path, opening.folder, _terms(opening), opening.description)
+
     def open(self, opening: Opening[FmuConfig]) -> Instance:
         """Extract, load and instantiate the FMU."""
-        from .archive.archive import Terms  # noqa: PLC0415  as above
         from .opening import open_instance, stepped  # noqa: PLC0415  as above
 
         section, description = opening.section, opening.description
@@ -181,13 +193,19 @@ class FmuKind(Kind[FmuConfig]):
             retry_discarded_steps=section.retry_discarded_steps,
             linear_inputs=opening.linear_inputs,
         )
-        terms = Terms(opening.limits, section.sha256, opening.content)
-        instance = open_instance(opening.path, opening.name, description, opening.folder, opening.log, terms, options)
+        path, folder, terms = opening.path, opening.folder, _terms(opening)
+        instance = open_instance(path, opening.name, description, folder, opening.log, terms, options)
         return stepped(instance, options)
 
 
 KIND_OF_FMUS = FmuKind()
 """What the entry point `fmu` names."""
+
+
+def _terms(opening: Opening[FmuConfig]) -> Terms:
+    from .archive.archive import Terms  # noqa: PLC0415  as above
+
+    return Terms(opening.limits, opening.section.sha256, opening.content)
 
 
 def _takes_no_tolerance(description: ModelDescription) -> tuple[str, str] | None:

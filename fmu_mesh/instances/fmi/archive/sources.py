@@ -32,7 +32,7 @@ from .archive import OpenFmu, Terms, opened, unpacked
 from .examining import library_name, source_names
 from .reading import description_of
 
-__all__ = ["cache_folder", "describe", "extract"]
+__all__ = ["cache_folder", "describe", "extract", "prepare"]
 
 log = logging.getLogger(__name__)
 
@@ -47,6 +47,10 @@ _OWN_HEADERS = Path(__file__).parent / "headers"
 _FLAGS: Final = ("-O2", "-fPIC", "-ffp-contract=off", "-w")
 # -Bsymbolic: calls go to the FMU's own functions, even if the C library or Python has one with the same name.
 _LINK_FLAGS: Final = ("-shared", "-Wl,--no-undefined", "-Wl,-Bsymbolic", "-lm", "-ldl", "-lpthread")
+
+
+_prepared: dict[tuple[Path, Terms, str, str], Path] = {}
+"""The folders of FMUs that `prepare` has extracted."""
 
 
 class _Build(msgspec.Struct, frozen=True):
@@ -78,8 +82,34 @@ def extract(
         LoadFailed: the archive is damaged or does not meet ``terms``, or the sources do not compile; nothing is left
             behind.
     """
+    if model is not None and (prepared := _prepared.get((path, terms, model.model_identifier, model.kind))) is not None:
+        return _copied(path, prepared, parent)
     with opened(path, terms) as fmu:
         return _extract(fmu, parent, tell, model)
+
+
+def prepare(path: Path, parent: Path, terms: Terms, model: ModelDescription) -> None:
+    """Extract an FMU as `extract`, for each later `extract` in this process and in those that it forks: they copy it.
+
+    Each has a folder of its own, because an FMU may write to its files.
+
+    Raises:
+        LoadFailed: as `extract`.
+    """
+    key = (path, terms, model.model_identifier, model.kind)
+    if key not in _prepared:
+        _prepared[key] = extract(path, parent, terms, model=model)
+
+
+def _copied(path: Path, prepared: Path, parent: Path) -> Path:
+    """A new private folder below ``parent`` with copies of all files of an extracted FMU."""
+    try:
+        parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        folder = Path(tempfile.mkdtemp(prefix=f"{path.stem[:40]}-", dir=parent))
+        shutil.copytree(prepared, folder, symlinks=True, dirs_exist_ok=True)
+    except OSError as error:
+        raise LoadFailed(f"'{path}' cannot be extracted into '{parent}': {error.strerror or error}") from error
+    return folder
 
 
 def describe(path: Path, terms: Terms, kind: Literal["auto"] | Kind, tell: Callable[[str], None]) -> ModelDescription:

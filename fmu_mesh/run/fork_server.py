@@ -1,0 +1,331 @@
+"""The fork server: a process that has imported what the processes of a run need, and forks them.
+
+It is started by exec, never forked from the program of a user, and has one thread and no Zenoh session. It imports, and
+then forks a process for each request of its launcher. It loads no model. A forked process starts in milliseconds, and
+shares the memory of all imported modules with the others.
+
+Launcher and server share a pair of sockets. A request has the arguments of `fmu_mesh.run.__main__`, and two descriptors
+for standard output and standard error. The server answers with the process id, and later with the exit code. It leaves
+ended processes as zombies until it ends itself, so that no other process can get the id of one of them. When the
+launcher sends no more requests, the server ends after its last process.
+"""
+
+from __future__ import annotations
+
+import gc
+import os
+import select
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from types import FrameType
+from typing import IO, Final
+
+import msgspec
+
+from ..errors import ConfigurationError, Interrupted, MeshLost
+from ..wire.runtime import is_alive
+from .child import own_command, own_environment
+
+__all__ = ["ForkServer", "Forked", "fork_server", "serve", "started_ahead"]
+
+Job = Callable[[], None]
+"""What a process does, from its start to its end."""
+
+_ROOM: Final = "-" * 64
+"""An argument that makes room for the titles of the processes: a title is not longer than the command."""
+
+_SIGNALS: Final = (signal.SIGCHLD, signal.SIGINT, signal.SIGTERM)
+_REQUEST_BYTES: Final = 1 << 16
+_KILL_S: Final = 5.0
+"""How long processes may take to end after the server was asked to end them. Each ends itself in less."""
+
+
+class _Request(msgspec.Struct, frozen=True):
+    number: int
+    mesh: str
+    arguments: tuple[str, ...]
+
+
+class _News(msgspec.Struct, frozen=True):
+    """The process of a request has started, or has ended with a code: the negative number of a signal if it was one."""
+
+    number: int
+    pid: int
+    code: int | None = None
+
+
+class ForkServer:
+    """The fork server as its launcher sees it. It starts at once.
+
+    The kernel ends the server with the thread that makes this object, and the server ends what it has forked.
+
+    Attributes:
+        process: its process.
+    """
+
+    def __init__(self) -> None:
+        self._control, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        with theirs:
+            self.process = subprocess.Popen(
+                own_command("forks", str(theirs.fileno()), _ROOM),
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                start_new_session=True,
+                pass_fds=(theirs.fileno(),),
+                env=own_environment(),
+            )
+        self._forked: list[Forked] = []
+        self._reader = threading.Thread(target=self._read, name="fork server", daemon=True)
+        self._reader.start()
+
+    def fork(self, mesh: str, *arguments: str) -> Forked:
+        """Ask for a process of the mesh ``mesh``, with these arguments of `fmu_mesh.run.__main__`."""
+        output, errors = os.pipe(), os.pipe()
+        forked = Forked(os.fdopen(output[0], "rb"), os.fdopen(errors[0], "rb"))
+        self._forked.append(forked)
+        request = msgspec.msgpack.encode(_Request(len(self._forked) - 1, mesh, arguments))
+        with suppress(OSError):  # the server is gone, which its own end tells
+            socket.send_fds(self._control, [request], [output[1], errors[1]])
+        os.close(output[1])
+        os.close(errors[1])
+        return forked
+
+    def finish(self) -> None:
+        """Ask for no more processes: the server ends when all have ended."""
+        with suppress(OSError):
+            self._control.shutdown(socket.SHUT_WR)
+
+    def discard(self) -> None:
+        """End a server that has forked nothing."""
+        self.process.kill()
+        self.process.communicate()
+        self.close()
+
+    def close(self) -> None:
+        """After the end of the server: close what is open."""
+        self._reader.join(1.0)
+        self._control.close()
+
+    def _read(self) -> None:
+        with suppress(OSError):
+            while data := self._control.recv(_REQUEST_BYTES):
+                news = msgspec.msgpack.decode(data, type=_News)
+                self._forked[news.number].take(news.pid, news.code)
+        for forked in self._forked:
+            forked.orphaned()
+
+
+_ahead: list[ForkServer] = []
+"""The server that was started ahead, until a run takes it."""
+
+
+@contextmanager
+def started_ahead() -> Iterator[None]:
+    """Start the server of the next run of this process now: it imports while this process imports and plans.
+
+    At the end of the block it is ended if no run has taken it. Use it on a thread that lives as long as the run.
+    """
+    _ahead.append(ForkServer())
+    try:
+        yield
+    finally:
+        while _ahead:
+            _ahead.pop().discard()
+
+
+def fork_server() -> ForkServer:
+    """The server for one run: the one that was started ahead, or a new one."""
+    return _ahead.pop() if _ahead else ForkServer()
+
+
+class Forked:
+    """A process that the fork server was asked for; offers what `subprocess.Popen` does.
+
+    Attributes:
+        pid: its process id; None before it has started.
+        stdout: the reading end of its standard output.
+        stderr: the same of its standard error.
+    """
+
+    stdin: None = None
+
+    def __init__(self, stdout: IO[bytes], stderr: IO[bytes]) -> None:
+        self.stdout = stdout
+        self.stderr = stderr
+        self.pid: int | None = None
+        self._code: int | None = None
+        self._orphaned = False
+        self._ended = threading.Event()
+
+    def take(self, pid: int, code: int | None) -> None:
+        """It has started, or has ended with ``code``."""
+        self.pid = pid
+        self._code = code
+        if code is not None:
+            self._ended.set()
+
+    def orphaned(self) -> None:
+        """The server is gone. Nobody can tell the exit code any more, and the kernel asks this process to end."""
+        self._orphaned = True
+        self._ended.set()
+
+    def poll(self) -> int | None:
+        """None if it still runs, or has not started yet; otherwise its exit code, as `wait` tells it."""
+        if self._code is None and (is_alive(self.pid) if self.pid is not None else not self._orphaned):
+            return None
+        return self._known_code()
+
+    def wait(self) -> int:
+        """Wait until the server has told its exit code, or is gone; then the code says that a process is missing."""
+        self._ended.wait()
+        return self._known_code()
+
+    def send_signal(self, number: int) -> None:
+        """Send a signal if it still runs."""
+        if self.pid is not None and self.poll() is None:
+            with suppress(ProcessLookupError):
+                os.kill(self.pid, number)
+
+    def _known_code(self) -> int:
+        return self._code if self._code is not None else MeshLost.exit_code
+
+
+def serve(control: int, job: Callable[..., Job]) -> Job | None:
+    """Be the fork server. Returns in each forked process, with its job; in the server at its end, with None.
+
+    Args:
+        control: the descriptor of the server's end of the pair of sockets.
+        job: returns the job of a request from its arguments. It is called in the server: what it opens or reads, all
+            processes have that are forked later.
+
+    Raises:
+        ConfigurationError: the system starts no more processes.
+        Interrupted: the server was asked to end.
+    """
+    from ..instances.registry import preload  # noqa: PLC0415 only the server needs it
+    from . import roles  # noqa: F401, PLC0415 as above
+
+    preload()
+    gc.collect()
+    gc.freeze()  # otherwise the next collection in a forked process would copy the memory that it shares
+    return _Server(control, job).run()
+
+
+class _Server:
+    """The fork server itself."""
+
+    def __init__(self, control: int, job: Callable[..., Job]) -> None:
+        os.set_inheritable(control, False)  # noqa: FBT003 it takes no keyword
+        self._control = socket.socket(fileno=control)
+        self._job = job
+        self._reading, self._writing = os.pipe()
+        os.set_blocking(self._reading, False)
+        os.set_blocking(self._writing, False)
+        self._numbers: dict[int, int] = {}
+        """The requests of the running processes by process id."""
+        self._accepting = True
+        self._asked: str | None = None
+        self._deadline: float | None = None
+
+    def run(self) -> Job | None:
+        """Serve; see `serve`."""
+        self._before = {number: signal.signal(number, _ignore) for number in _SIGNALS}
+        signal.set_wakeup_fd(self._writing, warn_on_full_buffer=False)
+        while self._accepting or self._numbers:
+            requests: list[int | socket.socket] = [self._control] if self._accepting else []
+            left_s = max(0.0, self._deadline - time.monotonic()) if self._deadline is not None else None
+            ready, _, _ = select.select([self._reading, *requests], [], [], left_s)
+            if self._reading in ready:
+                self._take_signals()
+            if self._control in ready and (job := self._take_request()) is not None:
+                return job
+            if not ready:
+                self._end_all(signal.SIGKILL)
+        if self._asked is not None:
+            raise Interrupted(f"{self._asked} was received").already_reported()  # the launcher tells it by the code
+        return None
+
+    def _take_request(self) -> Job | None:
+        """Fork a process; returns its job there, and None in the server."""
+        from setproctitle import setproctitle  # noqa: PLC0415 the launcher does without it
+
+        data, descriptors, _, _ = socket.recv_fds(self._control, _REQUEST_BYTES, 2)
+        if not data:
+            self._accepting = False
+            return None
+        request = msgspec.msgpack.decode(data, type=_Request)
+        setproctitle(f"fmu-mesh fork server {request.mesh}")
+        job = self._job(*request.arguments)
+        # A signal for the server must not run the handler of the server in the new process.
+        signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)
+        server = os.getpid()
+        try:
+            pid = os.fork()
+        except OSError as error:
+            text = f"the system starts no more processes: {error.strerror}"
+            raise ConfigurationError(text, hint="Is the limit of processes (`ulimit -u`) too low?") from error
+        if pid == 0:
+            self._become(request, descriptors, server)
+            return job
+        self._numbers[pid] = request.number
+        self._tell(_News(request.number, pid))
+        for descriptor in descriptors:
+            os.close(descriptor)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, _SIGNALS)
+        return None
+
+    def _become(self, request: _Request, descriptors: list[int], server: int) -> None:
+        """In the new process: keep nothing of the server but its memory and its standard input."""
+        from .process import die_with_parent  # noqa: PLC0415 as above
+
+        os.setsid()
+        signal.set_wakeup_fd(-1)
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, _SIGNALS)
+        die_with_parent()
+        if os.getppid() != server:  # it has died before
+            os._exit(0)
+        self._control.close()
+        for own in (self._reading, self._writing):
+            os.close(own)
+        for target, descriptor in enumerate(descriptors, start=1):
+            os.dup2(descriptor, target)
+            os.close(descriptor)
+        sys.argv[1:] = request.arguments
+        if (random := sys.modules.get("numpy.random")) is not None:  # Python itself does so with `random`
+            random.seed()
+
+    def _take_signals(self) -> None:
+        numbers = os.read(self._reading, 4096)
+        for pid, request in list(self._numbers.items()):
+            ended = os.waitid(os.P_PID, pid, os.WEXITED | os.WNOHANG | os.WNOWAIT)
+            if ended is not None:
+                del self._numbers[pid]
+                exited = ended.si_code == os.CLD_EXITED
+                self._tell(_News(request, pid, ended.si_status if exited else -ended.si_status))
+        asked = next((number for number in numbers if number != signal.SIGCHLD), None)
+        if asked is not None:  # by somebody, or by the kernel because the launcher is gone
+            self._asked = signal.Signals(asked).name
+            self._accepting = False
+            self._deadline = time.monotonic() + _KILL_S
+            self._end_all(signal.SIGTERM)
+
+    def _end_all(self, number: signal.Signals) -> None:
+        for pid in self._numbers:
+            os.kill(pid, number)
+
+    def _tell(self, news: _News) -> None:
+        with suppress(OSError):  # the launcher is gone
+            self._control.send(msgspec.msgpack.encode(news))
+
+
+def _ignore(_number: int, _frame: FrameType | None) -> None:
+    """The number of the signal is in the pipe."""

@@ -1,0 +1,232 @@
+"""The library of C: that it is the one of its sources, how it is found, and what a mesh is told where there is none."""
+
+from __future__ import annotations
+
+import ctypes
+import re
+import shutil
+import subprocess
+import sys
+import tarfile
+import zipfile
+from pathlib import Path
+
+import pytest
+from hatchling.builders.sdist import SdistBuilder
+from hatchling.builders.wheel import WheelBuilder
+
+import build_library
+from fmu_mesh.errors import ConfigurationError
+from fmu_mesh.rings.library import LIBRARY_VARIABLE, TRIED_ON, load_library, why_no_library
+
+LIBRARY = build_library.library_path("linux-x86_64")
+NAME = "fmu_mesh/rings/burst-linux-x86_64.so"
+ASK = "from fmu_mesh.rings.library import *; print(load_library(), why_no_library(), sep='\\n')"
+
+
+@pytest.fixture(autouse=True)
+def as_users_have_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv(LIBRARY_VARIABLE, raising=False)
+
+
+@pytest.fixture
+def clone(tmp_path: Path) -> Path:
+    """A copy of the package and of what builds a wheel of it."""
+    root = build_library.ROOT
+    shutil.copytree(root / "fmu_mesh", tmp_path / "fmu_mesh", ignore=shutil.ignore_patterns("__pycache__"))
+    for name in ("LICENSE", "README.md", "build_library.py", "pyproject.toml"):
+        shutil.copy(root / name, tmp_path)
+    return tmp_path
+
+
+def ask_in(clone: Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, "-c", ASK], cwd=clone, capture_output=True, text=True, check=False)
+
+
+def built_by_the_pinned_compiler() -> bool:
+    try:
+        build_library.require_compiler()
+    except build_library.BuildError:
+        return False
+    return True
+
+
+needs_the_compiler = pytest.mark.skipif(not built_by_the_pinned_compiler(), reason="`make library` installs ziglang")
+
+
+def test_the_library_in_the_tree_was_built_from_the_sources_in_the_tree() -> None:
+    assert build_library.manifest().encode() in LIBRARY.read_bytes(), "make library"
+
+
+@needs_the_compiler
+def test_whoever_builds_the_library_gets_the_bytes_in_the_tree() -> None:
+    assert build_library.build("linux-x86_64") == LIBRARY.read_bytes(), "make library"
+
+
+@needs_the_compiler
+def test_the_library_for_another_processor_can_be_built_here() -> None:
+    built = build_library.build("linux-aarch64")
+
+    assert built[:4] == b"\x7fELF"
+    assert int.from_bytes(built[18:20], "little") == 183  # AArch64 in the header of ELF
+    assert build_library.manifest().encode() in built
+
+
+@needs_the_compiler
+def test_a_library_is_built_from_several_files_and_knows_the_headers_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "one.c").write_text('#include "two/two.h"\nVISIBLE int one(void) { return two() - 1; }\n')
+    (tmp_path / "two").mkdir()
+    (tmp_path / "two" / "two.c").write_text('#include "two.h"\nint two(void) { return 2; }\n')
+    (tmp_path / "two" / "two.h").write_text('#define VISIBLE __attribute__((visibility("default")))\nint two(void);\n')
+    monkeypatch.setattr(build_library, "PACKAGE", tmp_path)
+    monkeypatch.setattr(build_library, "SOURCES", ("one.c", "two/two.c", "two/two.h"))
+
+    path = tmp_path / "library.so"
+    path.write_bytes(build_library.build("linux-x86_64"))
+
+    assert ctypes.CDLL(str(path)).one() == 1
+    assert not hasattr(ctypes.CDLL(str(path)), "two")
+    assert re.findall(rb"[0-9a-f]{64}  (\S+)\n", path.read_bytes()) == [b"one.c", b"two/two.c", b"two/two.h"]
+
+
+@needs_the_compiler
+def test_a_source_that_the_compiler_refuses_is_told_with_its_message(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "wrong.c").write_text("int wrong(void) { return unknown; }\n")
+    monkeypatch.setattr(build_library, "PACKAGE", tmp_path)
+    monkeypatch.setattr(build_library, "SOURCES", ("wrong.c",))
+
+    with pytest.raises(build_library.BuildError, match=r"wrong\.c:1:\d+: error: .*unknown"):
+        build_library.build("linux-x86_64")
+
+
+def test_another_version_of_the_compiler_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("importlib.metadata.version", lambda _: "0.1.0")
+
+    with pytest.raises(build_library.BuildError, match=r"by ziglang [\d.]+; installed: 0\.1\.0"):
+        build_library.build("linux-x86_64")
+
+
+def test_the_library_needs_nothing_but_a_c_library_of_2014_or_later() -> None:
+    content = LIBRARY.read_bytes()
+    versions = {tuple(map(int, version.split(b"."))) for version in re.findall(rb"GLIBC_([\d.]+)\0", content)}
+
+    assert max(versions) <= (2, 17)
+    assert set(re.findall(rb"\0([\w.-]+\.so[\w.]*)\0", content)) <= {b"libc.so.6", b"libm.so.6"}
+
+
+def test_the_library_beside_its_module_is_the_one_that_is_loaded() -> None:
+    assert TRIED_ON == ("linux-x86_64",)
+    assert load_library() == str(LIBRARY)
+    assert why_no_library() is None
+
+
+def test_a_variable_of_the_environment_switches_the_library_off(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(LIBRARY_VARIABLE, "none")
+
+    assert load_library() is None
+    assert why_no_library() == "The environment variable FMU_MESH_LIBRARY is none."
+
+
+def test_on_a_platform_that_was_never_tried_a_library_is_used_only_if_it_is_named(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    named = tmp_path / "named.so"
+    shutil.copy(LIBRARY, named)
+    monkeypatch.setattr("platform.machine", lambda: "aarch64")
+
+    assert load_library() is None
+    assert why_no_library() == "The library is for linux-x86_64, and this is linux-aarch64."
+    monkeypatch.setenv(LIBRARY_VARIABLE, str(named))
+    assert load_library() == str(named)
+    assert why_no_library() is None
+
+
+def test_a_library_that_is_named_and_cannot_be_loaded_is_an_error(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv(LIBRARY_VARIABLE, str(tmp_path / "missing.so"))
+
+    with pytest.raises(ConfigurationError, match=r"FMU_MESH_LIBRARY names a library .*missing\.so: cannot open"):
+        load_library()
+
+
+def test_a_library_of_somebody_else_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(LIBRARY_VARIABLE, sys.modules["_ctypes"].__file__ or "")
+
+    with pytest.raises(ConfigurationError, match=r"does not say what it was built from\. In a clone, `make library`"):
+        load_library()
+
+
+def test_a_library_of_older_sources_is_an_error_that_says_how_to_build_it(clone: Path) -> None:
+    with (clone / "fmu_mesh" / "rings" / "burst.c").open("a") as source:
+        source.write("/* changed */\n")
+    command = [sys.executable, "-m", "fmu_mesh", "launch", "mesh.yaml"]
+
+    asked = subprocess.run(command, cwd=clone, capture_output=True, text=True, check=False)
+
+    assert asked.returncode == 2
+    assert asked.stderr == (
+        f"fmu-mesh: {clone / NAME} was built from another version of {clone / 'fmu_mesh/rings/burst.c'}. "
+        "In a clone, `make library` builds it; an installation has to be installed again.\n"
+    )
+
+
+def test_a_library_without_its_sources_is_loaded(clone: Path) -> None:
+    (clone / "fmu_mesh" / "rings" / "burst.c").unlink()
+
+    assert ask_in(clone).stdout == f"{clone / NAME}\nNone\n"
+
+
+@pytest.mark.parametrize("content", [None, b"", b"\x7fELF is not enough"], ids=["missing", "empty", "broken"])
+def test_where_the_library_cannot_be_loaded_a_sentence_says_why(clone: Path, content: bytes | None) -> None:
+    (clone / NAME).unlink()
+    if content is not None:
+        (clone / NAME).write_bytes(content)
+
+    asked = ask_in(clone)
+
+    assert re.fullmatch(rf"None\nThe library cannot be loaded: {clone / NAME}: .+\.\n", asked.stdout), asked
+
+
+def test_a_wheel_for_linux_has_the_library_of_the_tree(tmp_path: Path) -> None:
+    wheel = next(WheelBuilder(str(build_library.ROOT)).build(directory=str(tmp_path), versions=["standard"]))
+
+    assert wheel.endswith("-py3-none-manylinux_2_17_x86_64.whl")
+    with zipfile.ZipFile(wheel) as archive:
+        assert archive.read(NAME) == LIBRARY.read_bytes()
+        assert [name for name in archive.namelist() if name.endswith(".so")] == [NAME]
+
+
+def test_a_wheel_that_is_built_on_another_system_has_no_library(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("packaging.tags.platform_tags", lambda: iter(["musllinux_1_2_x86_64"]))
+
+    wheel = next(WheelBuilder(str(build_library.ROOT)).build(directory=str(tmp_path), versions=["standard"]))
+
+    assert wheel.endswith("-py3-none-any.whl")
+    with zipfile.ZipFile(wheel) as archive:
+        assert [name for name in archive.namelist() if name.endswith(".so")] == []
+
+
+@pytest.mark.parametrize("change", ["missing", "stale"])
+def test_no_wheel_is_built_with_a_library_that_is_not_that_of_its_sources(clone: Path, change: str) -> None:
+    if change == "missing":
+        (clone / NAME).unlink()
+    else:
+        (clone / "fmu_mesh" / "rings" / "burst.c").write_text("")
+
+    with pytest.raises(Exception, match=r"is missing, or was built from other sources: make library"):
+        next(WheelBuilder(str(clone)).build(directory=str(clone / "dist"), versions=["standard"]))
+
+
+def test_the_source_distribution_has_the_library_and_what_builds_it(tmp_path: Path) -> None:
+    sdist = next(SdistBuilder(str(build_library.ROOT)).build(directory=str(tmp_path), versions=["standard"]))
+
+    with tarfile.open(sdist) as archive:
+        names = {name.partition("/")[2] for name in archive.getnames()}
+    assert {NAME, "fmu_mesh/rings/burst.c", "build_library.py"} <= names
