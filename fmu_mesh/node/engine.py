@@ -148,10 +148,7 @@ class BurstEngine(Engine):
             self._complete(node.unit, runner, member, result)
             self._units[node.unit].spent_ns += int((perf_counter() - began) * 1e9)
             if perf_counter() - started > _SLICE_S:
-                node.wait_ns = 0  # commit this step, and return
-                if library.run(self._address) >= Result.PYTHON:
-                    continue
-                break
+                library.attend(self._address)  # so it returns after this tick
         library.attended(self._address)
         self.waited_s = node.waited_ns / 1e9
         return self._ticks != before
@@ -282,7 +279,7 @@ class BurstEngine(Engine):
 
 
 class PlainEngine(Engine):
-    """Steps in plain Python.
+    """Steps in plain Python; it waits only where it has not stepped, so it is always eager.
 
     Args:
         slice_s: time in s after which `run` returns, once every unit had a turn.
@@ -308,7 +305,7 @@ class PlainEngine(Engine):
         for runner in self.runners:
             runner.follow(self._positions[runner.name], lambda: None)
 
-    def run(self, wait_s: float, *, eager: bool) -> bool:
+    def run(self, wait_s: float, *, eager: bool) -> bool:  # noqa: ARG002
         """See `Engine`."""
         started = perf_counter()
         seen = self._memory.seen()
@@ -319,7 +316,7 @@ class PlainEngine(Engine):
             stepped = stepped or any(advanced)
             if not any(advanced) or perf_counter() - started > self._slice_s:
                 break
-        if not stepped and not self._attention and wait_s > 0 and not eager:
+        if not stepped and not self._attention and wait_s > 0:
             began = perf_counter()
             self._memory.sleep(seen, wait_s)
             self.waited_s += perf_counter() - began

@@ -12,7 +12,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, Self, cast
+from typing import Self, cast
 
 import numpy as np
 import zenoh
@@ -308,7 +308,7 @@ class _SimulatedMemory(HostMemory):
     def of(cls, process: _Process, plan: NodePlan) -> Self:
         """The memory of a node."""
         memory = cls.private(plan.memory, plan.node)
-        memory._owner = process  # noqa: SLF001 of this class
+        memory._owner = process
         return memory
 
     def seen(self) -> int:
@@ -327,7 +327,7 @@ class _SimulatedMemory(HostMemory):
 class _SimulatedEngine(PlainEngine):
     """Lets the others go on before it steps; then it takes one tick of each unit, or some more."""
 
-    def __init__(  # noqa: PLR0913 as `make_engine`, and the process
+    def __init__(
         self,
         process: _Process,
         plan: NodePlan,

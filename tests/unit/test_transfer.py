@@ -31,7 +31,7 @@ INPUTS = Layout.of(
 PLAIN = (("c", "x", 1.0, 0.0), ("a", "z", 1.0, 0.0), ("m", "j", 1.0, 0.0))
 
 
-def transfer(  # noqa: PLR0913 the two ends of a connection
+def transfer(
     source: Ring,
     inputs: Ring,
     source_points: int = 1,
