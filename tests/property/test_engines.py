@@ -210,10 +210,8 @@ def test_an_fmu_that_ends_the_simulation_steps_no_more_and_the_others_do(make: M
     [engine] = mesh.engines.values()
 
     with pytest.raises(TerminationRequested):
-        for _ in range(1000):
-            engine.run(0.0, eager=False)
-    for _ in range(1000):
-        engine.run(0.0, eager=False)
+        run_for_ever(engine)
+    run_for_ever(engine)
 
     assert [mesh.runners[name].step for name in ("i0", "i1")] == [7, 20]
 
