@@ -27,13 +27,16 @@ _LIST = (
 class Peers:
     """The environment of the peers.
 
+    Args:
+        python: its interpreter.
+
     Attributes:
         python: its interpreter.
         failures: why a package is not there, by package.
     """
 
-    def __init__(self) -> None:
-        self.python = _PYTHON
+    def __init__(self, python: Path = _PYTHON) -> None:
+        self.python = python
         self.failures: dict[str, str] = {}
 
     def prepare(self) -> None:

@@ -1,21 +1,30 @@
-"""The jobs: which system, which contestants, how many points, and what the ratios should be."""
+"""The jobs: which system, which contestants, and how many points."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Literal
 
+from benchmarks.first_step import FMU, POINTS
 from benchmarks.task import Algorithm, Member, System
 
-__all__ = ["JOBS", "OURS", "Entry", "Job", "Target"]
+__all__ = ["JOBS", "OTHER", "OURS", "Entry", "Job", "with_checkout"]
 
 OURS = "fmu_mesh_launch"
+KINDS = "fmu_mesh_kinds"
+OTHER = ", other checkout"
+"""The end of the label of a row that another checkout runs."""
+
 _MODULES_NEED = {
+    "c_program": ("fmpy",),
     "fmpy_loop": ("fmpy",),
     "fmpy_arrays": ("fmpy",),
     "zeromq_lockstep": ("fmpy", "pyzmq"),
     "zenoh_lockstep": ("fmpy", "eclipse-zenoh"),
     "helics_federates": ("fmpy", "helics"),
-    "ecos_proxyfmu": ("ecospy", "tbb"),
+    "ecos_engine": ("ecospy", "tbb"),
     "mosaik_scenario": ("fmpy", "mosaik"),
 }
 
@@ -27,55 +36,66 @@ class Entry:
     Attributes:
         label: unique within the job.
         module: of `benchmarks.contestants`.
-        points: communication steps of a full run; a quick one takes `quick`.
-        clock: `summed` for a peer whose time is a running sum of step sizes; its values are compared with such a loop.
+        points: communication steps of a run.
+        quick: the same in a quick run; 0: as many.
         coupling: the algorithm it runs where it is not the job's.
         system: where it is not the job's.
+        clock: `summed` for a peer whose time is a running sum of step sizes; its values are compared with such a loop.
+        rounds: it takes part in so many rounds; 0: in all.
+        beside: label of the row that its ratio refers to; by default the first row of the job.
     """
 
     label: str
     module: str
     points: int
-    quick: int
+    quick: int = 0
     options: dict[str, str] = field(default_factory=dict)
     coupling: Algorithm | None = None
     system: System | None = None
-    clock: str = "multiplied"
+    clock: Literal["multiplied", "summed"] = "multiplied"
+    rounds: int = 0
+    beside: str = ""
 
     @property
     def packages(self) -> tuple[str, ...]:
         """What has to be installed for it."""
         return _MODULES_NEED.get(self.module, ())
 
-
-@dataclass(frozen=True)
-class Target:
-    """What issue 3 asks for.
-
-    The ratio is that of the costs (seconds per point and instance): of `against` over `entry` for a speed-up, which
-    should be at least `required`; of `entry` over `against` for an overhead, which should be at most that.
-    """
-
-    entry: str
-    against: str
-    required: float
-    aim: float
-    overhead: bool = False
-
-    def meets(self, ratio: float) -> bool:
-        """Whether a ratio is what is required."""
-        return ratio <= self.required if self.overhead else ratio >= self.required
+    @property
+    def is_ours(self) -> bool:
+        """Whether it runs fmu_mesh, of this checkout or of another one."""
+        return self.module in (OURS, KINDS)
 
 
 @dataclass(frozen=True)
 class Job:
-    """One table. The first entry is what the others' ratios refer to."""
+    """One table.
+
+    Attributes:
+        system: has no members where there is nothing to compare the values with.
+        timed: the communication steps, or whole commands, from the start of the process to its end.
+        watched: whether the first step and the memory of the commands are watched.
+    """
 
     name: str
     title: str
-    system: System | None
+    system: System
     entries: tuple[Entry, ...]
-    targets: tuple[Target, ...] = ()
+    timed: Literal["steps", "commands"] = "steps"
+    watched: bool = False
+
+
+def with_checkout(jobs: Sequence[Job], folder: Path) -> list[Job]:
+    """The jobs with each of our rows a second time, run by the fmu_mesh of another checkout."""
+    found = []
+    for job in jobs:
+        others = [
+            replace(entry, label=entry.label + OTHER, options={**entry.options, "checkout": str(folder.resolve())})
+            for entry in job.entries
+            if entry.is_ours
+        ]
+        found.append(replace(job, entries=(*job.entries, *others)))
+    return found
 
 
 def _gains(count: int) -> tuple[Member, ...]:
@@ -84,6 +104,14 @@ def _gains(count: int) -> tuple[Member, ...]:
     return (source, *(Member(f"gain_{number}", "Gain", "u", "y", {"k": 1.1}) for number in range(1, count)))
 
 
+def _starting(count: int) -> System:
+    """A chain of integrators that tell when they have done their first step."""
+    source = Member("node_0", FMU, "u", "y", {"u": 1.0})
+    others = (Member(f"node_{number}", FMU, "u", "y") for number in range(1, count))
+    return System("chain", "gauss_seidel", 0.001, (source, *others))
+
+
+_NOTHING = System("chain", "jacobi", 1.0, ())
 _PENDULUM = System(
     "chain",
     "gauss_seidel",
@@ -104,13 +132,32 @@ _CYCLE2 = System(
         Member("velocity", "Integrator", "u", "y", {"k": -1.0, "y": 0.0}),
     ),
 )
+_SIZES = (2, 16, 64)
+_US = "fmu_mesh"
+_NO_FILE = "fmu_mesh, nothing recorded"
+_LOCAL = "fmu_mesh, launch --local"
 _FMPY = "FMPy loop, one process"
-_ARRAYS = "FMPy with preallocated arrays, one process"
-_ECOS = "ecos, proxyfmu"
-_ZEROMQ = "ZeroMQ lockstep by hand"
+_C_ONE = "C, one process"
+_C_OWN = "C, process per FMU"
 _ZENOH = "zenoh lockstep by hand"
-_MOSAIK = "mosaik, process per FMU"
-_HELICS = "HELICS coupled, tcp"
+_MEMORY = "shared memory, C"
+
+
+def _c(points: int, processes: Literal["one", "own"]) -> Entry:
+    return Entry(_C_ONE if processes == "one" else _C_OWN, "c_program", points, options={"processes": processes})
+
+
+def _fmpy(points: int) -> Entry:
+    return Entry(_FMPY, "fmpy_loop", points)
+
+
+def _arrays(points: int) -> Entry:
+    return Entry("FMPy with preallocated arrays, one process", "fmpy_arrays", points)
+
+
+def _ecos(points: int, processes: Literal["one", "own"], quick: int = 0) -> Entry:
+    label = "ecos, one process" if processes == "one" else "ecos, proxyfmu"
+    return Entry(label, "ecos_engine", points, quick, {"processes": processes}, "jacobi", clock="summed")
 
 
 def _helics(label: str, points: int, quick: int, *, core: str = "tcp", coupled: bool = True) -> Entry:
@@ -118,23 +165,40 @@ def _helics(label: str, points: int, quick: int, *, core: str = "tcp", coupled: 
     return Entry(label, "helics_federates", points, quick, options, "jacobi")
 
 
-def _limit(label: str, transport: str, language: str, cores: str = "any") -> Entry:
-    options = {"transport": transport, "language": language, "cores": cores}
-    return Entry(label, "ping_pong", 100_000, 30_000, options)
-
-
-def _recording(name: str, what: str, system: System, **options: str) -> Job:
-    recorded, plain = "fmu_mesh, all outputs to a file", "fmu_mesh, nothing recorded"
-    return Job(
-        name,
-        f"{what}: recording all outputs against recording none",
-        system,
-        (
-            Entry(recorded, OURS, 100_000, 40_000, {**options, "record": "all"}),
-            Entry(plain, OURS, 100_000, 40_000, {**options, "record": "none"}),
-        ),
-        (Target(recorded, plain, 1.3, 1.05, overhead=True),),
+def _lockstep(points: int, quick: int) -> tuple[Entry, ...]:
+    """What exchanges a message for every value."""
+    return (
+        _helics("HELICS coupled, tcp", points, quick),
+        Entry("ZeroMQ lockstep by hand", "zeromq_lockstep", points, quick, coupling="jacobi"),
+        Entry(_ZENOH, "zenoh_lockstep", points, quick, coupling="jacobi"),
+        Entry("mosaik, process per FMU", "mosaik_scenario", points // 2, quick),
     )
+
+
+def _limit(label: str, transport: str, language: str, cores: str = "any", points: int = 30_000) -> Entry:
+    options = {"transport": transport, "language": language, "cores": cores}
+    return Entry(label, "ping_pong", points, options=options, system=_NOTHING)
+
+
+def _starts(count: int) -> tuple[Entry, ...]:
+    """The start-up of a chain of so many instances. A peer that starts 64 Pythons takes half a minute."""
+    system, rounds = _starting(count), {2: 0, 16: 2, 64: 1}[count]
+    own, one = {"processes": "own"}, {"processes": "one"}
+    rows = (
+        Entry(_US, OURS, POINTS),
+        Entry("FMPy script, one process", "fmpy_loop", POINTS),
+        Entry("ecos, one process", "ecos_engine", POINTS, options=one, coupling="jacobi", clock="summed"),
+        Entry("ecos, proxyfmu", "ecos_engine", POINTS, options=own, coupling="jacobi", clock="summed"),
+        replace(_helics("HELICS, tcp", POINTS, 0, coupled=False), rounds=rounds),
+        Entry("mosaik, process per FMU", "mosaik_scenario", POINTS, rounds=rounds),
+    )
+    return tuple(
+        replace(row, label=f"{count}: {row.label}", system=system, beside=f"{count}: {rows[0].label}") for row in rows
+    )
+
+
+def _kind(label: str, kind: str, points: int) -> Entry:
+    return Entry(label, KINDS, points, points // 4, {"kind": kind}, beside=label)
 
 
 JOBS = (
@@ -143,22 +207,29 @@ JOBS = (
         "pendulum -> delay, 2 ms (configs/pendulum_delay.yaml), own process per FMU",
         _PENDULUM,
         (
-            Entry("fmu_mesh", OURS, 20_000, 20_000),
-            Entry(_FMPY, "fmpy_loop", 20_000, 20_000),
-            Entry(_ARRAYS, "fmpy_arrays", 20_000, 20_000),
-            Entry(_ECOS, "ecos_proxyfmu", 20_000, 20_000, coupling="jacobi", clock="summed"),
-            _helics("HELICS one-way, tcp", 20_000, 4_000, coupled=False),
-            _helics(_HELICS, 20_000, 4_000),
-            _helics("HELICS coupled, zmq", 20_000, 2_000, core="zmq"),
-            Entry(_ZEROMQ, "zeromq_lockstep", 20_000, 5_000, coupling="jacobi"),
-            Entry(_ZENOH, "zenoh_lockstep", 20_000, 5_000, coupling="jacobi"),
-            Entry(_MOSAIK, "mosaik_scenario", 20_000, 2_000),
+            Entry(_US, OURS, 20_000),
+            Entry(_LOCAL, OURS, 20_000, options={"local": "yes"}),
+            _c(20_000, "own"),
+            _c(20_000, "one"),
+            _fmpy(20_000),
+            _arrays(20_000),
+            _ecos(20_000, "one"),
+            _ecos(20_000, "own"),
+            _helics("HELICS one-way, tcp", 10_000, 4_000, coupled=False),
+            _helics("HELICS coupled, zmq", 5_000, 2_000, core="zmq"),
+            *_lockstep(10_000, 3_000),
         ),
+    ),
+    Job(
+        "limit",
+        "pendulum -> delay, many points: recording, and the limit",
+        _PENDULUM,
         (
-            Target("fmu_mesh", _FMPY, 1.3, 1.8),
-            Target("fmu_mesh", _ECOS, 1.5, 3.0),
-            Target("fmu_mesh", _HELICS, 8.0, 15.0),
-            Target("fmu_mesh", _ZENOH, 8.0, 15.0),
+            Entry(_NO_FILE, OURS, 200_000, options={"record": "none"}),
+            Entry("fmu_mesh, two columns to a file", OURS, 200_000),
+            Entry("fmu_mesh, all outputs to a file", OURS, 200_000, options={"record": "all"}),
+            _c(200_000, "own"),
+            _c(200_000, "one"),
         ),
     ),
     Job(
@@ -166,71 +237,103 @@ JOBS = (
         "two trivial FMUs in a chain (Integrator -> Gain), own processes",
         _CHAIN2,
         (
-            Entry("fmu_mesh", OURS, 100_000, 50_000),
-            Entry(_FMPY, "fmpy_loop", 100_000, 50_000),
-            Entry(_ARRAYS, "fmpy_arrays", 100_000, 50_000),
-            Entry(_ECOS, "ecos_proxyfmu", 100_000, 20_000, coupling="jacobi", clock="summed"),
+            Entry(_US, OURS, 100_000),
+            _c(100_000, "own"),
+            _c(100_000, "one"),
+            _fmpy(100_000),
+            _arrays(100_000),
+            _ecos(50_000, "one"),
+            _ecos(50_000, "own", 20_000),
         ),
-        (Target("fmu_mesh", _FMPY, 1.2, 2.0),),
     ),
     Job(
         "cycle2",
         "two instances in a cycle (configs/cycle2.yaml), own processes",
         _CYCLE2,
         (
-            Entry("fmu_mesh", OURS, 20_000, 10_000),
-            Entry(_FMPY, "fmpy_loop", 20_000, 20_000),
-            Entry(_ECOS, "ecos_proxyfmu", 20_000, 20_000, clock="summed"),
-            _helics(_HELICS, 20_000, 4_000),
-            Entry(_ZEROMQ, "zeromq_lockstep", 20_000, 5_000),
-            Entry(_ZENOH, "zenoh_lockstep", 20_000, 5_000),
-            Entry(_MOSAIK, "mosaik_scenario", 20_000, 2_000),
+            Entry(_US, OURS, 50_000),
+            Entry(_NO_FILE, OURS, 50_000, options={"record": "none"}),
+            _c(50_000, "own"),
+            _fmpy(50_000),
+            _ecos(20_000, "own"),
+            *_lockstep(10_000, 3_000),
         ),
-        (Target("fmu_mesh", _HELICS, 3.0, 5.0),),
     ),
     Job(
         "group",
         "the same cycle in one group",
         _CYCLE2,
         (
-            Entry("fmu_mesh", OURS, 100_000, 50_000, {"group": "one"}),
-            Entry(_FMPY, "fmpy_loop", 100_000, 50_000),
-            Entry(_ARRAYS, "fmpy_arrays", 100_000, 50_000),
+            Entry(_US, OURS, 100_000, options={"group": "one"}),
+            Entry(_NO_FILE, OURS, 100_000, options={"group": "one", "record": "none"}),
+            _c(100_000, "one"),
+            _fmpy(100_000),
+            _arrays(100_000),
+            _ecos(50_000, "one"),
         ),
-        (Target("fmu_mesh", _FMPY, 1.5, 3.0),),
     ),
     Job(
         "window1",
-        "window 1, two nodes in a chain",
+        "window 1, two nodes in a chain, with the master in a process of its own",
         _CHAIN2,
         (
-            Entry("fmu_mesh, jacobi", OURS, 10_000, 4_000, {"window": "1"}, "jacobi"),
-            Entry(f"{_ZENOH}, jacobi", "zenoh_lockstep", 10_000, 4_000, coupling="jacobi"),
-            Entry("fmu_mesh, gauss_seidel", OURS, 10_000, 4_000, {"window": "1"}),
-            Entry(f"{_ZENOH}, gauss_seidel", "zenoh_lockstep", 10_000, 4_000),
-        ),
-        (
-            Target("fmu_mesh, jacobi", f"{_ZENOH}, jacobi", 1.0, 1.3),
-            Target("fmu_mesh, gauss_seidel", f"{_ZENOH}, gauss_seidel", 1.0, 1.3),
+            Entry("fmu_mesh, gauss_seidel", OURS, 10_000, options={"window": "1"}),
+            Entry("fmu_mesh, jacobi", OURS, 10_000, options={"window": "1"}, coupling="jacobi"),
+            Entry(f"{_ZENOH}, gauss_seidel", "zenoh_lockstep", 5_000, 3_000),
+            Entry(f"{_ZENOH}, jacobi", "zenoh_lockstep", 5_000, 3_000, coupling="jacobi"),
+            _limit(f"{_MEMORY}: one round trip", "memory", "c", points=200_000),
         ),
     ),
     Job(
         "chain8",
-        "chain of 8 against chain of 2: cost per point and instance, own processes",
+        "chain of 8 against chain of 2, own processes",
         _CHAIN2,
         (
-            Entry("fmu_mesh, chain of 2", OURS, 100_000, 50_000),
-            Entry("fmu_mesh, chain of 8", OURS, 50_000, 20_000, system=_CHAIN8),
+            Entry("fmu_mesh, chain of 2", OURS, 100_000),
+            Entry("fmu_mesh, chain of 8", OURS, 100_000, 50_000, system=_CHAIN8),
+            replace(_c(100_000, "own"), label="C, chain of 2"),
+            replace(_c(100_000, "own"), label="C, chain of 8", system=_CHAIN8),
         ),
-        (Target("fmu_mesh, chain of 8", "fmu_mesh, chain of 2", 1.5, 1.0, overhead=True),),
     ),
-    _recording("record", "pendulum -> delay", replace(_PENDULUM, step_size=0.001)),
-    _recording("record_group", "the cycle in one group", _CYCLE2, group="one"),
+    Job(
+        "kinds",
+        "two instances of one kind in a chain, launch --local, nothing recorded",
+        _NOTHING,
+        (
+            _kind("FMI 2.0: Real", "fmi2", 100_000),
+            _kind("FMI 1.0: Real, Integer, Boolean", "fmi1", 40_000),
+            _kind("FMI 2.0: Real, Integer, Boolean, Enumeration", "fmi2_types", 40_000),
+            _kind("FMI 3.0: Float64, Int32, Boolean", "fmi3", 40_000),
+            _kind("FMI 2.0, model exchange", "model_exchange", 20_000),
+            _kind("component in Python", "component", 100_000),
+        ),
+    ),
+    Job(
+        "command",
+        "pendulum -> delay: the whole command, from its start to its end",
+        _PENDULUM,
+        (
+            Entry("fmu-mesh launch", OURS, 20_000),
+            Entry("fmu-mesh launch --local", OURS, 20_000, options={"local": "yes"}),
+            Entry("FMPy script, one process, no file", "fmpy_loop", 20_000),
+            replace(_ecos(20_000, "one"), label="ecos, one process, no file"),
+        ),
+        timed="commands",
+    ),
+    Job(
+        "startup",
+        "start-up: a chain of 2, 16 and 64 integrators, 10 points",
+        _starting(2),
+        tuple(entry for count in _SIZES for entry in _starts(count)),
+        timed="commands",
+        watched=True,
+    ),
     Job(
         "limits",
         "physical limits: one round trip of 16 bytes between two processes",
-        None,
+        _NOTHING,
         (
+            _limit(_MEMORY, "memory", "c", points=200_000),
             _limit("Unix socket, C", "unix", "c"),
             _limit("Unix socket, C, both on one core", "unix", "c", "one"),
             _limit("TCP loopback, C", "tcp", "c"),

@@ -2,139 +2,161 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
+import statistics
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
-from benchmarks.jobs import Entry, Job, Target
+from benchmarks.jobs import OTHER, Entry, Job
 from benchmarks.running import Measured
+from benchmarks.targets import TARGETS, Target
 
 __all__ = ["Report", "write_docs"]
 
 _BEGIN = "<!-- measured: begin (written by `python -m benchmarks --write-docs`) -->"
 _END = "<!-- measured: end -->"
-_HEADER = ("contestant", "points", "points/s", "us/point", "spread", "ratio", "at least", "aim", "", "values")
+_STEPS = ("contestant", "points", "points/s", "us/point", "spread", "ratio", "values")
+_COMMANDS = ("contestant", "s", "spread", "ratio", "values")
+_WATCHED = (
+    "contestant",
+    "first point, s",
+    "end, s",
+    "spread",
+    "ratio",
+    "processes",
+    "MB, private",
+    "MB, PSS",
+    "MB per node",
+    "values",
+)
+_TARGETS = ("figure", "measured", "at least", "aim", "")
 
 Results = Mapping[str, Mapping[str, Measured]]
+Row = tuple[str, ...]
 
 
 class Report:
-    """The report of one run of the benchmark; ``about`` are lines on how it was measured."""
+    """The report of one run of the benchmark.
 
-    def __init__(self, jobs: Sequence[Job], results: Results, about: Sequence[str]) -> None:
+    Args:
+        jobs: what ran.
+        results: by job name, then by entry label.
+        about: lines on how it was measured.
+        targets: what our own figures should be; those of other jobs are left out.
+    """
+
+    def __init__(
+        self, jobs: Sequence[Job], results: Results, about: Sequence[str], targets: Sequence[Target] = TARGETS
+    ) -> None:
         self._jobs = jobs
         self._results = results
         self._about = about
+        self._targets = [
+            target
+            for target in targets
+            if all(label in results.get(target.job, {}) for label in (target.entry, target.against) if label)
+        ]
 
     def text(self) -> str:
-        """For the terminal: one table, a section per job."""
-        tables = [(job.title, [_HEADER, *self._rows(job)]) for job in self._jobs]
-        widths = [max(len(row[column]) for _, rows in tables for row in rows) for column in range(len(_HEADER))]
+        """For the terminal: the targets, and a table per job."""
         lines = [*self._about]
-        for title, rows in tables:
+        for title, rows in self._tables():
+            widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
             lines += ["", title]
             lines += ["  " + "  ".join(_aligned(row, widths)).rstrip() for row in rows]
-        return "\n".join([*lines, "", *self._target_lines()])
+        return "\n".join(lines)
 
     def markdown(self) -> str:
         """For the documentation."""
         lines = [f"* {line}" for line in self._about]
-        for job in self._jobs:
-            lines += ["", f"### {job.title[0].upper()}{job.title[1:]}", ""]
-            lines += [_markdown_row(_HEADER), _markdown_row(["---"] * len(_HEADER))]
-            lines += [_markdown_row(row) for row in self._rows(job)]
+        for title, (header, *rows) in self._tables():
+            lines += ["", f"### {title[0].upper()}{title[1:]}", ""]
+            lines += [_markdown_row(header), _markdown_row(["---", *["---:"] * (len(header) - 2), "---"])]
+            lines += [_markdown_row(row) for row in rows]
         return "\n".join(lines)
 
     def json(self) -> str:
         """For machines; times in s."""
-        jobs: dict[str, Any] = {}
-        for job in self._jobs:
-            jobs[job.name] = {
+        jobs = {
+            job.name: {
                 "title": job.title,
-                "entries": {
-                    label: {
-                        "points": measured.points,
-                        "instances": measured.instances,
-                        "seconds_per_point": [cost * measured.instances for cost in measured.costs],
-                        "values": measured.result,
-                        "failure": measured.failure,
-                    }
-                    for label, measured in self._results[job.name].items()
-                },
-                "targets": [
-                    {
-                        "entry": target.entry,
-                        "against": target.against,
-                        "ratio": ratio,
-                        "required": target.required,
-                        "aim": target.aim,
-                        "met": target.meets(ratio) if ratio is not None else None,
-                    }
-                    for target in job.targets
-                    for ratio in [self._ratio(job, target)]
-                ],
+                "timed": job.timed,
+                "entries": {label: dataclasses.asdict(measured) for label, measured in self._results[job.name].items()},
             }
-        return json.dumps({"about": list(self._about), "jobs": jobs}, indent=2)
+            for job in self._jobs
+        }
+        targets = [
+            {**dataclasses.asdict(target), "value": value, "met": None if value is None else target.meets(value)}
+            for target in self._targets
+            for value in [self.value_of(target)]
+        ]
+        return json.dumps({"about": list(self._about), "jobs": jobs, "targets": targets}, indent=2)
 
-    def _rows(self, job: Job) -> list[tuple[str, ...]]:
-        return [self._row(job, entry) for entry in job.entries]
+    def value_of(self, target: Target) -> float | None:
+        """The figure of a target; None if it was not measured."""
+        own = self._results[target.job][target.entry]
+        match target.figure:
+            case "points/s":
+                return None if own.cost is None else 1 / own.cost
+            case "first point, s":
+                return own.first_point_s
+            case "MB per node":
+                return own.node_mb
+        other = self._results[target.job][target.against]
+        if own.cost is None or other.cost is None:
+            return None
+        if target.figure == "times as fast":
+            return other.cost / own.cost
+        each = other.instances / own.instances if target.figure == "times as long, each" else 1.0
+        return own.cost / other.cost * each
 
-    def _row(self, job: Job, entry: Entry) -> tuple[str, ...]:
-        measured = self._results[job.name][entry.label]
-        cost = measured.cost
-        if cost is None:
-            return (entry.label, *["-"] * 5, *self._target(job, entry), measured.failure or "not run")
-        per_point = cost * measured.instances
-        spread = f"{_micro(min(measured.costs), measured)}-{_micro(max(measured.costs), measured)}"
-        failed = f"; later: {measured.failure}" if measured.failure else ""
+    def _tables(self) -> list[tuple[str, list[Row]]]:
+        """Title, header and rows of each table."""
+        tables = [(job.title, [_header(job), *(self._row(job, entry) for entry in job.entries)]) for job in self._jobs]
+        if self._targets:
+            tables.insert(0, ("our targets", [_TARGETS, *map(self._target_row, self._targets)]))
+        return tables
+
+    def _target_row(self, target: Target) -> Row:
+        value = self.value_of(target)
+        sign = "" if target.more_is_better else "<= "
+        verdict = "-" if value is None else "PASS" if target.meets(value) else "BELOW"
         return (
-            entry.label,
-            f"{measured.points:,}",
-            f"{1 / per_point:,.0f}",
-            f"{1e6 * per_point:.1f}",
-            spread,
-            self._ratio_text(job, entry),
-            *self._target(job, entry),
-            measured.result + failed,
+            f"{target.what} ({target.figure.removesuffix(', each')})",
+            "-" if value is None else _number(value),
+            f"{sign}{target.required:,}",
+            f"{sign}{target.aim:,}",
+            verdict,
         )
 
-    def _ratio_text(self, job: Job, entry: Entry) -> str:
-        """The ratio of this row's target if it has one, else how many times faster the first entry is."""
-        for target in job.targets:
-            if entry.label == _row_of(target):
-                ratio = self._ratio(job, target)
-                return f"{ratio:.2f}" if ratio is not None else "-"
-        first = job.entries[0]
-        if job.system is None or entry is first or entry.label in {target.entry for target in job.targets}:
-            return ""
-        ratio = self._ratio(job, Target(first.label, entry.label, 1.0, 1.0))
-        return f"{ratio:.2f}" if ratio is not None else "-"
+    def _row(self, job: Job, entry: Entry) -> Row:
+        measured = self._results[job.name][entry.label]
+        if measured.cost is None:
+            return (entry.label, *["-"] * (len(_header(job)) - 2), measured.failure or "not run")
+        values = measured.result + (f"; later: {measured.failure}" if measured.failure else "")
+        ratio = self._ratio(job, entry, measured.cost)
+        if job.timed == "commands":
+            spread = f"{min(measured.costs):.2f}-{max(measured.costs):.2f}"
+            return (
+                entry.label,
+                *_first_point(job, measured),
+                f"{measured.cost:.2f}",
+                spread,
+                ratio,
+                *_memory(job, measured),
+                values,
+            )
+        spread = f"{_number(1e6 * min(measured.costs))}-{_number(1e6 * max(measured.costs))}"
+        figures = (f"{measured.points:,}", f"{1 / measured.cost:,.0f}", _number(1e6 * measured.cost), spread)
+        return (entry.label, *figures, ratio, values)
 
-    def _target(self, job: Job, entry: Entry) -> tuple[str, str, str]:
-        for target in job.targets:
-            if entry.label == _row_of(target):
-                ratio = self._ratio(job, target)
-                sign = "<= " if target.overhead else ""
-                verdict = "-" if ratio is None else "PASS" if target.meets(ratio) else "BELOW"
-                return f"{sign}{target.required:g}", f"{sign}{target.aim:g}", verdict
-        return "", "", ""
-
-    def _ratio(self, job: Job, target: Target) -> float | None:
-        own = self._results[job.name][target.entry].cost
-        other = self._results[job.name][target.against].cost
-        if own is None or other is None:
-            return None
-        return own / other if target.overhead else other / own
-
-    def _target_lines(self) -> list[str]:
-        met = [
-            target.meets(ratio)
-            for job in self._jobs
-            for target in job.targets
-            if (ratio := self._ratio(job, target)) is not None
-        ]
-        return [f"{sum(met)} of {len(met)} required ratios met"]
+    def _ratio(self, job: Job, entry: Entry, cost: float) -> str:
+        """How many times as long it takes as the row that it is compared with."""
+        own = entry.beside or job.entries[0].label
+        base = entry.label.removesuffix(OTHER) if entry.label.endswith(OTHER) else own
+        compared = self._results[job.name][base].cost
+        return "" if base == entry.label or compared is None else f"{cost / compared:.2f}"
 
 
 def write_docs(path: Path, report: Report) -> None:
@@ -152,19 +174,39 @@ def write_docs(path: Path, report: Report) -> None:
     path.write_text(f"{before}{_BEGIN}\n\n{report.markdown()}\n\n{_END}{after}")
 
 
-def _row_of(target: Target) -> str:
-    """A target stands in the row of the contestant it is measured against, an overhead in its own."""
-    return target.entry if target.overhead else target.against
+def _header(job: Job) -> Row:
+    return _WATCHED if job.watched else _COMMANDS if job.timed == "commands" else _STEPS
 
 
-def _micro(cost: float, measured: Measured) -> str:
-    return f"{1e6 * cost * measured.instances:.1f}"
+def _first_point(job: Job, measured: Measured) -> Row:
+    if not job.watched:
+        return ()
+    return ("-" if measured.first_point_s is None else f"{measured.first_point_s:.2f}",)
+
+
+def _memory(job: Job, measured: Measured) -> Row:
+    """Medians of what was seen of the processes."""
+    if not job.watched:
+        return ()
+    if not measured.started:
+        return ("-",) * 4
+    names = ("processes", "private_mb", "pss_mb")
+    medians = [statistics.median(getattr(started, name) for started in measured.started) for name in names]
+    return (*(f"{median:,.0f}" for median in medians), f"{measured.node_mb or 0.0:.1f}")
+
+
+def _number(value: float) -> str:
+    """With three digits or more."""
+    return (
+        f"{value:,.0f}" if value >= 1000 else f"{value:.1f}" if value >= 100 else f"{value:.{2 if value >= 1 else 3}f}"
+    )
 
 
 def _aligned(row: Sequence[str], widths: Sequence[int]) -> list[str]:
-    left = (0, len(_HEADER) - 1)
+    """The first and the last column begin left, the others end right."""
+    last = len(row) - 1
     return [
-        cell.ljust(width) if column in left else cell.rjust(width)
+        cell.ljust(width) if column in (0, last) else cell.rjust(width)
         for column, (cell, width) in enumerate(zip(row, widths, strict=True))
     ]
 

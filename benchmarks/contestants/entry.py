@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import json
 import multiprocessing
+import os
+import shutil
+import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import contextmanager
@@ -18,9 +22,10 @@ from benchmarks.task import Outcome, Task
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-__all__ = ["FMUS", "main", "nodes", "versions"]
+__all__ = ["FMUS", "compiled", "main", "nodes", "versions"]
 
-FMUS = Path(__file__).resolve().parents[2] / "fmus"
+_ROOT = Path(__file__).resolve().parents[2]
+FMUS = _ROOT / "fmus"
 _DEADLINE_S = 30.0
 
 
@@ -33,6 +38,31 @@ def main(run: Callable[[Task], Outcome]) -> None:
 def versions(*packages: str) -> dict[str, str]:
     """The installed versions of these packages."""
     return {package: version(package) for package in packages}
+
+
+def compiled(source: Path, *flags: str) -> tuple[Path, dict[str, str]]:
+    """The program of one C file, and the version of the compiler. It is built once and kept under `build/`.
+
+    Raises:
+        RuntimeError: there is no C compiler, or it refuses the file.
+    """
+    compiler = next((found for name in ("cc", "gcc", "clang") if (found := shutil.which(name))), None)
+    if compiler is None:
+        msg = "there is no C compiler"
+        raise RuntimeError(msg)
+    about = subprocess.run([compiler, "--version"], check=True, capture_output=True, text=True).stdout.splitlines()[0]
+    digest = hashlib.sha256(repr((about, flags, source.read_bytes())).encode()).hexdigest()[:12]
+    program = _ROOT / "build" / "bench-programs" / f"{source.stem}-{digest}"
+    if not program.exists():
+        program.parent.mkdir(parents=True, exist_ok=True)
+        draft = program.with_name(f"{program.name}.{os.getpid()}")
+        command = [compiler, "-std=gnu11", "-O2", "-o", str(draft), str(source), *flags]
+        done = subprocess.run(command, check=False, capture_output=True, text=True)
+        if done.returncode:
+            msg = f"{source.name} does not compile: {done.stderr.strip()}"
+            raise RuntimeError(msg)
+        draft.replace(program)
+    return program, {"cc": about}
 
 
 @contextmanager

@@ -14,7 +14,7 @@ __all__: list[str] = []
 def run(task: Task) -> Outcome:
     """Step all instances; timed is the loop alone."""
     with opened_all(task.system, task.stop_time) as (fmus, _):
-        loop = _chain if task.system.kind == "chain" else _cycle
+        loop = _cycle if task.system.kind == "cycle" else _chain if len(fmus) == 2 else _long_chain
         started = perf_counter()
         rows = loop(fmus, task)
         seconds = perf_counter() - started
@@ -35,6 +35,22 @@ def _chain(fmus: list[Fmu], task: Task) -> list[tuple[float, ...]]:
         target.setReal(target_inputs, values)
         target.doStep(currentCommunicationPoint=time, communicationStepSize=step_size)
         rows.append((values[0], target.getReal(target_outputs)[0]))
+    return rows
+
+
+def _long_chain(fmus: list[Fmu], task: Task) -> list[tuple[float, ...]]:
+    """Gauss-Seidel with any number of instances."""
+    step_size = task.system.step_size
+    rows: list[tuple[float, ...]] = []
+    for point in range(task.points):
+        time, values, row = point * step_size, None, []
+        for fmu in fmus:
+            if values is not None:
+                fmu.fmu.setReal(fmu.inputs, values)
+            fmu.fmu.doStep(currentCommunicationPoint=time, communicationStepSize=step_size)
+            values = fmu.fmu.getReal(fmu.outputs)
+            row.append(values[0])
+        rows.append(tuple(row))
     return rows
 
 

@@ -1,7 +1,8 @@
 """fmu_mesh: `fmu-mesh launch` on a configuration written from the task; runs in the project's own environment.
 
-Options: `window`; `group` = `one` puts all instances into one node; `record` = `outputs` (the outputs that the system
-reads), `all` or `none`; `result` is the CSV file.
+Options: `window`; `group` = `one` puts all instances into one node; `local` = `yes` is `launch --local`; `record` =
+`outputs` (the outputs that the system reads), `all` or `none`; `result` is the CSV file; `checkout` is the folder of
+another checkout with its `.venv`, whose fmu_mesh runs instead of this one.
 """
 
 from __future__ import annotations
@@ -17,18 +18,26 @@ from typing import Any
 from benchmarks.contestants.entry import FMUS, main, versions
 from benchmarks.task import Outcome, Task
 
-__all__ = ["configuration"]
+__all__ = ["configuration", "launch_command", "launched"]
 
+_ROOT = FMUS.parent
 _SUMMARY = re.compile(r"^(\d+) points in ([0-9.]+) s: (\d+) points/s", re.MULTILINE)
 
 
 def run(task: Task) -> Outcome:
     """Timed is what the summary line says: from the first grant to the last point, recording included."""
+    return launched(configuration(task), task)
+
+
+def launched(config: dict[str, Any], task: Task) -> Outcome:
+    """The outcome of one launch of a configuration.
+
+    Raises:
+        RuntimeError: it failed, or printed no summary.
+    """
     with tempfile.TemporaryDirectory(prefix="bench-") as folder:
-        config = Path(folder, "bench.yaml")
-        config.write_text(json.dumps(configuration(task)))  # JSON is YAML
-        command = [sys.executable, "-m", "fmu_mesh", "launch", str(config), "--no-progress"]
-        done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=110)
+        command, root = launch_command(config, task.options, Path(folder))
+        done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=110, cwd=root)
     if done.returncode:
         msg = f"exit code {done.returncode}: {done.stderr.strip()[-400:]}"
         raise RuntimeError(msg)
@@ -38,8 +47,18 @@ def run(task: Task) -> Outcome:
         raise RuntimeError(msg)
     # The summary has milliseconds and the rate; for a short run the rate is the finer of the two.
     seconds = task.points / int(found[3])
-    used = versions("eclipse-zenoh", "fmpy", "msgspec", "numpy")
-    return Outcome(seconds, versions=versions("fmu-mesh") | used, result_file=task.options.get("result"))
+    used = {} if "checkout" in task.options else versions("fmu-mesh", "eclipse-zenoh", "fmpy", "msgspec", "numpy")
+    return Outcome(seconds, versions=used, result_file=task.options.get("result"))
+
+
+def launch_command(config: dict[str, Any], options: dict[str, str], folder: Path) -> tuple[list[str], Path]:
+    """The command that launches a configuration, which is written into the folder; and where it has to run."""
+    file = folder / "bench.yaml"
+    file.write_text(json.dumps(config))  # JSON is YAML
+    root = Path(options.get("checkout", _ROOT))
+    python = str(root / ".venv" / "bin" / "python") if "checkout" in options else sys.executable
+    local = ["--local"] if options.get("local") == "yes" else []
+    return [python, "-m", "fmu_mesh", "launch", str(file), "--no-progress", *local], root
 
 
 def configuration(task: Task) -> dict[str, Any]:

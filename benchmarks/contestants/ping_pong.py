@@ -1,15 +1,14 @@
-"""The physical limit: 16 bytes there and back between two processes, over a Unix or a TCP socket, in C or in Python.
+"""The physical limit: 16 bytes there and back between two processes, in C or in Python.
 
-One round trip is the least that one step of a coupled pair costs. Options: `transport` (`unix` or
-`tcp`), `language` (`c` or `python`), and `cores`: `one` keeps both processes on one core, where a hand-over wakes no
-sleeping core up.
+One round trip is the least that one step of a coupled pair costs. Options: `transport` (`memory`, `unix` or `tcp`),
+`language` (`c` or `python`; `memory` only in C), and `cores`: `one` keeps both processes on one core, where a message
+wakes no sleeping core up.
 """
 
 from __future__ import annotations
 
 import os
 import platform
-import shutil
 import socket
 import subprocess
 import tempfile
@@ -17,10 +16,10 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from time import perf_counter
 
-from benchmarks.contestants.entry import main, nodes
+from benchmarks.contestants.entry import compiled, main, nodes
 from benchmarks.task import Outcome, Task
 
-__all__: list[str] = []
+__all__ = ["run"]
 
 _BYTES = 16
 _SOURCE = Path(__file__).with_suffix(".c")
@@ -74,17 +73,10 @@ def _configure(connection: socket.socket, transport: str) -> None:
 
 
 def _in_c(task: Task) -> Outcome:
-    compiler = next((found for name in ("cc", "gcc", "clang") if (found := shutil.which(name))), None)
-    if compiler is None:
-        msg = "there is no C compiler"
-        raise RuntimeError(msg)
-    with tempfile.TemporaryDirectory(prefix="bench-") as folder:
-        program = f"{folder}/ping_pong"
-        subprocess.run([compiler, "-O2", "-o", program, str(_SOURCE)], check=True, capture_output=True)
-        command = [program, task.options["transport"], str(task.points)]
-        output = subprocess.run(command, check=True, capture_output=True, text=True, timeout=60).stdout
-        about = subprocess.run([compiler, "--version"], check=True, capture_output=True, text=True).stdout
-    return Outcome(float(output), versions={"cc": about.splitlines()[0]})
+    program, compiler = compiled(_SOURCE)
+    command = [str(program), task.options["transport"], str(task.points)]
+    output = subprocess.run(command, check=True, capture_output=True, text=True, timeout=60).stdout
+    return Outcome(float(output), versions=compiler)
 
 
 if __name__ == "__main__":

@@ -12,11 +12,11 @@ from pathlib import Path
 from benchmarks.contestants.fmu import opened_all
 from benchmarks.task import Task
 
-__all__: list[str] = []
+__all__ = ["rows_of"]
 
 
-def _main() -> None:
-    task = Task.from_json(Path(sys.argv[1]).read_text())
+def rows_of(task: Task) -> tuple[list[list[float]], list[float | None]]:
+    """All rows, from point 0 on, and the value of each connected input in Initialization Mode."""
     system = task.system
     with opened_all(system, task.stop_time) as (fmus, inputs):
         values = [fmu.get() for fmu in fmus]
@@ -34,6 +34,11 @@ def _main() -> None:
             rows.append(list(values))
             summed = task.options.get("clock") == "summed"
             time = time + system.step_size if summed else (point + 1) * system.step_size
+    return rows, inputs
+
+
+def _main() -> None:
+    rows, inputs = rows_of(Task.from_json(Path(sys.argv[1]).read_text()))
     Path(sys.argv[2]).write_text(json.dumps({"rows": rows, "initial_inputs": inputs}))
     print("{}")
 

@@ -88,6 +88,13 @@ class Engine(ABC):
     def spent_s(self) -> list[float]:
         """How long each unit was stepped, in s."""
 
+    @property
+    def awaited(self) -> str | None:
+        """The instance or node whose progress the last wait was for; None: it was the master's grant."""
+        own = {runner.name for runner in self.runners}
+        sources = (source for runner in self.runners for source in runner.lacking)
+        return next((source.instance for source in sources if source.instance not in own), None)
+
     def tick_points(self, unit: Sequence[Runner]) -> int:
         """Base points of one tick: a unit of one instance ticks at its own points, a cycle at every point."""
         return unit[0].plan.step_points if len(unit) == 1 else 1
@@ -161,6 +168,14 @@ class BurstEngine(Engine):
     def spent_s(self) -> list[float]:
         """See `Engine`."""
         return [unit.spent_ns / 1e9 for unit, _ in zip(self._units, self.units, strict=False)]
+
+    @property
+    def awaited(self) -> str | None:
+        """See `Engine`."""
+        names = {source.counter.address: source.instance for runner in self.runners for source in runner.sources}
+        names |= {counter.address: name for name, counter in self._memory.progress.items()}
+        unfinished = (unit for unit in self._units if unit.tick < unit.last_tick and not unit.stopped)
+        return next((names.get(unit.blocked_by) for unit in unfinished if unit.blocked_by is not None), None)
 
     @property
     def late(self) -> int:
@@ -279,7 +294,7 @@ class BurstEngine(Engine):
 
 
 class PlainEngine(Engine):
-    """Steps in plain Python; it waits only where it has not stepped, so it is always eager.
+    """Steps in plain Python.
 
     Args:
         slice_s: time in s after which `run` returns, once every unit had a turn.
@@ -305,7 +320,7 @@ class PlainEngine(Engine):
         for runner in self.runners:
             runner.follow(self._positions[runner.name], lambda: None)
 
-    def run(self, wait_s: float, *, eager: bool) -> bool:  # noqa: ARG002
+    def run(self, wait_s: float, *, eager: bool) -> bool:  # noqa: ARG002  it never waits after a step
         """See `Engine`."""
         started = perf_counter()
         seen = self._memory.seen()
@@ -316,7 +331,7 @@ class PlainEngine(Engine):
             stepped = stepped or any(advanced)
             if not any(advanced) or perf_counter() - started > self._slice_s:
                 break
-        if not stepped and not self._attention and wait_s > 0:
+        if not stepped and not self._attention:
             began = perf_counter()
             self._memory.sleep(seen, wait_s)
             self.waited_s += perf_counter() - began
@@ -351,7 +366,7 @@ class PlainEngine(Engine):
                 every = unit[index].plan.step_points // tick_points
                 if (self._ticks[number] + 1) % every:
                     continue
-                if unit[index].lacking is not None:
+                if any(unit[index].lacking):
                     self._spent_s[number] += perf_counter() - began
                     return stepped
                 self._step(number, unit[index])

@@ -157,11 +157,8 @@ class Runner:
         return min((step + 1) * self.plan.step_points - 1, self.grid.last_point)
 
     @property
-    def lacking(self) -> Source | None:
-        """The first source without the row for the next step; None if all have it."""
-        return next(self._lacking(), None)
-
-    def _lacking(self) -> Iterator[Source]:
+    def lacking(self) -> Iterator[Source]:
+        """The sources without the row for the next step."""
         step = self.step
         if step < self.last_step:
             yield from (source for source in self.sources if not source.has(step))
@@ -169,7 +166,7 @@ class Runner:
     @property
     def waits_for(self) -> str:
         """What the next step waits for, in words."""
-        source = self.lacking
+        source = next(self.lacking, None)
         if source is None:
             return "the master's grant"
         output, own = source.transfer.columns[0][:2]

@@ -63,8 +63,8 @@ class Profiler:
                 self._store(Burst(begin + busy_s, begin + busy_s + lasted_s, number, steps, 0.0))
                 self._ended = now
             busy_s += lasted_s
-        reason = self._reason(engine)
-        if waited_s > 0.0 and reason is not None:
+        if waited_s > 0.0 and any(runner.step < runner.last_step for runner in engine.runners):
+            reason = engine.awaited or GRANT
             self._wait_s[reason] = self._wait_s.get(reason, 0.0) + waited_s
             self._store(Wait(begin + busy_s, begin + busy_s + waited_s, reason))
         if self._ended == now:
@@ -105,13 +105,3 @@ class Profiler:
             self._bursts.append(entry)
         else:
             self._waits.append(entry)
-
-    @staticmethod
-    def _reason(engine: Engine) -> str | None:
-        """The instance for which this node waits, `GRANT`, or None after the last point."""
-        unfinished = [runner for runner in engine.runners if runner.step < runner.last_step]
-        if not unfinished:
-            return None
-        own = {runner.name for runner in engine.runners}
-        lacking = (runner.lacking for runner in unfinished)
-        return next((source.instance for source in lacking if source is not None and source.instance not in own), GRANT)

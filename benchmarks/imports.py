@@ -1,4 +1,4 @@
-"""`python -m benchmarks.startup`: how long it takes until a program can use fmu_mesh, and until the command answers.
+"""`python -m benchmarks.imports`: how long it takes until a program can use fmu_mesh, and until the command answers.
 
 Each program is started in turns with the others, so that a busy minute of the machine is shared by all. The table has
 medians in ms, and how many times as long as `import msgspec` each one takes.

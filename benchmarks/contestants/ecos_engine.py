@@ -1,7 +1,8 @@
-"""ecos with proxyfmu: a C++ engine in this process, one `proxyfmu` process per FMU, over Unix sockets.
+"""ecos: a C++ engine in this process, with the FMUs in this process or one `proxyfmu` process per FMU.
 
 Its fixed-step algorithm is Jacobi and its time a running sum of step sizes, with which its values are compared.
-Nothing is recorded and no Python runs during the steps.
+Nothing is recorded and no Python runs during the steps. In one process, several threads step the instances. Option
+`processes`: `one`, or `own` for `proxyfmu` over Unix sockets.
 """
 
 from __future__ import annotations
@@ -19,14 +20,17 @@ __all__: list[str] = []
 
 def run(task: Task) -> Outcome:
     """Step in one call; that call is what is timed."""
-    _make_executable()
-    import ecospy  # type: ignore[import-not-found] # noqa: PLC0415 - it loads a library that looks for the program
+    own = task.options["processes"] == "own"
+    if own:
+        _make_executable()
+    import ecospy  # type: ignore[import-not-found] # noqa: PLC0415 - it loads a library, which looks for the program
 
     system = task.system
     with ecospy.EcosSimulationStructure() as structure:
         starts: dict[str, float] = {}
         for index, member in enumerate(system.members):
-            structure.add_model(member.name, f"proxyfmu://localhost?file={FMUS / member.fmu}.fmu")
+            path = f"{FMUS / member.fmu}.fmu"
+            structure.add_model(member.name, f"proxyfmu://localhost?file={path}" if own else path)
             starts |= {f"{member.name}::{name}": value for name, value in member.start_values.items()}
             source = system.source_of(index)
             if source is not None:

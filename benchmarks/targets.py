@@ -1,0 +1,81 @@
+"""What our own figures should be: what issue 17 asks for, and what is aimed at."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from benchmarks.jobs import OTHER
+
+__all__ = ["TARGETS", "Figure", "Target"]
+
+Figure = Literal["times as fast", "times as long", "times as long, each", "points/s", "first point, s", "MB per node"]
+
+
+@dataclass(frozen=True)
+class Target:
+    """What one figure should be.
+
+    Attributes:
+        what: the figure in words.
+        job: name of the job.
+        entry: label of our row.
+        figure: how many times as fast as `against` the row is; how many times as long as `against` it takes, for a
+            point (or a command), or for a point and instance; or a figure of the row alone.
+        required: the least, of a speed; the most, of anything else.
+        aim: what is better than required.
+        against: label of the other row of this job.
+    """
+
+    what: str
+    job: str
+    entry: str
+    figure: Literal[
+        "times as fast", "times as long", "times as long, each", "points/s", "first point, s", "MB per node"
+    ]
+    required: float
+    aim: float
+    against: str = ""
+
+    @property
+    def more_is_better(self) -> bool:
+        """Whether `required` is a lower limit."""
+        return self.figure in ("times as fast", "points/s")
+
+    def meets(self, value: float) -> bool:
+        """Whether a figure is what is required."""
+        return value >= self.required if self.more_is_better else value <= self.required
+
+
+_FMPY = "FMPy loop, one process"
+_FMI1 = "FMI 1.0: Real, Integer, Boolean"
+_FMI2 = "FMI 2.0: Real, Integer, Boolean, Enumeration"
+_COMMAND, _LOCAL = "fmu-mesh launch", "fmu-mesh launch --local"
+_NO_FILE = "fmu_mesh, nothing recorded"
+_EIGHT, _TWO = "fmu_mesh, chain of 8", "fmu_mesh, chain of 2"
+_ROUND_TRIP = "shared memory, C: one round trip"
+_WINDOW1 = "fmu_mesh, gauss_seidel"
+
+TARGETS = (
+    Target("main job with its CSV, against the FMPy loop", "pendulum", "fmu_mesh", "times as fast", 25, 40, _FMPY),
+    Target("main job, nothing recorded, against C", "limit", _NO_FILE, "times as long", 2, 1.3, "C, process per FMU"),
+    Target("cycle in own processes, against the FMPy loop", "cycle2", "fmu_mesh", "times as fast", 8, 30, _FMPY),
+    Target("cycle in one group, against the FMPy loop", "group", "fmu_mesh", "times as fast", 40, 80, _FMPY),
+    Target("window 1: a point, against a round trip", "window1", _WINDOW1, "times as long", 25, 8, _ROUND_TRIP),
+    Target("chain of 8 against chain of 2", "chain8", _EIGHT, "times as long, each", 1.0, 0.7, _TWO),
+    Target("FMI 1.0, against the other checkout", "kinds", _FMI1, "times as fast", 2, 4, _FMI1 + OTHER),
+    Target("Boolean, Enumeration, against the other checkout", "kinds", _FMI2, "times as fast", 2, 4, _FMI2 + OTHER),
+    Target("main job, launch --local", "pendulum", "fmu_mesh, launch --local", "points/s", 437_000, 800_000),
+    Target("main job, whole command, against --local", "command", _COMMAND, "times as long", 1.5, 1.2, _LOCAL),
+    Target(
+        "the same, against --local of the other checkout",
+        "command",
+        _COMMAND,
+        "times as long",
+        1.5,
+        1.2,
+        _LOCAL + OTHER,
+    ),
+    Target("64 nodes, from the command to the first point", "startup", "64: fmu_mesh", "first point, s", 3, 1.5),
+    Target("private memory of a node, one of 64", "startup", "64: fmu_mesh", "MB per node", 15, 9),
+)

@@ -1,0 +1,154 @@
+"""The benchmarks: what a target names is there, what differs is found, and figures are put into words."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+from pathlib import Path
+
+import pytest
+
+from benchmarks.comparing import Reference, compare
+from benchmarks.first_step import Started
+from benchmarks.jobs import JOBS, OTHER, Entry, Job, with_checkout
+from benchmarks.report import Report, write_docs
+from benchmarks.running import Measured
+from benchmarks.targets import TARGETS, Figure, Target
+from benchmarks.task import Member, Outcome, System
+
+ROOT = Path(__file__).resolve().parents[2]
+PAIR = System("chain", "jacobi", 0.5, (Member("a", "Gain", "u", "y"), Member("b", "Gain", "u", "y")))
+REFERENCE = Reference([[float(point), point / 2] for point in range(3)], (None, 0.0))
+CSV = "time,a.y,b.y\n0.0,0.0,0.0\n0.5,1.0,0.5\n1.0,2.0,1.0\n"
+
+
+def reported(target: Target, entries: dict[str, Measured], timed: str = "steps") -> tuple[Report, Job]:
+    """The report of a job with these results."""
+    rows = tuple(Entry(label, "fmu_mesh_launch" if label == "ours" else "fmpy_loop", 4) for label in entries)
+    job = Job("pair", "a pair", PAIR, rows, "commands" if timed == "commands" else "steps", timed == "commands")
+    return Report([job], {"pair": entries}, ["a test"], [target]), job
+
+
+@pytest.mark.parametrize("target", TARGETS, ids=lambda target: target.what)
+def test_a_target_names_rows_of_its_job(target: Target) -> None:
+    labels = {entry.label for job in with_checkout(JOBS, ROOT) if job.name == target.job for entry in job.entries}
+
+    assert target.entry in labels
+    assert not target.against or target.against in labels
+
+
+@pytest.mark.parametrize("job", with_checkout(JOBS, ROOT), ids=lambda job: job.name)
+def test_the_rows_of_a_job_have_different_labels_and_a_module(job: Job) -> None:
+    labels = [entry.label for entry in job.entries]
+
+    assert len(set(labels)) == len(labels)
+    assert all(not entry.beside or entry.beside in labels for entry in job.entries)
+    for entry in job.entries:
+        assert importlib.util.find_spec(f"benchmarks.contestants.{entry.module}") is not None, entry.module
+
+
+def test_another_checkout_runs_each_of_our_rows_and_no_other(tmp_path: Path) -> None:
+    (job,) = with_checkout([JOBS[0]], tmp_path)
+
+    added = job.entries[len(JOBS[0].entries) :]
+    assert [entry.label for entry in added] == [e.label + OTHER for e in JOBS[0].entries if e.is_ours]
+    assert all(entry.options["checkout"] == str(tmp_path) for entry in added)
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        (CSV, "all points equal"),
+        (CSV.replace("2.0,", "2.0000000000000004,"), "DIFFERS: a.y is 2.0000000000000004 at point 2, not 2.0"),
+        (CSV.replace("0.5,1.0", "0.25,1.0"), "DIFFERS: row 1 has time 0.25"),
+        (CSV.removesuffix("1.0,2.0,1.0\n"), "DIFFERS: 2 rows, not 3"),
+    ],
+    ids=["equal", "a value", "a time", "a row is missing"],
+)
+def test_every_point_of_a_file_is_compared(text: str, found: str, tmp_path: Path) -> None:
+    file = tmp_path / "result.csv"
+    file.write_text(text)
+
+    assert compare(PAIR, REFERENCE, Outcome(0.1, result_file=str(file)), 2) == found
+
+
+def test_the_last_values_are_compared_where_there_is_no_file() -> None:
+    assert compare(PAIR, REFERENCE, Outcome(0.1, {"a.y": 2.0, "b.y": 1.0}), 2) == "last values equal"
+    assert compare(PAIR, REFERENCE, Outcome(0.1), 2) == "nothing to see"
+    wrong = compare(PAIR, REFERENCE, Outcome(0.1, {"a.y": 2.0, "b.y": 1.0000000000000002}), 2)
+    assert wrong == "DIFFERS: b.y is 1.0000000000000002 at the end, not 1.0"
+
+
+@pytest.mark.parametrize(
+    ("figure", "value", "verdict"),
+    [
+        ("times as fast", 4.0, "PASS"),
+        ("times as long", 0.25, "PASS"),
+        ("times as long, each", 0.0625, "PASS"),
+        ("points/s", 1e6, "PASS"),
+        ("first point, s", 3.0, "BELOW"),
+        ("MB per node", 20.0, "BELOW"),
+    ],
+)
+def test_each_figure_of_a_target_is_the_median_of_what_was_measured(figure: Figure, value: float, verdict: str) -> None:
+    seen = Started(first_point_ns=0, held_ns=0, processes=3, private_mb=50.0, pss_mb=60.0, node_mb=20.0)
+    ours = Measured(8, 4, [9e-6, 1e-6, 5e-7], [9.0, 3.0, 1.0], [seen], "all points equal")
+    target = Target("a figure", "pair", "ours", figure, 2, 1, "theirs")
+
+    report, _ = reported(target, {"ours": ours, "theirs": Measured(2, 4, [4e-6])})
+
+    assert report.value_of(target) == value
+    (row,) = [line for line in report.markdown().splitlines() if "a figure" in line]
+    assert row.endswith(f"{verdict} |")
+    assert json.loads(report.json())["targets"][0]["value"] == value
+
+
+def test_a_target_without_figures_is_not_met_and_one_of_another_job_is_left_out() -> None:
+    target = Target("speed", "pair", "ours", "times as fast", 2, 3, "theirs")
+    report, job = reported(target, {"ours": Measured(2, 4, [1e-6]), "theirs": Measured(2, 4, failure="no compiler")})
+
+    assert report.value_of(target) is None
+    assert "| speed (times as fast) | - | 2 | 3 | - |" in report.markdown()
+    assert "| theirs | - | - | - | - | - | no compiler |" in report.markdown()
+    elsewhere = Target("speed", "elsewhere", "ours", "times as fast", 2, 3)
+    assert "speed" not in Report([job], {"pair": {}}, [], [elsewhere]).json()
+
+
+def test_a_row_of_another_checkout_is_compared_with_ours_of_the_same_label() -> None:
+    target = Target("speed", "pair", "ours", "points/s", 2, 3)
+    first, ours, other = Measured(2, 4, [1e-6]), Measured(2, 4, [2e-6]), Measured(2, 4, [3e-6])
+
+    report, _ = reported(target, {"first": first, "ours": ours, "ours" + OTHER: other})
+
+    ratios = [
+        line.split("|")[6].strip() for line in report.markdown().splitlines() if line.startswith(("| first", "| ours"))
+    ]
+    assert ratios == ["", "2.00", "1.50"]
+
+
+def test_the_table_of_start_up_has_times_and_memory() -> None:
+    seen = Started(first_point_ns=0, held_ns=0, processes=3, private_mb=50.0, pss_mb=60.4, node_mb=20.0)
+    target = Target("start", "pair", "ours", "first point, s", 2, 3)
+
+    report, _ = reported(target, {"ours": Measured(2, 4, [1.5], [1.0], [seen], "all points equal")}, "commands")
+
+    assert "| ours | 1.00 | 1.50 | 1.50-1.50 |  | 3 | 50 | 60 | 20.0 | all points equal |" in report.markdown()
+    assert "all points equal" in report.text()
+
+
+def test_the_tables_replace_those_of_the_page_and_nothing_else(tmp_path: Path) -> None:
+    page = tmp_path / "performance.md"
+    before = (ROOT / "docs" / "performance.md").read_text()
+    page.write_text(before)
+    report, _ = reported(Target("speed", "pair", "ours", "points/s", 2, 3), {"ours": Measured(2, 4, [1e-6])})
+
+    write_docs(page, report)
+
+    begin, end = "<!-- measured: begin", "<!-- measured: end -->"
+    after = page.read_text()
+    assert report.markdown() in after
+    assert after.partition(begin)[0] == before.partition(begin)[0]
+    assert after.partition(end)[2] == before.partition(end)[2]
+    page.write_text("no markers")
+    with pytest.raises(ValueError, match="no markers"):
+        write_docs(page, report)
