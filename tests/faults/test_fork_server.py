@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import psutil
@@ -157,6 +159,26 @@ def test_a_forked_process_is_one_of_its_own(place: Place) -> None:
     launched.signal(signal.SIGINT)
     assert launched.wait() == 130
     place.assert_nothing_left()
+
+
+def test_each_process_has_a_title_and_a_profiler_can_look_into_it(place: Place) -> None:
+    launched, _ = running(place)
+    processes = [launched.child(role) for role in ROLES]
+
+    titles = [" ".join(process.cmdline()).strip() for process in processes]
+
+    assert titles == [
+        "fmu-mesh fork server pair",
+        "fmu-mesh master pair",
+        "fmu-mesh node pendulum",
+        "fmu-mesh node delay",
+    ]
+    scope = Path("/proc/sys/kernel/yama/ptrace_scope")
+    if os.geteuid() and scope.exists() and scope.read_text().strip() != "0":
+        return  # this host lets nobody look into a process of its own user
+    command = [str(Path(sys.executable).with_name("py-spy")), "dump", "--pid", str(processes[2].pid)]
+    stacks = subprocess.run(command, capture_output=True, text=True, timeout=DEADLINE_S, check=True).stdout
+    assert "Node.run (" in stacks
 
 
 NOISE = """
