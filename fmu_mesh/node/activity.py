@@ -107,7 +107,7 @@ class Activity:
             with engine.sending:
                 self._send()
         else:
-            engine.attend()
+            engine.ring_bell()
         if under_way_s <= self._plan.timeouts.step:
             return None
         return StepFailed(

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import ctypes
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from threading import Lock
 from time import perf_counter
@@ -71,7 +71,7 @@ class Engine(ABC):
         """
 
     @abstractmethod
-    def attend(self) -> None:
+    def ring_bell(self) -> None:
         """From any thread: let `run` return after the current step."""
 
     @property
@@ -138,11 +138,9 @@ class BurstEngine(Engine):
         self._address = ctypes.addressof(self._node)
         for number, unit in enumerate(units):
             for index, runner in enumerate(unit):
-                runner.follow(
-                    self._members[number][index],  # type: ignore[arg-type]  # it has a step and a stage, as a `Position`
-                    partial(self._fill, number, index),
-                )
-                self._fill(number, index)
+                fill = partial(self._fill, number, index)
+                runner.follow(_InTable(self._members[number][index], fill))
+                fill()
 
     def run(self, wait_s: float, *, eager: bool) -> bool:
         """See `Engine`."""
@@ -165,7 +163,7 @@ class BurstEngine(Engine):
         self.waited_s = node.waited_ns / 1e9
         return self._ticks != before
 
-    def attend(self) -> None:
+    def ring_bell(self) -> None:
         """See `Engine`."""
         self._library.attend(self._address)
 
@@ -285,6 +283,28 @@ class BurstEngine(Engine):
         )
 
 
+class _InTable(Position):
+    """How far a runner is, as its table has it."""
+
+    def __init__(self, member: native.MemberTable, fill: Callable[[], None]) -> None:
+        self._member = member
+        self._fill = fill
+
+    @property
+    def step(self) -> int:  # type: ignore[override]  # only the burst changes it
+        """See `Position`."""
+        return int(self._member.step)
+
+    @property
+    def stage(self) -> int:  # type: ignore[override]  # as above
+        """See `Position`."""
+        return int(self._member.stage)
+
+    def refit(self) -> None:
+        """See `Position`."""
+        self._fill()
+
+
 def _gate(source: Source) -> native.Gate:
     ring, rule = source.transfer.source, source.transfer.rule
     return native.Gate(
@@ -322,7 +342,7 @@ class PlainEngine(Engine):
         self._spent_s = [0.0] * len(units)
         self._attention = False
         for runner in self.runners:
-            runner.follow(self._positions[runner.name], lambda: None)
+            runner.follow(self._positions[runner.name])
 
     def run(self, wait_s: float, *, eager: bool) -> bool:  # noqa: ARG002  it never waits after a step
         """See `Engine`."""
@@ -342,7 +362,7 @@ class PlainEngine(Engine):
         self._attention = False
         return stepped
 
-    def attend(self) -> None:
+    def ring_bell(self) -> None:
         """See `Engine`."""
         self._attention = True
         self._memory.ring_bell()
@@ -387,16 +407,16 @@ class PlainEngine(Engine):
         step = position.step
         for source in runner.sources:
             source.transfer.step(step)
-        position.stage = Stage.IN_PYTHON
+        position.enter(Stage.IN_PYTHON)
         try:
             runner.instance.do_step(step)
         except TerminationRequested:
             self._stopped.add(number)
             raise
         finally:
-            position.stage = Stage.WAITING
+            position.enter(Stage.WAITING)
         if floating_point_changed():
             restore_floating_point()
         runner.outputs.stamp(step + 1)
-        position.step = step + 1
+        position.count()
         runner.counter.raise_to(step + 2)

@@ -219,7 +219,7 @@ class Node:
         rings = self._rings_of_sources(shares)
         step_points = {place.instance: place.step_points for place in plan.rings}
         for runner in self._runners.values():
-            runner.sources += sources_of(runner, rings, step_points)
+            runner.connect(sources_of(runner, rings, step_points))
         self._put_progress = membership.sender(keys.progress(plan.node))
 
     def _rings_of_sources(self, shares: Collection[str]) -> dict[str, list[tuple[Ring, Counter, bool | None]]]:
@@ -270,7 +270,7 @@ class Node:
         units = [[self._runners[name] for name in names] for names in plan.units]
         shared = self._memory is not self._own_memory
         self._engine = engine = self._make_engine(plan, units, self._memory, shared=shared, spins=not ONE_CORE)
-        self._inbox.move_to(self._memory, engine.attend)
+        self._inbox.move_to(self._memory, engine)
         self._activity.steps_with(engine)
         for runner in self._runners.values():
             runner.begin()
