@@ -44,7 +44,7 @@ typedef struct {
   int64_t stride;
   int64_t type;
   uint64_t bits;    /* the last value */
-  const char *text; /* its text, with the character after it; NULL: there is none yet */
+  const char *text; /* where its text was first written, with the character after it; NULL: nowhere yet */
   int64_t size;     /* of this text */
 } Column;
 
@@ -300,8 +300,7 @@ static inline void read_cells(Column *column, int64_t type, int64_t rows, const 
 
 static inline char *put_cell(char *out, Column *column, const Tables *tables, const Cell *cell, char separator) {
   if (cell->kind == HELD) {
-    memmove(out, column->text, 32);
-    column->text = out;
+    memmove(out, column->text, 32); /* what follows the text is written over; in a short line the two overlap */
     return out + column->size;
   }
   column->text = out;
