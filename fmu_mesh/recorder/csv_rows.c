@@ -161,7 +161,7 @@ static inline Text text_of(const Digits digits) {
                 (char)('0' + digits.last), 32 - __builtin_clz((zeros ^ 0xffff) | (digits.last != 0) << 16)};
 }
 #else
-/* The digits of a number below 10^8, one in each byte; here n / 100 is n * 10486 / 2^20, and n / 10 is n * 103 / 2^10. */
+/* The digits of a number below 10^8, one in each byte. Here n / 100 is n * 10486 / 2^20; n / 10 is n * 103 / 2^10. */
 static inline uint64_t eight(uint64_t n) {
   n = (n << 32) - (n * 109951163 >> 40) * ((10000ull << 32) - 1);
   n = (n << 16) - ((n * 10486 >> 20) & 0x7f0000007f) * ((100 << 16) - 1);
@@ -319,8 +319,8 @@ static inline char *put_cell(char *out, Column *column, const Tables *tables, co
 }
 
 /* Write rows of n columns as lines; returns their size. A value takes up to 25 bytes, and `out` needs 40 more behind
- * them. First the digits of many values, then their texts: a processor does more at once within a short loop than within
- * a long one. Instances with larger steps hold their values: the text of a value that has not changed is copied. */
+ * them. First the digits of many values, then their texts: in a short loop a processor does more at once than in a long
+ * one. Instances with larger steps hold their values: the text of a value that has not changed is copied. */
 PUBLIC int64_t csv_rows(Column *columns, int64_t n, int64_t rows, const Tables *tables, char *out) {
   char *const start = out;
   Cell cells[CELLS];
