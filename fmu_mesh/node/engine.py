@@ -155,10 +155,7 @@ class BurstEngine(Engine):
             self._complete(node.unit, runner, member, result)
             self._units[node.unit].spent_ns += int((perf_counter() - began) * 1e9)
             if perf_counter() - started > _SLICE_S:
-                node.wait_ns = 0  # commit this step, and return
-                if library.run(self._address) >= Result.PYTHON:
-                    continue
-                break
+                library.attend(self._address)  # so it returns after this tick
         library.attended(self._address)
         self.waited_s = node.waited_ns / 1e9
         return self._ticks != before
@@ -297,10 +294,23 @@ class BurstEngine(Engine):
 
 
 class PlainEngine(Engine):
-    """Steps in plain Python."""
+    """Steps in plain Python.
 
-    def __init__(self, plan: NodePlan, units: Sequence[Sequence[Runner]], memory: HostMemory, *, shared: bool) -> None:
+    Args:
+        slice_s: time in s after which `run` returns, once every unit had a turn.
+    """
+
+    def __init__(
+        self,
+        plan: NodePlan,
+        units: Sequence[Sequence[Runner]],
+        memory: HostMemory,
+        *,
+        shared: bool,
+        slice_s: float = _SLICE_S,
+    ) -> None:
         super().__init__(plan, units, memory, shared=shared)
+        self._slice_s = slice_s
         self._positions = {runner.name: Position() for runner in self.runners}
         self._ticks = [0] * len(units)
         self._next = [0] * len(units)
@@ -319,7 +329,7 @@ class PlainEngine(Engine):
             advanced = [self._advance(number, started) for number in range(len(self.units))]
             self._progress.raise_to(self.covered + 1)
             stepped = stepped or any(advanced)
-            if not any(advanced) or perf_counter() - started > _SLICE_S:
+            if not any(advanced) or perf_counter() - started > self._slice_s:
                 break
         if not stepped and not self._attention:
             began = perf_counter()
@@ -363,7 +373,7 @@ class PlainEngine(Engine):
                 stepped = True
             self._ticks[number] += 1
             self._next[number] = 0
-            if perf_counter() - started > _SLICE_S:
+            if perf_counter() - started > self._slice_s:
                 break
         self._spent_s[number] += perf_counter() - began
         return stepped

@@ -87,6 +87,7 @@ class Node:
         on_hang: called on another thread if a step does not return in time.
         router: the link to the router that connects this node to the others, if there is one.
         launch: the launcher that started this process; None if it was started manually.
+        engine: makes the engine, as `make_engine` does.
 
     Attributes:
         failure_is_known: whether others know what ended the run: the master knows it, or is gone.
@@ -103,10 +104,12 @@ class Node:
         on_hang: Callable[[FmuError], None] = lambda _error: None,
         router: RouterLink | None = None,
         launch: str | None = None,
+        engine: Callable[..., Engine] = make_engine,
     ) -> None:
         self._plan = plan
         self._session = session
         self._open_instance = open_instance
+        self._make_engine = engine
         self._finished = False
         self.failure_is_known = False
         self._heard = time.monotonic()
@@ -266,7 +269,7 @@ class Node:
             runner.bind()
         units = [[self._runners[name] for name in names] for names in plan.units]
         shared = self._memory is not self._own_memory
-        self._engine = engine = make_engine(plan, units, self._memory, shared=shared, spins=not ONE_CORE)
+        self._engine = engine = self._make_engine(plan, units, self._memory, shared=shared, spins=not ONE_CORE)
         self._inbox.move_to(self._memory, engine.attend)
         self._activity.steps_with(engine)
         for runner in self._runners.values():

@@ -207,8 +207,10 @@ class Recorder:
                 self._take(message)
             elif time.monotonic() - heard > self._plan.timeouts.step:
                 raise DeadlineExceeded("the recorder received nothing from the master")
-        while self._leaving.is_set() and (message := self._inbox.poll()) is not None:
-            self._take(message)  # messages that arrived before the end, above all its reason
+        end = time.monotonic() + _LAST_S
+        while self._leaving.is_set() and (left := end - time.monotonic()) > 0:
+            if (message := self._inbox.wait(left)) is not None:
+                self._take(message)  # messages that are under way, above all the reason of the end
 
     def _wishes(self) -> list[Wish]:
         """Wake up when a quarter of the window can be written, or all that is left."""

@@ -12,7 +12,13 @@ import msgspec
 
 from .layout import Layout, row_bytes
 
-__all__ = ["MemoryMap", "RingPlace", "map_memory"]
+__all__ = ["MASTER", "RECORDER", "MemoryMap", "RingPlace", "map_memory"]
+
+RECORDER = "@record"
+"""Name of the recorder in place of the name of a node. No instance can have it."""
+
+MASTER = "@mesh"
+"""Name of the master in place of the name of a node."""
 
 _LINE = 64
 """Size of a cache line in bytes. Two processes that write do not share one."""

@@ -22,17 +22,11 @@ from .graph import cycle_through, feedback_edges, strongly_connected, topologica
 from .initialization_plan import InitializationPlan, Loop, plan_initialization
 from .layout import Layout, row_bytes, rows_for
 from .linear_inputs import LinearInput, linear_inputs
-from .memory_map import MemoryMap, RingPlace, map_memory
+from .memory_map import MASTER, RECORDER, MemoryMap, RingPlace, map_memory
 from .system import Connection, ResolvedSystem, SystemInstance
 from .window import recorder_window, window_of
 
 __all__ = ["MASTER", "RECORDER", "Feed", "InstancePlan", "Link", "NodePlan", "Plan", "make_plan"]
-
-RECORDER = "@record"
-"""Name of the recorder in place of the name of a node. No instance can have it."""
-
-MASTER = "@mesh"
-"""Name of the master in place of the name of a node."""
 
 
 class Feed(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -9,7 +9,7 @@ from typing import Literal
 
 import msgspec
 
-from ..system.plan import MASTER
+from ..system.memory_map import MASTER
 
 __all__ = ["MASTER", "RUN_ID_BYTES", "Keys", "RunKeys", "VariableKind", "batched", "escape", "unescape"]
 

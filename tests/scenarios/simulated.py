@@ -10,28 +10,35 @@ from __future__ import annotations
 import random
 import threading
 from collections import deque
-from collections.abc import Callable
-from typing import Any, Self, cast
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Self, cast
 
 import numpy as np
 import zenoh
 from numpy.typing import NDArray
 
 from fmu_mesh.instances.contract import Instance
+from fmu_mesh.node.engine import PlainEngine
 from fmu_mesh.node.node import Node
+from fmu_mesh.node.stepping import Runner
+from fmu_mesh.rings.host_memory import HostMemory, Wish
+from fmu_mesh.rings.ring import Ring
 from fmu_mesh.system.plan import RECORDER, NodePlan, Plan
 from fmu_mesh.wire.frames import FrameReceiver
 from fmu_mesh.wire.keys import RunKeys
 from fmu_mesh.wire.membership import Membership, Welcome
-from fmu_mesh.wire.messages import FINISH, FRAME, GRANT, HEADER, PROGRESS, WAKE
+from fmu_mesh.wire.messages import FINISH, FRAME, GRANT, HEADER, PROGRESS
 
 __all__ = ["SimulatedMesh"]
 
 _MASTER = "@mesh"
 RUN = RunKeys("fmu_mesh/scenario", "0123456789abcdef")
-_WAKE = HEADER.pack(WAKE, 0, 0, 0)
 _TURN_S = 30.0
 """A node that does not come back to the scheduler within this time hangs in a loop of its own."""
+
+_LONG_BURST = 40
+"""Most ticks that a node steps in one turn; mostly it is one."""
 
 _QUIET_ROUNDS = 3
 """So many times all waits time out without any message before it is called a deadlock."""
@@ -66,16 +73,24 @@ class SimulatedMesh:
         self._quiet_rounds = 0
         self.back = threading.Semaphore(0)
         self.stopping = False
+        self.thread = threading.current_thread()
         self._processes = {
             node: _Process(self, plan.nodes[node], open_instance, number)
             for number, node in enumerate(self._nodes)
             if node != RECORDER
         }
         self._receivers: dict[int, FrameReceiver] = {}
+        self._mirrors: dict[int, Ring] = {}
         if RECORDER in plan.nodes:
             recorder = plan.nodes[RECORDER]
+            memory = HostMemory.private(recorder.memory, RECORDER)
+            places = {place.instance: place for place in recorder.rings}
             for link in recorder.links_in:
-                self._receivers[link.index] = FrameReceiver(link, "the recorder", recorder.ring_rows)
+                place = places[link.source]
+                self._mirrors[link.index] = mirror = memory.ring(place)
+                self._receivers[link.index] = FrameReceiver(
+                    link, link.layout, "the recorder", mirror, memory.counter(place.counter)
+                )
                 self.recorded[link.source] = []
 
     def run(self) -> None:
@@ -85,6 +100,7 @@ class SimulatedMesh:
             AssertionError: nothing can go on any more.
             BaseException: what ended a node.
         """
+        self.thread = threading.current_thread()
         for process in self._processes.values():
             process.thread.start()
         try:
@@ -100,6 +116,10 @@ class SimulatedMesh:
     def slow_down(self, node: str, times: float) -> None:
         """Give a node its turn so many times less often than the fastest of the others. Call before `run`."""
         self._pace[node] = 1.0 / times
+
+    def burst(self) -> int:
+        """How many ticks a node steps in its turn."""
+        return 1 if self._random.random() < 0.8 else self._random.randint(2, _LONG_BURST)
 
     def send(self, key: str, data: bytes) -> None:
         """Put a message on its way; called by nodes."""
@@ -138,7 +158,7 @@ class SimulatedMesh:
         elif target == RECORDER:
             self._record(data)
         else:
-            self._processes[target].inbox.append((_internal(key), data))
+            self._processes[target].take(cast("zenoh.Sample", _Sample(_internal(key), data)))
 
     def _resume(self, process: _Process) -> None:
         process.turn.release()
@@ -154,7 +174,7 @@ class SimulatedMesh:
             where = dict(zip(self._nodes, self._progress, strict=True))
             raise AssertionError(f"a deadlock: {waiting} wait for ever; grant {self._grant}, progress {where}")
         for process in self._processes.values():
-            process.inbox.append((RUN.wake(process.name), _WAKE))
+            process.rung = True
 
     # --- master and recorder
 
@@ -183,9 +203,12 @@ class SimulatedMesh:
         kind, number, count, first = HEADER.unpack_from(data)
         assert kind == FRAME
         receiver = self._receivers[number]
-        new = receiver.take(first, count, data)
-        if new is not None:
-            self.recorded[receiver.link.source] += list(new[1][0])
+        before, mirror = receiver.received, self._mirrors[number]
+        receiver.take(first, count, data)
+        values = mirror.part("Float64")
+        for row in range(before, receiver.received):
+            assert mirror.has_row(row)
+            self.recorded[receiver.link.source].append(values[row & mirror.mask].copy())
         last = self._plan.grid.last_point
         covered = [r.received * r.link.step_points for r in self._receivers.values()]
         complete = min(last if points > last else points - 1 for points in covered)
@@ -204,35 +227,44 @@ class _Process:
         self.name = plan.node
         self.mesh = mesh
         self.number = number
-        self.inbox: deque[tuple[str, bytes]] = deque()
+        self.take: Callable[[zenoh.Sample], None]
+        self.rung = False
         self.turn = threading.Semaphore(0)
         self.thread = threading.Thread(target=self._live, name=f"node {plan.node}", daemon=True)
         self.over = False
         self.error: BaseException | None = None
+        self._arrived: list[zenoh.Sample] = []
+        self.take = self._arrived.append  # what comes before its inbox is open
         self._waiting = False
         self._plan = plan
         self._open_instance = open_instance
 
     @property
     def can_go_on(self) -> bool:
-        """Whether it does not wait for a message, or one is there."""
-        return not self._waiting or bool(self.inbox)
+        """Whether it does not sleep, or its bell has rung."""
+        return not self._waiting or self.rung
 
-    def receive(self) -> tuple[str, bytes]:
-        """The next message; lets the others go on until one is there."""
+    @property
+    def may_be_told(self) -> bool:
+        """Whether this is a thread of the simulation; what other threads want has time until the next message."""
+        return threading.current_thread() in (self.thread, self.mesh.thread)
+
+    def receive_with(self, take: Callable[[zenoh.Sample], None]) -> None:
+        """From now on ``take`` gets the messages."""
+        for sample in self._arrived:
+            take(sample)
+        self.take = take
+
+    def sleep(self) -> None:
+        """Let the others go on until the bell has rung, or time has passed."""
         self._waiting = True
-        self._give_up()
-        while not self.inbox:
-            self._give_up()
+        self.give_up()
+        while not self.rung:
+            self.give_up()
         self._waiting = False
-        return self.inbox.popleft()
 
-    def poll(self) -> tuple[str, bytes] | None:
-        """The next message if one is there, after the others had a chance to send one."""
-        self._give_up()
-        return self.inbox.popleft() if self.inbox else None
-
-    def _give_up(self) -> None:
+    def give_up(self) -> None:
+        """Let the others go on, once."""
         self.mesh.back.release()
         assert self.turn.acquire(timeout=2 * _TURN_S)
         if self.mesh.stopping:
@@ -260,8 +292,65 @@ class _SimulatedNode(Node):
     """A node whose mesh is complete from the start."""
 
     def __init__(self, process: _Process, plan: NodePlan, open_instance: Callable[[str], Instance]) -> None:
-        super().__init__(plan, cast("zenoh.Session", _Session(process)), open_instance)
+        session = cast("zenoh.Session", _Session(process))
+        super().__init__(plan, session, open_instance, engine=partial(_SimulatedEngine, process))
+        self._memory = self._own_memory = _SimulatedMemory.of(process, plan)
+        self._inbox.move_to(self._memory)
         self._membership = _SimulatedMembership(plan, self._session, self._inbox)
+
+
+class _SimulatedMemory(HostMemory):
+    """Private memory; the scheduler decides how long a node sleeps."""
+
+    _owner: _Process
+
+    @classmethod
+    def of(cls, process: _Process, plan: NodePlan) -> Self:
+        """The memory of a node."""
+        memory = cls.private(plan.memory, plan.node)
+        memory._owner = process
+        return memory
+
+    def seen(self) -> int:
+        self._owner.rung = False
+        return 0
+
+    def sleep(self, seen: int, timeout_s: float, wishes: Sequence[Wish] = ()) -> None:  # noqa: ARG002 time is simulated
+        if timeout_s > 0 and not self._owner.rung:
+            self._owner.sleep()
+
+    def ring_bell(self) -> None:
+        if self._owner.may_be_told:
+            self._owner.rung = True
+
+
+class _SimulatedEngine(PlainEngine):
+    """Lets the others go on before it steps; then it takes one tick of each unit, or some more."""
+
+    def __init__(
+        self,
+        process: _Process,
+        plan: NodePlan,
+        units: Sequence[Sequence[Runner]],
+        memory: HostMemory,
+        *,
+        shared: bool,
+        spins: bool,  # noqa: ARG002 nobody spins
+    ) -> None:
+        super().__init__(plan, units, memory, shared=shared, slice_s=-1.0)
+        self._process = process
+
+    def run(self, wait_s: float, *, eager: bool) -> bool:
+        self._process.give_up()
+        stepped = super().run(wait_s, eager=eager)
+        for _ in range(1, self._process.mesh.burst() if stepped else 1):
+            if not super().run(0.0, eager=eager):
+                break
+        return stepped
+
+    def attend(self) -> None:
+        if self._process.may_be_told:
+            super().attend()
 
 
 class _SimulatedMembership(Membership):
@@ -280,7 +369,7 @@ class _SimulatedMembership(Membership):
         plan = self._plan
         senders = {RUN.frames(link.source, plan.node): link.source_node for link in plan.links_in}
         senders[RUN.grants([plan.node])[0]] = _MASTER
-        self._inbox.open(self._session, RUN, plan.node, senders, 1)
+        self._inbox.open(self._session, RUN, plan.node, senders)
         return Welcome()
 
 
@@ -291,8 +380,6 @@ def _internal(key: str) -> str:
 
 class _Entity:
     """Whatever is declared and never used: nobody is outside of the mesh."""
-
-    handler: Any = None
 
     def __enter__(self) -> Self:
         return self
@@ -321,11 +408,10 @@ class _Session:
     def __init__(self, process: _Process) -> None:
         self._process = process
 
-    def declare_subscriber(self, key: str, _handler: object = None, **_settings: object) -> _Entity:
-        subscriber = _Entity()
+    def declare_subscriber(self, key: str, handler: Callable[[zenoh.Sample], None], **_settings: object) -> _Entity:
         if key.endswith(f"/to={self._process.name}/**"):
-            subscriber.handler = _Handler(self._process)
-        return subscriber
+            self._process.receive_with(handler)
+        return _Entity()
 
     def declare_publisher(self, key: str, **_settings: object) -> _Entity:
         return _Publisher(self._process, key) if "/@sync/" in key else _Entity()
@@ -346,24 +432,7 @@ class _Publisher(_Entity):
         self._key = key
 
     def put(self, data: bytes) -> None:
-        if data[0] != WAKE:
-            self._process.mesh.send(f"{self._process.name}/{self._key}", data)
-        elif threading.current_thread() is self._process.thread:
-            self._process.inbox.append((self._key, data))  # of timeouts, the scheduler decides
-
-
-class _Handler:
-    """The receiving end of a node's inbox."""
-
-    def __init__(self, process: _Process) -> None:
-        self._process = process
-
-    def recv(self) -> _Sample:
-        return _Sample(*self._process.receive())
-
-    def try_recv(self) -> _Sample | None:
-        arrived = self._process.poll()
-        return None if arrived is None else _Sample(*arrived)
+        self._process.mesh.send(f"{self._process.name}/{self._key}", data)
 
 
 class _Sample:

@@ -137,3 +137,18 @@ def test_a_recorder_that_reports_ends_with_a_master_that_takes_no_reports_any_mo
         raise MeshLost("node 'n' was lost")
 
     assert_has_ended(recorder)
+
+
+def test_a_recorder_hears_why_a_run_ends_although_its_end_is_told_first(mesh: Mesh) -> None:
+    """The master's message comes on a thread of Zenoh; the end of the context does not wait for it."""
+    error = MeshLost("node 'n' was lost", instance="a, b")
+    reason = threading.Timer(0.1, mesh.put, [encode_abort(error.report())])
+
+    with suppress(MeshLost), Recorder(mesh.plan, mesh.session, mesh.file()) as recorder:
+        mesh.put_rows()
+        reason.start()
+        raise error
+
+    reason.join(DEADLINE_S)
+    assert_has_ended(recorder)
+    assert not mesh.reported.is_set()

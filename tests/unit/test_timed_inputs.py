@@ -12,10 +12,12 @@ from fmu_mesh.instances.contract import Instance
 from fmu_mesh.instances.fmi import Fmi2Instance, read_description
 from fmu_mesh.instances.fmi.fmu_kind import FmuConfig
 from fmu_mesh.node.inputs import TimedInputs, set_input
-from fmu_mesh.node.stepping import Runner
+from fmu_mesh.node.stepping import Position, Runner
+from fmu_mesh.rings.host_memory import HostMemory
 from fmu_mesh.rings.ring import Ring
 from fmu_mesh.simtime import TimeGrid
 from fmu_mesh.system.layout import Layout
+from fmu_mesh.system.memory_map import MASTER, map_memory
 from fmu_mesh.system.plan import InstancePlan
 from fmu_mesh.wire.values import ValueRefused, decode_time
 from tests.helpers import FMUS
@@ -113,17 +115,22 @@ def test_values_that_come_before_the_first_point_wait_for_it(tmp_path: Path) -> 
     steps.inputs.close()
 
 
-def runner_of(instance: Instance) -> Runner:
-    """A runner in the middle of a run, whose steps are a tenth of a second."""
+def runner_of(instance: Instance) -> tuple[Runner, Position]:
+    """A runner in the middle of a run, whose steps are a tenth of a second, and where it is."""
     outputs = Layout.of([("y", "Float64")])
     plan = InstancePlan("gain", "Gain.fmu", {}, 1, outputs, Layout(), (), {}, FmuConfig(fmu="Gain.fmu"))
-    runner = Runner(plan, instance, TimeGrid(1.0, STEP_SIZE, 60), 64)
+    map_, places = map_memory(["gain", MASTER], {"gain": ("gain", 1, outputs)}, 64)
+    memory = HostMemory.private(map_, "gain")
+    ring, counter = memory.ring(places["gain"]), memory.counter(places["gain"].counter)
+    runner = Runner(plan, instance, TimeGrid(1.0, STEP_SIZE, 60), ring, counter)
+    position = Position()
+    runner.follow(position, lambda: None)
     runner.bind()
-    return runner
+    return runner, position
 
 
 def test_a_parameter_without_a_time_is_set_at_once_and_with_one_holds_from_it_on(linear: Steps) -> None:
-    runner = runner_of(linear.inputs)
+    runner, position = runner_of(linear.inputs)
 
     assert set_input(runner, "k", 2.0, None) == 0
     assert linear.inputs.get_values(["k"]) == [2.0]
@@ -132,7 +139,7 @@ def test_a_parameter_without_a_time_is_set_at_once_and_with_one_holds_from_it_on
     used = []
     for step in range(5):
         runner.instance.do_step(step)
-        runner.step = step + 1
+        position.step = step + 1
         used += runner.instance.get_values(["y"])
     assert used == [10.0, 10.0, 10.0, 20.0, 20.0]  # a parameter does not change in between, as inputs do here
 
@@ -142,11 +149,11 @@ def test_an_instance_follows_times_from_the_first_value_with_one_on(tmp_path: Pa
     instance = Fmi2Instance(path, "gain", read_description(path), tmp_path)
     instance.enter_initialization(1.0, None, {"u": 5.0})
     instance.exit_initialization()
-    runner = runner_of(instance)
+    runner, position = runner_of(instance)
     used = []
     for step in range(6):
         runner.instance.do_step(step)
-        runner.step = step + 1
+        position.step = step + 1
         used.append(runner.instance.get_values(["y"]))
         if step == 0:
             assert set_input(runner, "u", 6.0, None) == 1
