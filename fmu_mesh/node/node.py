@@ -175,14 +175,14 @@ class Node:
     def _load(self) -> None:
         """Instantiate the FMUs."""
         plan = self._plan
-        self._activity.state = "loading"
+        self._activity.enter("loading")
         instances = {}
         for item in plan.instances:
             instance = self._open_instance(item.name)
             if item.section.interpolation is not None:
                 instance = TimedInputs(instance, item.section.interpolation)
             instances[item.name] = instance
-        self._activity.state = "waiting for the mesh"
+        self._activity.enter("waiting for the mesh")
         self._membership.keys(plan.timeouts.start)
         self._memory = self._membership.open_memory() or self._own_memory
         for place in plan.rings:
@@ -258,7 +258,7 @@ class Node:
 
     def _initialize(self) -> Engine:
         """Initialization Mode: set, get and exchange values level by level; then the outputs are those of point 0."""
-        self._activity.state = "initializing"
+        self._activity.enter("initializing")
         plan, grid = self._plan, self._plan.grid
         for runner in self._runners.values():
             stop_time = grid.told_stop_time(runner.plan.step_points)
@@ -288,7 +288,7 @@ class Node:
 
     def _step_to_the_end(self, engine: Engine) -> None:
         """The loop of the module's docstring."""
-        self._activity.state = "running"
+        self._activity.enter("running")
         eager = any(link.has_frames for runner in self._runners.values() for link in runner.out_links)
         if self._profiler is not None:
             self._profiler.start(engine)
@@ -429,7 +429,7 @@ class Node:
 
     def _report_failure(self, error: FmuMeshError) -> bool:
         """Report the failure to the master, unless the master is gone; return whether it knows now."""
-        self._activity.state = "failed"
+        self._activity.enter("failed")
         if self._membership.lost_master:
             return True
         self.server.say_everything()
