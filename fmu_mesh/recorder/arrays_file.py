@@ -27,6 +27,9 @@ ENDING = ".arrays"
 _HEAD = struct.Struct("<qq")
 """Number of bytes that follow, and number of rows in them."""
 
+_BLOCK_BYTES = 1 << 16
+"""The size of a block: for a larger one, each time, the operating system would give new memory, page by page."""
+
 
 def bytes_of_a_row(types: Sequence[VariableType]) -> int:
     """The size of a row in bytes, time included; texts are not counted, as their size is not known."""
@@ -76,6 +79,7 @@ class ArraysFile:
         self.path = path
         self.rows = 0
         self._types = types
+        self._block_rows = max(1, _BLOCK_BYTES // bytes_of_a_row(types))
         self._file = open_alone(path)
 
     @classmethod
@@ -108,6 +112,18 @@ class ArraysFile:
 
     def write(self, times: NDArray[np.float64], columns: Sequence[NDArray[Any]]) -> None:
         """Append one row per time; ``columns`` are arrays of the same length."""
+        for first in range(0, len(times), self._block_rows):
+            part = slice(first, first + self._block_rows)
+            self._write(times[part], [column[part] for column in columns])
+
+    def flush(self) -> None:
+        """Do nothing: `write` gives everything to the operating system."""
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+    def _write(self, times: NDArray[np.float64], columns: Sequence[NDArray[Any]]) -> None:
         parts = [
             column.tolist() if is_text(type_) else np.ascontiguousarray(column, DTYPES[type_]).tobytes()
             for column, type_ in zip(columns, self._types, strict=True)
@@ -117,10 +133,3 @@ class ArraysFile:
         while left:
             left = left[self._file.write(left) :]
         self.rows += len(times)
-
-    def flush(self) -> None:
-        """Do nothing: `write` gives everything to the operating system."""
-
-    def close(self) -> None:
-        """Close the file."""
-        self._file.close()

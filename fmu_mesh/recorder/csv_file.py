@@ -6,31 +6,27 @@ String is quoted text, a Binary is base64.
 
 from __future__ import annotations
 
-import base64
 import csv
 import io
-import math
 from collections.abc import Sequence
 from contextlib import suppress
-from itertools import chain
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
-import orjson
 from numpy.typing import NDArray
 
 from ..config.findings import Findings
 from ..files import Kept, open_alone
 from ..system.recording import Recording
-from ..variables.value_types import Value, VariableType, is_text
-from .lines import in_lines, prepare
+from ..variables.value_types import VariableType
+from .lines import lines_of
 
 __all__ = ["CsvFile"]
 
-_CHUNK_NUMBERS = 4096
-"""How much is formatted at once: more does not fit into the cache, and needs new memory from the system each time."""
+_CHUNK_NUMBERS = 16384
+"""How much is formatted at once: the text of more does not fit into the cache."""
 
 _BUFFER_BYTES = 1 << 16
 _READ_BYTES = 1 << 20
@@ -56,16 +52,12 @@ class CsvFile:
         self.path = path
         self.rows = 0
         self.kept = Kept()
-        self._has_text = any(is_text(type_) for _, type_ in columns)
-        self._is_float = all(type_ == "Float64" for _, type_ in columns)
         self._chunk_rows = max(1, _CHUNK_NUMBERS // (1 + len(columns)))
-        if not self._has_text:
-            prepare()
         self._file = open_alone(path)
         header = io.StringIO()
         csv.writer(header, lineterminator="\n").writerow(["time", *(name for name, _ in columns)])
-        self._waiting: list[bytes | memoryview] = [header.getvalue().encode()]
-        self._waiting_bytes = 0
+        self._header = header.getvalue().encode()  # it is written with the first rows
+        self._lines = lines_of([type_ for _, type_ in columns], self._chunk_rows, _BUFFER_BYTES)
 
     def __enter__(self) -> Self:
         return self
@@ -112,20 +104,18 @@ class CsvFile:
         """Append one row per time; ``columns`` are arrays of the same length, of their types' dtypes."""
         for first in range(0, len(times), self._chunk_rows):
             part = slice(first, first + self._chunk_rows)
-            chunk = [times[part], *(column[part] for column in columns)]
-            lines = self._format(chunk)
-            self._waiting.append(lines)
-            self._waiting_bytes += len(lines)
-            self.rows += len(chunk[0])
-            if self._waiting_bytes >= _BUFFER_BYTES:
+            self._lines.append([times[part], *(column[part] for column in columns)])
+            self.rows += len(times[part])
+            if self._lines.size >= _BUFFER_BYTES:
                 self.flush()
 
     def flush(self) -> None:
         """Give everything to the operating system, so that it is not lost if this process dies."""
-        if not self._waiting_bytes:
+        if not self._lines.size:
             return
-        left = memoryview(b"".join(self._waiting))
-        self._waiting, self._waiting_bytes = [], 0
+        left = self._lines.take()
+        if self._header:
+            left, self._header = memoryview(self._header + left), b""
         try:
             while left:
                 left = left[self._file.write(left) :]
@@ -147,27 +137,3 @@ class CsvFile:
             if self.path.is_file():
                 return self.keep_whole_rows(self.path, self.kept)
         return self.kept.rows
-
-    def _format(self, columns: Sequence[NDArray[Any]]) -> bytes | memoryview:
-        # JSON numbers also have the smallest number of digits, and orjson writes an array without Python objects.
-        if self._is_float:
-            values = np.stack(columns, axis=1)
-            if np.isfinite(values).all():
-                return in_lines(orjson.dumps(values.ravel(), option=orjson.OPT_SERIALIZE_NUMPY), len(columns))
-        rows = zip(*(column.tolist() for column in columns), strict=True)
-        if self._has_text or not all(np.isfinite(column).all() for column in columns):
-            return "".join(",".join(map(_text, row)) + "\n" for row in rows).encode()
-        return in_lines(orjson.dumps(list(chain.from_iterable(rows))), len(columns))
-
-
-def _text(value: Value) -> str:
-    """One value as text: `nan`, `inf`, `-inf` and strings are not as in JSON; all others are."""
-    match value:
-        case str():
-            return '"' + value.replace('"', '""') + '"'
-        case bytes():
-            return base64.b64encode(value).decode()
-        case float() if not math.isfinite(value):
-            return repr(value)
-        case _:
-            return orjson.dumps(value).decode()

@@ -1,105 +1,183 @@
-"""Makes lines of a CSV file from a JSON array of numbers: after a line's last number, the comma becomes a line end.
+"""Makes lines of a CSV file from columns: in C for numbers, in Python for texts and where the library is missing.
 
-orjson writes the numbers. With NumPy, finding the commas would take a third of the time of both steps. So a compiled
-function does it if llvmlite is available.
+Both write the same characters. A float has the smallest number of digits that gives the same bits when it is read.
 """
 
 from __future__ import annotations
 
+import base64
 import ctypes
-from collections.abc import Callable
+import math
+from collections.abc import Sequence
+from ctypes import c_int64, c_void_p
 from functools import cache
-from typing import Final, NamedTuple
+from itertools import chain
+from typing import Any, Final, Protocol
 
 import numpy as np
+import orjson
+from numpy.typing import NDArray
 
-from ..compiled import Compiled, compile_function
+from ..rings.library import load_library
+from ..rings.native import NUMBER_TYPES
+from ..variables.value_types import DTYPES, Value, VariableType, is_text
 
-__all__ = ["in_lines", "prepare"]
+__all__ = ["Lines", "NativeLines", "PythonLines", "lines_of"]
 
-_COMMA, _NEWLINE = b",\n"
-_BLOCK: Final = 64
+_VALUE_BYTES: Final = 25
+_END_BYTES: Final = 40
+_LEAST_POWER, _MOST_POWER, _EXPONENTS = -293, 325, 2047
+"""The sizes of the tables in `csv_rows.c`."""
 
-# 64 characters at a time: compare all with a comma, and go from one bit of the result to the next. The last block ends
-# where the text ends; what it has in common with the one before is masked out.
-_ENDS = f"""
-declare i64 @llvm.cttz.i64(i64, i1)
-
-define void @end_lines(ptr %text, i64 %size, i64 %width) {{
-start:
-  %last = sub i64 %size, {_BLOCK}
-  br label %block
-block:
-  %i = phi i64 [0, %start], [%following, %next]
-  %left = phi i64 [%width, %start], [%left_then, %next]
-  %is_last = icmp ugt i64 %i, %last
-  %first = select i1 %is_last, i64 %last, i64 %i
-  %known = sub i64 %i, %first
-  %place = getelementptr i8, ptr %text, i64 %first
-  %characters = load <{_BLOCK} x i8>, ptr %place, align 1
-  %equal = icmp eq <{_BLOCK} x i8> %characters, <{", ".join([f"i8 {_COMMA}"] * _BLOCK)}>
-  %commas = bitcast <{_BLOCK} x i1> %equal to i64
-  %without = lshr i64 %commas, %known
-  %new = shl i64 %without, %known
-  br label %look
-look:
-  %found = phi i64 [%new, %block], [%rest, %counted]
-  %left_then = phi i64 [%left, %block], [%left_now, %counted]
-  %is_over = icmp eq i64 %found, 0
-  br i1 %is_over, label %next, label %count
-count:
-  %fewer = sub i64 %left_then, 1
-  %ends = icmp eq i64 %fewer, 0
-  br i1 %ends, label %end, label %counted
-end:
-  %number = call i64 @llvm.cttz.i64(i64 %found, i1 true)
-  %comma = getelementptr i8, ptr %place, i64 %number
-  store i8 {_NEWLINE}, ptr %comma
-  br label %counted
-counted:
-  %left_now = phi i64 [%fewer, %count], [%width, %end]
-  %less = sub i64 %found, 1
-  %rest = and i64 %found, %less
-  br label %look
-next:
-  %following = add i64 %i, {_BLOCK}
-  %more = icmp ult i64 %following, %size
-  br i1 %more, label %block, label %done
-done:
-  ret void
-}}
-"""
+_COLUMN_FIELDS = 6
+"""A column in `csv_rows.c`: its address, stride, type; and three fields of its own."""
 
 
-def prepare() -> None:
-    """Compile the function that `in_lines` calls before the first row arrives; this takes some milliseconds."""
-    _compiled()
+class Lines(Protocol):
+    """The text of rows that are not in a file yet.
+
+    Attributes:
+        size: its number of bytes.
+    """
+
+    size: int
+
+    def append(self, columns: Sequence[NDArray[Any]]) -> None:
+        """Append a line for each row; ``columns`` are arrays of the same length, the times first."""
+
+    def take(self) -> memoryview:
+        """The text, which is valid until the next call of `append`; there is none left then."""
 
 
-def in_lines(numbers: bytes, width: int) -> memoryview:
-    """Lines with ``width`` numbers each, from a JSON array of at least one number."""
-    text = bytearray(numbers)
-    characters = np.frombuffer(text, dtype=np.uint8)
-    if len(text) >= _BLOCK and (compiled := _compiled()) is not None:
-        compiled.call(characters.ctypes.data, len(text), width)
-    else:
-        characters[np.flatnonzero(characters == _COMMA)[width - 1 :: width]] = _NEWLINE
-    characters[-1] = _NEWLINE
-    return memoryview(text)[1:]
+def lines_of(types: Sequence[VariableType], rows: int, size: int) -> Lines:
+    """What makes the lines of a file.
+
+    Args:
+        types: the types of the columns but the time.
+        rows: how many rows are appended at most at once, and only while there are fewer than ``size`` bytes.
+        size: see ``rows``.
+    """
+    if _native() is None or any(is_text(type_) for type_ in types):
+        return PythonLines(types)
+    return NativeLines(types, rows, size)
 
 
-class _EndLines(NamedTuple):
-    """``call(address of the text, its size, at least 64, numbers of a line)``, and where it is."""
+class PythonLines:
+    """Lines of values of all types, written by orjson and Python."""
 
-    call: Callable[[int, int, int], None]
-    code: Compiled
+    def __init__(self, types: Sequence[VariableType]) -> None:
+        self.size = 0
+        self._parts: list[bytes] = []
+        self._has_text = any(is_text(type_) for type_ in types)
+        self._is_float = all(type_ == "Float64" for type_ in types)
+
+    def append(self, columns: Sequence[NDArray[Any]]) -> None:
+        """Append a line for each row."""
+        lines = self._format(columns)
+        self._parts.append(lines)
+        self.size += len(lines)
+
+    def take(self) -> memoryview:
+        """The text so far."""
+        text = b"".join(self._parts)
+        self._parts, self.size = [], 0
+        return memoryview(text)
+
+    def _format(self, columns: Sequence[NDArray[Any]]) -> bytes:
+        # JSON numbers also have the smallest number of digits, and orjson writes an array without Python objects.
+        if self._is_float:
+            values = np.stack(columns, axis=1)
+            if np.isfinite(values).all():
+                return _in_lines(orjson.dumps(values.ravel(), option=orjson.OPT_SERIALIZE_NUMPY), len(columns))
+        rows = zip(*(column.tolist() for column in columns), strict=True)
+        if self._has_text or not all(np.isfinite(column).all() for column in columns):
+            return "".join(",".join(map(_text, row)) + "\n" for row in rows).encode()
+        return _in_lines(orjson.dumps(list(chain.from_iterable(rows))), len(columns))
+
+
+def _in_lines(numbers: bytes, width: int) -> bytes:
+    """Lines with ``width`` numbers each, from a JSON array: the comma after a line's last number becomes a line end."""
+    characters = np.frombuffer(numbers, dtype=np.uint8).copy()
+    characters[np.flatnonzero(characters == ord(","))[width - 1 :: width]] = ord("\n")
+    characters[-1] = ord("\n")
+    return characters[1:].tobytes()
+
+
+def _text(value: Value) -> str:
+    """One value as text: `nan`, `inf`, `-inf` and strings are not as in JSON; all others are."""
+    match value:
+        case str():
+            return '"' + value.replace('"', '""') + '"'
+        case bytes():
+            return base64.b64encode(value).decode()
+        case float() if not math.isfinite(value):
+            return repr(value)
+        case _:
+            return orjson.dumps(value).decode()
+
+
+class _Native:
+    """The function of `csv_rows.c`: ``rows(columns, number of columns, rows, tables, text)``; and its tables."""
+
+    def __init__(self, path: str) -> None:
+        library = ctypes.CDLL(path)
+        self.rows = ctypes.CFUNCTYPE(c_int64, c_void_p, c_int64, c_int64, c_void_p, c_void_p)(("csv_rows", library))
+        powers = (_power(n) for n in range(_LEAST_POWER, _MOST_POWER + 1))
+        halves = [half for power in powers for half in divmod(power, 2**64)]
+        self._tables = np.array(halves + [0, 0] * _EXPONENTS, dtype=np.uint64)
+        self.tables: int = self._tables.ctypes.data
+        ctypes.CFUNCTYPE(None, c_void_p)(("csv_prepare", library))(self.tables)
+
+
+def _power(exponent: int) -> int:
+    """The first 128 bits of a power of ten, rounded down."""
+    bits = 127 - math.floor(exponent * math.log2(10))
+    numerator, denominator = (10**exponent, 1) if exponent >= 0 else (1, 10**-exponent)
+    return (numerator << bits) // denominator if bits >= 0 else numerator >> -bits
 
 
 @cache
-def _compiled() -> _EndLines | None:
-    code = compile_function("end_lines", _ENDS)
-    if code is None:
-        return None
-    # It keeps the interpreter's lock: releasing and acquiring it takes longer than the call.
-    function = ctypes.PYFUNCTYPE(None, ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64)
-    return _EndLines(function(code.address), code)
+def _native() -> _Native | None:
+    path = load_library()
+    return _Native(path) if path is not None else None
+
+
+class NativeLines:
+    """Lines of numbers, written by `csv_rows.c` into memory that is used again and again.
+
+    New memory from the operating system would take as long as its text.
+    """
+
+    def __init__(self, types: Sequence[VariableType], rows: int, size: int) -> None:
+        native = _native()
+        if native is None:
+            msg = "there is no library for this platform"
+            raise OSError(msg)
+        all_types: tuple[VariableType, ...] = ("Float64", *types)
+        self.size = 0
+        self._native = native
+        self._dtypes = [np.dtype(DTYPES[type_]) for type_ in all_types]
+        self._columns = np.zeros((len(all_types), _COLUMN_FIELDS), np.int64)
+        self._columns_address: int = self._columns.ctypes.data
+        self._columns[:, 2] = [NUMBER_TYPES[type_] for type_ in all_types]
+        self._rows, self._limit = rows, size
+        self._text = np.empty(size + rows * len(all_types) * _VALUE_BYTES + _END_BYTES, np.uint8)
+        self._text_address: int = self._text.ctypes.data
+
+    def append(self, columns: Sequence[NDArray[Any]]) -> None:
+        """Append a line for each row."""
+        arrays = [np.asarray(column, dtype) for column, dtype in zip(columns, self._dtypes, strict=True)]
+        rows = len(arrays[0])
+        if any(array.shape != (rows,) for array in arrays) or self.size >= self._limit or rows > self._rows:
+            msg = f"{rows} rows after {self.size} bytes, in columns of shape {[array.shape for array in arrays]}"
+            raise ValueError(msg)  # the library would read or write beyond the end of an array
+        self._columns[:, 0] = [array.ctypes.data for array in arrays]
+        self._columns[:, 1] = [array.strides[0] for array in arrays]
+        end = self._text_address + self.size
+        self.size += self._native.rows(self._columns_address, len(arrays), rows, self._native.tables, end)
+
+    def take(self) -> memoryview:
+        """The text so far."""
+        text = self._text.data[: self.size]
+        self.size = 0
+        return text

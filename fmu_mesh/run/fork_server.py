@@ -162,6 +162,7 @@ class Forked:
         self.pid: int | None = None
         self._code: int | None = None
         self._orphaned = False
+        self._signal: int | None = None
         self._ended = threading.Event()
 
     def take(self, pid: int, code: int | None) -> None:
@@ -170,6 +171,8 @@ class Forked:
         self._code = code
         if code is not None:
             self._ended.set()
+        elif self._signal is not None:
+            self.send_signal(self._signal)
 
     def orphaned(self) -> None:
         """The server is gone. Nobody can tell the exit code any more, and the kernel asks this process to end."""
@@ -188,7 +191,8 @@ class Forked:
         return self._known_code()
 
     def send_signal(self, number: int) -> None:
-        """Send a signal if it still runs."""
+        """Send a signal if it still runs; if it has not started yet, at its start."""
+        self._signal = number
         if self.pid is not None and self.poll() is None:
             with suppress(ProcessLookupError):
                 os.kill(self.pid, number)

@@ -88,6 +88,7 @@ class Launcher:
         self._quiet = False
         self._ending = False
         self._signalled = False
+        self._server_killed = False
         self._interrupted_at: float | None = None
 
     def run(self) -> Outcome:
@@ -143,7 +144,8 @@ class Launcher:
 
     def _watch(self, name: str, process: Process, on_line: Callable[[bytes], None], *, limited: bool = False) -> None:
         self._processes[name] = child = Child(name, process, self._happened.put)
-        child.watch(on_line, self._take_output, self._take_exit, limited=limited)
+        on_exit = self._take_exit if name != _SERVER else self._take_exit_of_server
+        child.watch(on_line, self._take_output, on_exit, limited=limited)
 
     # --- what happens; all of it on the thread that called `run`
 
@@ -204,14 +206,18 @@ class Launcher:
     def _take_exit(self, name: str, code: int) -> None:
         if not self._signalled:  # afterwards the signal is the reason
             self._how[name] = how_it_ended(code)
-            if name == _SERVER and code != 0:  # also when the master has reported what that means for it
-                self._lost.insert(0, (name, code, time.monotonic()))
-        if self._ending or name == _SERVER:
+        if self._ending:
             return
         if self._outcome is None and (code != 0 or name == _MASTER):
             self._lost.append((name, code, time.monotonic()))
         elif name == _GATEWAY:
             self._gateway_ended = time.monotonic()
+
+    def _take_exit_of_server(self, name: str, code: int) -> None:
+        """The server ends after all others. Otherwise it is lost, whatever the master reports of what that means."""
+        if code != 0 and not self._server_killed:
+            self._how[name] = how_it_ended(code)
+            self._lost.insert(0, (name, code, time.monotonic()))
 
     def _interrupt(self) -> None:
         master = self._processes.get(_MASTER)
@@ -249,8 +255,9 @@ class Launcher:
         if self._outcome is not None and self._outcome.error is None:  # the gateway may still have samples for ROS
             patience = self._timeouts.stop
         grace_s = _KILL_S if self._interrupted_at is None else 0.3
+        server = [process for process in self._processes.values() if process.name == _SERVER]
         for step in (None, signal.SIGTERM, signal.SIGKILL):
-            running = [process for process in self._processes.values() if process.running]
+            running = [process for process in self._processes.values() if process.running and process not in server]
             if not running:
                 break
             if step is not None:
@@ -258,6 +265,11 @@ class Launcher:
                 for process in running:
                     process.signal(step)
             self._wait_for_end(running, patience if step is None else grace_s)
+        self._wait_for_end(server, grace_s)
+        for process in server:
+            self._server_killed = process.running
+            process.signal(signal.SIGKILL)
+        self._wait_for_end(server, grace_s)
         self._close_all()
 
     def _wait_for_end(self, running: list[Child], timeout_s: float) -> None:

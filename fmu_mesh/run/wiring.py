@@ -46,6 +46,9 @@ def wiring(config: ZenohConfig, config_file: Path, folder: Path, process: str, p
         # Peers on other hosts learn about each other by gossip.
         gossip=bool(config.connect or config.listen),
         config=base,
+        # Processes of one host start at the same time, so one of two that connect is not there yet. Each waits for the
+        # others later: it registers, and says hello.
+        waits=bool(config.connect),
     )
 
 

@@ -77,6 +77,7 @@ class Wiring(msgspec.Struct, frozen=True):
         gossip: whether peers find each other through other peers (meshes over several hosts).
         config: a Zenoh configuration file to start from.
         patience_s: how long a client tries to connect, in s.
+        waits: whether opening the session waits, half a second at most, for the processes that it connects to.
     """
 
     mode: str = "peer"
@@ -85,6 +86,7 @@ class Wiring(msgspec.Struct, frozen=True):
     gossip: bool = False
     config: Path | None = None
     patience_s: float = 20.0
+    waits: bool = True
 
 
 def open_session(wiring: Wiring) -> zenoh.Session:
@@ -133,6 +135,7 @@ def _configuration(wiring: Wiring) -> zenoh.Config:
         "connect/timeout_ms": -1 if wiring.mode == "peer" else round(1000 * wiring.patience_s),
         "connect/retry": {"period_init_ms": 20, "period_max_ms": 250, "period_increase_factor": 1.5},
         "listen/exit_on_failure": True,
+        "open/return_conditions/connect_scouted": wiring.waits,
         "transport/link/tx/lease": LEASE_MS,
         "transport/link/tx/queue/congestion_control/block/wait_before_close": STUCK_US,
         # A slow subscriber must not delay other messages on its link: its samples are dropped at once (the default is

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 
-from tests.helpers import FMUS, Place
-
-CONFIG = FMUS.parent / "configs" / "pendulum_delay.yaml"
+from tests.helpers import Place, write_config
 
 COUNTING = """
 import os, sys
@@ -17,24 +15,27 @@ def note(event, arguments):
     if event == "open" and isinstance(arguments[0], (str, bytes)):
         name = os.path.basename(os.fsdecode(arguments[0]))
         if name.endswith((".fmu", ".yaml")):
-            os.write(log, f"{' '.join(sys.argv[1:4:2])} {name}\\n".encode())
+            os.write(log, f"{' '.join(sys.argv[1:2])} {name}\\n".encode())
 
 sys.addaudithook(note)
 """
 
 
-def test_a_launch_opens_the_configuration_once_and_each_fmu_once_per_process_that_runs_it(place: Place) -> None:
+def test_a_launch_opens_the_configuration_once_and_each_fmu_once_to_plan_and_once_for_all_nodes(place: Place) -> None:
     opened = place.folder / "opened.txt"
     (place.folder / "sitecustomize.py").write_text(COUNTING)
     place.environment = {**place.environment, "PYTHONPATH": str(place.folder), "OPENED_FILES": str(opened)}
 
-    launched = place.run("launch", CONFIG, "--output", place.folder / "result.csv")
+    gains = {f"gain_{number}": {"fmu": "Gain"} for number in range(4)}
+    config = write_config(place.folder, instances={"pendulum": {"fmu": "DampedPendulum"}, **gains}, connections=[])
 
-    assert "20000 points in" in launched.output
+    launched = place.run("launch", config)
+
+    assert "1000 points in" in launched.output
     assert Counter(opened.read_text().splitlines()) == {
-        "launch --output pendulum_delay.yaml": 1,
-        "launch --output DampedPendulum.fmu": 1,
-        "launch --output TransportDelay.fmu": 1,
-        "node pendulum DampedPendulum.fmu": 1,
-        "node delay TransportDelay.fmu": 1,
+        "launch pair.yaml": 1,
+        "launch DampedPendulum.fmu": 1,
+        "launch Gain.fmu": 1,
+        "forks DampedPendulum.fmu": 1,
+        "forks Gain.fmu": 1,
     }

@@ -206,9 +206,9 @@ def test_a_process_that_is_stopped_before_it_has_met_the_others_is_named_long_be
     if victim == "gateway":
         sections["ros"] = {"profile": "ros2dds", "distribution": "jazzy"}
     config = write_config(place.folder, stop_time=FAR_S, **sections)  # type: ignore[arg-type]  # they are sections
-    launched = place.start("launch", config)
+    place.hold({"pendulum": "node pendulum"}.get(victim, f"{victim} pair"))
 
-    launched.child(victim).suspend()
+    launched = place.start("launch", config)
 
     assert launched.wait(30.0) == 4
     who = {"pendulum": "node 'pendulum'", "master": "the master", "gateway": "the gateway to ROS"}[victim]
@@ -218,9 +218,9 @@ def test_a_process_that_is_stopped_before_it_has_met_the_others_is_named_long_be
 
 def test_a_process_that_goes_on_in_time_is_not_lost(place: Place) -> None:
     config = write_config(place.folder)
+    place.hold("node pendulum")
     launched = place.start("launch", config)
     child = launched.child("pendulum")
-    child.suspend()
     wait_until(lambda: child.status() == psutil.STATUS_STOPPED, "a stopped node")
     place.note()
 
@@ -380,10 +380,13 @@ def test_a_process_that_is_stopped_is_noticed_after_its_lease_and_does_not_stay(
 
 def test_a_run_that_is_over_before_its_launcher_looks_is_a_run_like_any_other(place: Place) -> None:
     config = write_config(place.folder, stop_time=0.1)
+    place.hold("node pendulum")
     launched = place.start("launch", config)
-    children = [launched.child(role) for role in ("master", "pendulum", "delay")]
+    children = [launched.child(role) for role in ("master", "delay", "pendulum")]
     launcher = psutil.Process(launched.pid)
     launcher.suspend()
+    wait_until(lambda: children[-1].status() == psutil.STATUS_STOPPED, "a stopped node")
+    children[-1].resume()
     wait_until(lambda: all(child.status() == psutil.STATUS_ZOMBIE for child in children), "the end of the processes")
 
     launcher.resume()

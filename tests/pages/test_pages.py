@@ -284,6 +284,16 @@ NOT_RUN = [
     ),
     ("docs/performance.md", "make bench", "it takes 20 minutes, and figures of a busy machine mean nothing"),
     (
+        "docs/profiling.md",
+        "$ pgrep -af '^fmu-mesh'",
+        "it lists the processes of all meshes of this host; tests/faults/test_fork_server.py reads the titles",
+    ),
+    (
+        "docs/profiling.md",
+        "PID=$(pgrep -f '^fmu-mesh node pendulum$')",
+        "it needs perf and gdb, and may need root; tests/faults/test_fork_server.py attaches py-spy",
+    ),
+    (
         "docs/ros-node.md",
         "source /opt/ros/jazzy/setup.bash",
         "it needs a ROS with its commands; tests/ros/test_node.py starts this node and switches it",

@@ -15,7 +15,7 @@ import pytest
 from fmu_mesh.cli.main import COMMANDS, main
 
 ROUNDS = 15
-HEAVY = {"numpy", "zenoh", "rich", "fmpy", "lxml", "ruamel", "llvmlite", "logging", "matplotlib", "argcomplete"}
+HEAVY = {"numpy", "zenoh", "rich", "fmpy", "lxml", "ruamel", "logging", "matplotlib", "argcomplete"}
 
 
 def imported(*arguments: str) -> set[str]:

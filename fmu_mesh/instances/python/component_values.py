@@ -48,8 +48,8 @@ def reader(ring: Ring, variable: Variable) -> Callable[[int], Any]:
         return lambda slot: part[slot, first:end].reshape(shape).copy()
     if variable.type != "Float64":
         return lambda slot: part.item(slot, first)
-    width, memory = part.shape[1], _memory(part)
-    return lambda slot: memory[slot * width + first]
+    memory = _memory(part)
+    return lambda slot: memory[slot, first]
 
 
 def writer(ring: Ring, variable: Variable) -> Callable[[int, object], None]:
@@ -77,10 +77,10 @@ def writer(ring: Ring, variable: Variable) -> Callable[[int, object], None]:
 
         return write_scalar
 
-    width, memory = part.shape[1], _memory(part)
+    memory = _memory(part)
 
     def write_float(slot: int, attribute: object) -> None:
-        memory[slot * width + first] = attribute if attribute.__class__ is float else _scalar(attribute, variable)
+        memory[slot, first] = attribute if attribute.__class__ is float else _scalar(attribute, variable)
 
     return write_float
 
@@ -95,8 +95,8 @@ def _exact(variable: Variable) -> tuple[type, Container[object]]:
 
 
 def _memory(part: Any) -> Any:  # noqa: ANN401 an array, and a view of its memory
-    """The numbers of an array one after the other: indexing this takes half the time of indexing numpy."""
-    return part.reshape(-1).data
+    """The numbers of an array by row and column: indexing this takes half the time of indexing numpy."""
+    return part.data
 
 
 def _scalar(attribute: object, variable: Variable) -> Value:

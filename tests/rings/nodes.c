@@ -1,0 +1,323 @@
+/* Nodes of `burst.c` over one memory, as threads of this process or as processes that are killed: for sanitizers, for
+ * lost wake-ups, and for the cost of the loop itself. docs/rings.md says what is checked.
+ *
+ *   nodes SHAPE NODES WINDOW POINTS SECONDS MODE
+ *
+ *   SHAPE   chain: each node reads the one before it at the same point. cycle: the first also reads the last, one point
+ *           before. jacobi: a cycle in which all read one point before
+ *   MODE    quiet: threads, nothing else happens. disturbed: a master that grants little, attention, bells that nobody
+ *           needs, needs that a killed sleeper has left. killed: processes, killed at random moments and started again
+ *
+ * Runs of POINTS points follow each other for SECONDS. The rings are as small as the window allows. Each float is
+ * compared with those of a plain loop. Prints `runs R late L wrong W us U best B`: lost wake-ups, runs with a wrong
+ * value, median and least time per point. Ends with code 1 if something is wrong, and by a signal if a run stops. */
+#ifndef BURST
+#define BURST "../../fmu_mesh/rings/burst.c"
+#endif
+#include BURST
+
+#include <math.h>
+#include <pthread.h>
+#include <signal.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <sys/mman.h>
+#include <sys/prctl.h>
+#include <sys/wait.h>
+
+enum { MAX_NODES = 16, ROW_BYTES = 16, MAX_RUNS = 1 << 16 };
+
+typedef struct { /* y(k+1) of a model depends on all its inputs until then, in every bit */
+  double u, y;
+} Model;
+
+static int set_real(void *model, const void *references, size_t n, void *values) {
+  (void)references, (void)n;
+  memcpy(&((Model *)model)->u, values, 8);
+  return 0;
+}
+
+static int do_step(void *instance, double time, double step_size, int no_set_state) {
+  (void)step_size, (void)no_set_state;
+  Model *model = instance;
+  double y = model->y * 1.618033988749895 + model->u * 0.7071067811865476 + time;
+  model->y = y - (double)(int64_t)y;
+  return 0;
+}
+
+static int get_real(void *model, const void *references, size_t n, void *values) {
+  (void)references, (void)n;
+  memcpy(values, &((Model *)model)->y, 8);
+  return 0;
+}
+
+/* ---- the memory */
+
+static int64_t n_nodes, window, points, rows, is_chain, is_jacobi;
+static char *memory;
+static double expected[MAX_NODES]; /* the last row of each node */
+static double times[MAX_RUNS];     /* of the runs, in us per point */
+
+static size_t counter_bytes(void) { return (size_t)(64 + (8 * (n_nodes + 1) + 63) / 64 * 64); }
+static Bell *bells(void) { return (Bell *)(void *)memory; }
+static Counter *counter_at(int64_t i) {
+  return (Counter *)(void *)(memory + 64 * (size_t)(n_nodes + 1) + counter_bytes() * (size_t)i);
+}
+static Counter *rows_of(int64_t i) { return counter_at(i); }
+static Counter *progress_of(int64_t i) { return counter_at(n_nodes + i); }
+static Counter *ceiling(void) { return counter_at(2 * n_nodes); }
+static char *ring_of(int64_t i) { return (char *)counter_at(2 * n_nodes + 1) + rows * ROW_BYTES * i; }
+static size_t memory_bytes(void) {
+  return (size_t)(64 * (n_nodes + 1) + rows * ROW_BYTES * n_nodes) + counter_bytes() * (size_t)(2 * n_nodes + 1);
+}
+
+static double start_of(int64_t i) { return 0.1 + 0.05 * (double)i; }
+static int64_t source_of(int64_t i) { return i > 0 ? i - 1 : is_chain ? -1 : n_nodes - 1; }
+static int64_t lead_of(int64_t i) { return is_jacobi || i == 0 ? 0 : 1; }
+
+static void prepare(int64_t granted_points) {
+  memset(memory, 0, memory_bytes());
+  for (int64_t i = 0; i < 2 * n_nodes + 1; i++) {
+    atomic_store(&counter_at(i)->wake_at, NEVER);
+    atomic_store(&counter_at(i)->value, i < 2 * n_nodes ? 1 : granted_points);
+  }
+  for (int64_t i = 0; i < n_nodes; i++) {
+    double y = start_of(i);
+    memcpy(ring_of(i) + 8, &y, 8);
+    atomic_store(stamp_of(ring_of(i), ROW_BYTES, rows - 1, 0), 1);
+  }
+}
+
+static void compute_expected(void) {
+  Model models[MAX_NODES] = {0};
+  double before[MAX_NODES];
+  for (int64_t i = 0; i < n_nodes; i++) models[i].y = start_of(i);
+  for (int64_t k = 0; k < points; k++) {
+    for (int64_t i = 0; i < n_nodes; i++) before[i] = models[i].y;
+    for (int64_t i = 0; i < n_nodes; i++) {
+      int64_t source = source_of(i);
+      if (source >= 0) models[i].u = lead_of(i) ? models[source].y : before[source];
+      do_step(&models[i], (double)k, 1.0, 1);
+    }
+  }
+  for (int64_t i = 0; i < n_nodes; i++) expected[i] = models[i].y;
+}
+
+/* Whether all nodes have come to the end, with the right value. */
+static int is_right(void) {
+  for (int64_t i = 0; i < n_nodes; i++)
+    if (value_of(rows_of(i)) != points + 1 || value_of(progress_of(i)) != points + 1 ||
+        memcmp(ring_of(i) + (points & (rows - 1)) * ROW_BYTES + 8, &expected[i], 8) != 0)
+      return 0;
+  return 1;
+}
+
+/* ---- a node */
+
+typedef struct {
+  int64_t own;
+  Node node;
+  Unit unit;
+  Member member;
+  Gate gate;
+  Peer peers[1];
+  Move load;
+  Call setter, getter;
+  Said said;
+  Model model;
+  double input;
+  char *bases[FIRST_GATE + 1];
+  uint64_t random;
+  int64_t is_disturbed;
+} Participant;
+
+static uint64_t draw(uint64_t *state) {
+  *state ^= *state << 13, *state ^= *state >> 7, *state ^= *state << 17;
+  return *state;
+}
+
+/* A node that goes on where its ring ends. */
+static void set_up(Participant *p, int64_t own, int64_t wait_ns, int64_t spins) {
+  int64_t source = source_of(own), step = value_of(rows_of(own)) - 1, readers = is_chain && own == n_nodes - 1 ? 0 : 1;
+  memset(p, 0, sizeof *p);
+  p->own = own;
+  memcpy(&p->model.y, ring_of(own) + (step & (rows - 1)) * ROW_BYTES + 8, 8);
+  if (source >= 0) {
+    p->gate = (Gate){.counter = rows_of(source), .rows = ring_of(source), .stride = ROW_BYTES, .mask = rows - 1,
+                     .lead = lead_of(own), .points = 1};
+    p->load = (Move){.from_base = FIRST_GATE, .from = 8, .to_base = FIXED, .to = (int64_t)(uintptr_t)&p->input, .count = 1};
+    p->setter = (Call){(void *)set_real, NULL, 1, FIXED, (int64_t)(uintptr_t)&p->input, -1};
+  }
+  p->getter = (Call){(void *)get_real, NULL, 1, OUTPUT, 8, -1};
+  p->said.quiet_until = HUGE_VAL;
+  p->member = (Member){.gates = &p->gate, .loads = &p->load, .setters = &p->setter, .getters = &p->getter,
+                       .n_gates = source >= 0, .n_loads = source >= 0, .n_setters = source >= 0, .n_getters = 1,
+                       .kind = FMI2, .component = &p->model, .do_step = (void *)do_step, .said = &p->said,
+                       .base_step_size = 1.0, .step_size = 1.0, .points = 1, .every = 1, .last_step = points,
+                       .outputs = {{ring_of(own), ROW_BYTES, rows - 1}}, .counter = rows_of(own), .bases = p->bases,
+                       .step = step};
+  p->member.outputs[1] = p->member.outputs[0];
+  p->unit = (Unit){.members = &p->member, .n_members = 1, .tick_points = 1, .last_tick = points, .tick = step, .burst = 1};
+  p->peers[0] = (Peer){progress_of((own + 1) % n_nodes), window};
+  p->node = (Node){.place = {bells(), n_nodes + 1, own}, .units = &p->unit, .n_units = 1, .peers = p->peers,
+                   .n_peers = readers, .ceiling = ceiling(), .progress = progress_of(own), .last_point = points,
+                   .slice_ns = 1000000, .wait_ns = wait_ns, .spins = spins};
+}
+
+/* What a sleeper leaves that was killed. */
+static void leave_need(Participant *p) {
+  Counter *counter = draw(&p->random) & 1 ? rows_of((p->own + 1) % n_nodes) : ceiling();
+  int64_t need = value_of(counter) + (int64_t)(draw(&p->random) % 4);
+  if (need < 1) return;
+  atomic_store(&counter->needs[p->own], need);
+  lower(&counter->wake_at, need);
+}
+
+static void *run_node(void *argument) {
+  Participant *p = argument;
+  for (;;) {
+    int64_t result = node_run(&p->node);
+    if (result == DONE) return NULL;
+    if (result != SLICE && result != ATTENTION && result != BLOCKED) abort();
+    if (result == ATTENTION) node_attended(&p->node);
+    if (p->is_disturbed) leave_need(p);
+  }
+}
+
+/* ---- a master, and somebody who disturbs */
+
+static uint64_t seed = 88172645463325252u;
+static _Atomic int64_t is_over;
+static int64_t master_late;
+static Participant participants[MAX_NODES];
+
+static void *run_master(void *argument) {
+  const Place place = {bells(), n_nodes + 1, n_nodes};
+  const int64_t ahead = *(int64_t *)argument;
+  for (int64_t known = 0; known < points;) {
+    uint32_t seen = bell_seen(&place);
+    Wish wish = {NULL, 0};
+    known = points;
+    for (int64_t i = 0; i < n_nodes; i++)
+      if (value_of(progress_of(i)) - 1 < known) {
+        known = value_of(progress_of(i)) - 1;
+        wish = (Wish){progress_of(i), known + 2};
+      }
+    counter_raise(&place, ceiling(), known + ahead < points ? known + ahead : points);
+    if (known < points) sleep_for(&place, seen, &wish, 1, 1000000000, &master_late);
+  }
+  return NULL;
+}
+
+static void *disturb(void *argument) {
+  uint64_t random = *(uint64_t *)argument;
+  while (!atomic_load(&is_over)) {
+    Participant *p = &participants[draw(&random) % (uint64_t)n_nodes];
+    if (draw(&random) & 1)
+      node_attend(&p->node);
+    else
+      ring_bell(&bells()[p->own]);
+    struct timespec pause = {0, (long)(draw(&random) % 200000)};
+    nanosleep(&pause, NULL);
+  }
+  return NULL;
+}
+
+static int run_threads(int is_disturbed, int64_t *late) {
+  pthread_t threads[MAX_NODES], master, disturber;
+  int64_t ahead = 1 + (int64_t)(draw(&seed) % 200);
+  uint64_t random = draw(&seed);
+  prepare(is_disturbed ? 0 : points);
+  atomic_store(&is_over, 0);
+  for (int64_t i = 0; i < n_nodes; i++) {
+    set_up(&participants[i], i, 1000000000, draw(&seed) % 4 != 0);
+    participants[i].random = draw(&seed);
+    participants[i].is_disturbed = is_disturbed;
+  }
+  for (int64_t i = 0; i < n_nodes; i++) pthread_create(&threads[i], NULL, run_node, &participants[i]);
+  if (is_disturbed) {
+    pthread_create(&master, NULL, run_master, &ahead);
+    pthread_create(&disturber, NULL, disturb, &random);
+  }
+  for (int64_t i = 0; i < n_nodes; i++) {
+    pthread_join(threads[i], NULL);
+    *late += participants[i].node.late;
+  }
+  if (is_disturbed) {
+    atomic_store(&is_over, 1);
+    pthread_join(master, NULL);
+    pthread_join(disturber, NULL);
+    *late += master_late;
+    master_late = 0;
+  }
+  return is_right();
+}
+
+/* ---- processes that are killed */
+
+static pid_t start_process(int64_t own) {
+  pid_t pid = fork();
+  if (pid != 0) return pid;
+  prctl(PR_SET_PDEATHSIG, SIGKILL);
+  set_up(&participants[own], own, 20000000, 1);
+  run_node(&participants[own]);
+  _exit(0);
+}
+
+/* Kills 20 times or more, and then lets all come to their end. */
+static int run_processes(int64_t *kills) {
+  pid_t pids[MAX_NODES];
+  int64_t alive = n_nodes, budget = 20;
+  prepare(points);
+  for (int64_t i = 0; i < n_nodes; i++) pids[i] = start_process(i);
+  while (alive > 0) {
+    struct timespec pause = {0, (long)(draw(&seed) % 3000000)};
+    nanosleep(&pause, NULL);
+    int64_t victim = (int64_t)(draw(&seed) % (uint64_t)n_nodes);
+    if (budget > 0 && pids[victim] != 0) kill(pids[victim], SIGKILL);
+    for (int64_t i = 0; i < n_nodes; i++) {
+      int status;
+      if (pids[i] == 0 || waitpid(pids[i], &status, WNOHANG) != pids[i]) continue;
+      if (WIFSIGNALED(status) && WTERMSIG(status) != SIGKILL) abort();
+      if (WIFSIGNALED(status)) {
+        budget--, *kills += 1;
+        pids[i] = start_process(i);
+      } else {
+        pids[i] = 0, alive--;
+      }
+    }
+  }
+  return is_right();
+}
+
+static int by_size(const void *a, const void *b) {
+  double difference = *(const double *)a - *(const double *)b;
+  return (difference > 0) - (difference < 0);
+}
+
+int main(int n, char **arguments) {
+  if (n != 7) return 2;
+  is_chain = strcmp(arguments[1], "chain") == 0;
+  is_jacobi = strcmp(arguments[1], "jacobi") == 0;
+  n_nodes = atoll(arguments[2]), window = atoll(arguments[3]), points = atoll(arguments[4]);
+  const int64_t seconds = atoll(arguments[5]), is_killed = strcmp(arguments[6], "killed") == 0;
+  const int64_t end = now() + seconds * 1000000000;
+  if (n_nodes < 2 || n_nodes > MAX_NODES || window < 1) return 2;
+  for (rows = 1; rows < window + 1; rows *= 2) continue;
+  memory = mmap(NULL, memory_bytes(), PROT_READ | PROT_WRITE, MAP_SHARED | MAP_ANONYMOUS, -1, 0);
+  if (memory == MAP_FAILED) return 2;
+  compute_expected();
+  int64_t runs = 0, late = 0, wrong = 0, kills = 0;
+  alarm((unsigned)seconds + 120);
+  do {
+    int64_t begin = now();
+    wrong += !(is_killed ? run_processes(&kills) : run_threads(strcmp(arguments[6], "disturbed") == 0, &late));
+    times[runs++] = (double)(now() - begin) / 1e3 / (double)points;
+  } while (now() < end && runs < MAX_RUNS);
+  qsort(times, (size_t)runs, 8, by_size);
+  printf("runs %lld late %lld wrong %lld us %.3f best %.3f", (long long)runs, (long long)late, (long long)wrong,
+         times[runs / 2], times[0]);
+  if (is_killed) printf(" kills %lld", (long long)kills);
+  printf("\n");
+  return late > 0 || wrong > 0;
+}

@@ -1,0 +1,116 @@
+"""The burst in many threads or processes over one memory: `nodes.c`, which has `burst.c` in it.
+
+``FMU_MESH_BURST_SECONDS`` is how long each job runs; without it 1 s. `.ci/long tsan` runs them for longer.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+HERE = Path(__file__).parent
+BURST = HERE.parents[1] / "fmu_mesh/rings/burst.c"
+SECONDS = int(os.environ.get("FMU_MESH_BURST_SECONDS", "1"))
+SANITIZERS = {"": ["-O2"], "thread": ["-O1", "-g"], "address,undefined": ["-O1", "-g", "-fno-sanitize-recover=all"]}
+
+Job = tuple[str, int, int]
+"""Shape, number of nodes, and window."""
+JOBS: list[Job] = [
+    ("chain", 2, 1),
+    ("chain", 8, 64),
+    ("cycle", 2, 64),
+    ("jacobi", 4, 3),
+    ("cycle", 4, 2),
+    ("cycle", 8, 1),
+]
+
+Build = Callable[[str, Path], Path]
+
+
+@pytest.fixture(scope="module")
+def build(tmp_path_factory: pytest.TempPathFactory) -> Build:
+    """Builds `nodes.c` with a sanitizer, and with a text of `burst.c`; each only once."""
+    compiler = shutil.which("gcc") or shutil.which("clang")
+    if compiler is None:
+        pytest.skip("there is no C compiler")
+    built: dict[tuple[str, Path], Path] = {}
+
+    def build(sanitizer: str, burst: Path) -> Path:
+        if (sanitizer, burst) not in built:
+            program = tmp_path_factory.mktemp("nodes") / "nodes"
+            options = [*SANITIZERS[sanitizer], *([f"-fsanitize={sanitizer}"] if sanitizer else [])]
+            command = [compiler, "-std=c11", "-ffp-contract=off", "-pthread", *options, f'-DBURST="{burst}"']
+            made = subprocess.run(
+                [*command, HERE / "nodes.c", "-o", program, "-lm"], capture_output=True, text=True, check=False
+            )
+            if sanitizer and "cannot find" in made.stderr:
+                pytest.skip(f"the compiler has no -fsanitize={sanitizer}")
+            assert made.returncode == 0, made.stderr
+            built[sanitizer, burst] = program
+        return built[sanitizer, burst]
+
+    return build
+
+
+def run(program: Path, job: Job, points: int, mode: str, seconds: int = SECONDS) -> subprocess.CompletedProcess[str]:
+    command = [str(program), *map(str, job), str(points), str(seconds), mode]
+    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=seconds + 150)
+
+
+@pytest.mark.parametrize("mode", ["quiet", "disturbed"])
+@pytest.mark.parametrize("job", JOBS, ids=str)
+def test_every_float_is_that_of_a_plain_loop_and_no_wake_up_is_lost(build: Build, job: Job, mode: str) -> None:
+    done = run(build("", BURST), job, 500, mode)
+
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert " late 0 wrong 0 " in done.stdout
+
+
+@pytest.mark.parametrize("sanitizer", ["thread", "address,undefined"])
+@pytest.mark.parametrize("job", JOBS, ids=str)
+def test_a_sanitizer_finds_nothing(build: Build, job: Job, sanitizer: str) -> None:
+    done = run(build(sanitizer, BURST), job, 200, "disturbed")
+
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert " wrong 0 " in done.stdout
+    assert not done.stderr
+
+
+@pytest.mark.parametrize("job", [("chain", 3, 4), ("cycle", 3, 4)], ids=str)
+def test_processes_that_are_killed_at_any_moment_go_on_where_their_rings_end(build: Build, job: Job) -> None:
+    done = run(build("", BURST), job, 20_000, "killed")
+
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert int(done.stdout.split()[-1]) >= 20
+
+
+def changed(folder: Path, old: str, new: str) -> Path:
+    """A copy of `burst.c` with another line."""
+    text = BURST.read_text()
+    assert text.count(old) == 1
+    copy = folder / "burst.c"
+    copy.write_text(text.replace(old, new))
+    return copy
+
+
+def test_a_lost_wake_up_would_be_found(build: Build, tmp_path: Path) -> None:
+    burst = changed(tmp_path, "ring_bell(&place->bells[process]);", "(void)process;")
+
+    done = run(build("", burst), ("cycle", 4, 2), 3, "quiet")
+
+    assert done.returncode == 1
+    assert " late 0 " not in done.stdout
+
+
+def test_a_race_would_be_found(build: Build, tmp_path: Path) -> None:
+    line = "atomic_store_explicit(&counter->value, value, memory_order_release);\n  wake_if_needed"
+    burst = changed(tmp_path, line, line.replace("release", "relaxed"))
+
+    done = run(build("thread", burst), ("chain", 2, 4), 2000, "quiet")
+
+    assert "WARNING: ThreadSanitizer: data race" in done.stderr
