@@ -14,6 +14,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -49,7 +50,7 @@ def memory() -> Iterator[HostMemory]:
     made.close()
 
 
-def opened(memory: HostMemory, process: str, map_: MemoryMap = MAP, **changes: object) -> HostMemory | None:
+def opened(memory: HostMemory, process: str, map_: MemoryMap = MAP, **changes: Any) -> HostMemory | None:
     return HostMemory.opened(replace(memory.offer, **changes), map_, process)
 
 
@@ -327,7 +328,7 @@ def test_without_the_library_threads_wake_one_another(monkeypatch: pytest.Monkey
     assert not host_memory.can_share()
     for wake in (memory.ring_bell, memory.ring_bell):
         seen = memory.seen()
-        sleeper = threading.Thread(target=lambda seen=seen: memory.sleep(seen, LONG_S))  # type: ignore[misc] # a default
+        sleeper = threading.Thread(target=lambda seen=seen: memory.sleep(seen, LONG_S))
         sleeper.start()
         wake()
         sleeper.join(LONG_S / 2)

@@ -105,7 +105,7 @@ class EngineMesh:
         """
         chance = random.Random(seed)  # noqa: S311 no secret
         acts: list[Callable[[], object]] = [
-            *(lambda engine=engine: engine.run(0.0, eager=chance.random() < 0.5) for engine in self.engines.values()),  # type: ignore[misc] # a default
+            *(lambda engine=engine: engine.run(0.0, eager=chance.random() < 0.5) for engine in self.engines.values()),
             lambda: self.grant(chance.randint(1, 20)),
             *([self.record] if self._records else []),
         ]
