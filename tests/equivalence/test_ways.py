@@ -9,11 +9,11 @@ from pathlib import Path
 
 import pytest
 import yaml
+from fmu_mesh.wire.shared_memory import available
 
 from fmu_mesh.run.local import LocalMesh
 from fmu_mesh.run.options import Options
 from fmu_mesh.run.preparing import prepare
-from fmu_mesh.wire.shared_memory import available
 from tests.equivalence.test_equivalence import CHAIN, CYCLE, GAUSS_SEIDEL, JACOBI, PENDULUM, rewritten, shortened
 from tests.helpers import Place, wait_until, write_config
 
