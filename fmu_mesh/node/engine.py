@@ -19,7 +19,7 @@ from ..instances.call_guard import floating_point_changed, restore_floating_poin
 from ..instances.contract import StepsNatively
 from ..rings import native
 from ..rings.host_memory import HostMemory
-from ..rings.native import Base, Kind, Result, Stage, table
+from ..rings.native import BurstEnd, RowBase, Stage, StepKind, table
 from ..system.plan import NodePlan
 from .stepping import Position, Runner
 
@@ -119,10 +119,10 @@ class BurstEngine(Engine):
         assert native.library is not None
         self._library = native.library
         self._kept: dict[int, list[object]] = {}
-        self._members = [(native.Member * len(unit))() for unit in units]
-        self._units = table(native.Unit, [self._unit(number) for number in range(len(units))])
+        self._members = [(native.MemberTable * len(unit))() for unit in units]
+        self._units = table(native.UnitTable, [self._unit(number) for number in range(len(units))])
         self._peers = table(native.Peer, [native.Peer(counter.address, window) for counter, window in self._windows])
-        self._node = native.Node(
+        self._node = native.NodeTable(
             place=memory.place,
             units=self._units,
             n_units=len(units),
@@ -146,10 +146,10 @@ class BurstEngine(Engine):
         started, before = perf_counter(), self._ticks
         while True:
             result = library.run(self._address)
-            if result < Result.PYTHON:
+            if result < BurstEnd.PYTHON:
                 break
             runner, member = self._at(node.unit, node.member)
-            if result == Result.FORGED:
+            if result == BurstEnd.FORGED:
                 raise self._forged(runner)
             began = perf_counter()
             self._complete(node.unit, runner, member, result)
@@ -186,15 +186,15 @@ class BurstEngine(Engine):
     def _ticks(self) -> int:
         return sum(runner.step for runner in self.runners)
 
-    def _unit(self, number: int) -> native.Unit:
+    def _unit(self, number: int) -> native.UnitTable:
         unit = self.units[number]
         points = self.tick_points(unit)
         last_tick = unit[0].last_step if len(unit) == 1 else self._last_point
-        return native.Unit(
+        return native.UnitTable(
             members=self._members[number], n_members=len(unit), tick_points=points, last_tick=last_tick, burst=1
         )
 
-    def _follow(self, runner: Runner, member: native.Member) -> None:
+    def _follow(self, runner: Runner, member: native.MemberTable) -> None:
         """Fill the table of a runner now, and again whenever it steps in another way."""
 
         def changed() -> None:
@@ -203,7 +203,7 @@ class BurstEngine(Engine):
         runner.follow(member, changed)  # type: ignore[arg-type]  # it has a step and a stage, as a `Position`
         changed()
 
-    def _fill(self, runner: Runner, member: native.Member) -> None:
+    def _fill(self, runner: Runner, member: native.MemberTable) -> None:
         own = runner.instance.native if isinstance(runner.instance, StepsNatively) else None
         if own is not None and any(source.transfer.has_text for source in runner.sources):
             own = None
@@ -220,10 +220,10 @@ class BurstEngine(Engine):
                     points=rule.source_points,
                 )
             )
-            loads += source.transfer.moves(Base.FIRST_GATE + number)
+            loads += source.transfer.moves(RowBase.FIRST_GATE + number)
         watched = runner.watched if runner.watched is not None else runner.outputs
         grid, points = runner.grid, runner.plan.step_points
-        bases = (ctypes.c_void_p * (Base.FIRST_GATE + len(gates)))()
+        bases = (ctypes.c_void_p * (RowBase.FIRST_GATE + len(gates)))()
         loads = [*loads, *(own.loads if own is not None else ())]
         setters, getters, stores = (own.setters, own.getters, own.stores) if own is not None else ((), (), ())
         tables = [
@@ -237,7 +237,7 @@ class BurstEngine(Engine):
         member.gates, member.loads, member.setters, member.getters, member.stores = tables
         member.n_gates, member.n_loads, member.n_setters = len(gates), len(loads), len(setters)
         member.n_getters, member.n_stores = len(getters), len(stores)
-        member.kind = own.kind if own is not None else Kind.BY_PYTHON
+        member.kind = own.kind if own is not None else StepKind.BY_PYTHON
         member.component, member.do_step, member.said = (
             (own.component, own.do_step, own.said) if own is not None else (None, None, None)
         )
@@ -254,14 +254,14 @@ class BurstEngine(Engine):
     def _unit_of(self, runner: Runner) -> Sequence[Runner]:
         return next(unit for unit in self.units if runner in unit)
 
-    def _at(self, unit: int, member: int) -> tuple[Runner, native.Member]:
+    def _at(self, unit: int, member: int) -> tuple[Runner, native.MemberTable]:
         return self.units[unit][member], self._members[unit][member]
 
-    def _complete(self, unit: int, runner: Runner, member: native.Member, result: int) -> None:
+    def _complete(self, unit: int, runner: Runner, member: native.MemberTable, result: int) -> None:
         """Let Python take a step, or complete one that returned something unusual."""
         step = member.step
         try:
-            if result == Result.STATUS:
+            if result == BurstEnd.STATUS:
                 cast("StepsNatively", runner.instance).finish(step, member.outcome)
             else:
                 for source in runner.sources:

@@ -76,7 +76,7 @@ class HostMemory:
         self._view = memoryview(memory)
         self.address = ctypes.addressof(ctypes.c_char.from_buffer(memory))
         number = map_.number_of(process)
-        self.place = native.Place(self.address + map_.bells, len(map_.processes), number)
+        self.place = native.Participant(self.address + map_.bells, len(map_.processes), number)
         self.grant = self.counter(map_.grant)
         self.progress = {
             name: self.counter(offset) for name, offset in zip(map_.processes, map_.progress, strict=False)

@@ -20,21 +20,21 @@ __all__ = [
     "NUMBER_TYPES",
     "OUT_OF_RANGE",
     "STAGE_BITS",
-    "Base",
+    "BurstEnd",
     "Call",
     "Gate",
-    "Kind",
-    "Member",
+    "MemberTable",
     "Move",
     "NativeStep",
-    "Node",
-    "Output",
+    "NodeTable",
+    "OutputTable",
+    "Participant",
     "Peer",
-    "Place",
-    "Result",
+    "RowBase",
     "Said",
     "Stage",
-    "Unit",
+    "StepKind",
+    "UnitTable",
     "Wish",
     "library",
     "table",
@@ -46,7 +46,7 @@ OUT_OF_RANGE: Final = 100
 """The status of a call where a value does not fit into the type of the model."""
 
 
-class Kind(IntEnum):
+class StepKind(IntEnum):
     """How a member takes its step."""
 
     BY_PYTHON = 0
@@ -66,7 +66,7 @@ class Stage(IntEnum):
     STEPPED = 5
 
 
-class Base(IntEnum):
+class RowBase(IntEnum):
     """What an offset of a table is relative to; row ``n`` of the gates is ``FIRST_GATE + n``."""
 
     FIXED = 0
@@ -75,7 +75,7 @@ class Base(IntEnum):
     FIRST_GATE = 3
 
 
-class Result(IntEnum):
+class BurstEnd(IntEnum):
     """Why `node_run` returned."""
 
     SLICE = 0
@@ -104,7 +104,7 @@ NUMBER_TYPES: Final[dict[VariableType, int]] = {
 """The types of `Move`. An Enumeration is 64 bits in a ring."""
 
 
-class Place(Structure):
+class Participant(Structure):
     """Which process this is among those of the memory."""
 
     _fields_ = (("bells", c_void_p), ("processes", c_int64), ("own", c_int64))
@@ -155,7 +155,7 @@ class Call(Structure):
     )
 
 
-class Output(Structure):
+class OutputTable(Structure):
     """A ring that a member writes."""
 
     _fields_ = (("rows", c_void_p), ("stride", c_int64), ("mask", c_int64))
@@ -209,7 +209,7 @@ class Said(Structure):
         return bool(self.event_needed or self.terminate or self.early)
 
 
-class Member(Structure):
+class MemberTable(Structure):
     """One instance: how it gets its inputs, steps, and gives its outputs."""
 
     _fields_ = (
@@ -233,7 +233,7 @@ class Member(Structure):
         ("points", c_int64),
         ("every", c_int64),
         ("last_step", c_int64),
-        ("outputs", Output * 2),
+        ("outputs", OutputTable * 2),
         ("counter", c_void_p),
         ("bases", POINTER(c_void_p)),
         ("step", c_int64),
@@ -242,11 +242,11 @@ class Member(Structure):
     )
 
 
-class Unit(Structure):
+class UnitTable(Structure):
     """Members that step together."""
 
     _fields_ = (
-        ("members", POINTER(Member)),
+        ("members", POINTER(MemberTable)),
         ("n_members", c_int64),
         ("tick_points", c_int64),
         ("last_tick", c_int64),
@@ -266,12 +266,12 @@ class Peer(Structure):
     _fields_ = (("progress", c_void_p), ("window", c_int64))
 
 
-class Node(Structure):
+class NodeTable(Structure):
     """All units of a process."""
 
     _fields_ = (
-        ("place", Place),
-        ("units", POINTER(Unit)),
+        ("place", Participant),
+        ("units", POINTER(UnitTable)),
         ("n_units", c_int64),
         ("peers", POINTER(Peer)),
         ("n_peers", c_int64),
@@ -309,12 +309,12 @@ class NativeStep(NamedTuple):
         said: address of its `Said`.
         loads: from the row of inputs to buffers of other types.
         setters: read the row of inputs, or buffers.
-        getters: write the rows of `Base.OUTPUT` and `Base.WATCHED`, or buffers.
+        getters: write the rows of `RowBase.OUTPUT` and `RowBase.WATCHED`, or buffers.
         stores: from buffers to these rows.
         kept: what the addresses point to.
     """
 
-    kind: Kind
+    kind: StepKind
     component: int
     do_step: int
     said: int
@@ -330,7 +330,7 @@ def table(kind: Any, items: Sequence[Any]) -> Any:  # noqa: ANN401 ctypes has no
     return (kind * max(len(items), 1))(*items)
 
 
-_STRUCTURES: Final = (Place, Gate, Move, Call, Output, Member, Unit, Peer, Node, Wish, Said)
+_STRUCTURES: Final = (Participant, Gate, Move, Call, OutputTable, MemberTable, UnitTable, Peer, NodeTable, Wish, Said)
 
 
 class _Library:
