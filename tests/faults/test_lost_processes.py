@@ -13,7 +13,7 @@ import pytest
 
 from fmu_mesh.cli.main import main
 from fmu_mesh.run.child import StopWatch
-from fmu_mesh.system.window import AUTO_WINDOW_POINTS, lazy_frame_rows
+from fmu_mesh.system.window import AUTO_WINDOW_POINTS
 from tests.helpers import DEADLINE_S, Launched, Place, on_a_busy_machine, row_count, rows_of, wait_until, write_config
 
 FAST = pytest.param({}, 2000, id="as fast as possible")
@@ -67,8 +67,8 @@ def test_a_killed_process_ends_the_run_within_two_seconds_and_the_rows_before_ar
     assert who in message
     assert "its process was ended by SIGKILL" in message
     assert f"({kept} rows) is in '{result}'" in message
-    # The other node may be a window behind, and up to a frame of its rows for the recorder ends with it.
-    assert kept - 1 <= point_in(message) <= kept - 1 + AUTO_WINDOW_POINTS + lazy_frame_rows(AUTO_WINDOW_POINTS)
+    # The other node may be a window behind.
+    assert kept - 1 <= point_in(message) <= kept - 1 + AUTO_WINDOW_POINTS
     assert_is_what_one_process_calculates(place, result)
 
 
