@@ -9,7 +9,6 @@ from pathlib import Path
 
 import pytest
 import yaml
-from fmu_mesh.wire.shared_memory import available
 
 from fmu_mesh.rings.host_memory import can_share
 from fmu_mesh.run.local import LocalMesh
