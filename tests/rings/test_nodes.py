@@ -82,11 +82,21 @@ def test_a_sanitizer_finds_nothing(build: Build, job: Job, sanitizer: str) -> No
 
 
 @pytest.mark.parametrize("job", [("chain", 3, 4), ("cycle", 3, 4)], ids=str)
-def test_processes_that_are_killed_at_any_moment_go_on_where_their_rings_end(build: Build, job: Job) -> None:
+def test_processes_that_are_stopped_or_killed_at_any_moment_go_on_where_their_rings_end(build: Build, job: Job) -> None:
     done = run(build("", BURST), job, 20_000, "killed")
 
     assert done.returncode == 0, done.stdout + done.stderr
     assert int(done.stdout.split()[-1]) >= 20
+
+
+@pytest.mark.parametrize("sanitizer", ["", "address,undefined"])
+@pytest.mark.parametrize("job", [("chain", 2, 1), ("chain", 4, 4), ("cycle", 4, 4)], ids=str)
+def test_a_forged_counter_ends_the_run_and_leaves_no_wrong_row(build: Build, job: Job, sanitizer: str) -> None:
+    done = run(build(sanitizer, BURST), job, 20_000, "forged")
+
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert " wrong 0 " in done.stdout
+    assert int(done.stdout.split()[-1]) > 0
 
 
 def changed(folder: Path, old: str, new: str) -> Path:
