@@ -17,8 +17,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Collection
-from functools import partial
+from collections.abc import Callable
 
 import zenoh
 
@@ -35,8 +34,7 @@ from ..errors import (
     from_report,
 )
 from ..instances.contract import Instance
-from ..rings.host_memory import ONE_CORE, Counter, HostMemory
-from ..rings.ring import Ring
+from ..rings.host_memory import ONE_CORE, HostMemory
 from ..system.plan import RECORDER, Link, NodePlan
 from ..wire.frames import FrameReceiver, of_text
 from ..wire.inbox import Inbox, Message
@@ -54,12 +52,13 @@ from ..wire.messages import (
 )
 from ..wire.session import RouterLink
 from .activity import Activity
+from .connecting import connect
 from .engine import Engine, make_engine
 from .initialization import Initialization
 from .inputs import TimedInputs
 from .links import OutLink
 from .node_server import NodeServer
-from .stepping import Runner, sources_of
+from .stepping import Runner
 from .streams import PRIORITY
 from .time_measurement import Profiler
 
@@ -216,45 +215,8 @@ class Node:
             layout = of_text(link.layout) if link.target_node in shares else link.layout
             links = self._initialization.out_links if link.initial_only else runner.out_links
             links.append(OutLink(link, layout, runner.outputs, put))
-        rings = self._rings_of_sources(shares)
-        step_points = {place.instance: place.step_points for place in plan.rings}
-        for runner in self._runners.values():
-            runner.connect(sources_of(runner, rings, step_points))
+        self._receivers = connect(plan, self._runners, self._memory, self._own_memory, shares)
         self._put_progress = membership.sender(keys.progress(plan.node))
-
-    def _rings_of_sources(self, shares: Collection[str]) -> dict[str, list[tuple[Ring, Counter, bool | None]]]:
-        """Where the rows of each source are: in a ring that others share, or in a mirror that its frames fill."""
-        plan = self._plan
-        rings: dict[str, list[tuple[Ring, Counter, bool | None]]] = {
-            name: [(runner.outputs, runner.counter, None)] for name, runner in self._runners.items()
-        }
-        places = {place.instance: place for place in plan.rings}
-        for link in plan.links_in:
-            self._receivers[link.index] = link
-            if link.initial_only:
-                continue
-            place = places[link.source]
-            shared = link.source_node in shares
-            layout = of_text(link.layout) if shared else link.layout
-            found = rings.setdefault(link.source, [])
-            if shared:
-                found.append((self._memory.ring(place), self._memory.counter(place.counter), False))
-            if layout.columns:
-                mirror, counter = self._own_memory.ring(place), self._own_memory.counter(place.counter)
-                found.append((mirror, counter, True if shared else None))
-                fits = partial(self._fits, link.source)
-                who = f"node '{plan.node}'"
-                self._receivers[link.index] = FrameReceiver(link, layout, who, mirror, counter, fits)
-        return rings
-
-    def _fits(self, source: str, end: int) -> bool:
-        """Whether rows of a mirror before own step ``end`` overwrite no row that a step still needs."""
-        return all(
-            end - own.transfer.rule.row_for(runner.step) <= own.transfer.source.rows
-            for runner in self._runners.values()
-            for own in runner.sources
-            if own.instance == source
-        )
 
     def _initialize(self) -> Engine:
         """Initialization Mode: set, get and exchange values level by level; then the outputs are those of point 0."""

@@ -5,7 +5,7 @@ Owns what one step of one instance needs, and nothing about waiting. `fmu_mesh.n
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import NamedTuple, TypeVar
 
 from ..instances.contract import Instance
@@ -18,7 +18,7 @@ from ..system.layout import Layout
 from ..system.plan import InstancePlan
 from .links import OutLink
 
-__all__ = ["Position", "Runner", "Source", "sources_of"]
+__all__ = ["Position", "Runner", "Source"]
 
 Wrapped = TypeVar("Wrapped", bound=Instance)
 
@@ -184,28 +184,3 @@ class Runner:
             return "the master's grant"
         output, own = source.transfer.columns[0][:2]
         return f"'{source.instance}.{output}', which feeds '{self.name}.{own}'"
-
-
-def sources_of(
-    runner: Runner, rings: Mapping[str, Sequence[tuple[Ring, Counter, bool | None]]], step_points: Mapping[str, int]
-) -> Iterator[Source]:
-    """The sources of a runner.
-
-    Args:
-        runner: the runner.
-        rings: of each instance, where its rows are: rings with their counters, and whether only text (True) or only
-            numbers (False) are taken from there.
-        step_points: base points per own step of each instance.
-    """
-    for feed in runner.plan.feeds:
-        for ring, counter, text in rings[feed.source]:
-            transfer = Transfer(
-                feed,
-                ring,
-                runner.inputs,
-                source_points=step_points[feed.source],
-                target_points=runner.plan.step_points,
-                text=text,
-            )
-            if transfer.columns:
-                yield Source(feed.source, transfer, counter)
