@@ -6,7 +6,8 @@
  *   SHAPE   chain: each node reads the one before it at the same point. cycle: the first also reads the last, one point
  *           before. jacobi: a cycle in which all read one point before
  *   MODE    quiet: threads, nothing else happens. disturbed: a master that grants little, attention, bells that nobody
- *           needs, needs that a killed sleeper has left. killed: processes, killed at random moments and started again
+ *           needs, needs that a killed sleeper has left. forged: threads, and somebody writes wrong counters. killed:
+ *           processes that are stopped, or killed and started again, at random moments
  *
  * Runs of POINTS points follow each other for SECONDS. The rings are as small as the window allows. Each float is
  * compared with those of a plain loop. Prints `runs R late L wrong W us U best B`: lost wake-ups, runs with a wrong
@@ -55,7 +56,7 @@ static int get_real(void *model, const void *references, size_t n, void *values)
 
 static int64_t n_nodes, window, points, rows, is_chain, is_jacobi;
 static char *memory;
-static double expected[MAX_NODES]; /* the last row of each node */
+static double *expected; /* all rows of all nodes */
 static double times[MAX_RUNS];     /* of the runs, in us per point */
 
 static size_t counter_bytes(void) { return (size_t)(64 + (8 * (n_nodes + 1) + 63) / 64 * 64); }
@@ -90,25 +91,31 @@ static void prepare(int64_t granted_points) {
 
 static void compute_expected(void) {
   Model models[MAX_NODES] = {0};
-  double before[MAX_NODES];
-  for (int64_t i = 0; i < n_nodes; i++) models[i].y = start_of(i);
-  for (int64_t k = 0; k < points; k++) {
-    for (int64_t i = 0; i < n_nodes; i++) before[i] = models[i].y;
+  for (int64_t i = 0; i < n_nodes; i++) expected[i] = models[i].y = start_of(i);
+  for (int64_t k = 0; k < points; k++)
     for (int64_t i = 0; i < n_nodes; i++) {
       int64_t source = source_of(i);
-      if (source >= 0) models[i].u = lead_of(i) ? models[source].y : before[source];
+      if (source >= 0) models[i].u = expected[(k + lead_of(i)) * n_nodes + source];
       do_step(&models[i], (double)k, 1.0, 1);
+      expected[(k + 1) * n_nodes + i] = models[i].y;
     }
-  }
-  for (int64_t i = 0; i < n_nodes; i++) expected[i] = models[i].y;
 }
 
-/* Whether all nodes have come to the end, with the right value. */
+/* Whether all rows that have a stamp are right. */
 static int is_right(void) {
   for (int64_t i = 0; i < n_nodes; i++)
-    if (value_of(rows_of(i)) != points + 1 || value_of(progress_of(i)) != points + 1 ||
-        memcmp(ring_of(i) + (points & (rows - 1)) * ROW_BYTES + 8, &expected[i], 8) != 0)
-      return 0;
+    for (int64_t slot = 0; slot < rows; slot++) {
+      int64_t row = atomic_load(stamp_of(ring_of(i), ROW_BYTES, rows - 1, slot)) - 1;
+      if (row > points) return 0;
+      if (row >= 0 && memcmp(ring_of(i) + slot * ROW_BYTES + 8, &expected[row * n_nodes + i], 8) != 0) return 0;
+    }
+  return 1;
+}
+
+/* Whether all nodes have come to the end. */
+static int is_complete(void) {
+  for (int64_t i = 0; i < n_nodes; i++)
+    if (value_of(rows_of(i)) != points + 1 || value_of(progress_of(i)) != points + 1) return 0;
   return 1;
 }
 
@@ -128,7 +135,6 @@ typedef struct {
   double input;
   char *bases[FIRST_GATE + 1];
   uint64_t random;
-  int64_t is_disturbed;
 } Participant;
 
 static uint64_t draw(uint64_t *state) {
@@ -173,23 +179,30 @@ static void leave_need(Participant *p) {
   lower(&counter->wake_at, need);
 }
 
+static uint64_t seed = 88172645463325252u;
+static enum { QUIET, DISTURBED, FORGING, KILLED } mode;
+static _Atomic int64_t is_over, n_forged;
+static int64_t master_late;
+static Participant participants[MAX_NODES];
+
 static void *run_node(void *argument) {
   Participant *p = argument;
   for (;;) {
     int64_t result = node_run(&p->node);
-    if (result == DONE) return NULL;
+    if (result == DONE || (mode == FORGING && atomic_load(&is_over))) return NULL;
+    if (result == FORGED && mode == FORGING) { /* end the run */
+      n_forged++;
+      atomic_store(&is_over, 1);
+      for (int64_t i = 0; i < n_nodes; i++) node_attend(&participants[i].node);
+      return NULL;
+    }
     if (result != SLICE && result != ATTENTION && result != BLOCKED) abort();
     if (result == ATTENTION) node_attended(&p->node);
-    if (p->is_disturbed) leave_need(p);
+    if (mode == DISTURBED) leave_need(p);
   }
 }
 
 /* ---- a master, and somebody who disturbs */
-
-static uint64_t seed = 88172645463325252u;
-static _Atomic int64_t is_over;
-static int64_t master_late;
-static Participant participants[MAX_NODES];
 
 static void *run_master(void *argument) {
   const Place place = {bells(), n_nodes + 1, n_nodes};
@@ -212,45 +225,43 @@ static void *run_master(void *argument) {
 static void *disturb(void *argument) {
   uint64_t random = *(uint64_t *)argument;
   while (!atomic_load(&is_over)) {
+    struct timespec pause = {0, (long)(draw(&random) % 200000)};
+    nanosleep(&pause, NULL);
     Participant *p = &participants[draw(&random) % (uint64_t)n_nodes];
-    if (draw(&random) & 1)
+    Counter *counter = draw(&random) & 1 ? rows_of(p->own) : progress_of(p->own);
+    if (mode == FORGING)
+      atomic_store(&counter->value, draw(&random) & 1 ? INT64_MAX : (int64_t)(draw(&random) % (uint64_t)points));
+    else if (draw(&random) & 1)
       node_attend(&p->node);
     else
       ring_bell(&bells()[p->own]);
-    struct timespec pause = {0, (long)(draw(&random) % 200000)};
-    nanosleep(&pause, NULL);
   }
   return NULL;
 }
 
-static int run_threads(int is_disturbed, int64_t *late) {
+static int run_threads(int64_t *late) {
   pthread_t threads[MAX_NODES], master, disturber;
   int64_t ahead = 1 + (int64_t)(draw(&seed) % 200);
   uint64_t random = draw(&seed);
-  prepare(is_disturbed ? 0 : points);
+  prepare(mode == DISTURBED ? 0 : points);
   atomic_store(&is_over, 0);
   for (int64_t i = 0; i < n_nodes; i++) {
     set_up(&participants[i], i, 1000000000, draw(&seed) % 4 != 0);
     participants[i].random = draw(&seed);
-    participants[i].is_disturbed = is_disturbed;
   }
   for (int64_t i = 0; i < n_nodes; i++) pthread_create(&threads[i], NULL, run_node, &participants[i]);
-  if (is_disturbed) {
-    pthread_create(&master, NULL, run_master, &ahead);
-    pthread_create(&disturber, NULL, disturb, &random);
-  }
+  if (mode == DISTURBED) pthread_create(&master, NULL, run_master, &ahead);
+  if (mode != QUIET) pthread_create(&disturber, NULL, disturb, &random);
   for (int64_t i = 0; i < n_nodes; i++) {
     pthread_join(threads[i], NULL);
     *late += participants[i].node.late;
   }
-  if (is_disturbed) {
-    atomic_store(&is_over, 1);
-    pthread_join(master, NULL);
-    pthread_join(disturber, NULL);
-    *late += master_late;
-    master_late = 0;
-  }
-  return is_right();
+  atomic_store(&is_over, 1);
+  if (mode == DISTURBED) pthread_join(master, NULL);
+  if (mode != QUIET) pthread_join(disturber, NULL);
+  *late += master_late;
+  master_late = 0;
+  return is_right() && (mode == FORGING || is_complete());
 }
 
 /* ---- processes that are killed */
@@ -274,7 +285,11 @@ static int run_processes(int64_t *kills) {
     struct timespec pause = {0, (long)(draw(&seed) % 3000000)};
     nanosleep(&pause, NULL);
     int64_t victim = (int64_t)(draw(&seed) % (uint64_t)n_nodes);
-    if (budget > 0 && pids[victim] != 0) kill(pids[victim], SIGKILL);
+    if (budget > 0 && pids[victim] != 0) {
+      kill(pids[victim], draw(&seed) & 1 ? SIGKILL : SIGSTOP);
+      nanosleep(&pause, NULL);
+      kill(pids[victim], SIGCONT);
+    }
     for (int64_t i = 0; i < n_nodes; i++) {
       int status;
       if (pids[i] == 0 || waitpid(pids[i], &status, WNOHANG) != pids[i]) continue;
@@ -287,7 +302,7 @@ static int run_processes(int64_t *kills) {
       }
     }
   }
-  return is_right();
+  return is_right() && is_complete();
 }
 
 static int by_size(const void *a, const void *b) {
@@ -300,24 +315,27 @@ int main(int n, char **arguments) {
   is_chain = strcmp(arguments[1], "chain") == 0;
   is_jacobi = strcmp(arguments[1], "jacobi") == 0;
   n_nodes = atoll(arguments[2]), window = atoll(arguments[3]), points = atoll(arguments[4]);
-  const int64_t seconds = atoll(arguments[5]), is_killed = strcmp(arguments[6], "killed") == 0;
-  const int64_t end = now() + seconds * 1000000000;
-  if (n_nodes < 2 || n_nodes > MAX_NODES || window < 1) return 2;
+  const int64_t seconds = atoll(arguments[5]), end = now() + seconds * 1000000000;
+  const char *modes[] = {"quiet", "disturbed", "forged", "killed"};
+  while (mode <= KILLED && strcmp(arguments[6], modes[mode]) != 0) mode++;
+  if (mode > KILLED || n_nodes < 2 || n_nodes > MAX_NODES || window < 1) return 2;
   for (rows = 1; rows < window + 1; rows *= 2) continue;
+  expected = malloc((size_t)((points + 1) * n_nodes) * 8);
   memory = mmap(NULL, memory_bytes(), PROT_READ | PROT_WRITE, MAP_SHARED | MAP_ANONYMOUS, -1, 0);
-  if (memory == MAP_FAILED) return 2;
+  if (memory == MAP_FAILED || expected == NULL) return 2;
   compute_expected();
   int64_t runs = 0, late = 0, wrong = 0, kills = 0;
   alarm((unsigned)seconds + 120);
   do {
     int64_t begin = now();
-    wrong += !(is_killed ? run_processes(&kills) : run_threads(strcmp(arguments[6], "disturbed") == 0, &late));
+    wrong += !(mode == KILLED ? run_processes(&kills) : run_threads(&late));
     times[runs++] = (double)(now() - begin) / 1e3 / (double)points;
   } while (now() < end && runs < MAX_RUNS);
   qsort(times, (size_t)runs, 8, by_size);
   printf("runs %lld late %lld wrong %lld us %.3f best %.3f", (long long)runs, (long long)late, (long long)wrong,
          times[runs / 2], times[0]);
-  if (is_killed) printf(" kills %lld", (long long)kills);
+  if (mode == KILLED) printf(" kills %lld", (long long)kills);
+  if (mode == FORGING) printf(" forged %lld", (long long)n_forged);
   printf("\n");
-  return late > 0 || wrong > 0;
+  return (late > 0 && mode != FORGING) || wrong > 0;
 }

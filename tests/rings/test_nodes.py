@@ -82,24 +82,36 @@ def test_a_sanitizer_finds_nothing(build: Build, job: Job, sanitizer: str) -> No
 
 
 @pytest.mark.parametrize("job", [("chain", 3, 4), ("cycle", 3, 4)], ids=str)
-def test_processes_that_are_killed_at_any_moment_go_on_where_their_rings_end(build: Build, job: Job) -> None:
+def test_processes_that_are_stopped_or_killed_at_any_moment_go_on_where_their_rings_end(build: Build, job: Job) -> None:
     done = run(build("", BURST), job, 20_000, "killed")
 
     assert done.returncode == 0, done.stdout + done.stderr
     assert int(done.stdout.split()[-1]) >= 20
 
 
-def changed(folder: Path, old: str, new: str) -> Path:
-    """A copy of `burst.c` with another line."""
+@pytest.mark.parametrize("sanitizer", ["", "address,undefined"])
+@pytest.mark.parametrize("job", [("chain", 2, 1), ("chain", 4, 4), ("cycle", 4, 4)], ids=str)
+def test_a_forged_counter_ends_the_run_and_leaves_no_wrong_row(build: Build, job: Job, sanitizer: str) -> None:
+    done = run(build(sanitizer, BURST), job, 20_000, "forged")
+
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert " wrong 0 " in done.stdout
+    assert int(done.stdout.split()[-1]) > 0
+
+
+def changed(folder: Path, *lines: tuple[str, str]) -> Path:
+    """A copy of `burst.c` with other lines."""
     text = BURST.read_text()
-    assert text.count(old) == 1
+    for old, new in lines:
+        assert text.count(old) == 1
+        text = text.replace(old, new)
     copy = folder / "burst.c"
-    copy.write_text(text.replace(old, new))
+    copy.write_text(text)
     return copy
 
 
 def test_a_lost_wake_up_would_be_found(build: Build, tmp_path: Path) -> None:
-    burst = changed(tmp_path, "ring_bell(&place->bells[process]);", "(void)process;")
+    burst = changed(tmp_path, ("ring_bell(&place->bells[process]);", "(void)process;"))
 
     done = run(build("", burst), ("cycle", 4, 2), 3, "quiet")
 
@@ -109,8 +121,21 @@ def test_a_lost_wake_up_would_be_found(build: Build, tmp_path: Path) -> None:
 
 def test_a_race_would_be_found(build: Build, tmp_path: Path) -> None:
     line = "atomic_store_explicit(&counter->value, value, memory_order_release);\n  wake_if_needed"
-    burst = changed(tmp_path, line, line.replace("release", "relaxed"))
+    burst = changed(tmp_path, (line, line.replace("release", "relaxed")))
 
     done = run(build("thread", burst), ("chain", 2, 4), 2000, "quiet")
 
     assert "WARNING: ThreadSanitizer: data race" in done.stderr
+
+
+def test_a_wrong_row_would_be_found(build: Build, tmp_path: Path) -> None:
+    burst = changed(
+        tmp_path,
+        ("memory_order_acquire) != row + 1)", "memory_order_acquire) < 0)"),
+        ("if (!gates_held(member)) {", "if (0) {"),
+    )
+
+    done = run(build("", burst), ("chain", 2, 1), 20_000, "forged")
+
+    assert done.returncode == 1
+    assert " wrong 0 " not in done.stdout
