@@ -19,6 +19,7 @@ from ...rings.native import Said
 from ...variables.model_description import ModelDescription
 from ...variables.value_conversion import to_value
 from ...variables.value_types import Value
+from ..call_guard import FOLDER
 from ..contract import LogMessage
 from .archive.archive import Terms
 from .archive.sources import extract
@@ -82,12 +83,13 @@ class FmuInstance(KeepsFmuState, FmuValues):
         self._describe(description)
         self._extracted = extract(path, folder, terms, model=description)
         try:
-            fmu = self._library(
-                guid=description.guid,
-                modelIdentifier=description.model_identifier,
-                unzipDirectory=str(self._extracted),
-                instanceName=name,
-            )
+            with FOLDER:  # FMPy loads a library from its own folder
+                fmu = self._library(
+                    guid=description.guid,
+                    modelIdentifier=description.model_identifier,
+                    unzipDirectory=str(self._extracted),
+                    instanceName=name,
+                )
             self._fmu: Any = FmpyCalls(fmu, self._prefix, self._function_names)
             self._instantiate()
             self._component = fmu.component
