@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Sequence
-from ctypes import POINTER, Structure, c_bool, c_double, c_int32, c_int64, c_uint32, c_void_p
+from ctypes import CFUNCTYPE, POINTER, PYFUNCTYPE, Structure, c_bool, c_double, c_int32, c_int64, c_uint32, c_void_p
 from enum import IntEnum
 from typing import Any, Final, NamedTuple
 
@@ -20,21 +20,21 @@ __all__ = [
     "NUMBER_TYPES",
     "OUT_OF_RANGE",
     "STAGE_BITS",
-    "Base",
+    "BurstEnd",
     "Call",
     "Gate",
-    "Kind",
-    "Member",
+    "MemberTable",
     "Move",
     "NativeStep",
-    "Node",
-    "Output",
+    "NodeTable",
+    "OutputTable",
+    "Participant",
     "Peer",
-    "Place",
-    "Result",
+    "RowBase",
     "Said",
     "Stage",
-    "Unit",
+    "StepKind",
+    "UnitTable",
     "Wish",
     "library",
     "table",
@@ -46,7 +46,7 @@ OUT_OF_RANGE: Final = 100
 """The status of a call where a value does not fit into the type of the model."""
 
 
-class Kind(IntEnum):
+class StepKind(IntEnum):
     """How a member takes its step."""
 
     BY_PYTHON = 0
@@ -66,7 +66,7 @@ class Stage(IntEnum):
     STEPPED = 5
 
 
-class Base(IntEnum):
+class RowBase(IntEnum):
     """What an offset of a table is relative to; row ``n`` of the gates is ``FIRST_GATE + n``."""
 
     FIXED = 0
@@ -75,7 +75,7 @@ class Base(IntEnum):
     FIRST_GATE = 3
 
 
-class Result(IntEnum):
+class BurstEnd(IntEnum):
     """Why `node_run` returned."""
 
     SLICE = 0
@@ -104,7 +104,7 @@ NUMBER_TYPES: Final[dict[VariableType, int]] = {
 """The types of `Move`. An Enumeration is 64 bits in a ring."""
 
 
-class Place(Structure):
+class Participant(Structure):
     """Which process this is among those of the memory."""
 
     _fields_ = (("bells", c_void_p), ("processes", c_int64), ("own", c_int64))
@@ -155,7 +155,7 @@ class Call(Structure):
     )
 
 
-class Output(Structure):
+class OutputTable(Structure):
     """A ring that a member writes."""
 
     _fields_ = (("rows", c_void_p), ("stride", c_int64), ("mask", c_int64))
@@ -209,7 +209,7 @@ class Said(Structure):
         return bool(self.event_needed or self.terminate or self.early)
 
 
-class Member(Structure):
+class MemberTable(Structure):
     """One instance: how it gets its inputs, steps, and gives its outputs."""
 
     _fields_ = (
@@ -233,7 +233,7 @@ class Member(Structure):
         ("points", c_int64),
         ("every", c_int64),
         ("last_step", c_int64),
-        ("outputs", Output * 2),
+        ("outputs", OutputTable * 2),
         ("counter", c_void_p),
         ("bases", POINTER(c_void_p)),
         ("step", c_int64),
@@ -242,11 +242,11 @@ class Member(Structure):
     )
 
 
-class Unit(Structure):
+class UnitTable(Structure):
     """Members that step together."""
 
     _fields_ = (
-        ("members", POINTER(Member)),
+        ("members", POINTER(MemberTable)),
         ("n_members", c_int64),
         ("tick_points", c_int64),
         ("last_tick", c_int64),
@@ -266,12 +266,12 @@ class Peer(Structure):
     _fields_ = (("progress", c_void_p), ("window", c_int64))
 
 
-class Node(Structure):
+class NodeTable(Structure):
     """All units of a process."""
 
     _fields_ = (
-        ("place", Place),
-        ("units", POINTER(Unit)),
+        ("place", Participant),
+        ("units", POINTER(UnitTable)),
         ("n_units", c_int64),
         ("peers", POINTER(Peer)),
         ("n_peers", c_int64),
@@ -309,12 +309,12 @@ class NativeStep(NamedTuple):
         said: address of its `Said`.
         loads: from the row of inputs to buffers of other types.
         setters: read the row of inputs, or buffers.
-        getters: write the rows of `Base.OUTPUT` and `Base.WATCHED`, or buffers.
+        getters: write the rows of `RowBase.OUTPUT` and `RowBase.WATCHED`, or buffers.
         stores: from buffers to these rows.
         kept: what the addresses point to.
     """
 
-    kind: Kind
+    kind: StepKind
     component: int
     do_step: int
     said: int
@@ -330,7 +330,7 @@ def table(kind: Any, items: Sequence[Any]) -> Any:  # noqa: ANN401 ctypes has no
     return (kind * max(len(items), 1))(*items)
 
 
-_STRUCTURES: Final = (Place, Gate, Move, Call, Output, Member, Unit, Peer, Node, Wish, Said)
+_STRUCTURES: Final = (Participant, Gate, Move, Call, OutputTable, MemberTable, UnitTable, Peer, NodeTable, Wish, Said)
 
 
 class _Library:
@@ -338,28 +338,18 @@ class _Library:
 
     def __init__(self, path: str) -> None:
         quick, slow = ctypes.PyDLL(path), ctypes.CDLL(path)
-        self.run = slow.node_run
-        self.run.argtypes, self.run.restype = (c_void_p,), c_int64
-        self.sleep_for = slow.sleep_for
-        self.sleep_for.argtypes = (c_void_p, c_uint32, c_void_p, c_int64, c_int64, c_void_p)
-        self.sleep_for.restype = c_int64
-        self.member_step = slow.member_step
-        self.member_step.argtypes, self.member_step.restype = (c_void_p, c_int64), c_int64
-        self.attend = quick.node_attend
-        self.attend.argtypes, self.attend.restype = (c_void_p,), None
-        self.attended = quick.node_attended
-        self.attended.argtypes, self.attended.restype = (c_void_p,), None
-        self.ring_bell = quick.ring_bell
-        self.ring_bell.argtypes, self.ring_bell.restype = (c_void_p,), None
-        self.bell_seen = quick.bell_seen
-        self.bell_seen.argtypes, self.bell_seen.restype = (c_void_p,), c_uint32
-        self.counter_raise = quick.counter_raise
-        self.counter_raise.argtypes, self.counter_raise.restype = (c_void_p, c_void_p, c_int64), None
-        self.counter_value = quick.counter_value
-        self.counter_value.argtypes, self.counter_value.restype = (c_void_p,), c_int64
+        address = c_void_p
+        self.run = CFUNCTYPE(c_int64, address)(("node_run", slow))
+        self.sleep_for = CFUNCTYPE(c_int64, address, c_uint32, address, c_int64, c_int64, address)(("sleep_for", slow))
+        self.member_step = CFUNCTYPE(c_int64, address, c_int64)(("member_step", slow))
+        self.attend = PYFUNCTYPE(None, address)(("node_attend", quick))
+        self.attended = PYFUNCTYPE(None, address)(("node_attended", quick))
+        self.ring_bell = PYFUNCTYPE(None, address)(("ring_bell", quick))
+        self.bell_seen = PYFUNCTYPE(c_uint32, address)(("bell_seen", quick))
+        self.counter_raise = PYFUNCTYPE(None, address, address, c_int64)(("counter_raise", quick))
+        self.counter_value = PYFUNCTYPE(c_int64, address)(("counter_value", quick))
         sizes = (c_int64 * len(_STRUCTURES))()
-        quick.structure_sizes.restype = c_int64
-        count = quick.structure_sizes(sizes)
+        count = PYFUNCTYPE(c_int64, address)(("structure_sizes", quick))(sizes)
         if count != len(_STRUCTURES) or list(sizes) != [ctypes.sizeof(structure) for structure in _STRUCTURES]:
             msg = f"{path} was built from other structures"
             raise OSError(msg)

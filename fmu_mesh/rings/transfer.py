@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ..system.coupling_rule import CouplingRule
 from ..system.plan import Feed
 from ..variables.value_types import is_text
-from .native import NUMBER_TYPES, Base, Move
+from .native import NUMBER_TYPES, Move, RowBase
 from .ring import Ring
 
 __all__ = ["Transfer"]
@@ -89,7 +89,7 @@ class Transfer:
                 Move(
                     from_base=base,
                     from_=self.source.place_in_row(have.part, have.first),
-                    to_base=Base.FIXED,
+                    to_base=RowBase.FIXED,
                     to=self._inputs.address + self._inputs.place_in_row(want.part, want.first),
                     count=want.size,
                     from_type=NUMBER_TYPES[from_type],

@@ -20,7 +20,19 @@ from fmu_mesh.instances.fmi import FmuInstance, open_instance, read_description
 from fmu_mesh.instances.fmi.co_simulation.native_instance import NativeInstance
 from fmu_mesh.instances.fmi.step_options import StepOptions
 from fmu_mesh.rings import native
-from fmu_mesh.rings.native import NEVER, STAGE_BITS, Base, Call, Kind, Member, Move, NativeStep, Output, Said, Stage
+from fmu_mesh.rings.native import (
+    NEVER,
+    STAGE_BITS,
+    Call,
+    MemberTable,
+    Move,
+    NativeStep,
+    OutputTable,
+    RowBase,
+    Said,
+    Stage,
+    StepKind,
+)
 from fmu_mesh.rings.ring import Ring
 from fmu_mesh.simtime import TimeGrid
 from fmu_mesh.system.layout import Layout
@@ -37,10 +49,10 @@ SETTER = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p, ctypes
 SETTER_3 = ctypes.CFUNCTYPE(
     ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_size_t, ctypes.c_void_p, ctypes.c_size_t
 )
-DO_STEP: dict[Kind, Any] = {
-    Kind.FMI1: ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_double, ctypes.c_double, ctypes.c_char),
-    Kind.FMI2: ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_double, ctypes.c_double, ctypes.c_int),
-    Kind.FMI3: ctypes.CFUNCTYPE(
+DO_STEP: dict[StepKind, Any] = {
+    StepKind.FMI1: ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_double, ctypes.c_double, ctypes.c_char),
+    StepKind.FMI2: ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_double, ctypes.c_double, ctypes.c_int),
+    StepKind.FMI3: ctypes.CFUNCTYPE(
         ctypes.c_int, ctypes.c_void_p, ctypes.c_double, ctypes.c_double, ctypes.c_bool, *[ctypes.c_void_p] * 4
     ),
 }
@@ -53,22 +65,22 @@ class Recorded:
     It has two setters on fixed memory, doStep, and one getter on its ring, which has four rows of eight bytes.
     """
 
-    def __init__(self, kind: Kind, **statuses: int) -> None:
+    def __init__(self, kind: StepKind, **statuses: int) -> None:
         self.calls: list[tuple[Any, ...]] = []
         self.said = Said(quiet_until=math.inf)
         self.flag: int | None = None
         self._statuses = statuses
-        self._sized = kind == Kind.FMI3
+        self._sized = kind == StepKind.FMI3
         self._inputs, self._rows = (ctypes.c_double * 2)(), (ctypes.c_double * 4)()
         self._keep: list[Any] = []
         inputs, rows = ctypes.addressof(self._inputs), ctypes.addressof(self._rows)
         setters = [
-            self._call("set_real", Base.FIXED, inputs, inputs, 3, 1),
-            self._call("set_integer", Base.FIXED, inputs + 8, inputs, 5),
+            self._call("set_real", RowBase.FIXED, inputs, inputs, 3, 1),
+            self._call("set_integer", RowBase.FIXED, inputs + 8, inputs, 5),
         ]
-        getters = [self._call("get_real", Base.OUTPUT, 0, rows, 7, 8, 9)]
+        getters = [self._call("get_real", RowBase.OUTPUT, 0, rows, 7, 8, 9)]
         self._keep.append(DO_STEP[kind](self._stepped))
-        self.member = Member(
+        self.member = MemberTable(
             setters=native.table(Call, setters),
             getters=native.table(Call, getters),
             n_setters=2,
@@ -81,8 +93,8 @@ class Recorded:
             base_step_size=0.1,
             step_size=0.2,
             points=2,
-            outputs=(Output * 2)(Output(rows, 8, 3)),
-            bases=(ctypes.c_void_p * Base.FIRST_GATE)(),
+            outputs=(OutputTable * 2)(OutputTable(rows, 8, 3)),
+            bases=(ctypes.c_void_p * RowBase.FIRST_GATE)(),
         )
 
     def step(self, step: int) -> tuple[int, int]:
@@ -91,7 +103,7 @@ class Recorded:
         outcome: int = native.library.member_step(ctypes.addressof(self.member), step)
         return divmod(outcome, 1 << STAGE_BITS)
 
-    def _call(self, name: str, base: Base, values: int, memory: int, *references: int) -> Call:
+    def _call(self, name: str, base: RowBase, values: int, memory: int, *references: int) -> Call:
         array = (ctypes.c_uint * len(references))(*references)
 
         def moved(component: int, given: int, count: int, place: int, *size: int) -> int:
@@ -119,19 +131,19 @@ def address_of(function: Any) -> int:  # noqa: ANN401 a function of ctypes
     return ctypes.cast(function, ctypes.c_void_p).value or 0
 
 
-def calls_of(kind: Kind) -> list[tuple[Any, ...]]:
+def calls_of(kind: StepKind) -> list[tuple[Any, ...]]:
     """What the FMU notes in own step 5, whose outputs are row 6: in slot 2."""
-    size = (6,) if kind == Kind.FMI3 else ()
+    size = (6,) if kind == StepKind.FMI3 else ()
     return [
         ("set_real", COMPONENT, (3, 1), 0, *size),
         ("set_integer", COMPONENT, (5,), 1, *size),
-        ("step", COMPONENT, 1.5, 0.2, b"\x01" if kind == Kind.FMI1 else 1),
+        ("step", COMPONENT, 1.5, 0.2, b"\x01" if kind == StepKind.FMI1 else 1),
         ("get_real", COMPONENT, (7, 8, 9), 2, *size),
     ]
 
 
 @pytest.mark.parametrize("kind", DO_STEP)
-def test_all_functions_are_called_in_their_order_on_their_memory(kind: Kind) -> None:
+def test_all_functions_are_called_in_their_order_on_their_memory(kind: StepKind) -> None:
     recorded = Recorded(kind, set_real=1, step=1)  # a warning changes nothing
 
     assert recorded.step(5) == (0, 0)
@@ -152,7 +164,7 @@ def test_all_functions_are_called_in_their_order_on_their_memory(kind: Kind) -> 
     ],
 )
 def test_the_first_status_above_warning_ends_the_step_and_is_told_with_its_stage(
-    kind: Kind, name: str, status: int, stage: Stage, calls: int, number: int | None
+    kind: StepKind, name: str, status: int, stage: Stage, calls: int, number: int | None
 ) -> None:
     recorded = Recorded(kind, **{name: status})
 
@@ -164,20 +176,20 @@ def test_the_first_status_above_warning_ends_the_step_and_is_told_with_its_stage
 
 @pytest.mark.parametrize("flag", [0, 1, 2])
 def test_a_step_of_fmi_3_ends_where_the_fmu_says_more_than_its_status(flag: int) -> None:
-    recorded = Recorded(Kind.FMI3)
+    recorded = Recorded(StepKind.FMI3)
     recorded.flag = flag
 
     for _ in range(2):  # what the first step said is not there in the second
         assert recorded.step(5) == (Stage.STEPPING, 0)
-        assert recorded.calls == calls_of(Kind.FMI3)[:3]
+        assert recorded.calls == calls_of(StepKind.FMI3)[:3]
         recorded.calls.clear()
 
 
 @pytest.mark.parametrize("kind", DO_STEP)
-def test_a_step_that_ends_where_python_is_needed_or_later_is_left_to_it_with_its_inputs(kind: Kind) -> None:
+def test_a_step_that_ends_where_python_is_needed_or_later_is_left_to_it_with_its_inputs(kind: StepKind) -> None:
     recorded = Recorded(kind)
     given, taken = ctypes.c_double(0.7), ctypes.c_double()
-    move = Move(Base.FIXED, ctypes.addressof(given), Base.FIXED, ctypes.addressof(taken), 1, factor=1.0)
+    move = Move(RowBase.FIXED, ctypes.addressof(given), RowBase.FIXED, ctypes.addressof(taken), 1, factor=1.0)
     recorded.member.loads, recorded.member.n_loads = native.table(Move, [move]), 1
     recorded.said.note(quiet_until=0.5 + 12 * 0.1)
 
@@ -342,8 +354,8 @@ class Burst:
                 self._instance.finish(step, outcome)
 
 
-def member_of(tables: NativeStep, outputs: Sequence[Ring], grid: TimeGrid) -> Member:
-    return Member(
+def member_of(tables: NativeStep, outputs: Sequence[Ring], grid: TimeGrid) -> MemberTable:
+    return MemberTable(
         loads=native.table(Move, tables.loads),
         setters=native.table(Call, tables.setters),
         getters=native.table(Call, tables.getters),
@@ -361,8 +373,8 @@ def member_of(tables: NativeStep, outputs: Sequence[Ring], grid: TimeGrid) -> Me
         step_size=grid.step_size,
         points=1,
         last_step=NEVER,
-        outputs=(Output * 2)(*(Output(ring.address, ring.stride, ring.mask) for ring in outputs)),
-        bases=(ctypes.c_void_p * Base.FIRST_GATE)(),
+        outputs=(OutputTable * 2)(*(OutputTable(ring.address, ring.stride, ring.mask) for ring in outputs)),
+        bases=(ctypes.c_void_p * RowBase.FIRST_GATE)(),
     )
 
 

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fmu_mesh.rings import native
-from fmu_mesh.rings.native import OUT_OF_RANGE, STAGE_BITS, Base, Member, Move, Said, Stage, table
+from fmu_mesh.rings.native import OUT_OF_RANGE, STAGE_BITS, MemberTable, Move, RowBase, Said, Stage, table
 from fmu_mesh.rings.ring import Ring
 from fmu_mesh.rings.transfer import Transfer
 from fmu_mesh.system.coupling_rule import CouplingRule
@@ -56,10 +56,10 @@ def filled(rows: int) -> Ring:
 def move_in_c(moved: Transfer, row: int) -> int:
     """Move the numbers of a row as the burst does; returns the outcome of a step that goes no further."""
     assert native.library is not None
-    moves, said = moved.moves(Base.FIRST_GATE), Said(quiet_until=0.0)
-    bases = (ctypes.c_void_p * (Base.FIRST_GATE + 1))()
-    bases[Base.FIRST_GATE] = moved.source.address + (row & moved.source.mask) * moved.source.stride
-    member = Member(
+    moves, said = moved.moves(RowBase.FIRST_GATE), Said(quiet_until=0.0)
+    bases = (ctypes.c_void_p * (RowBase.FIRST_GATE + 1))()
+    bases[RowBase.FIRST_GATE] = moved.source.address + (row & moved.source.mask) * moved.source.stride
+    member = MemberTable(
         loads=table(Move, moves),
         n_loads=len(moves),
         said=ctypes.addressof(said),
@@ -112,7 +112,7 @@ def test_text_is_moved_without_the_numbers() -> None:
     assert moved.has_text
     assert inputs.value(0, "t") == "row 2"
     assert not inputs.part("Float64").any()
-    assert [move.count for move in moved.moves(Base.FIRST_GATE)] == [1, 1, 1]
+    assert [move.count for move in moved.moves(RowBase.FIRST_GATE)] == [1, 1, 1]
 
 
 @pytest.mark.parametrize(("text", "names"), [(True, ["s"]), (False, ["c", "a", "m"]), (None, ["c", "a", "m", "s"])])

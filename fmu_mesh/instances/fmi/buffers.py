@@ -14,7 +14,7 @@ from typing import Any, Final, Protocol
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from ...rings.native import NUMBER_TYPES, Base, Move
+from ...rings.native import NUMBER_TYPES, Move, RowBase
 from ...variables.value_types import DTYPES, VariableType
 
 __all__ = ["BinaryBuffer", "Buffer", "NumberBuffer", "StringBuffer"]
@@ -83,7 +83,7 @@ class NumberBuffer:
             return truth if self._signs is None else truth ^ (self._signs < 0)
         return self._memory if self._signs is None else self._signed(self._memory)
 
-    def moves(self, base: Base, place: int, *, load: bool) -> list[Move]:
+    def moves(self, base: RowBase, place: int, *, load: bool) -> list[Move]:
         """What `load`, or `values`, does: as moves of the library, one for each run of elements with the same sign.
 
         Args:
@@ -99,7 +99,7 @@ class NumberBuffer:
             count = len(list(run))
             ends = [
                 (base, place + first * row_item, row_type),
-                (Base.FIXED, self.address + first * self._memory.itemsize, own_type),
+                (RowBase.FIXED, self.address + first * self._memory.itemsize, own_type),
             ]
             (from_base, from_, from_type), (to_base, to, to_type) = ends if load else reversed(ends)
             move = Move(from_base, from_, to_base, to, count, from_type, to_type, negated=sign < 0, factor=1.0)

@@ -14,7 +14,7 @@ from typing import Any, Final, Literal, NamedTuple
 from numpy.typing import NDArray
 
 from ...errors import InitializationFailed, StepFailed
-from ...rings.native import Base, Call, Said
+from ...rings.native import Call, RowBase, Said
 from ...rings.ring import Ring
 from ...simtime import TimeGrid
 from ...system.layout import Part
@@ -33,7 +33,7 @@ STATUS_NAMES: Final = ("ok", "warning", "discard", "error", "fatal", "pending")
 Verb = Literal["Get", "Set"]
 
 _DOING: Final[dict[Verb, str]] = {"Set": "setting the inputs", "Get": "reading the outputs"}
-_OWN_ROWS: Final = (Base.OUTPUT, Base.WATCHED)
+_OWN_ROWS: Final = (RowBase.OUTPUT, RowBase.WATCHED)
 
 
 class PartCall(NamedTuple):
@@ -44,7 +44,7 @@ class PartCall(NamedTuple):
         variables: its variables.
         array: the memory of the ring, of shape (rows, elements).
         base: what `place` is relative to, in the tables of the library.
-        place: of the elements in the row, in bytes; for `Base.FIXED` the address of those of row 0.
+        place: of the elements in the row, in bytes; for `RowBase.FIXED` the address of those of row 0.
         size: number of elements.
         buffer: what the function of the FMU works on; None: on the ring itself.
         function: the getter or setter.
@@ -55,7 +55,7 @@ class PartCall(NamedTuple):
     type: VariableType
     variables: Sequence[Variable]
     array: NDArray[Any]
-    base: Base
+    base: RowBase
     place: int
     size: int
     buffer: Buffer | None
@@ -70,7 +70,7 @@ class PartCall(NamedTuple):
 
     def in_table(self, *, sized: bool) -> Call:
         """The call for the library; ``sized``: the function also takes the number of values (FMI 3.0, 2.2.7)."""
-        base, values = (self.base, self.place) if self.buffer is None else (Base.FIXED, self.buffer.address)
+        base, values = (self.base, self.place) if self.buffer is None else (RowBase.FIXED, self.buffer.address)
         size = self.size if sized else -1
         return Call(address_of(self.function), address_of(self.references), len(self.variables), base, values, size)
 
@@ -125,7 +125,7 @@ class FmuValues(ABC):
         self._input_mask = inputs.mask
         self._output_mask = outputs[0].mask
         self._keep = [inputs, *outputs]
-        self._setters = self._part_calls("Set", inputs, Base.FIXED)
+        self._setters = self._part_calls("Set", inputs, RowBase.FIXED)
         getters = [
             call for base, ring in zip(_OWN_ROWS, outputs, strict=False) for call in self._part_calls("Get", ring, base)
         ]
@@ -176,7 +176,7 @@ class FmuValues(ABC):
         """The time in s at which own step ``step`` begins: one multiplication, as in `TimeGrid.time`."""
         return self._start_time + step * self._points * self._base_step_size
 
-    def _part_calls(self, verb: Verb, ring: Ring, base: Base) -> list[PartCall]:
+    def _part_calls(self, verb: Verb, ring: Ring, base: RowBase) -> list[PartCall]:
         """The calls that move a row of a ring; those that need no buffer are first."""
         calls = []
         for number, part in enumerate(ring.layout.parts):
@@ -188,7 +188,7 @@ class FmuValues(ABC):
                     variables=variables,
                     array=array,
                     base=base,
-                    place=ring.address + offset if base == Base.FIXED else offset,
+                    place=ring.address + offset if base == RowBase.FIXED else offset,
                     size=part.width,
                     buffer=None if self._is_direct(part) else self._buffer(part.type, variables),
                     function=cffi_function(self._function(verb, part.type), self._direct_declaration),

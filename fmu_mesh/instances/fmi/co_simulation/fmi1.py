@@ -10,7 +10,7 @@ from collections.abc import Mapping
 
 from fmpy.fmi1 import FMU1Slave
 
-from ....rings.native import Kind
+from ....rings.native import StepKind
 from ...call_guard import call_named
 from ..calls import cffi_function
 from ..fmi_versions import Fmi1Values
@@ -33,7 +33,7 @@ _NEW, _REPEATED = b"\x01", b"\x00"
 class Fmi1Instance(NativeInstance, Fmi1Values):
     """One instance of an FMI 1.0 co-simulation FMU."""
 
-    _kind = Kind.FMI1
+    _kind = StepKind.FMI1
     _library = FMU1Slave
     _function_names: Mapping[str, str] = {"instantiate": "fmiInstantiateSlave", "freeInstance": "fmiFreeSlaveInstance"}
     _derivatives: Mapping[str, float] = {}

@@ -10,7 +10,7 @@ from fmpy.fmi1 import FMICallException
 from fmpy.fmi2 import FMU2Slave, fmi2Terminated
 
 from ....errors import TerminationRequested
-from ....rings.native import Kind
+from ....rings.native import StepKind
 from ....variables.value_types import Value
 from ..calls import cffi_function
 from ..fmi_versions import Fmi2Values
@@ -28,7 +28,7 @@ _DO_STEP = "int (*)(void *, double, double, int)"
 class Fmi2Instance(NativeInstance, Fmi2Values):
     """One instance of an FMI 2.0 co-simulation FMU."""
 
-    _kind = Kind.FMI2
+    _kind = StepKind.FMI2
     _library = FMU2Slave
     _retrying: RetriedSteps | None = None
     _derivatives: Mapping[str, float] = {}

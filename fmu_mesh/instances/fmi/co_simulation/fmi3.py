@@ -15,7 +15,7 @@ from fmpy.fmi1 import FMICallException
 from fmpy.fmi3 import FMU3Slave
 
 from ....errors import FmuError, TerminationRequested
-from ....rings.native import Base, Kind
+from ....rings.native import RowBase, StepKind
 from ....rings.ring import Ring
 from ....simtime import TimeGrid
 from ....variables.value_types import Value
@@ -37,7 +37,7 @@ _DO_STEP = "int (*)(void *, double, double, _Bool, void *, void *, void *, void 
 class Fmi3Instance(NativeInstance, Fmi3Values):
     """One instance of an FMI 3.0 co-simulation FMU."""
 
-    _kind = Kind.FMI3
+    _kind = StepKind.FMI3
     _library = FMU3Slave
     _function_names: Mapping[str, str] = {"instantiate": "fmi3InstantiateCoSimulation"}
     _steps: Fmi3Steps
@@ -83,7 +83,7 @@ class Fmi3Instance(NativeInstance, Fmi3Values):
         super()._exit_initialization()
         self._checked(lambda: self._steps.exit_initialization(self._said.time))
 
-    def _part_calls(self, verb: Verb, ring: Ring, base: Base) -> list[PartCall]:
+    def _part_calls(self, verb: Verb, ring: Ring, base: RowBase) -> list[PartCall]:
         calls = super()._part_calls(verb, ring, base)
         if verb == "Set":
             self._discrete = [part for part in calls if self._is_discrete(part)]

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from typing import Final
 
 from ....rings import native
-from ....rings.native import OUT_OF_RANGE, STAGE_BITS, Kind, Member, Move, NativeStep, Output, Stage
+from ....rings.native import OUT_OF_RANGE, STAGE_BITS, MemberTable, Move, NativeStep, OutputTable, Stage, StepKind
 from ....rings.ring import Ring
 from ....simtime import TimeGrid
 from ..buffers import NumberBuffer
@@ -31,7 +31,7 @@ class NativeInstance(FmuInstance):
     `StepsNatively` without text, and where a step is nothing but setters, doStep and getters.
     """
 
-    _kind: Kind
+    _kind: StepKind
     _do_step: Function
     """The function of the FMU, as cffi calls it."""
 
@@ -101,7 +101,7 @@ class NativeInstance(FmuInstance):
         self._read_outputs(step + 1)
 
     def _tables(self) -> NativeStep:
-        sized = self._kind == Kind.FMI3
+        sized = self._kind == StepKind.FMI3
         return NativeStep(
             kind=self._kind,
             component=self._component,
@@ -114,10 +114,10 @@ class NativeInstance(FmuInstance):
             kept=(self._said, *self._setters, *self._getters),
         )
 
-    def _member(self, tables: NativeStep, outputs: Sequence[Ring]) -> Member:
+    def _member(self, tables: NativeStep, outputs: Sequence[Ring]) -> MemberTable:
         """The member that takes the steps in this process."""
-        own = [Output(ring.address, ring.stride, ring.mask) for ring in outputs]
-        return Member(
+        own = [OutputTable(ring.address, ring.stride, ring.mask) for ring in outputs]
+        return MemberTable(
             loads=native.table(Move, tables.loads),
             setters=native.table(native.Call, tables.setters),
             getters=native.table(native.Call, tables.getters),
@@ -134,8 +134,8 @@ class NativeInstance(FmuInstance):
             base_step_size=self._base_step_size,
             step_size=self._step_size,
             points=self._points,
-            outputs=(Output * 2)(*own),
-            bases=(ctypes.c_void_p * native.Base.FIRST_GATE)(),
+            outputs=(OutputTable * 2)(*own),
+            bases=(ctypes.c_void_p * native.RowBase.FIRST_GATE)(),
         )
 
     def _fail_to_set(self, step: int, status: int) -> None:
