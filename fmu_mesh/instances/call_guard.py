@@ -33,6 +33,7 @@ from .instance_wrapper import AroundInstance
 __all__ = [
     "DEFAULT_MODE",
     "ENDED",
+    "FOLDER",
     "CallWatch",
     "Guarded",
     "Unwatched",
@@ -61,6 +62,9 @@ _functions: dict[int, str] = {}
 
 _shown_files: set[str] = set()
 """Files of users: what does not return from a function of such a file is told with its line."""
+
+FOLDER: Final = threading.Lock()
+"""Held by who changes the working directory and goes back: all threads of the process have the same one."""
 
 _libm = ctypes.CDLL(None)
 _ENVIRONMENT_BYTES: Final = 512
@@ -101,7 +105,8 @@ def kept_state(*, keep_mode: bool = False) -> Iterator[None]:
     finally:
         _libm.fesetenv(environment if keep_mode else _DEFAULT_ENVIRONMENT)
         if folder is not None and _working_directory() != folder:
-            os.chdir(folder)
+            with FOLDER:
+                os.chdir(folder)
         if locale.setlocale(locale.LC_ALL) != language:
             locale.setlocale(locale.LC_ALL, language)
         for number, action in actions:
@@ -117,7 +122,8 @@ def _action(number: int) -> ctypes.Array[ctypes.c_char]:
 
 def _working_directory() -> str | None:
     try:
-        return os.getcwd()  # noqa: PTH109 `Path.cwd` is the same and slower
+        with FOLDER:
+            return os.getcwd()  # noqa: PTH109 `Path.cwd` is the same and slower
     except FileNotFoundError:  # the folder was removed
         return None
 

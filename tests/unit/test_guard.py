@@ -6,6 +6,7 @@ import ctypes
 import locale
 import os
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import closing
@@ -13,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from fmu_mesh.errors import FmuError, InitializationFailed, StepFailed
+from fmu_mesh.errors import FmuError, InitializationFailed, LoadFailed, StepFailed
 from fmu_mesh.instances.call_guard import (
     CallWatch,
     current_function,
@@ -171,3 +172,34 @@ def test_a_call_that_sets_or_gets_values_has_its_name(tmp_path: Path, monkeypatc
         gain.get_values(["y"])
 
     assert named == ["fmi2SetReal", "fmi2GetReal"]
+
+
+def test_threads_that_load_fmus_at_once_find_the_working_directory_as_it_was(tmp_path: Path) -> None:
+    """FMPy changes the working directory while it loads a library, and the process has only one."""
+    before, failures = Path.cwd(), list[Exception]()
+    description = read_description(FMUS / "Gain.fmu")
+
+    def load(number: int) -> None:
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        try:
+            for _ in range(20):
+                with kept_state():
+                    instance = Fmi2Instance(FMUS / "Gain.fmu", "gain", description, folder)
+                instance.close()
+        except (OSError, LoadFailed) as failed:
+            failures.append(failed)
+
+    threads = [threading.Thread(target=load, args=(number,)) for number in range(4)]
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-5)
+    try:
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join(DEADLINE_S)
+    finally:
+        sys.setswitchinterval(interval)
+
+    assert failures == []
+    assert Path.cwd() == before

@@ -327,6 +327,16 @@ def test_a_setter_that_fails_is_told_with_its_function_and_its_variables(way: st
             instance.do_step(0)
 
 
+def test_a_status_that_fmi_does_not_know_is_told_by_its_number(tmp_path: Path) -> None:
+    with closing(opened(find_fmu("Gain", tmp_path), tmp_path)) as gain:
+        inputs, outputs, _ = rings_of(gain)
+        gain.bind(inputs, (outputs,), GRID, 1)
+        assert isinstance(gain, StepsNatively)
+
+        with pytest.raises(StepFailed, match="fmi2DoStep returned 70000; the FMU gave no message"):
+            gain.finish(0, Stage.STEPPING << STAGE_BITS | 70_000)
+
+
 def variable(instance: FmuInstance, name: str) -> Variable:
     found = instance.description.variable(name)
     assert found is not None

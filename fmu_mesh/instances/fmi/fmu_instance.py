@@ -19,11 +19,12 @@ from ...rings.native import Said
 from ...variables.model_description import ModelDescription
 from ...variables.value_conversion import to_value
 from ...variables.value_types import Value
+from ..call_guard import FOLDER
 from ..contract import LogMessage
 from .archive.archive import Terms
 from .archive.sources import extract
 from .calls import FmpyCalls, pointer
-from .fmu_values import OK, STATUS_NAMES, FmuValues
+from .fmu_values import OK, FmuValues, status_name
 from .state import Bookkeeping, KeepsFmuState
 from .step_options import StepOptions
 
@@ -82,12 +83,13 @@ class FmuInstance(KeepsFmuState, FmuValues):
         self._describe(description)
         self._extracted = extract(path, folder, terms, model=description)
         try:
-            fmu = self._library(
-                guid=description.guid,
-                modelIdentifier=description.model_identifier,
-                unzipDirectory=str(self._extracted),
-                instanceName=name,
-            )
+            with FOLDER:  # FMPy loads a library from its own folder
+                fmu = self._library(
+                    guid=description.guid,
+                    modelIdentifier=description.model_identifier,
+                    unzipDirectory=str(self._extracted),
+                    instanceName=name,
+                )
             self._fmu: Any = FmpyCalls(fmu, self._prefix, self._function_names)
             self._instantiate()
             self._component = fmu.component
@@ -151,7 +153,7 @@ class FmuInstance(KeepsFmuState, FmuValues):
     def logged(self, status: int, category: bytes, message: bytes) -> None:
         """Take a message from the FMU's logger; the last ones become part of an error that follows."""
         text = message.decode(errors="replace").strip()
-        name = STATUS_NAMES[status] if 0 <= status < len(STATUS_NAMES) else str(status)
+        name = status_name(status)
         if status > OK:
             self._last_messages = [*self._last_messages[-2:], text]
         self._log(LogMessage(self.name, name, category.decode(errors="replace"), text, self._said.step))
@@ -211,7 +213,7 @@ class FmuInstance(KeepsFmuState, FmuValues):
 
     def _not_initialized(self, function: str, status: int) -> InitializationFailed:
         self._state = "failed"
-        return InitializationFailed(f"{function} returned {STATUS_NAMES[status]}{self._message()}", instance=self.name)
+        return InitializationFailed(f"{function} returned {status_name(status)}{self._message()}", instance=self.name)
 
     def _failed(
         self, what: str, variable: str | None = None, hint: str | None = None

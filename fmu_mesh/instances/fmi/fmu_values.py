@@ -24,11 +24,11 @@ from ..call_guard import call_named
 from .buffers import Buffer
 from .calls import Function, Pointer, RowPointers, address_of, cffi_function, memory
 
-__all__ = ["OK", "STATUS_NAMES", "WARNING", "FmuValues", "PartCall", "Verb"]
+__all__ = ["OK", "WARNING", "FmuValues", "PartCall", "Verb", "status_name"]
 
 OK: Final = 0
 WARNING: Final = 1
-STATUS_NAMES: Final = ("ok", "warning", "discard", "error", "fatal", "pending")
+_STATUS_NAMES: Final = ("ok", "warning", "discard", "error", "fatal", "pending")
 
 Verb = Literal["Get", "Set"]
 
@@ -229,7 +229,7 @@ class FmuValues(ABC):
     def _part_failed(self, verb: Verb, part: PartCall, status: int) -> StepFailed | InitializationFailed:
         """The error for a getter or setter of a row that has returned a status above warning."""
         if part.buffer is None:
-            return self._failed(f"{_DOING[verb]} returned {STATUS_NAMES[status]}")
+            return self._failed(f"{_DOING[verb]} returned {status_name(status)}")
         return self._transfer_failed(verb, part.type, part.variables, status)
 
     def _transfer(self, verb: Verb, type_: VariableType, variables: Sequence[Variable], buffer: Buffer) -> None:
@@ -249,7 +249,7 @@ class FmuValues(ABC):
         hint = None
         if odd is not None:
             hint = f"FMI does not allow setting '{odd.name}', {odd.role}: leave its start value out."
-        what = f"{self._function_name(verb, type_)} of {', '.join(names)} returned {STATUS_NAMES[status]}"
+        what = f"{self._function_name(verb, type_)} of {', '.join(names)} returned {status_name(status)}"
         return self._failed(what, variable=names[0] if len(names) == 1 else None, hint=hint)
 
     def _load(self, buffer: Buffer, elements: Any, names: Sequence[str]) -> None:  # noqa: ANN401 a list or an array
@@ -270,6 +270,11 @@ class FmuValues(ABC):
         for name in names:
             groups.setdefault(self._variables[name].type, []).append(name)
         return groups
+
+
+def status_name(status: int) -> str:
+    """The name of a status in the words of FMI (FMI 2.0, 2.1.3); of a number that FMI does not know, the number."""
+    return _STATUS_NAMES[status] if 0 <= status < len(_STATUS_NAMES) else str(status)
 
 
 def _is_buffered(part: PartCall) -> bool:

@@ -15,7 +15,7 @@ from fmpy.fmi1 import FMICallException
 
 from ....simtime import step_within
 from ..calls import Function, Pointer
-from ..fmu_values import STATUS_NAMES, WARNING
+from ..fmu_values import WARNING, status_name
 
 __all__ = [
     "DISCARD",
@@ -133,7 +133,7 @@ class RetriedSteps:
             if status == DISCARD:
                 status = take_sub_steps(attempt, time, step_size)
         except FMICallException as error:
-            raise self._failed(f"{error.function} returned {STATUS_NAMES[error.status]}") from error
+            raise self._failed(f"{error.function} returned {status_name(error.status)}") from error
         return DISCARD if self.ends else status
 
     def free(self) -> None:

@@ -14,7 +14,7 @@ from ....rings.native import StepKind
 from ...call_guard import call_named
 from ..calls import cffi_function
 from ..fmi_versions import Fmi1Values
-from ..fmu_values import STATUS_NAMES, WARNING
+from ..fmu_values import WARNING, status_name
 from .discarded_steps import DISCARD, PENDING, SMALLER_STEPS, SMALLEST, StepStatus, discarded, take_sub_steps
 from .native_instance import NativeInstance
 
@@ -80,7 +80,7 @@ class Fmi1Instance(NativeInstance, Fmi1Values):
         if status <= WARNING:
             return
         if status != DISCARD:
-            raise self._failed(f"fmiDoStep returned {STATUS_NAMES[status]}")
+            raise self._failed(f"fmiDoStep returned {status_name(status)}")
         messages = self._last_messages
         last_time = self._step_status.last_successful_time()
         self._last_messages = messages  # a message about this question is not the reason of the failure
@@ -115,7 +115,7 @@ class Fmi1Instance(NativeInstance, Fmi1Values):
         function = _SET_DERIVATIVES((self._symbol("SetRealInputDerivatives"), self._fmu.dll))
         status = function(self._component, references, count, orders, (ctypes.c_double * count)(*signed))
         if status > WARNING:
-            raise self._failed(f"fmiSetRealInputDerivatives returned {STATUS_NAMES[status]}")
+            raise self._failed(f"fmiSetRealInputDerivatives returned {status_name(status)}")
 
     def _initialize(self, start_time: float, stop_time: float | None) -> None:
         """FmiInitializeSlave (FMI 1.0 CS, 3.3)."""

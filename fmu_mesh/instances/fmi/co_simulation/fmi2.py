@@ -14,7 +14,7 @@ from ....rings.native import StepKind
 from ....variables.value_types import Value
 from ..calls import cffi_function
 from ..fmi_versions import Fmi2Values
-from ..fmu_values import STATUS_NAMES, WARNING
+from ..fmu_values import WARNING, status_name
 from ..model_exchange.solver import resolvable
 from ..state import Bookkeeping
 from .discarded_steps import DISCARD, PENDING, RETRY, SMALLER_STEPS, SMALLEST, RetriedSteps, StepStatus, discarded
@@ -83,7 +83,7 @@ class Fmi2Instance(NativeInstance, Fmi2Values):
         try:
             self._fmu.setRealInputDerivatives(references, [1] * len(references), list(derivatives.values()))
         except FMICallException as error:
-            raise self._failed(f"{error.function} returned {STATUS_NAMES[error.status]}") from error
+            raise self._failed(f"{error.function} returned {status_name(error.status)}") from error
 
     def _finish(self, status: int, end: float) -> None:
         """Complete a step to ``end`` (s) whose ``status`` is above warning (FMI 2.0, 4.2.1).
@@ -97,7 +97,7 @@ class Fmi2Instance(NativeInstance, Fmi2Values):
         if status <= WARNING:
             return
         if status != DISCARD:
-            raise self._failed(f"fmi2DoStep returned {STATUS_NAMES[status]}")
+            raise self._failed(f"fmi2DoStep returned {status_name(status)}")
         messages = self._last_messages
         if self._asks_to_end() if self._retrying is None else self._retrying.ends:
             # The outputs are those of the last successful time: a row, if this is the end of the step.

@@ -46,7 +46,7 @@ class NativeInstance(FmuInstance):
         """Let `do_step` work on these rings, ``points`` of ``grid`` each; write the current outputs as row ``step``."""
         super().bind(inputs, outputs, grid, points, step)
         self._native = None
-        self._in_step: tuple[Callable[[Pointer, int], int], Pointer] = _left_to_python, None
+        self._in_step: tuple[Callable[[Pointer, int], int], Pointer] = self._in_python, None
         # A setter of the library has one address to read from; in a ring with more rows, it changes in every step.
         if native.library is None or inputs.rows > 1 or self._needs_python():
             return
@@ -92,6 +92,11 @@ class NativeInstance(FmuInstance):
     @abstractmethod
     def _complete(self, step: int, status: int) -> None:
         """Complete own step ``step`` after the FMU has returned ``status``, or has said that there is more to do."""
+
+    def _in_python(self, _member: Pointer, step: int) -> int:
+        """In the place of the function of the library."""
+        self._step_by_calls(step)
+        return 0
 
     def _step_by_calls(self, step: int) -> None:
         """`do_step` with one call for each function."""
@@ -156,11 +161,6 @@ class NativeInstance(FmuInstance):
             if part.buffer is not None:
                 self._elements(part.buffer, part.names)
         raise self._failed("reading the outputs: a value is out of the range of the type of its output")
-
-
-def _left_to_python(_member: Pointer, _step: int) -> int:
-    """In the place of the function of the library."""
-    return Stage.IN_PYTHON << STAGE_BITS
 
 
 def _moves(part: PartCall, *, load: bool) -> list[Move]:
