@@ -15,7 +15,6 @@ windows among themselves; a node that does not share this memory gets grants and
 
 from __future__ import annotations
 
-import operator
 import time
 from collections.abc import Callable
 
@@ -30,12 +29,11 @@ from ..errors import (
     Interrupted,
     MeshLost,
     MessageRefused,
-    ProtocolBroken,
     TerminationRequested,
     from_report,
 )
-from ..rings.host_memory import HostMemory, Offer, Wish, can_share
-from ..system.plan import MASTER, RECORDER, Plan
+from ..rings.host_memory import HostMemory, can_share
+from ..system.plan import MASTER, Plan
 from ..wire.inbox import Inbox
 from ..wire.keys import Keys, RunKeys
 from ..wire.messages import FINISH, GRANT, PROGRESS, NodeReport, decode_json
@@ -44,9 +42,10 @@ from ..wire.session import RouterLink, tokens
 from ..wire.time_profile import TIME_LINE_ENTRIES, MeshProfile
 from ..wire.values import json_encoding
 from ..wire.views import GOING_ON, Command, CommandAnswer, MeshInfo, MeshState, MeshStatus
+from .granting import Granting
 from .members import Followers, Members, spoken
 from .mesh_server import STATUS_S, Events, MasterServer, mesh_info
-from .pacing import CLOCK, PAUSE, GrantWatch, Pacer, Reach, RunClock
+from .pacing import GrantWatch, Pacer, Reach, RunClock
 
 __all__ = ["Master", "MasterSettings"]
 
@@ -107,35 +106,27 @@ class Master:
         self._run_keys = RunKeys.new(self._keys)
         self._router = router or RouterLink(session)
         self._nodes = list(plan.nodes)
-        self._numbers = {node: number for number, node in enumerate(self._nodes)}
-        # The progress of a slower instance is the point up to which its outputs hold: its next own point minus one.
-        self._most_ahead = 2 * max(item.step_points for item in plan.system.instances.values()) - 2
-        self._windows = [plan.nodes[node].window for node in self._nodes]
-        self._sharing: list[int] = []
-        self._told = 0
         self._most_instances = max(len(node.instances) for node in plan.nodes.values())
-        self._progress = [-1] * len(self._nodes)
-        self._slowest = -1
         self._reports: dict[str, NodeReport] = {}
         self._failure: FmuMeshError | None = None
         self.ended_by: TerminationRequested | None = None
         self._state: MeshState = "starting"
-        self._grant = 0
         self._hold: int | None = None
         self._watch = GrantWatch() if settings.profile else None
         self._pacer = Pacer(plan, config.simulation.real_time_factor)
         self._reach = Reach(plan.window)
-        self._stepping = [number for number, node in enumerate(self._nodes) if node != RECORDER]
         self._clock = RunClock()
         self._published = 0.0
         self._moved = time.monotonic()
         self._shares = config.zenoh.shared_memory and can_share()
         memory_of = HostMemory.create if self._shares else HostMemory.private
         self._memory = memory_of(next(iter(plan.nodes.values())).memory, MASTER)
+        self._granting = Granting(plan, self._memory)
         self._inbox = Inbox(self._memory)
         self._inbox.open(session, self._run_keys, MASTER, {self._run_keys.progress(node): node for node in self._nodes})
         self._followers = Followers(self._inbox, lambda: self._state in ("running", "paused"))
-        self._members = Members(plan, session, self._run_keys, self._offer(), self._lose, settings.launch)
+        offer = self._memory.offer if self._shares else None
+        self._members = Members(plan, session, self._run_keys, offer, self._lose, settings.launch)
         self._send = self._members.send
         self._server = MasterServer(session, self._keys, self._inbox, events, self.last_status, plan.system.instances)
         self._publish_status = self._server.publish_status
@@ -143,9 +134,6 @@ class Master:
     def memory_for(self, participant: str) -> HostMemory | None:
         """The memory of the host for a participant in this process; None if nothing is shared."""
         return self._memory.participant(participant) if self._shares else None
-
-    def _offer(self) -> Offer | None:
-        return self._memory.offer if self._shares else None
 
     def claim(self) -> None:
         """Become the visible master of this mesh; from now on queries wait until `run` answers them.
@@ -174,7 +162,9 @@ class Master:
         try:
             self._wait_for_nodes()
             self._enter("initializing")
-            self._wait_for(lambda: self._slowest >= 0, self._timeouts.initialize, "Initialization Mode is not over in")
+            self._wait_for(
+                lambda: self._granting.slowest >= 0, self._timeouts.initialize, "Initialization Mode is not over in"
+            )
             self._grant_to_the_end()
             self._enter("stopping")
             self._send(FINISH, 0)
@@ -210,7 +200,7 @@ class Master:
     @property
     def has_begun(self) -> bool:
         """Whether all nodes have reached the first point; from any thread."""
-        return self._slowest >= 0
+        return self._granting.slowest >= 0
 
     @property
     def seconds(self) -> float:
@@ -242,7 +232,7 @@ class Master:
                 raise self._members.absence()
             self._turn(0.25)
         self._members.welcome(TIME_LINE_ENTRIES // len(self._nodes) if self._watch is not None else 0)
-        self._sharing = [self._numbers[node] for node in self._members.shared]
+        self._granting.share(self._members.shared)
 
     def _grant_to_the_end(self) -> None:
         if self._settings.paused:
@@ -254,60 +244,46 @@ class Master:
         self._moved = time.monotonic()
         # Each instance has its own deadline for a step; the instances of a group step one after the other.
         patience_s = 3 * self._timeouts.step * self._most_instances
-        while self._slowest < self._last_point:
+        while self._granting.slowest < self._last_point:
             self._turn(self._publish_grant())
-            if self._hold is not None and self._slowest >= self._hold:
+            if self._hold is not None and self._granting.slowest >= self._hold:
                 self._clock.stop()
             silent_s = time.monotonic() - self._moved
-            if silent_s > patience_s and self._slowest < self._grant and self._hold is None:
+            if silent_s > patience_s and self._granting.slowest < self._granting.grant and self._hold is None:
                 raise DeadlineExceeded(
                     f"no progress for {silent_s:.1f} s",
-                    instance=spoken(self._nodes[self._progress.index(self._slowest)]),
-                    point=self._slowest,
-                    time=self._plan.grid.time(self._slowest),
+                    instance=spoken(self._granting.laggard),
+                    point=self._granting.slowest,
+                    time=self._plan.grid.time(self._granting.slowest),
                 )
         self._clock.stop()
 
     def _publish_grant(self) -> float:
         """Raise the grant if it can be increased; return how long to wait until the next check, in s."""
-        ahead = min(self._progress[number] for number in self._stepping)
+        granting = self._granting
+        ahead = granting.ahead
         grant = min(ahead + self._reach.points(ahead, time.monotonic()), self._last_point)
         if self._hold is not None:
             grant = min(grant, self._hold)
-        paced, pause = self._pacer.limit(grant, self._slowest)
-        grant = max(self._grant, min(grant, paced))
+        paced, pause = self._pacer.limit(grant, self._granting.slowest)
+        grant = max(granting.grant, min(grant, paced))
         if self._watch is not None:
-            self._watch.look(self._holder(grant, paced))
-        if grant > self._grant:
-            now = time.monotonic()
-            if self._slowest >= self._grant:  # they had nothing to do until now, because of the wall clock
-                self._moved = now
-            self._grant = grant
-            self._memory.grant.raise_to(grant)
+            at_end = grant == self._last_point
+            self._watch.look(None if at_end else granting.holder(grant, hold=self._hold, paced=paced))
+        if grant > granting.grant:
+            if granting.slowest >= granting.grant:  # they had nothing to do until now, because of the wall clock
+                self._moved = time.monotonic()
+            granting.raise_to(grant)
         self._tell_grant()
         return min(pause, STATUS_S, self._heartbeat_s)
 
     def _tell_grant(self) -> None:
         """Send the grant to nodes that cannot read it, and to all as a sign that the master lives."""
         now = time.monotonic()
-        is_due = now - self._published >= self._heartbeat_s
-        if len(self._sharing) < len(self._nodes):
-            credit = min(map(operator.add, self._progress, self._windows))
-            granted = max(self._told, min(self._grant, credit))
-            if granted > self._told:
-                self._told = granted
-                is_due = True
-        if is_due:
+        owed, grown = self._granting.owed()
+        if grown or now - self._published >= self._heartbeat_s:
             self._published = now
-            self._send(GRANT, self._told)
-
-    def _holder(self, grant: int, paced: int) -> str | None:
-        """What limits the steps at present, for a profile."""
-        if grant == self._last_point:
-            return None
-        if grant in (self._hold, paced):
-            return PAUSE if grant == self._hold else CLOCK
-        return self._nodes[min(range(len(self._nodes)), key=lambda n: self._progress[n] + self._windows[n])]
+            self._send(GRANT, owed)
 
     @property
     def _last_point(self) -> int:
@@ -319,11 +295,9 @@ class Master:
         deadline = time.monotonic() + timeout_s
         while not reached():
             if time.monotonic() > deadline:
-                missing = [
-                    node
-                    for number, node in enumerate(self._nodes)
-                    if (self._progress[number] < 0 if self._state == "initializing" else node not in self._reports)
-                ]
+                initializing = self._state == "initializing"
+                progress = self._granting.progress
+                missing = [n for n in self._nodes if (progress[n] < 0 if initializing else n not in self._reports)]
                 raise DeadlineExceeded(f"{what} {spoken(*missing)} within {timeout_s:g} s")
             if self._state == "initializing":
                 self._tell_grant()
@@ -335,51 +309,21 @@ class Master:
         Raises:
             FmuMeshError: a node failed or was lost.
         """
-        message, moved = self._inbox.wait(timeout_s, self._wishes()), False
+        granting, ended = self._granting, self.ended_by is not None
+        wishes = granting.wishes(self._last_point) if self._state != "stopping" else ()
+        message, moved = self._inbox.wait(timeout_s, wishes), False
         while message is not None:
-            moved = self._take_progress(*message) or moved
+            node, kind, _, _, point, _ = message
+            if kind == PROGRESS:
+                moved = granting.take(node, point, ended=ended) or moved
+            else:
+                self._inbox.refusals.add(spoken(node), f"a message of kind {kind} is not one that the master accepts")
             message = self._inbox.poll()
-        for number in self._sharing:
-            moved = self._progressed(number, self._memory.progress[self._nodes[number]].value - 1) or moved
-        if moved:  # whichever it is: the slowest node may wait for another slow one
-            self._slowest = min(self._progress)
+        if granting.look(ended=self.ended_by is not None) or moved:  # the slowest node may wait for another slow one
             self._moved = time.monotonic()
         self._publish_status()
         if self._failure is not None:
             raise self._failure
-
-    def _take_progress(self, node: str, kind: int, _link: int, _count: int, point: int, _data: bytes) -> bool:
-        """Store the progress of a node; return whether it has increased."""
-        if kind != PROGRESS:
-            self._inbox.refusals.add(spoken(node), f"a message of kind {kind} is not one that the master accepts")
-            return False
-        number = self._numbers[node]
-        if number in self._sharing or not self._progressed(number, point):
-            return False
-        self._memory.progress[node].raise_to(point + 1)
-        return True
-
-    def _progressed(self, number: int, point: int) -> bool:
-        """Store the progress of a node; return whether it has increased."""
-        if not self._may_be_at(self._nodes[number], point):
-            self._fail(self._broken(self._nodes[number], f"is at point {point}"))
-            return False
-        if point <= self._progress[number]:
-            return False
-        self._progress[number] = point
-        return True
-
-    def _wishes(self) -> list[Wish]:
-        """Wake up when the slowest node of this host has come so far that there is something to do."""
-        if not self._sharing:
-            return []
-        numbers = self._sharing if self._grant >= self._last_point else [*{*self._sharing} & {*self._stepping}]
-        slowest = min(numbers or self._sharing, key=self._progress.__getitem__)
-        reached = self._progress[slowest]
-        goal = self._grant if self._grant >= self._last_point else (reached + self._grant) // 2
-        if reached >= self._grant or self._state == "stopping":
-            return [] if reached >= 0 else [(self._memory.progress[self._nodes[slowest]], 1)]
-        return [(self._memory.progress[self._nodes[slowest]], max(goal, reached + 1) + 1)]
 
     def _fail(self, error: FmuMeshError) -> None:
         if self._failure is None:
@@ -402,18 +346,18 @@ class Master:
 
     def _take_report(self, query: zenoh.Query) -> None:
         node = RunKeys.node_in(str(query.key_expr))
-        report = decode_json(payload_of(query), NodeReport)
+        report, granting = decode_json(payload_of(query), NodeReport), self._granting
         if report.node != node or not self._members.is_admitted(node):
             raise MessageRefused("its sender has not registered")
         error = from_report(report.error) if report.error is not None else None
         if isinstance(error, TerminationRequested):
             # Its node continues with its other instances, and reports this again at the end.
-            if error.point is None or not self._may_be_at(node, error.point):
-                self._fail(self._broken(node, f"has an FMU that ends the simulation at point {error.point}"))
+            if error.point is None or not granting.may_be_at(node, error.point, ended=self.ended_by is not None):
+                self._fail(granting.broken(node, f"has an FMU that ends the simulation at point {error.point}"))
             elif error.point < self._last_point:
                 self.ended_by = error
         elif error is None and self._state in GOING_ON:
-            self._fail(self._broken(node, f"has ended at point {report.point}"))
+            self._fail(granting.broken(node, f"has ended at point {report.point}"))
         else:
             self._reports[node] = report
             if error is not None:
@@ -421,34 +365,18 @@ class Master:
         query.reply(query.key_expr, b"")
         query.drop()
 
-    def _may_be_at(self, node: str, point: int) -> bool:
-        """Whether a node can have reached this point with its grants."""
-        ended = self.ended_by is not None and node != RECORDER
-        most = self._plan.grid.last_point if ended else self._grant + self._most_ahead
-        return -1 <= point <= most
-
-    def _broken(self, node: str, what: str) -> ProtocolBroken:
-        return ProtocolBroken(
-            f"{spoken(node)} says that it {what}, and the master has granted point {self._grant}",
-            instance=self._instances_of(node),
-            hint="Does another process send messages with its name?",
-        )
-
-    def _instances_of(self, node: str) -> str | None:
-        return ", ".join(item.name for item in self._plan.nodes[node].instances) or None
-
     def _lose(self, node: str) -> None:
         """The process of a node is gone; this is an error unless the node has reported its end."""
         if node in self._reports:
             return
-        point = max(self._progress[self._numbers[node]], 0)
+        point = max(self._granting.progress[node], 0)
         loss = self._router.loss()
         self._fail(
             MeshLost(
                 f"{loss}, and {spoken(node)} with it"
                 if loss is not None
                 else f"{spoken(node)} was lost: its process does not answer any more",
-                instance=self._instances_of(node),
+                instance=self._granting.instances_of(node),
                 point=point,
                 time=self._plan.grid.time(point),
             )
@@ -470,19 +398,19 @@ class Master:
             return
         match command.command:
             case "pause":
-                self._state, self._hold = "paused", self._grant
+                self._state, self._hold = "paused", self._granting.grant
             case "resume":
                 self._state, self._hold = "running", None
                 self._clock.start()
-                self._pacer.start(self._slowest)
+                self._pacer.start(self._granting.slowest)
             case "step":
-                self._state, self._hold = "paused", max(self._hold or 0, self._grant) + max(1, command.points)
+                self._state, self._hold = "paused", max(self._hold or 0, self._granting.grant) + max(1, command.points)
                 self._clock.start()
-                self._pacer.start(self._slowest)
+                self._pacer.start(self._granting.slowest)
             case "stop":
                 self._stop()
         self._moved = time.monotonic()
-        answer = CommandAnswer(command.command, self._state, self._slowest, self._hold)
+        answer = CommandAnswer(command.command, self._state, self._granting.slowest, self._hold)
         query.reply(self._keys.mesh_key("command"), msgspec.json.encode(answer), encoding=json_encoding)
         query.drop()
 
@@ -491,10 +419,10 @@ class Master:
         grid, self._hold = self._plan.grid, None
         if grid.stop_time is not None:
             text = f"stopped by a command before its stop time of {grid.stop_time:.12g} s"
-            self._fail(Interrupted(text, point=self._slowest, time=grid.time(self._slowest)))
+            self._fail(Interrupted(text, point=self._granting.slowest, time=grid.time(self._granting.slowest)))
         elif self.ended_by is None:
             text = "stopped by a command, the normal end of a run without a stop time"
-            self.ended_by = TerminationRequested(text, point=self._grant, time=grid.time(self._grant))
+            self.ended_by = TerminationRequested(text, point=self._granting.grant, time=grid.time(self._granting.grant))
 
     # --- views
 
@@ -504,7 +432,7 @@ class Master:
 
     def last_status(self) -> MeshStatus:
         """The state of the run right now."""
-        point = min(max(self._slowest, 0), self._last_point)
+        point = min(max(self._granting.slowest, 0), self._last_point)
         elapsed = self._clock.elapsed()
         rate = point / elapsed if elapsed > 0 else 0.0
         failure: ErrorReport | None = self._failure.report() if self._failure is not None else None
@@ -516,7 +444,7 @@ class Master:
             time=self._plan.grid.time(point),
             points_per_second=rate,
             real_time_factor=rate * self._plan.grid.step_size,
-            progress={node: max(progress, 0) for node, progress in zip(self._nodes, self._progress, strict=True)},
+            progress={node: max(point, 0) for node, point in self._granting.progress.items()},
             error=failure,
             overruns=self._pacer.overruns,
             refused=self._inbox.refusals.count,

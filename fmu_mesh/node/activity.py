@@ -44,6 +44,14 @@ class Activity:
         self._engine: Engine | None = None
         self._under_way: tuple[str, int, float] | None = None
 
+    def enter(self, state: str) -> None:
+        """From now on the node is in this state."""
+        self.state = state
+
+    def serve(self, runners: Mapping[str, Runner]) -> None:
+        """All instances are loaded."""
+        self.runners = runners
+
     def steps_with(self, engine: Engine) -> None:
         """The engine of this node, once there is one."""
         self._engine = engine
@@ -99,7 +107,7 @@ class Activity:
             with engine.sending:
                 self._send()
         else:
-            engine.attend()
+            engine.ring_bell()
         if under_way_s <= self._plan.timeouts.step:
             return None
         return StepFailed(

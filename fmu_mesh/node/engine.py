@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import ctypes
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from threading import Lock
 from time import perf_counter
 from typing import Final, cast
@@ -21,7 +22,7 @@ from ..rings import native
 from ..rings.host_memory import HostMemory
 from ..rings.native import BurstEnd, RowBase, Stage, StepKind, table
 from ..system.plan import NodePlan
-from .stepping import Position, Runner
+from .stepping import Position, Runner, Source
 
 __all__ = ["BurstEngine", "Engine", "PlainEngine", "make_engine"]
 
@@ -70,7 +71,7 @@ class Engine(ABC):
         """
 
     @abstractmethod
-    def attend(self) -> None:
+    def ring_bell(self) -> None:
         """From any thread: let `run` return after the current step."""
 
     @property
@@ -118,7 +119,7 @@ class BurstEngine(Engine):
         super().__init__(plan, units, memory, shared=shared)
         assert native.library is not None
         self._library = native.library
-        self._kept: dict[int, list[object]] = {}
+        self._kept: dict[tuple[int, int], list[object]] = {}
         self._members = [(native.MemberTable * len(unit))() for unit in units]
         self._units = table(native.UnitTable, [self._unit(number) for number in range(len(units))])
         self._peers = table(native.Peer, [native.Peer(counter.address, window) for counter, window in self._windows])
@@ -137,7 +138,9 @@ class BurstEngine(Engine):
         self._address = ctypes.addressof(self._node)
         for number, unit in enumerate(units):
             for index, runner in enumerate(unit):
-                self._follow(runner, self._members[number][index])
+                fill = partial(self._fill, number, index)
+                runner.follow(_InTable(self._members[number][index], fill))
+                fill()
 
     def run(self, wait_s: float, *, eager: bool) -> bool:
         """See `Engine`."""
@@ -160,7 +163,7 @@ class BurstEngine(Engine):
         self.waited_s = node.waited_ns / 1e9
         return self._ticks != before
 
-    def attend(self) -> None:
+    def ring_bell(self) -> None:
         """See `Engine`."""
         self._library.attend(self._address)
 
@@ -194,65 +197,52 @@ class BurstEngine(Engine):
             members=self._members[number], n_members=len(unit), tick_points=points, last_tick=last_tick, burst=1
         )
 
-    def _follow(self, runner: Runner, member: native.MemberTable) -> None:
-        """Fill the table of a runner now, and again whenever it steps in another way."""
-
-        def changed() -> None:
-            self._fill(runner, member)
-
-        runner.follow(member, changed)  # type: ignore[arg-type]  # it has a step and a stage, as a `Position`
-        changed()
-
-    def _fill(self, runner: Runner, member: native.MemberTable) -> None:
+    def _fill(self, unit: int, index: int) -> None:
+        """Fill the table of a runner: at the start, and again whenever it steps in another way."""
+        runner, before = self._at(unit, index)
         own = runner.instance.native if isinstance(runner.instance, StepsNatively) else None
         if own is not None and any(source.transfer.has_text for source in runner.sources):
             own = None
         gates, loads = [], []
         for number, source in enumerate(runner.sources):
-            ring, rule = source.transfer.source, source.transfer.rule
-            gates.append(
-                native.Gate(
-                    counter=source.counter.address,
-                    rows=ring.address,
-                    stride=ring.stride,
-                    mask=ring.mask,
-                    lead=rule.lead,
-                    points=rule.source_points,
-                )
-            )
+            gates.append(_gate(source))
             loads += source.transfer.moves(RowBase.FIRST_GATE + number)
-        watched = runner.watched if runner.watched is not None else runner.outputs
-        grid, points = runner.grid, runner.plan.step_points
-        bases = (ctypes.c_void_p * (RowBase.FIRST_GATE + len(gates)))()
-        loads = [*loads, *(own.loads if own is not None else ())]
+        loads += own.loads if own is not None else ()
         setters, getters, stores = (own.setters, own.getters, own.stores) if own is not None else ((), (), ())
-        tables = [
-            table(native.Gate, gates),
-            table(native.Move, loads),
-            table(native.Call, setters),
-            table(native.Call, getters),
-            table(native.Move, stores),
-        ]
-        self._kept[id(runner)] = [*tables, bases, own]
-        member.gates, member.loads, member.setters, member.getters, member.stores = tables
-        member.n_gates, member.n_loads, member.n_setters = len(gates), len(loads), len(setters)
-        member.n_getters, member.n_stores = len(getters), len(stores)
-        member.kind = own.kind if own is not None else StepKind.BY_PYTHON
-        member.component, member.do_step, member.said = (
-            (own.component, own.do_step, own.said) if own is not None else (None, None, None)
+        bases = (ctypes.c_void_p * (RowBase.FIRST_GATE + len(gates)))()
+        grid, points = runner.grid, runner.plan.step_points
+        watched = runner.watched if runner.watched is not None else runner.outputs
+        rings = [native.OutputTable(ring.address, ring.stride, ring.mask) for ring in (runner.outputs, watched)]
+        made = native.MemberTable(
+            gates=table(native.Gate, gates),
+            loads=table(native.Move, loads),
+            setters=table(native.Call, setters),
+            getters=table(native.Call, getters),
+            stores=table(native.Move, stores),
+            n_gates=len(gates),
+            n_loads=len(loads),
+            n_setters=len(setters),
+            n_getters=len(getters),
+            n_stores=len(stores),
+            kind=own.kind if own is not None else StepKind.BY_PYTHON,
+            component=own.component if own is not None else None,
+            do_step=own.do_step if own is not None else None,
+            said=own.said if own is not None else None,
+            start_time=grid.start_time,
+            base_step_size=grid.step_size,
+            step_size=points * grid.step_size,
+            points=points,
+            every=points // self.tick_points(self.units[unit]),
+            last_step=runner.last_step,
+            outputs=(native.OutputTable * 2)(*rings),
+            counter=runner.counter.address,
+            bases=ctypes.cast(bases, ctypes.POINTER(ctypes.c_void_p)),
+            step=before.step,
+            stage=before.stage,
+            outcome=before.outcome,
         )
-        member.start_time, member.base_step_size = grid.start_time, grid.step_size
-        member.step_size, member.points = points * grid.step_size, points
-        member.every = points // self.tick_points(self._unit_of(runner))
-        member.last_step = runner.last_step
-        for place, ring in enumerate((runner.outputs, watched)):
-            output = member.outputs[place]
-            output.rows, output.stride, output.mask = ring.address, ring.stride, ring.mask
-        member.counter = runner.counter.address
-        member.bases = ctypes.cast(bases, ctypes.POINTER(ctypes.c_void_p))
-
-    def _unit_of(self, runner: Runner) -> Sequence[Runner]:
-        return next(unit for unit in self.units if runner in unit)
+        self._kept[unit, index] = [made, bases, own]  # what the table points to
+        self._members[unit][index] = made
 
     def _at(self, unit: int, member: int) -> tuple[Runner, native.MemberTable]:
         return self.units[unit][member], self._members[unit][member]
@@ -293,6 +283,40 @@ class BurstEngine(Engine):
         )
 
 
+class _InTable(Position):
+    """How far a runner is, as its table has it."""
+
+    def __init__(self, member: native.MemberTable, fill: Callable[[], None]) -> None:
+        self._member = member
+        self._fill = fill
+
+    @property
+    def step(self) -> int:  # type: ignore[override]  # only the burst changes it
+        """See `Position`."""
+        return int(self._member.step)
+
+    @property
+    def stage(self) -> int:  # type: ignore[override]  # as above
+        """See `Position`."""
+        return int(self._member.stage)
+
+    def refit(self) -> None:
+        """See `Position`."""
+        self._fill()
+
+
+def _gate(source: Source) -> native.Gate:
+    ring, rule = source.transfer.source, source.transfer.rule
+    return native.Gate(
+        counter=source.counter.address,
+        rows=ring.address,
+        stride=ring.stride,
+        mask=ring.mask,
+        lead=rule.lead,
+        points=rule.source_points,
+    )
+
+
 class PlainEngine(Engine):
     """Steps in plain Python.
 
@@ -318,7 +342,7 @@ class PlainEngine(Engine):
         self._spent_s = [0.0] * len(units)
         self._attention = False
         for runner in self.runners:
-            runner.follow(self._positions[runner.name], lambda: None)
+            runner.follow(self._positions[runner.name])
 
     def run(self, wait_s: float, *, eager: bool) -> bool:  # noqa: ARG002  it never waits after a step
         """See `Engine`."""
@@ -338,7 +362,7 @@ class PlainEngine(Engine):
         self._attention = False
         return stepped
 
-    def attend(self) -> None:
+    def ring_bell(self) -> None:
         """See `Engine`."""
         self._attention = True
         self._memory.ring_bell()
@@ -383,16 +407,16 @@ class PlainEngine(Engine):
         step = position.step
         for source in runner.sources:
             source.transfer.step(step)
-        position.stage = Stage.IN_PYTHON
+        position.enter(Stage.IN_PYTHON)
         try:
             runner.instance.do_step(step)
         except TerminationRequested:
             self._stopped.add(number)
             raise
         finally:
-            position.stage = Stage.WAITING
+            position.enter(Stage.WAITING)
         if floating_point_changed():
             restore_floating_point()
         runner.outputs.stamp(step + 1)
-        position.step = step + 1
+        position.count()
         runner.counter.raise_to(step + 2)

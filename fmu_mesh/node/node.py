@@ -17,8 +17,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Collection
-from functools import partial
+from collections.abc import Callable
 
 import zenoh
 
@@ -35,8 +34,7 @@ from ..errors import (
     from_report,
 )
 from ..instances.contract import Instance
-from ..rings.host_memory import ONE_CORE, Counter, HostMemory
-from ..rings.ring import Ring
+from ..rings.host_memory import ONE_CORE, HostMemory
 from ..system.plan import RECORDER, Link, NodePlan
 from ..wire.frames import FrameReceiver, of_text
 from ..wire.inbox import Inbox, Message
@@ -54,12 +52,13 @@ from ..wire.messages import (
 )
 from ..wire.session import RouterLink
 from .activity import Activity
+from .connecting import connect
 from .engine import Engine, make_engine
 from .initialization import Initialization
 from .inputs import TimedInputs
 from .links import OutLink
 from .node_server import NodeServer
-from .stepping import Runner, sources_of
+from .stepping import Runner
 from .streams import PRIORITY
 from .time_measurement import Profiler
 
@@ -175,14 +174,14 @@ class Node:
     def _load(self) -> None:
         """Instantiate the FMUs."""
         plan = self._plan
-        self._activity.state = "loading"
+        self._activity.enter("loading")
         instances = {}
         for item in plan.instances:
             instance = self._open_instance(item.name)
             if item.section.interpolation is not None:
                 instance = TimedInputs(instance, item.section.interpolation)
             instances[item.name] = instance
-        self._activity.state = "waiting for the mesh"
+        self._activity.enter("waiting for the mesh")
         self._membership.keys(plan.timeouts.start)
         self._memory = self._membership.open_memory() or self._own_memory
         for place in plan.rings:
@@ -216,49 +215,12 @@ class Node:
             layout = of_text(link.layout) if link.target_node in shares else link.layout
             links = self._initialization.out_links if link.initial_only else runner.out_links
             links.append(OutLink(link, layout, runner.outputs, put))
-        rings = self._rings_of_sources(shares)
-        step_points = {place.instance: place.step_points for place in plan.rings}
-        for runner in self._runners.values():
-            runner.sources += sources_of(runner, rings, step_points)
+        self._receivers = connect(plan, self._runners, self._memory, self._own_memory, shares)
         self._put_progress = membership.sender(keys.progress(plan.node))
-
-    def _rings_of_sources(self, shares: Collection[str]) -> dict[str, list[tuple[Ring, Counter, bool | None]]]:
-        """Where the rows of each source are: in a ring that others share, or in a mirror that its frames fill."""
-        plan = self._plan
-        rings: dict[str, list[tuple[Ring, Counter, bool | None]]] = {
-            name: [(runner.outputs, runner.counter, None)] for name, runner in self._runners.items()
-        }
-        places = {place.instance: place for place in plan.rings}
-        for link in plan.links_in:
-            self._receivers[link.index] = link
-            if link.initial_only:
-                continue
-            place = places[link.source]
-            shared = link.source_node in shares
-            layout = of_text(link.layout) if shared else link.layout
-            found = rings.setdefault(link.source, [])
-            if shared:
-                found.append((self._memory.ring(place), self._memory.counter(place.counter), False))
-            if layout.columns:
-                mirror, counter = self._own_memory.ring(place), self._own_memory.counter(place.counter)
-                found.append((mirror, counter, True if shared else None))
-                fits = partial(self._fits, link.source)
-                who = f"node '{plan.node}'"
-                self._receivers[link.index] = FrameReceiver(link, layout, who, mirror, counter, fits)
-        return rings
-
-    def _fits(self, source: str, end: int) -> bool:
-        """Whether rows of a mirror before own step ``end`` overwrite no row that a step still needs."""
-        return all(
-            end - own.transfer.rule.row_for(runner.step) <= own.transfer.source.rows
-            for runner in self._runners.values()
-            for own in runner.sources
-            if own.instance == source
-        )
 
     def _initialize(self) -> Engine:
         """Initialization Mode: set, get and exchange values level by level; then the outputs are those of point 0."""
-        self._activity.state = "initializing"
+        self._activity.enter("initializing")
         plan, grid = self._plan, self._plan.grid
         for runner in self._runners.values():
             stop_time = grid.told_stop_time(runner.plan.step_points)
@@ -270,7 +232,7 @@ class Node:
         units = [[self._runners[name] for name in names] for names in plan.units]
         shared = self._memory is not self._own_memory
         self._engine = engine = self._make_engine(plan, units, self._memory, shared=shared, spins=not ONE_CORE)
-        self._inbox.move_to(self._memory, engine.attend)
+        self._inbox.move_to(self._memory, engine)
         self._activity.steps_with(engine)
         for runner in self._runners.values():
             runner.begin()
@@ -288,7 +250,7 @@ class Node:
 
     def _step_to_the_end(self, engine: Engine) -> None:
         """The loop of the module's docstring."""
-        self._activity.state = "running"
+        self._activity.enter("running")
         eager = any(link.has_frames for runner in self._runners.values() for link in runner.out_links)
         if self._profiler is not None:
             self._profiler.start(engine)
@@ -429,7 +391,7 @@ class Node:
 
     def _report_failure(self, error: FmuMeshError) -> bool:
         """Report the failure to the master, unless the master is gone; return whether it knows now."""
-        self._activity.state = "failed"
+        self._activity.enter("failed")
         if self._membership.lost_master:
             return True
         self.server.say_everything()

@@ -90,7 +90,7 @@ class NodeServer:
 
     def serve(self, runners: Mapping[str, Runner]) -> None:
         """From now on values can be read and set, and streams can be subscribed."""
-        self._activity.runners = runners
+        self._activity.serve(runners)
         for runner in runners.values():
             self._streams.append(
                 InstanceStreams(runner, self._session, self._keys, self._plan.grid, self._streams_changed)

@@ -5,7 +5,7 @@ Owns what one step of one instance needs, and nothing about waiting. `fmu_mesh.n
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import NamedTuple, TypeVar
 
 from ..instances.contract import Instance
@@ -18,7 +18,7 @@ from ..system.layout import Layout
 from ..system.plan import InstancePlan
 from .links import OutLink
 
-__all__ = ["Position", "Runner", "Source", "sources_of"]
+__all__ = ["Position", "Runner", "Source"]
 
 Wrapped = TypeVar("Wrapped", bound=Instance)
 
@@ -42,7 +42,7 @@ class Source(NamedTuple):
 
 
 class Position:
-    """How far a runner is.
+    """How far a runner is; whoever steps it has a class of its own for it.
 
     Attributes:
         step: number of own steps done.
@@ -52,6 +52,17 @@ class Position:
     def __init__(self) -> None:
         self.step = 0
         self.stage = 0
+
+    def enter(self, stage: int) -> None:
+        """Note what it is doing."""
+        self.stage = stage
+
+    def count(self) -> None:
+        """Note that a step is done."""
+        self.step += 1
+
+    def refit(self) -> None:
+        """The runner steps in another way from now on."""
 
 
 class Runner:
@@ -82,8 +93,7 @@ class Runner:
         self.watched: Ring | None = None
         self.last_step = grid.last_point // plan.step_points
         self.grid = grid
-        self._position: Position = Position()
-        self._changed: Callable[[], None] = lambda: None
+        self._position = Position()
 
     def bind(self) -> None:
         """Bind the instance to its rows, and read the current outputs. Call after Initialization Mode."""
@@ -91,7 +101,7 @@ class Runner:
         fill_unconnected(self.inputs, connected, self.instance.get_values)
         outputs = (self.outputs,) if self.watched is None else (self.outputs, self.watched)
         self.instance.bind(self.inputs, outputs, self.grid, self.plan.step_points, self.step)
-        self._changed()
+        self._position.refit()
 
     def begin(self) -> None:
         """The outputs after Initialization Mode are complete: row 0."""
@@ -101,7 +111,7 @@ class Runner:
     def stop(self) -> None:
         """This instance takes no more steps: its outputs hold to the end."""
         self.last_step = self.step
-        self._changed()
+        self._position.refit()
 
     def flush(self, *, lazy: bool = True) -> None:
         """Send all rows that were not sent yet; those for the recorder only if ``lazy``."""
@@ -116,10 +126,13 @@ class Runner:
             if link.to_recorder:
                 link.send_last(end)
 
-    def follow(self, position: Position, changed: Callable[[], None]) -> None:
-        """From now on, ``position`` is where this runner is; ``changed`` is called when it steps in another way."""
+    def follow(self, position: Position) -> None:
+        """From now on, ``position`` is where this runner is."""
         self._position = position
-        self._changed = changed
+
+    def connect(self, sources: Iterable[Source]) -> None:
+        """Add sources of its inputs."""
+        self.sources += sources
 
     def watch(self, names: Sequence[str]) -> None:
         """From now on also read these outputs after every step; the plan does not contain them."""
@@ -130,7 +143,7 @@ class Runner:
     def wrap(self, wrapper: Callable[[Instance], Wrapped]) -> Wrapped:
         """Replace the instance by what ``wrapper`` makes of it, from the next step on; return the new one."""
         self.instance = wrapped = wrapper(self.instance)
-        self._changed()
+        self._position.refit()
         return wrapped
 
     @property
@@ -171,28 +184,3 @@ class Runner:
             return "the master's grant"
         output, own = source.transfer.columns[0][:2]
         return f"'{source.instance}.{output}', which feeds '{self.name}.{own}'"
-
-
-def sources_of(
-    runner: Runner, rings: Mapping[str, Sequence[tuple[Ring, Counter, bool | None]]], step_points: Mapping[str, int]
-) -> Iterator[Source]:
-    """The sources of a runner.
-
-    Args:
-        runner: the runner.
-        rings: of each instance, where its rows are: rings with their counters, and whether only text (True) or only
-            numbers (False) are taken from there.
-        step_points: base points per own step of each instance.
-    """
-    for feed in runner.plan.feeds:
-        for ring, counter, text in rings[feed.source]:
-            transfer = Transfer(
-                feed,
-                ring,
-                runner.inputs,
-                source_points=step_points[feed.source],
-                target_points=runner.plan.step_points,
-                text=text,
-            )
-            if transfer.columns:
-                yield Source(feed.source, transfer, counter)

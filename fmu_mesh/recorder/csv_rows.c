@@ -44,7 +44,7 @@ typedef struct {
   int64_t stride;
   int64_t type;
   uint64_t bits;    /* the last value */
-  const char *text; /* its text, with the character after it; NULL: there is none yet */
+  const char *text; /* where its text was first written, with the character after it; NULL: nowhere yet */
   int64_t size;     /* of this text */
 } Column;
 
@@ -144,6 +144,8 @@ typedef struct { /* 16 characters in order, and the last one; `count` of the 17 
   int count;
 } Text;
 
+/* Split numbers in halves, until each is one digit: n / 10000 is n * 109951163 / 2^40, n / 100 is n * 5243 / 2^19, and
+ * n / 10 is n * 6554 / 2^16, for all n that occur. The high half goes before the low half. */
 #ifdef __SSE2__
 static inline Text text_of(const Digits digits) {
   __m128i v = _mm_set_epi64x((int64_t)(digits.first % 100000000), (int64_t)(digits.first / 100000000)), high;
@@ -159,7 +161,7 @@ static inline Text text_of(const Digits digits) {
                 (char)('0' + digits.last), 32 - __builtin_clz((zeros ^ 0xffff) | (digits.last != 0) << 16)};
 }
 #else
-/* The digits of a number below 10^8, one in each byte. */
+/* The digits of a number below 10^8, one in each byte. Here n / 100 is n * 10486 / 2^20; n / 10 is n * 103 / 2^10. */
 static inline uint64_t eight(uint64_t n) {
   n = (n << 32) - (n * 109951163 >> 40) * ((10000ull << 32) - 1);
   n = (n << 16) - ((n * 10486 >> 20) & 0x7f0000007f) * ((100 << 16) - 1);
@@ -277,7 +279,8 @@ static SELDOM char *put_other(char *out, int64_t type, uint64_t bits) {
 }
 
 /* Read values of one column; the next of them are `step` cells apart. */
-static inline void read_cells(Column *column, int64_t type, int64_t rows, const Tables *tables, Cell *cell, int64_t step) {
+static inline void read_cells(Column *column, int64_t type, int64_t rows, const Tables *tables, Cell *cell,
+                              int64_t step) {
   const char *from = column->values;
   uint64_t previous = column->text != NULL ? column->bits : ~load(from, type);
   for (int64_t row = 0; row < rows; row++, from += column->stride, cell += step) {
@@ -300,8 +303,7 @@ static inline void read_cells(Column *column, int64_t type, int64_t rows, const 
 
 static inline char *put_cell(char *out, Column *column, const Tables *tables, const Cell *cell, char separator) {
   if (cell->kind == HELD) {
-    memmove(out, column->text, 32);
-    column->text = out;
+    memmove(out, column->text, 32); /* what follows the text is written over; in a short line the two overlap */
     return out + column->size;
   }
   column->text = out;
@@ -316,9 +318,9 @@ static inline char *put_cell(char *out, Column *column, const Tables *tables, co
   return out;
 }
 
-/* Write rows of n columns as lines; returns their size. A value takes up to 25 bytes, and `out` needs 40 more behind them.
- * The text of a value that is that of the row before is copied: instances with larger steps hold their values. First
- * the digits of many values, then their texts: a processor does more at once within a short loop than within a long one. */
+/* Write rows of n columns as lines; returns their size. A value takes up to 25 bytes, and `out` needs 40 more behind
+ * them. First the digits of many values, then their texts: in a short loop a processor does more at once than in a long
+ * one. Instances with larger steps hold their values: the text of a value that has not changed is copied. */
 PUBLIC int64_t csv_rows(Column *columns, int64_t n, int64_t rows, const Tables *tables, char *out) {
   char *const start = out;
   Cell cells[CELLS];
@@ -326,7 +328,7 @@ PUBLIC int64_t csv_rows(Column *columns, int64_t n, int64_t rows, const Tables *
   for (int64_t i = 0; i < n; i++) columns[i].text = NULL;
   for (int64_t row = 0; row < rows; row += block) {
     const int64_t count = rows - row < block ? rows - row : block;
-    for (int64_t first = 0; first < n; first += CELLS) { /* all columns at once, or one row of more columns than cells */
+    for (int64_t first = 0; first < n; first += CELLS) { /* more columns than cells: one row, and a part of it */
       const int64_t width = n - first < CELLS ? n - first : CELLS;
       for (int64_t i = 0; i < width; i++) {
         Column *column = &columns[first + i];

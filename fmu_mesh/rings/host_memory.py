@@ -20,6 +20,7 @@ from typing import Final, Self
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from ..system.memory_map import MemoryMap, RingPlace
 from . import native
@@ -144,6 +145,10 @@ class HostMemory:
         """The counter at an offset."""
         return Counter(self, offset)
 
+    def number(self, offset: int) -> NDArray[np.int64]:
+        """The eight bytes at an offset."""
+        return np.frombuffer(self._memory, np.int64, 1, offset)
+
     def ring(self, place: RingPlace) -> Ring:
         """The ring of an instance; text is beside it, in this process."""
         return Ring(place.layout, place.rows, self._view[place.offset :])
@@ -190,7 +195,7 @@ class HostMemory:
     def _prepare(self) -> None:
         """Nobody sleeps: no counter wakes anybody."""
         for counter in (self.map.grant, *self.map.progress, *self.map.rings):
-            np.frombuffer(self._memory, np.int64, 1, counter + 8)[:] = native.NEVER
+            self.number(counter + 8)[:] = native.NEVER
 
 
 class Counter:
@@ -204,7 +209,7 @@ class Counter:
     def __init__(self, memory: HostMemory, offset: int) -> None:
         self.address = memory.address + offset
         self._memory = memory
-        self._plain = np.frombuffer(memory._memory, np.int64, 1, offset)  # noqa: SLF001  the same module
+        self._plain = memory.number(offset)
 
     @property
     def value(self) -> int:

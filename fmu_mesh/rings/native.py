@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Sequence
-from ctypes import POINTER, Structure, c_bool, c_double, c_int32, c_int64, c_uint32, c_void_p
+from ctypes import CFUNCTYPE, POINTER, PYFUNCTYPE, Structure, c_bool, c_double, c_int32, c_int64, c_uint32, c_void_p
 from enum import IntEnum
 from typing import Any, Final, NamedTuple
 
@@ -338,28 +338,18 @@ class _Library:
 
     def __init__(self, path: str) -> None:
         quick, slow = ctypes.PyDLL(path), ctypes.CDLL(path)
-        self.run = slow.node_run
-        self.run.argtypes, self.run.restype = (c_void_p,), c_int64
-        self.sleep_for = slow.sleep_for
-        self.sleep_for.argtypes = (c_void_p, c_uint32, c_void_p, c_int64, c_int64, c_void_p)
-        self.sleep_for.restype = c_int64
-        self.member_step = slow.member_step
-        self.member_step.argtypes, self.member_step.restype = (c_void_p, c_int64), c_int64
-        self.attend = quick.node_attend
-        self.attend.argtypes, self.attend.restype = (c_void_p,), None
-        self.attended = quick.node_attended
-        self.attended.argtypes, self.attended.restype = (c_void_p,), None
-        self.ring_bell = quick.ring_bell
-        self.ring_bell.argtypes, self.ring_bell.restype = (c_void_p,), None
-        self.bell_seen = quick.bell_seen
-        self.bell_seen.argtypes, self.bell_seen.restype = (c_void_p,), c_uint32
-        self.counter_raise = quick.counter_raise
-        self.counter_raise.argtypes, self.counter_raise.restype = (c_void_p, c_void_p, c_int64), None
-        self.counter_value = quick.counter_value
-        self.counter_value.argtypes, self.counter_value.restype = (c_void_p,), c_int64
+        address = c_void_p
+        self.run = CFUNCTYPE(c_int64, address)(("node_run", slow))
+        self.sleep_for = CFUNCTYPE(c_int64, address, c_uint32, address, c_int64, c_int64, address)(("sleep_for", slow))
+        self.member_step = CFUNCTYPE(c_int64, address, c_int64)(("member_step", slow))
+        self.attend = PYFUNCTYPE(None, address)(("node_attend", quick))
+        self.attended = PYFUNCTYPE(None, address)(("node_attended", quick))
+        self.ring_bell = PYFUNCTYPE(None, address)(("ring_bell", quick))
+        self.bell_seen = PYFUNCTYPE(c_uint32, address)(("bell_seen", quick))
+        self.counter_raise = PYFUNCTYPE(None, address, address, c_int64)(("counter_raise", quick))
+        self.counter_value = PYFUNCTYPE(c_int64, address)(("counter_value", quick))
         sizes = (c_int64 * len(_STRUCTURES))()
-        quick.structure_sizes.restype = c_int64
-        count = quick.structure_sizes(sizes)
+        count = PYFUNCTYPE(c_int64, address)(("structure_sizes", quick))(sizes)
         if count != len(_STRUCTURES) or list(sizes) != [ctypes.sizeof(structure) for structure in _STRUCTURES]:
             msg = f"{path} was built from other structures"
             raise OSError(msg)

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from types import TracebackType
-from typing import Self
+from typing import Protocol, Self
 
 import zenoh
 
@@ -21,10 +21,18 @@ from .keys import RunKeys
 from .messages import HEADER
 from .refusals import Refusals
 
-__all__ = ["Inbox", "Message"]
+__all__ = ["Inbox", "Message", "Sleeper"]
 
 Message = tuple[str, int, int, int, int, bytes]
 """Sender, kind, link, count, point, and the whole message."""
+
+
+class Sleeper(Protocol):
+    """What the main thread may be in when there is something for it."""
+
+    def ring_bell(self) -> None:
+        """From any thread: wake it."""
+        ...
 
 
 class Inbox:
@@ -39,7 +47,7 @@ class Inbox:
 
     def __init__(self, memory: HostMemory) -> None:
         self._memory = memory
-        self._rouse = memory.ring_bell
+        self._sleeper: Sleeper = memory
         self._posted: deque[Callable[[], None]] = deque()
         self._arrived: deque[tuple[str, bytes]] = deque()
         self._subscriber: zenoh.Subscriber[None] | None = None
@@ -71,21 +79,20 @@ class Inbox:
                 self.refusals.add(key, "no participant of this run sends with this key")
                 return
             self._arrived.append((sender, sample.payload.to_bytes()))
-            self._rouse()
+            self._sleeper.ring_bell()
 
         self._subscriber = session.declare_subscriber(keys.inbox(name), take)
 
-    def move_to(self, memory: HostMemory, rouse: Callable[[], None] | None = None) -> None:
-        """From now on wait in another memory; ``rouse`` wakes the main thread there, which may also be stepping."""
-        before, self._memory = self._rouse, memory
-        self._rouse = rouse if rouse is not None else memory.ring_bell
-        before()
-        self._rouse()  # for what came meanwhile
+    def move_to(self, memory: HostMemory, sleeper: Sleeper) -> None:
+        """From now on wait in another memory, and wake ``sleeper``, which may also be stepping."""
+        before, self._memory, self._sleeper = self._sleeper, memory, sleeper
+        before.ring_bell()
+        sleeper.ring_bell()  # for what came meanwhile
 
     def post(self, action: Callable[[], None]) -> None:
         """From any thread: let the main thread run ``action`` when it next looks into the inbox."""
         self._posted.append(action)
-        self._rouse()
+        self._sleeper.ring_bell()
 
     def poll(self) -> Message | None:
         """The next message if there is one; also runs posted actions."""

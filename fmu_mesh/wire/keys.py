@@ -139,10 +139,6 @@ class RunKeys(msgspec.Struct, frozen=True):
         """Progress of a node, for the master."""
         return f"{self.base}/progress/{_of(node)}/to={MASTER}"
 
-    def wake(self, node: str) -> str:
-        """A key with which a node wakes itself up; messages with it never leave the process."""
-        return f"{self.base}/wake/to={node}"
-
     def grants(self, nodes: Iterable[str]) -> list[str]:
         """Keys on which one put each reaches up to 16 nodes."""
         return [f"{self.base}/grant/" + "/".join(f"to={node}" for node in part) for part in batched(nodes)]

@@ -9,15 +9,15 @@ from pathlib import Path
 
 import pytest
 import yaml
-from fmu_mesh.wire.shared_memory import available
 
+from fmu_mesh.rings.host_memory import can_share
 from fmu_mesh.run.local import LocalMesh
 from fmu_mesh.run.options import Options
 from fmu_mesh.run.preparing import prepare
 from tests.equivalence.test_equivalence import CHAIN, CYCLE, GAUSS_SEIDEL, JACOBI, PENDULUM, rewritten, shortened
 from tests.helpers import Place, wait_until, write_config
 
-shares = pytest.mark.skipif(not available(), reason="needs Linux with memfd_create and glibc 2.30")
+shares = pytest.mark.skipif(not can_share(), reason="needs Linux with memfd_create, and the library")
 
 
 def local_result(place: Place, config: Path) -> bytes:

@@ -151,7 +151,7 @@ def test_attention_ends_a_burst_after_the_step(make: MakeEngine) -> None:
     while runner.step < 200:  # the bursts of the engine grow to what it steps in a slice
         engine.run(0.0, eager=False)
     asked = runner.step + 2
-    script[asked] = engine.attend
+    script[asked] = engine.ring_bell
 
     while runner.step <= asked:
         assert engine.run(0.0, eager=False)
@@ -182,7 +182,7 @@ def test_an_engine_that_cannot_step_sleeps_until_attention(make: MakeEngine, eag
     thread.join(0.1)
 
     assert thread.is_alive()
-    engine.attend()
+    engine.ring_bell()
     thread.join(10.0)
     assert results == [False]
 

@@ -72,7 +72,7 @@ def test_who_opens_an_offer_sees_the_same_rows_and_counters(memory: HostMemory) 
 
 @pytest.mark.parametrize("change", [{"token": "00" * 16}, {"token": ""}, {"pid": 2**22 + 1}, {"descriptor": 999_999}])
 def test_memory_that_is_not_the_offered_one_is_not_used(memory: HostMemory, change: dict[str, object]) -> None:
-    assert opened(memory, "a", **change) is None
+    assert opened(memory, "a", **change) is None  # type: ignore[arg-type] # none of them is the map
 
 
 def test_memory_of_another_size_is_not_used(memory: HostMemory) -> None:
@@ -327,7 +327,7 @@ def test_without_the_library_threads_wake_one_another(monkeypatch: pytest.Monkey
     assert not host_memory.can_share()
     for wake in (memory.ring_bell, memory.ring_bell):
         seen = memory.seen()
-        sleeper = threading.Thread(target=lambda seen=seen: memory.sleep(seen, LONG_S))  # type: ignore[misc] # a default
+        sleeper = threading.Thread(target=lambda seen=seen: memory.sleep(seen, LONG_S))
         sleeper.start()
         wake()
         sleeper.join(LONG_S / 2)

@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fmu_mesh.instances.contract import Instance
+from fmu_mesh.node.connecting import SourceRows, sources_of
 from fmu_mesh.node.engine import BurstEngine, Engine
-from fmu_mesh.node.stepping import Runner, sources_of
+from fmu_mesh.node.stepping import Runner
 from fmu_mesh.rings.host_memory import Counter, HostMemory
 from fmu_mesh.rings.ring import Ring
 from fmu_mesh.system.plan import MASTER, RECORDER, NodePlan, Plan
@@ -76,10 +77,10 @@ class EngineMesh:
 
     def _engine(self, node: NodePlan, make: MakeEngine) -> Engine:
         step_points = {name: runner.plan.step_points for name, runner in self.runners.items()}
-        sources = {name: [(*ring, None)] for name, ring in self.rings.items()}
+        sources = {name: [SourceRows(*ring)] for name, ring in self.rings.items()}
         for item in node.instances:
             runner = self.runners[item.name]
-            runner.sources += sources_of(runner, sources, step_points)
+            runner.connect(sources_of(runner, sources, step_points))
             runner.instance.enter_initialization(self._plan.grid.start_time, None, item.start_values)
             runner.instance.exit_initialization()
             runner.bind()
@@ -105,7 +106,7 @@ class EngineMesh:
         """
         chance = random.Random(seed)  # noqa: S311 no secret
         acts: list[Callable[[], object]] = [
-            *(lambda engine=engine: engine.run(0.0, eager=chance.random() < 0.5) for engine in self.engines.values()),  # type: ignore[misc] # a default
+            *(lambda engine=engine: engine.run(0.0, eager=chance.random() < 0.5) for engine in self.engines.values()),
             lambda: self.grant(chance.randint(1, 20)),
             *([self.record] if self._records else []),
         ]

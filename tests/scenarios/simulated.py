@@ -295,7 +295,7 @@ class _SimulatedNode(Node):
         session = cast("zenoh.Session", _Session(process))
         super().__init__(plan, session, open_instance, engine=partial(_SimulatedEngine, process))
         self._memory = self._own_memory = _SimulatedMemory.of(process, plan)
-        self._inbox.move_to(self._memory)
+        self._inbox.move_to(self._memory, self._memory)
         self._membership = _SimulatedMembership(plan, self._session, self._inbox)
 
 
@@ -348,9 +348,9 @@ class _SimulatedEngine(PlainEngine):
                 break
         return stepped
 
-    def attend(self) -> None:
+    def ring_bell(self) -> None:
         if self._process.may_be_told:
-            super().attend()
+            super().ring_bell()
 
 
 class _SimulatedMembership(Membership):

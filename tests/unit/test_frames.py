@@ -44,7 +44,7 @@ class Receiver:
 
     def row(self, number: int) -> tuple[float, float, int]:
         assert self.mirror.has_row(number)
-        a, b, n = (self.mirror.value(number, name) for name in ("a", "b", "n"))
+        (a, b), [n] = (part[number & self.mirror.mask].tolist() for part in self.mirror.parts)
         return a, b, n
 
     @property

@@ -262,20 +262,4 @@ class Owner(Thing):
 
 
 # Printed by `python -m tests.house`. It only gets shorter: what has to stay goes into `house.ALLOWED`, with its reason.
-LEFT: dict[str, set[str]] = {
-    "large_modules": {
-        "master/master.py",
-    },
-    "attributes_assigned_from_outside": {
-        "node/node.py: feed.ready",
-        "node/node.py: runner.last_step",
-        "node/node.py: self._activity.advancing",
-        "node/node.py: self._activity.state",
-        "node/node.py: self._activity.waited_s",
-        "node/node.py: self._activity.waiting",
-        "node/node_server.py: self._activity.runners",
-        "node/stepping.py: runner.step",
-        "node/stepping.py: runner.step_seconds",
-        "node/time_measurement.py: self._profiler.sent_s",
-    },
-}
+LEFT: dict[str, set[str]] = {}

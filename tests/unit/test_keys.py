@@ -47,7 +47,6 @@ def test_one_subscription_gets_what_is_for_a_node_and_nothing_else() -> None:
         return inbox.intersects(zenoh.KeyExpr(key))
 
     assert gets(RUN.frames("pendulum", "delay"))
-    assert gets(RUN.wake("delay"))
     assert not gets(RUN.frames("pendulum", "delay2"))
     assert not gets(RUN.frames("delay", "pendulum"))
     assert not gets(RUN.progress("delay"))

@@ -23,15 +23,15 @@ from fmu_mesh.rings import native
 from fmu_mesh.rings.native import (
     NEVER,
     STAGE_BITS,
-    RowBase,
     Call,
-    StepKind,
     MemberTable,
     Move,
     NativeStep,
     OutputTable,
+    RowBase,
     Said,
     Stage,
+    StepKind,
 )
 from fmu_mesh.rings.ring import Ring
 from fmu_mesh.simtime import TimeGrid

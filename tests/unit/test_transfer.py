@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fmu_mesh.rings import native
-from fmu_mesh.rings.native import OUT_OF_RANGE, STAGE_BITS, RowBase, MemberTable, Move, Said, Stage, table
+from fmu_mesh.rings.native import OUT_OF_RANGE, STAGE_BITS, MemberTable, Move, RowBase, Said, Stage, table
 from fmu_mesh.rings.ring import Ring
 from fmu_mesh.rings.transfer import Transfer
 from fmu_mesh.system.coupling_rule import CouplingRule
