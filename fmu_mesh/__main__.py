@@ -30,7 +30,7 @@ def main() -> int:
 
 def _prepared(arguments: list[str]) -> AbstractContextManager[None]:
     """While the command is imported, start what takes as long and can be done at the same time."""
-    if arguments[:1] != ["launch"] or not {"--local", "--help", "-h"}.isdisjoint(arguments):
+    if arguments[:1] not in (["launch"], ["run"]) or not {"--local", "--help", "-h"}.isdisjoint(arguments):
         return nullcontext()
     from .run.fork_server import started_ahead  # noqa: PLC0415 as above
 

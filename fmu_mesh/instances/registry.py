@@ -128,12 +128,14 @@ def preload() -> None:
 
 
 def prepare(opening: Opening[Any]) -> None:
-    """Do once what every `open_instance` of a model needs; see `Kind.prepare`.
+    """Do once what every `open_instance` of a model needs; see `Kind.preload` and `Kind.prepare`.
 
     Raises:
         LoadFailed: it cannot be done; `open_instance` says so again.
     """
-    _kind_of(opening.section).prepare(opening)
+    kind = _kind_of(opening.section)
+    kind.preload()
+    kind.prepare(opening)
 
 
 def open_instance(opening: Opening[Any]) -> Instance:

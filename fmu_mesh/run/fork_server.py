@@ -6,7 +6,7 @@ shares the memory of all imported modules with the others.
 
 Launcher and server share a pair of sockets. A request has the arguments of `fmu_mesh.run.__main__`, and two descriptors
 for standard output and standard error. The server answers with the process id, and later with the exit code. It leaves
-ended processes as zombies until it ends itself, so that no other process can get the id of one of them. When the
+an ended process as a zombie until the launcher knows the code, so that no other process can get its id before. When the
 launcher sends no more requests, the server ends after its last process.
 """
 
@@ -47,6 +47,8 @@ _KILL_S: Final = 5.0
 
 
 class _Request(msgspec.Struct, frozen=True):
+    """A process with these arguments; without arguments: the exit code of the process of this number is known."""
+
     number: int
     mesh: str
     arguments: tuple[str, ...]
@@ -118,6 +120,9 @@ class ForkServer:
             while data := self._control.recv(_REQUEST_BYTES):
                 news = msgspec.msgpack.decode(data, type=_News)
                 self._forked[news.number].take(news.pid, news.code)
+                if news.code is not None:
+                    with suppress(OSError):  # no more requests; the server ends soon
+                        self._control.send(msgspec.msgpack.encode(_Request(news.number, "", ())))
         for forked in self._forked:
             forked.orphaned()
 
@@ -234,6 +239,8 @@ class _Server:
         os.set_blocking(self._writing, False)
         self._numbers: dict[int, int] = {}
         """The requests of the running processes by process id."""
+        self._ended: dict[int, int] = {}
+        """The process ids of the ended processes by request, until the launcher knows their exit codes."""
         self._accepting = True
         self._asked: str | None = None
         self._deadline: float | None = None
@@ -265,6 +272,9 @@ class _Server:
             self._accepting = False
             return None
         request = msgspec.msgpack.decode(data, type=_Request)
+        if not request.arguments:
+            os.waitpid(self._ended.pop(request.number), 0)
+            return None
         setproctitle(f"fmu-mesh fork server {request.mesh}")
         job = self._job(*request.arguments)
         # A signal for the server must not run the handler of the server in the new process.
@@ -312,7 +322,7 @@ class _Server:
         for pid, request in list(self._numbers.items()):
             ended = os.waitid(os.P_PID, pid, os.WEXITED | os.WNOHANG | os.WNOWAIT)
             if ended is not None:
-                del self._numbers[pid]
+                self._ended[self._numbers.pop(pid)] = pid
                 exited = ended.si_code == os.CLD_EXITED
                 self._tell(_News(request, pid, ended.si_status if exited else -ended.si_status))
         asked = next((number for number in numbers if number != signal.SIGCHLD), None)

@@ -15,7 +15,7 @@ import pytest
 from fmu_mesh.config.mesh import LimitsConfig
 from fmu_mesh.errors import LoadFailed
 from fmu_mesh.instances.fmi import Terms, open_instance, read_description, sha256_of
-from fmu_mesh.instances.fmi.archive.sources import extract
+from fmu_mesh.instances.fmi.archive.sources import extract, prepare
 from tests.fmus.helpers import FMUS, find_fmu
 from tests.fmus.packing import repacked, unpacked
 
@@ -203,6 +203,24 @@ def test_a_checksum_is_verified_when_an_fmu_is_read_and_when_it_is_unpacked(tmp_
         with pytest.raises(LoadFailed, match=f"has the SHA-256 {right}, not 0000"):
             refused()
     assert list((tmp_path / "parent").glob("*")) == []
+
+
+def test_an_fmu_that_was_prepared_is_not_opened_again_and_each_instance_has_its_own_files(tmp_path: Path) -> None:
+    path = tmp_path / "Gain.fmu"
+    path.write_bytes(GAIN.read_bytes())
+    model, terms = read_description(path), Terms(content=sha256_of(path))
+    prepare(path, tmp_path / "server", terms, model)
+    path.unlink()
+
+    first, second = (extract(path, tmp_path / "nodes", terms, model=model) for _ in range(2))
+    (first / "modelDescription.xml").write_text("changed", encoding="utf-8")
+
+    assert first != second
+    assert (second / "modelDescription.xml").read_bytes() == (
+        unpacked(tmp_path / "plain") / "modelDescription.xml"
+    ).read_bytes()
+    with pytest.raises(LoadFailed, match="does not exist"):
+        extract(path, tmp_path / "nodes", Terms(content="0" * 64), model=model)
 
 
 def test_an_unpacked_folder_is_used_without_writing_into_it(tmp_path: Path) -> None:
