@@ -50,7 +50,7 @@ def memory() -> Iterator[HostMemory]:
     made.close()
 
 
-def opened(memory: HostMemory, process: str, map_: MemoryMap = MAP, **changes: Any) -> HostMemory | None:
+def opened(memory: HostMemory, process: str, map_: MemoryMap = MAP, **changes: Any) -> HostMemory | None:  # noqa: ANN401 of any type
     return HostMemory.opened(replace(memory.offer, **changes), map_, process)
 
 
@@ -72,7 +72,7 @@ def test_who_opens_an_offer_sees_the_same_rows_and_counters(memory: HostMemory) 
 
 
 @pytest.mark.parametrize("change", [{"token": "00" * 16}, {"token": ""}, {"pid": 2**22 + 1}, {"descriptor": 999_999}])
-def test_memory_that_is_not_the_offered_one_is_not_used(memory: HostMemory, change: dict[str, object]) -> None:
+def test_memory_that_is_not_the_offered_one_is_not_used(memory: HostMemory, change: dict[str, Any]) -> None:
     assert opened(memory, "a", **change) is None
 
 

@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fmu_mesh.instances.contract import Instance
+from fmu_mesh.node.connecting import connect
 from fmu_mesh.node.engine import BurstEngine, Engine
-from fmu_mesh.node.stepping import Runner, sources_of
+from fmu_mesh.node.stepping import Runner
 from fmu_mesh.rings.host_memory import Counter, HostMemory
 from fmu_mesh.rings.ring import Ring
 from fmu_mesh.system.plan import MASTER, RECORDER, NodePlan, Plan
@@ -75,16 +76,15 @@ class EngineMesh:
         return RECORDER in self._plan.nodes
 
     def _engine(self, node: NodePlan, make: MakeEngine) -> Engine:
-        step_points = {name: runner.plan.step_points for name, runner in self.runners.items()}
-        sources = {name: [(*ring, None)] for name, ring in self.rings.items()}
+        memory = self.memory.participant(node.node)
+        connect(node, {item.name: self.runners[item.name] for item in node.instances}, memory, memory, self._plan.nodes)
         for item in node.instances:
             runner = self.runners[item.name]
-            runner.sources += sources_of(runner, sources, step_points)
             runner.instance.enter_initialization(self._plan.grid.start_time, None, item.start_values)
             runner.instance.exit_initialization()
             runner.bind()
         units = [[self.runners[name] for name in names] for names in node.units]
-        engine = make(node, units, self.memory.participant(node.node))
+        engine = make(node, units, memory)
         for unit in units:
             for runner in unit:
                 runner.begin()

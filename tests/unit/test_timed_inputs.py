@@ -124,7 +124,7 @@ def runner_of(instance: Instance) -> tuple[Runner, Position]:
     ring, counter = memory.ring(places["gain"]), memory.counter(places["gain"].counter)
     runner = Runner(plan, instance, TimeGrid(1.0, STEP_SIZE, 60), ring, counter)
     position = Position()
-    runner.follow(position, lambda: None)
+    runner.follow(position)
     runner.bind()
     return runner, position
 
