@@ -13,10 +13,10 @@ from ..system.plan import Link, NodePlan
 from ..wire.frames import FrameReceiver, of_text
 from .stepping import Runner, Source
 
-__all__ = ["connect"]
+__all__ = ["SourceRows", "connect", "sources_of"]
 
 
-class _Rows(NamedTuple):
+class SourceRows(NamedTuple):
     """Rows of an instance.
 
     Attributes:
@@ -47,7 +47,7 @@ def connect(
     Returns:
         What takes the frames of each link, by its number; the link itself if it brings initial values only.
     """
-    rows: dict[str, list[_Rows]] = {name: [_Rows(own.outputs, own.counter)] for name, own in runners.items()}
+    rows: dict[str, list[SourceRows]] = {name: [SourceRows(own.outputs, own.counter)] for name, own in runners.items()}
     places = {place.instance: place for place in plan.rings}
     receivers: dict[int, FrameReceiver | Link] = {}
     for link in plan.links_in:
@@ -57,23 +57,24 @@ def connect(
         place, found = places[link.source], rows.setdefault(link.source, [])
         is_shared = link.source_node in shares
         if is_shared:
-            found.append(_Rows(memory.ring(place), memory.counter(place.counter), text=False))
+            found.append(SourceRows(memory.ring(place), memory.counter(place.counter), text=False))
         layout = of_text(link.layout) if is_shared else link.layout
         if layout.columns:
             mirror, counter = own_memory.ring(place), own_memory.counter(place.counter)
-            found.append(_Rows(mirror, counter, text=True if is_shared else None))
+            found.append(SourceRows(mirror, counter, text=True if is_shared else None))
             fits = partial(_fits, runners, link.source)
             who = f"node '{plan.node}'"
             receivers[link.index] = FrameReceiver(link, layout, who, mirror, counter, fits)
     points = {name: place.step_points for name, place in places.items()}
     for runner in runners.values():
-        runner.connect(_sources_of(runner, rows, points))
+        runner.connect(sources_of(runner, rows, points))
     return receivers
 
 
-def _sources_of(
-    runner: Runner, rows: Mapping[str, Sequence[_Rows]], step_points: Mapping[str, int]
+def sources_of(
+    runner: Runner, rows: Mapping[str, Sequence[SourceRows]], step_points: Mapping[str, int]
 ) -> Iterator[Source]:
+    """The sources of a runner, from the rows and the base points per own step of each instance."""
     for feed in runner.plan.feeds:
         for ring, counter, text in rows[feed.source]:
             transfer = Transfer(

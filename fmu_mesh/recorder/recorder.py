@@ -213,10 +213,11 @@ class Recorder:
                 self._take(message)  # messages that are under way, above all the reason of the end
 
     def _wishes(self) -> list[Wish]:
-        """Wake up when a quarter of the window can be written, or all that is left."""
+        """Wake up when a quarter of the window can be written, or all that is left; but first for point 0."""
         last_point = self._plan.grid.last_point
+        ahead = self._plan.window // 4 if self._complete() >= 0 else 0
         slowest = min(self._sources.values(), key=lambda source: source.covered(last_point))
-        rows = min(self._written + self._plan.window // 4, last_point) // slowest.link.step_points + 1
+        rows = min(self._written + ahead, last_point) // slowest.link.step_points + 1
         return [(counter, rows) for counter in slowest.counters if counter.value < rows]
 
     def _take(self, message: Message) -> None:

@@ -14,7 +14,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import msgspec
 import numpy as np
@@ -50,7 +49,7 @@ def memory() -> Iterator[HostMemory]:
     made.close()
 
 
-def opened(memory: HostMemory, process: str, map_: MemoryMap = MAP, **changes: Any) -> HostMemory | None:  # noqa: ANN401 of any type
+def opened(memory: HostMemory, process: str, map_: MemoryMap = MAP, **changes: object) -> HostMemory | None:
     return HostMemory.opened(replace(memory.offer, **changes), map_, process)
 
 
@@ -72,8 +71,8 @@ def test_who_opens_an_offer_sees_the_same_rows_and_counters(memory: HostMemory) 
 
 
 @pytest.mark.parametrize("change", [{"token": "00" * 16}, {"token": ""}, {"pid": 2**22 + 1}, {"descriptor": 999_999}])
-def test_memory_that_is_not_the_offered_one_is_not_used(memory: HostMemory, change: dict[str, Any]) -> None:
-    assert opened(memory, "a", **change) is None
+def test_memory_that_is_not_the_offered_one_is_not_used(memory: HostMemory, change: dict[str, object]) -> None:
+    assert opened(memory, "a", **change) is None  # type: ignore[arg-type] # none of them is the map
 
 
 def test_memory_of_another_size_is_not_used(memory: HostMemory) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fmu_mesh.instances.contract import Instance
-from fmu_mesh.node.connecting import connect
+from fmu_mesh.node.connecting import SourceRows, sources_of
 from fmu_mesh.node.engine import BurstEngine, Engine
 from fmu_mesh.node.stepping import Runner
 from fmu_mesh.rings.host_memory import Counter, HostMemory
@@ -76,15 +76,16 @@ class EngineMesh:
         return RECORDER in self._plan.nodes
 
     def _engine(self, node: NodePlan, make: MakeEngine) -> Engine:
-        memory = self.memory.participant(node.node)
-        connect(node, {item.name: self.runners[item.name] for item in node.instances}, memory, memory, self._plan.nodes)
+        step_points = {name: runner.plan.step_points for name, runner in self.runners.items()}
+        sources = {name: [SourceRows(*ring)] for name, ring in self.rings.items()}
         for item in node.instances:
             runner = self.runners[item.name]
+            runner.connect(sources_of(runner, sources, step_points))
             runner.instance.enter_initialization(self._plan.grid.start_time, None, item.start_values)
             runner.instance.exit_initialization()
             runner.bind()
         units = [[self.runners[name] for name in names] for names in node.units]
-        engine = make(node, units, memory)
+        engine = make(node, units, self.memory.participant(node.node))
         for unit in units:
             for runner in unit:
                 runner.begin()
