@@ -96,9 +96,16 @@ def following(place: Place, *arguments: str) -> Launched:
     def connections() -> int:
         return Path("/proc/net/unix").read_text(encoding="ascii").count(socket_path)
 
-    before = connections()
+    least = connections()
     wait = place.start("wait", *arguments)
-    wait_until(lambda: connections() > before, "a connection to the master")
+
+    def is_there() -> bool:
+        nonlocal least
+        now = connections()
+        least = min(least, now)  # a connection that an earlier process has left may end only now
+        return now > least
+
+    wait_until(is_there, "a connection to the master")
     return wait
 
 

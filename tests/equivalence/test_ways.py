@@ -11,6 +11,7 @@ import pytest
 import yaml
 
 from fmu_mesh.rings.host_memory import can_share
+from fmu_mesh.rings.library import LIBRARY_VARIABLE
 from fmu_mesh.run.local import LocalMesh
 from fmu_mesh.run.options import Options
 from fmu_mesh.run.preparing import prepare
@@ -68,7 +69,58 @@ def test_a_node_in_a_container_of_its_own_joins_through_zenoh(place: Place) -> N
         found: list[str] = json.loads(asked.output)["shared_memory"] if asked.wait() == 0 else []
         return found
 
-    assert wait_until(shared, "a mesh that is there") == ["pendulum"]  # the others get something from the container
+    assert wait_until(shared, "a mesh that is there") == [
+        "pendulum",
+        "@record",
+        "@mesh",
+    ]  # it is another memory that the container has at this place
     wait_until(lambda: place.run("resume", "pair").wait() == 0, "a mesh that runs")
     assert [launched.wait() for launched in by_hand] == [0, 0, 0]
     assert config.with_suffix(".csv").read_bytes() == local_result(place, config)
+
+
+@pytest.mark.parametrize(
+    ("name", "points", "window", "algorithm"),
+    [(PENDULUM, 800, "auto", GAUSS_SEIDEL), (CHAIN, 200, 1, JACOBI), (CYCLE, 200, "auto", GAUSS_SEIDEL)],
+)
+def test_without_the_library_the_floats_are_those_of_one_process(
+    name: str, points: int, window: int | str, algorithm: str, place: Place
+) -> None:
+    """Then each process steps in Python, and they exchange frames."""
+    config = rewritten(name, place.folder, shortened(points, algorithm, window))
+    place.environment[LIBRARY_VARIABLE] = "none"
+    output = place.folder / "result.csv"
+
+    launched = place.run("launch", config, "--no-progress", "--output", output)
+
+    assert launched.wait() == 0, launched.errors
+    assert output.read_bytes() == local_result(place, config)
+    place.assert_nothing_left()
+
+
+@shares
+@pytest.mark.parametrize("without", ["pendulum", "gain", "delay", "master"])
+def test_where_one_process_has_no_library_the_floats_are_the_same(place: Place, without: str) -> None:
+    """The others share the memory, unless it is the master, which makes it."""
+    config = write_config(
+        place.folder,
+        instances={
+            "pendulum": {"fmu": "DampedPendulum", "start_values": {"a": 1.3}},
+            "gain": {"fmu": "Gain", "start_values": {"k": 0.5}},
+            "delay": {"fmu": "TransportDelay", "start_values": {"d": 0.1}},
+        },
+        connections=["pendulum.a -> gain.u", "gain.y -> delay.x"],
+        stop_time=0.8,
+    )
+
+    by_hand = [
+        place.start(*command, config, *which, prefix=("env", f"{LIBRARY_VARIABLE}=none") if role == without else ())
+        for role, command, which in [
+            ("master", ["master"], []),
+            *((node, ["node"], [node]) for node in ("pendulum", "gain", "delay")),
+        ]
+    ]
+
+    assert [launched.wait() for launched in by_hand] == [0, 0, 0, 0], place.story()
+    assert config.with_suffix(".csv").read_bytes() == local_result(place, config)
+    place.assert_nothing_left()

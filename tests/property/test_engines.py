@@ -177,14 +177,22 @@ def test_an_engine_that_cannot_step_sleeps_until_attention(make: MakeEngine, eag
     mesh, _ = meshed(chain(1, 10, 4), make)  # nothing is granted
     [engine] = mesh.engines.values()
     results: list[bool] = []
-    thread = threading.Thread(target=lambda: results.append(engine.run(30.0, eager=eager)))
-    thread.start()
-    thread.join(0.1)
+    enough = threading.Event()
 
-    assert thread.is_alive()
+    def run() -> None:
+        while not enough.is_set():
+            results.append(engine.run(30.0, eager=eager))
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    thread.join(0.3)
+
+    assert len(results) < 20  # it may return where a machine was too busy for it, and not thousands of times
+    enough.set()
     engine.ring_bell()
     thread.join(10.0)
-    assert results == [False]
+    assert not thread.is_alive()
+    assert not any(results)
 
 
 @needs_library
