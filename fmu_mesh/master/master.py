@@ -127,7 +127,6 @@ class Master:
         self._followers = Followers(self._inbox, lambda: self._state in ("running", "paused"))
         offer = self._memory.offer if self._shares else None
         self._members = Members(plan, session, self._run_keys, offer, self._lose, settings.launch)
-        self._send = self._members.send
         self._server = MasterServer(session, self._keys, self._inbox, events, self.last_status, plan.system.instances)
         self._publish_status = self._server.publish_status
 
@@ -167,7 +166,7 @@ class Master:
             )
             self._grant_to_the_end()
             self._enter("stopping")
-            self._send(FINISH, 0)
+            self._members.send(FINISH, 0)
             self._wait_for(
                 lambda: len(self._reports) == len(self._nodes),
                 self._timeouts.stop + self._timeouts.terminate * self._most_instances,
@@ -283,7 +282,7 @@ class Master:
         owed, grown = self._granting.owed()
         if grown or now - self._published >= self._heartbeat_s:
             self._published = now
-            self._send(GRANT, owed)
+            self._members.send(GRANT, owed)
 
     @property
     def _last_point(self) -> int:

@@ -15,7 +15,7 @@ from threading import Lock
 from time import perf_counter
 from typing import Final, cast
 
-from ..errors import ProtocolBroken, TerminationRequested
+from ..errors import ProtocolBroken, StepFailed, TerminationRequested
 from ..instances.call_guard import floating_point_changed, restore_floating_point
 from ..instances.contract import StepsNatively
 from ..rings import native
@@ -251,18 +251,21 @@ class BurstEngine(Engine):
         """Let Python take a step, or complete one that returned something unusual."""
         step = member.step
         try:
-            if result == BurstEnd.STATUS:
-                cast("StepsNatively", runner.instance).finish(step, member.outcome)
-            else:
+            if result == BurstEnd.PYTHON:
                 for source in runner.sources:
                     source.transfer.step_text(step)
                 runner.instance.do_step(step)
-                if floating_point_changed():
-                    restore_floating_point()
+            elif member.kind == StepKind.BY_PYTHON:
+                text = "setting the inputs: a value is out of the range of the type of its input"
+                raise StepFailed(text, instance=runner.name)
+            else:
+                cast("StepsNatively", runner.instance).finish(step, member.outcome)
         except TerminationRequested:
             self._units[unit].stopped = 1
             member.stage = Stage.WAITING
             raise
+        if floating_point_changed():
+            restore_floating_point()
         member.stage = Stage.STEPPED
 
     def _forged(self, runner: Runner) -> ProtocolBroken:

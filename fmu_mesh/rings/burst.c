@@ -725,8 +725,7 @@ static int64_t await(Node *node, int64_t limit_ns) {
 
 /* Step as far as it goes, for about one slice of time. Call it again and again. */
 PUBLIC int64_t node_run(Node *node) {
-  const int64_t start = now();
-  int64_t begin = start;
+  int64_t start = now(), begin = start;
   int any = 0;
   for (;;) {
     int stepped = 0, left = 0;
@@ -767,6 +766,7 @@ PUBLIC int64_t node_run(Node *node) {
         return BLOCKED;
       }
       begin = now();
+      if (!any) start = begin; /* the slice begins with the first step */
     }
     if (begin - start > node->slice_ns) {
       wake_all(node);
