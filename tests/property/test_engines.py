@@ -199,7 +199,12 @@ def test_an_engine_that_cannot_step_sleeps_until_attention(make: MakeEngine, eag
 def test_a_grant_wakes_an_engine() -> None:
     mesh, _ = meshed(chain(1, 10, 4), burst_engine)
     [engine] = mesh.engines.values()
-    thread = threading.Thread(target=lambda: engine.run(30.0, eager=False))
+
+    def run() -> None:
+        while engine.covered < 10:
+            engine.run(30.0, eager=False)
+
+    thread = threading.Thread(target=run)
     thread.start()
 
     mesh.memory.grant.raise_to(10)
