@@ -125,6 +125,7 @@ class Child:
         self._post = post
         self._threads: list[threading.Thread] = []
         self._left_others = False
+        self._others_asked = threading.Event()
 
     def watch(
         self,
@@ -168,6 +169,8 @@ class Child:
 
     def close(self) -> None:
         """Kill the processes it has left behind, wait for the readers and close the pipes; call it after the end."""
+        if self._threads:  # the end is known before its thread has looked for others
+            self._others_asked.wait(1.0)
         if self._left_others:
             self._signal_others(signal.SIGKILL)
         for thread in self._threads:
@@ -205,6 +208,7 @@ class Child:
     def _wait(self, readers: Sequence[threading.Thread], on_exit: Callable[[str, int], None]) -> None:
         code = self._process.wait()
         self._signal_others(signal.SIGTERM)
+        self._others_asked.set()
         for reader in readers:
             reader.join(1.0)
         self._post(lambda: on_exit(self.name, code))
