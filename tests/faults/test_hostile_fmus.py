@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 import signal
+import subprocess
+import sys
+import threading
 from collections.abc import Sequence
+from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
+import psutil
 import pytest
 
+from fmu_mesh.run.child import Child
 from tests.fmus.helpers import NO_COMPILER, built_once
-from tests.helpers import Place, row_count, rows_of, wait_until, write_config
+from tests.helpers import DEADLINE_S, Place, row_count, rows_of, wait_until, write_config
 
 SHORT = {"call": 2.0, "step": 2.0, "terminate": 2.0, "start": 60.0, "initialize": 60.0}
 STATE_FAULTS = (
@@ -268,3 +275,52 @@ def test_an_fmu_that_ignores_signals_does_not_take_ctrl_c_away(place: Place, hos
     assert launched.wait() == 130
     assert ": interrupted. " in launched.message
     place.assert_nothing_left()
+
+
+_LEAVES_ONE = """
+import os, signal
+signal.signal(signal.SIGTERM, signal.SIG_IGN)
+if (pid := os.fork()) == 0:
+    while True:
+        signal.pause()
+print(pid, flush=True)
+"""
+
+
+class _KnownLate:
+    """A process whose end is known to others before `wait` returns, as that of a process of the fork server."""
+
+    def __init__(self, process: subprocess.Popen[bytes]) -> None:
+        self._process = process
+
+    def __getattr__(self, name: str) -> Any:  # noqa: ANN401 of any type
+        return getattr(self._process, name)
+
+    def wait(self) -> int:
+        code = self._process.wait()
+        threading.Event().wait(0.3)
+        return code
+
+
+def test_a_process_that_is_left_behind_is_killed_although_its_end_was_known_first() -> None:
+    process = subprocess.Popen(
+        [sys.executable, "-c", _LEAVES_ONE],
+        start_new_session=True,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    )
+    lines: list[bytes] = []
+    child = Child("one", _KnownLate(process), lambda action: action())
+    child.watch(lines.append, lambda _name, _line: None, lambda _name, _code: None)
+    assert process.wait(DEADLINE_S) == 0
+    wait_until(lambda: len(lines), "its line")
+    left = psutil.Process(int(lines[0]))
+
+    child.close()
+
+    try:
+        left.wait(10.0)
+    finally:
+        with suppress(psutil.NoSuchProcess):
+            left.kill()
