@@ -61,10 +61,10 @@ class Reach:
     def points(self, slowest: int, now: float) -> int:
         """Number of points the grant may lead the slowest instance, at ``slowest``; ``now`` is monotonic, in s.
 
-        The speed is unknown at the start. It is measured every 10 ms, and when all points of the last answer are used.
+        The speed is unknown at the start. It is measured every 10 ms, and when half of the last answer is used.
         """
         gone, elapsed = slowest - self._slowest, now - self._since
-        if elapsed >= _SPEED_S or gone >= self._points:
+        if elapsed >= _SPEED_S or gone >= self._points // 2:
             wanted = gone * _STEADY_S / max(elapsed, _TICK_S)
             self._points = max(self._least, int(wanted))
             self._slowest, self._since = slowest, now

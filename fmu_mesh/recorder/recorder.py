@@ -49,6 +49,9 @@ log = logging.getLogger(__name__)
 
 _LOOK_S = 0.2
 _WRITE_ROWS = 4096
+_AT_ONCE_ROWS = 2048
+"""Rows that are worth to wake up for."""
+
 _REST_S = 0.005
 """How long in s the recorder pauses while rows come: each time it wakes up it takes a processor from a node that steps,
 and writing many rows at once takes less time."""
@@ -200,8 +203,10 @@ class Recorder:
             if message is None:
                 self._write_complete_rows()
                 self._tell_progress()
+                if (wishes := self._wishes()) is None:
+                    continue
                 self._turns.next()
-                message = self._inbox.wait(_REST_S if self._complete() >= self._written else _LOOK_S, self._wishes())
+                message = self._inbox.wait(_REST_S if self._complete() >= self._written else _LOOK_S, wishes)
             if message is not None:
                 heard = time.monotonic()
                 self._take(message)
@@ -212,13 +217,15 @@ class Recorder:
             if (message := self._inbox.wait(left)) is not None:
                 self._take(message)  # messages that are under way, above all the reason of the end
 
-    def _wishes(self) -> list[Wish]:
-        """Wake up when a quarter of the window can be written, or all that is left; but first for point 0."""
-        last_point = self._plan.grid.last_point
-        ahead = self._plan.window // 4 if self._complete() >= 0 else 0
+    def _wishes(self) -> list[Wish] | None:
+        """Wake up when many rows can be written, or all that are left; first for point 0. None: they are there."""
+        last_point, complete = self._plan.grid.last_point, self._complete()
+        due = min(self._written + _AT_ONCE_ROWS if complete >= 0 else 0, last_point)
+        if self._written <= complete and complete >= due and (self._written or self._has_begun()):
+            return None
         slowest = min(self._sources.values(), key=lambda source: source.covered(last_point))
-        rows = min(self._written + ahead, last_point) // slowest.link.step_points + 1
-        return [(counter, rows) for counter in slowest.counters if counter.value < rows]
+        rows = due // slowest.link.step_points + 1
+        return [(counter, rows) for counter in slowest.counters]
 
     def _take(self, message: Message) -> None:
         self._inbox.hand_on(message, self._take_from_master, self._take_from_node)
