@@ -49,9 +49,7 @@ log = logging.getLogger(__name__)
 
 _LOOK_S = 0.2
 _WRITE_ROWS = 4096
-_AT_ONCE_ROWS = 2048
-"""Rows that are worth to wake up for."""
-
+_WAKE_ROWS = 2048
 _REST_S = 0.005
 """How long in s the recorder pauses while rows come: each time it wakes up it takes a processor from a node that steps,
 and writing many rows at once takes less time."""
@@ -220,7 +218,7 @@ class Recorder:
     def _wishes(self) -> list[Wish] | None:
         """Wake up when many rows can be written, or all that are left; first for point 0. None: they are there."""
         last_point, complete = self._plan.grid.last_point, self._complete()
-        due = min(self._written + _AT_ONCE_ROWS if complete >= 0 else 0, last_point)
+        due = min(self._written + _WAKE_ROWS if complete >= 0 else 0, last_point)
         if self._written <= complete and complete >= due and (self._written or self._has_begun()):
             return None
         slowest = min(self._sources.values(), key=lambda source: source.covered(last_point))

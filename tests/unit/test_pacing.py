@@ -111,9 +111,9 @@ def test_a_fast_start_is_not_held_up_until_the_speed_is_measured_the_next_time()
     reach = Reach(4096)
 
     assert reach.points(0, 1000.0) == 1024
-    assert reach.points(1023, 1000.001) == 1024
-    assert reach.points(1024, 1000.001) == 51_200  # in the last millisecond it took 1024 points
-    assert reach.points(1024, 1000.012) == 1024
+    assert reach.points(511, 1000.001) == 1024
+    assert reach.points(512, 1000.001) == 25_600  # in the last millisecond it took 512 points
+    assert reach.points(512, 1000.012) == 1024
 
 
 def test_a_small_window_is_always_used_as_a_whole() -> None:
