@@ -59,7 +59,6 @@ _LAST_S = 0.5
 
 _TELL_S = 0.1
 _FLUSH_S = 0.2
-_CAN_CHOOSE = hasattr(os, "sched_setaffinity")  # Linux
 
 
 class Recorder:
@@ -443,7 +442,7 @@ class _Turns:
 
     def next(self) -> None:
         """Move the calling thread to the next processor; the scheduler may move it on to an idle one."""
-        processors = sorted(os.sched_getaffinity(0)) if _CAN_CHOOSE else []
+        processors = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_setaffinity") else []  # Linux
         if 1 < len(processors) <= self._busy:
             self._turn = (self._turn + 1) % len(processors)
             with suppress(OSError):  # this processor was just taken from this process
