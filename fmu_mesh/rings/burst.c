@@ -755,6 +755,7 @@ PUBLIC int64_t node_run(Node *node) {
       }
     }
     if (left == 0) {
+      if (!any) await(node, node->wait_ns); /* for what Python has to do */
       wake_all(node);
       return DONE;
     }
