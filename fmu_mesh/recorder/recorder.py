@@ -217,6 +217,8 @@ class Recorder:
     def _wishes(self) -> list[Wish] | None:
         """Wake up when many rows can be written, or all that are left; first for point 0. None: they are there."""
         last_point, complete = self._plan.grid.last_point, self._complete()
+        if self._written > last_point:
+            return []
         due = min(self._written + _WAKE_ROWS if complete >= 0 else 0, last_point)
         if self._written <= complete and complete >= due and (self._written or self._has_begun()):
             return None
