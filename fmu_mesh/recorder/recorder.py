@@ -7,11 +7,9 @@ ahead of the rows that are not written yet than the window of the recorder. So n
 from __future__ import annotations
 
 import logging
-import os
 import threading
 import time
 from collections.abc import Callable, Collection
-from contextlib import suppress
 from functools import partial
 from types import TracebackType
 from typing import Any, NamedTuple, Self
@@ -104,7 +102,6 @@ class Recorder:
         self._inbox = Inbox(self._memory)
         self._membership = Membership(plan, session, self._inbox, launch, memory=memory)
         self._put_progress: Callable[[bytes], None]
-        self._turns: _Turns
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
 
     @property
@@ -171,7 +168,6 @@ class Recorder:
     def _meet(self) -> None:
         welcome = self._membership.join()
         shares = {*welcome.shared} if self._memory is not self._own_memory else set()
-        self._turns = _Turns(len({link.source_node for link in self._plan.links_in}.intersection(shares)))
         self._sources = {link.index: self._source(link, shares) for link in self._plan.links_in}
         by_name = {source.link.source: source for source in self._sources.values()}
         self._columns = [by_name[instance].column(variable) for instance, variable in self._plan.recorded]
@@ -202,7 +198,6 @@ class Recorder:
                 self._tell_progress()
                 if (wishes := self._wishes()) is None:
                     continue
-                self._turns.next()
                 message = self._inbox.wait(_REST_S if self._complete() >= self._written else _LOOK_S, wishes)
             if message is not None:
                 heard = time.monotonic()
@@ -425,28 +420,3 @@ class _Source:
             return column
 
         return each if step_points == 1 else held
-
-
-class _Turns:
-    """Moves a thread that works from time to time to another processor each time.
-
-    The scheduler wakes a thread on the processor on which it slept. So a recorder would interrupt the same node again
-    and again, and this node would delay the others. Often two nodes then share one processor while another one is idle.
-
-    Args:
-        busy: number of nodes of this host that step all the time. If there are more processors, the scheduler finds the
-            idle one, and this class does nothing.
-    """
-
-    def __init__(self, busy: int) -> None:
-        self._busy = busy
-        self._turn = 0
-
-    def next(self) -> None:
-        """Move the calling thread to the next processor; the scheduler may move it on to an idle one."""
-        processors = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_setaffinity") else []  # Linux
-        if 1 < len(processors) <= self._busy:
-            self._turn = (self._turn + 1) % len(processors)
-            with suppress(OSError):  # this processor was just taken from this process
-                os.sched_setaffinity(0, {processors[self._turn]})
-                os.sched_setaffinity(0, processors)
