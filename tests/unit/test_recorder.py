@@ -23,7 +23,7 @@ from fmu_mesh.wire.membership import Admission, Welcome
 from fmu_mesh.wire.messages import FINISH, FRAME, HEADER, encode_abort
 from fmu_mesh.wire.rows import encode_rows
 from fmu_mesh.wire.session import Wiring, close_session, open_session
-from tests.helpers import DEADLINE_S
+from tests.helpers import DEADLINE_S, wait_until
 from tests.scenarios.scenario import Scenario
 
 POINTS = 1_000_000
@@ -106,21 +106,11 @@ def assert_has_ended(recorder: Recorder) -> None:
 def test_a_recorder_at_rest_ends_with_a_run_that_fails_and_writes_what_has_come(
     mesh: Mesh, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    rests = threading.Event()
-
-    class Turns:
-        def __init__(self, _nodes: int) -> None:
-            pass
-
-        def next(self) -> None:
-            rests.set()
-
-    monkeypatch.setattr(module, "_Turns", Turns)
     monkeypatch.setattr(module, "_REST_S", DEADLINE_S)
 
     with suppress(MeshLost), Recorder(mesh.plan, mesh.session, mesh.file()) as recorder:
         mesh.put_rows()
-        assert rests.wait(DEADLINE_S)
+        wait_until(lambda: recorder.rows == ROWS, "its rows are written, and it rests")
         error = MeshLost("node 'n' was lost", instance="a, b")
         mesh.put(encode_abort(error.report()))
         raise error
