@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from concurrent.futures import TimeoutError as NotYet
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, nullcontext
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self, Unpack
@@ -38,6 +38,7 @@ from .run_ways import TIMEOUT_S, ended_by_keyboard, follow, reach
 from .samples import Sample, Watch, sample_of, targets_of
 
 if TYPE_CHECKING:  # whoever attaches to a mesh needs nothing that plans or starts one
+    from ..ros.bags.bag import Bag
     from ..ros.bags.playing import Played, PlayOptions
     from ..run.run_plan import RunPlan
     from .plan_options import StartOptions
@@ -227,13 +228,13 @@ class Run:
         with self._client().logs(follow=follow) as lines:
             yield from lines
 
-    def play(self, bag: str | Path, **how: Unpack[PlayOptions]) -> Played:
+    def play(self, bag: str | Path | Bag, **how: Unpack[PlayOptions]) -> Played:
         """Send the messages of a recorded bag to inputs of the mesh, each at the point of its stamp.
 
         The mesh is paused at each of these points, so the result depends on the bag alone.
 
         Args:
-            bag: an MCAP file, or the folder of a `ros2 bag`.
+            bag: an MCAP file, or the folder of a `ros2 bag`; or a bag that is open.
             how: see `PlayOptions`.
 
         Returns:
@@ -243,9 +244,12 @@ class Run:
             ConfigurationError: the bag has no message of these topics, or an input takes no such value.
             DeadlineExceeded: the mesh does not come to the next message.
         """
-        from ..ros.bags.playing import play_bag  # noqa: PLC0415  not for those who only look
+        from ..ros.bags.bag import Bag  # noqa: PLC0415  not for those who only look
+        from ..ros.bags.playing import play_bag  # noqa: PLC0415  as above
 
-        return play_bag(self._running(), Path(bag), self._own.plan.loaded if self._own is not None else None, **how)
+        loaded = self._own.plan.loaded if self._own is not None else None
+        with nullcontext(bag) if isinstance(bag, Bag) else Bag(Path(bag)) as opened:
+            return play_bag(self._running(), opened, loaded, **how)
 
     # --- steering
 

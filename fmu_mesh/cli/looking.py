@@ -35,7 +35,7 @@ from .output.pages import (
     variables,
 )
 
-__all__ = ["PARSERS", "add_question"]
+__all__ = ["PARSERS"]
 
 _REFERENCE = "`instance.variable` or `MESH/instance.variable` (`*`: any characters), or a key (with wildcards of Zenoh)"
 _WHICH = "a mesh or an instance: NAME, MESH/INSTANCE, or its key"
@@ -43,7 +43,7 @@ _WHICH = "a mesh or an instance: NAME, MESH/INSTANCE, or its key"
 Run = Callable[[argparse.Namespace, Meshes], int]
 
 
-def add_question(parser: CommandParser, run: Run) -> None:
+def _add_question(parser: CommandParser, run: Run) -> None:
     """Add the flags of a command that asks running meshes."""
     add_reaching(parser)
     add_json(parser)
@@ -63,7 +63,7 @@ def _with_meshes(run: Run, arguments: argparse.Namespace) -> int:
 
 
 def _add_ls(parser: CommandParser) -> None:
-    add_question(parser, _ls)
+    _add_question(parser, _ls)
     parser.add_argument("name", nargs="?", metavar="NAME", help="a mesh, or an instance, whose variables are listed")
     parser.add_argument("-l", "--long", action="store_true", help="also list the variables of every instance")
 
@@ -121,7 +121,7 @@ def _statuses(client: MeshClient) -> list[InstanceStatus]:
 
 
 def _add_status(parser: CommandParser) -> None:
-    add_question(parser, _status)
+    _add_question(parser, _status)
     parser.add_argument("key", nargs="?", metavar="KEY", help=f"{_WHICH}; default: every mesh")
 
 
@@ -150,7 +150,7 @@ def _status(arguments: argparse.Namespace, meshes: Meshes) -> int:
 
 
 def _add_info(parser: CommandParser) -> None:
-    add_question(parser, _info)
+    _add_question(parser, _info)
     parser.add_argument("key", metavar="KEY", help=_WHICH)
 
 
@@ -173,7 +173,7 @@ def _info(arguments: argparse.Namespace, meshes: Meshes) -> int:
 
 
 def _add_get(parser: CommandParser) -> None:
-    add_question(parser, _get)
+    _add_question(parser, _get)
     parser.add_argument("key", nargs="+", metavar="KEY", help=_REFERENCE)
 
 
@@ -190,7 +190,7 @@ def _get(arguments: argparse.Namespace, meshes: Meshes) -> int:
 
 
 def _add_set(parser: CommandParser) -> None:
-    add_question(parser, _set)
+    _add_question(parser, _set)
     add_quiet(parser)
     parser.add_argument("key", metavar="KEY", help="`instance.variable`, `MESH/instance.variable`, or a key")
     parser.add_argument("value", metavar="VALUE", help="a number, true, false, text, or [a, list] for an array")
@@ -218,7 +218,7 @@ def _value(target: Target, text: str) -> object:
 
 
 def _add_watch(parser: CommandParser) -> None:
-    add_question(parser, _watch)
+    _add_question(parser, _watch)
     parser.add_argument("key", nargs="+", metavar="KEY", help=_REFERENCE)
     parser.add_argument("--count", type=count, metavar="N", help="end after N values")
 

@@ -42,11 +42,12 @@ def _add_play(parser: CommandParser) -> None:
 
 
 def _play(arguments: argparse.Namespace) -> int:
-    with Bag(arguments.bag):
-        pass  # what is wrong with it is told before anything about meshes
-    with attach(arguments.mesh, connect=arguments.connect, timeout=arguments.timeout) as run:
+    with (
+        Bag(arguments.bag) as bag,  # first: what is wrong with it is told before anything about meshes
+        attach(arguments.mesh, connect=arguments.connect, timeout=arguments.timeout) as run,
+    ):
         played = run.play(
-            arguments.bag,
+            bag,
             topics=arguments.topic,
             start=arguments.start,
             stamps=arguments.stamps,

@@ -73,12 +73,12 @@ class Played(msgspec.Struct, frozen=True):
     beyond: int
 
 
-def play_bag(client: MeshClient, file: Path, loaded: LoadedConfig | None = None, **how: Unpack[PlayOptions]) -> Played:
+def play_bag(client: MeshClient, bag: Bag, loaded: LoadedConfig | None = None, **how: Unpack[PlayOptions]) -> Played:
     """Play a bag to a mesh.
 
     Args:
         client: the mesh.
-        file: an MCAP file, or the folder of a `ros2 bag`.
+        bag: the bag.
         loaded: the configuration of the mesh; None: it is read from the file that the mesh names.
         how: see `PlayOptions`; its ``config`` comes first.
 
@@ -88,16 +88,14 @@ def play_bag(client: MeshClient, file: Path, loaded: LoadedConfig | None = None,
     mesh = client.info()
     infos = {name: client.instance_info(name) for name in mesh.instances}
     step_points = {name: round(info.step_size / mesh.step_size) for name, info in infos.items()}
-    start = how.get("start")
     if loaded is None or how.get("config") is not None:
         loaded = load(Path(how.get("config") or mesh.config))
-    with Bag(file) as bag:
-        topics = chosen_topics(loaded, infos, bag, how.get("topics", ()))
-        samples = bag.samples(topics, how.get("stamps", "header"))
-        moments, merged, beyond = schedule(samples, grid_of(mesh), step_points, start=start)
+    topics = chosen_topics(loaded, infos, bag, how.get("topics", ()))
+    samples = bag.samples(topics, how.get("stamps", "header"))
+    moments, merged, beyond = schedule(samples, grid_of(mesh), step_points, start=how.get("start"))
     names = [topic.name for topic in topics]
     if not moments:
-        raise _nothing(file, ", ".join(names), beyond)
+        raise _nothing(bag.path, ", ".join(names), beyond)
     count, first = play(client, moments, step_points, how.get("timeout", _TIMEOUT_S))
     past = sum(len(moment.values) for moment in moments) - count
     return Played(count, names, first, moments[-1].point, merged, past, beyond)

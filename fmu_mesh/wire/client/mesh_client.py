@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from itertools import chain
 from typing import Any, TypeVar, cast
@@ -221,7 +221,9 @@ class MeshClient:
                 follower.subscribe(target.key, Keeper(target, follower.arrived).keep)
             there = follower.there.wait(self._timeout_s)
             if there:
-                self._meet_nodes({target.instance for target in targets})
+                # An answer of a node comes after the subscribers of this session have come to it.
+                with suppress(ConfigurationError, DeadlineExceeded):  # it is about to end
+                    self.all_status()
             yield follower.to_the_last() if there else iter(())
 
     @contextmanager
@@ -240,12 +242,6 @@ class MeshClient:
             there = follow and follower.there.wait(self._timeout_s)
             new = follower.to_the_last() if there else iter(())
             yield chain(kept, (line for line in new if line.number > last))
-
-    def _meet_nodes(self, instances: Iterable[str]) -> None:
-        """Return when the nodes of these instances know the subscribers of this session: an answer comes after them."""
-        with suppress(ConfigurationError, DeadlineExceeded):  # it is about to end
-            for instance in instances:
-                self.instance_status(instance)
 
     # --- names
 
