@@ -59,6 +59,7 @@ class Display:
         self._endpoints: Sequence[str] = ()
 
     def __enter__(self) -> Self:
+        self._console.print(end="")  # the first print of rich takes some milliseconds: not when the nodes step
         self._progress.start()
         return self
 
