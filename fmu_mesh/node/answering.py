@@ -6,6 +6,8 @@ Settings are checked here and made by the main thread. A query that waits too lo
 
 from __future__ import annotations
 
+import os
+import socket
 import time
 from collections.abc import Callable
 from functools import partial
@@ -16,12 +18,12 @@ import zenoh
 from ..system.plan import NodePlan
 from ..system.settable import check_settable
 from ..variables.model_description import Value, Variable
+from ..variables.value_conversion import to_plain
 from ..wire.inbox import Inbox
-from ..wire.keys import Keys, unescape
+from ..wire.keys import Keys, escape, unescape
 from ..wire.values import ValueRefused, attachment, decode_time, decode_value, encode_value, json_encoding
-from ..wire.views import LogLine, SetAnswer
+from ..wire.views import ConnectionView, InstanceInfo, LogLine, SetAnswer, VariableView
 from .activity import Activity
-from .info import instance_info
 from .inputs import set_input
 from .stepping import Runner
 from .streams import kind_of
@@ -33,6 +35,16 @@ _BEFORE_VALUES = ("waiting for the mesh", "initializing")
 """States of a node that has its FMUs and no values yet. A mesh can be running for others already."""
 
 _LOOKS = 3
+
+_CAPABILITIES = (
+    "can_handle_variable_step_size",
+    "can_get_and_set_state",
+    "can_serialize_state",
+    "can_interpolate_inputs",
+    "has_event_mode",
+    "needs_execution_tool",
+    "only_once_per_process",
+)
 
 Job = Callable[[], None]
 
@@ -67,22 +79,16 @@ class Answers:
 
     def answer(self, name: str, query: zenoh.Query) -> None:
         """Answer for every key of the instance that the query's key expression matches."""
-        root = self._keys.instance(name)
-        asked = query.key_expr
-        runner = self._activity.runners.get(name)
         if query.payload is not None:
             self._answer_setting(name, query)
             return
-        for what in ("info", "status"):
-            if asked.intersects(zenoh.KeyExpr(f"{root}/{what}")):
-                if what == "status":
-                    query.reply(
-                        f"{root}/status", msgspec.json.encode(self._activity.status(name)), encoding=json_encoding
-                    )
-                elif runner is not None:
-                    query.reply(
-                        f"{root}/info", msgspec.json.encode(instance_info(self._plan, runner)), encoding=json_encoding
-                    )
+        root, runner = self._keys.instance(name), self._activity.runners.get(name)
+        views: dict[str, Callable[[], object]] = {"status": lambda: self._activity.status(name)}
+        if runner is not None:
+            views["info"] = lambda: instance_info(self._plan, runner)
+        for what, view in views.items():
+            if query.key_expr.intersects(zenoh.KeyExpr(f"{root}/{what}")):
+                query.reply(f"{root}/{what}", msgspec.json.encode(view()), encoding=json_encoding)
         pending = _Pending(name, query)
         self._answer_values(pending, pending.asked)
 
@@ -104,16 +110,20 @@ class Answers:
         self._reply_values(runner, query, known, step)
         answered = {key for key, _ in known}
         unknown = [(key, variable) for key, variable in wanted if key not in answered]
-        if unknown:
-            self._read_at_next_point(runner, query, unknown)
-        else:
+        if not unknown:
             query.drop()
+            return
+
+        def read() -> Job:
+            values = runner.instance.get_values([variable.name for _, variable in unknown])
+            pairs = [(key, value) for (key, _), value in zip(unknown, values, strict=True)]
+            return partial(self._reply_values, runner, query, pairs, runner.step)
+
+        self._answer_at_next_point(_Pending(name, query), read)
 
     def put_arrived(self, runner: Runner, sample: zenoh.Sample) -> None:
         """On a thread of Zenoh: accept a value that was put; if it is refused, the reason is logged."""
-        attachment = sample.attachment.to_bytes() if sample.attachment is not None else None
-        data = sample.payload.to_bytes()
-        self._post(partial(self._take_put, runner, str(sample.key_expr), data, attachment))
+        self._post(partial(self._take_put, runner, str(sample.key_expr), sample.payload, sample.attachment))
 
     def turn(self, now: float) -> None:
         """Answer queries that waited for the first point; refuse those that have waited too long for a point."""
@@ -156,75 +166,98 @@ class Answers:
         for key, value in values:
             query.reply(key, encode_value(value), encoding=json_encoding, attachment=stamp)
 
-    def _read_at_next_point(self, runner: Runner, query: zenoh.Query, wanted: list[tuple[str, Variable]]) -> None:
-        pending = _Pending(runner.name, query)
+    def _answer_at_next_point(self, pending: _Pending, action: Callable[[], Job]) -> None:
+        """Let the main thread run ``action`` between two steps; then answer, unless the query was refused meanwhile.
+
+        Args:
+            pending: the query.
+            action: returns what answers it, on the server's thread; a `ValueRefused` is the answer, too.
+        """
         self._pending.append(pending)
 
-        def read() -> None:
-            values = runner.instance.get_values([variable.name for _, variable in wanted])
-            pairs = [(key, value) for (key, _), value in zip(wanted, values, strict=True)]
-            step = runner.step
-            self._post(lambda: self._finish(pending, lambda: self._reply_values(runner, query, pairs, step)))
+        def act() -> None:
+            try:
+                reply = action()
+            except ValueRefused as refused:
+                reply = partial(pending.query.reply_err, str(refused))
+            self._post(partial(finish, reply))
 
-        self._inbox.post(read)
+        def finish(reply: Job) -> None:
+            if pending in self._pending:
+                self._pending.remove(pending)
+                reply()
+                pending.query.drop()
 
-    def _finish(self, pending: _Pending, reply: Job) -> None:
-        """Answer a query that waited for a point, unless it was refused in the meantime."""
-        if pending in self._pending:
-            self._pending.remove(pending)
-            reply()
-            pending.query.drop()
+        self._inbox.post(act)
 
-    def _take_put(self, runner: Runner, key: str, data: bytes, attachment: bytes | None) -> None:
-        try:
-            new = _checked_setting(runner, self._keys.instance(runner.name), key, data, attachment)
-        except ValueRefused as refused:
+    def _take_put(
+        self, runner: Runner, key: str, payload: zenoh.ZBytes | None, attachment: zenoh.ZBytes | None
+    ) -> None:
+        def refuse(refused: ValueRefused) -> None:
             self._log(LogLine(runner.name, "warning", "set", str(refused), runner.point))
-            return
 
         def take() -> None:
             try:
-                set_input(runner, new.variable, new.value, new.time)
+                set_input(runner, *new)
             except ValueRefused as refused:
-                self._post(partial(self._log, LogLine(runner.name, "warning", "set", str(refused), runner.point)))
+                self._post(partial(refuse, refused))
 
-        self._inbox.post(take)
+        try:
+            new = self._checked_setting(runner, key, payload, attachment)
+        except ValueRefused as refused:
+            refuse(refused)
+        else:
+            self._inbox.post(take)
 
     def _answer_setting(self, name: str, query: zenoh.Query) -> None:
         """Answer a query that sets a value: from which point on the value holds, or why it was refused."""
-        runner = self._activity.runners.get(name)
-        key = str(query.key_expr)
+        runner, pending, key = self._activity.runners.get(name), _Pending(name, query), str(query.key_expr)
         if runner is None:
-            query.reply_err(f"'{name}' is still being loaded")
-            query.drop()
+            pending.refuse(f"'{name}' is still being loaded")
             return
-        data = query.payload.to_bytes() if query.payload else b""
-        attachment = query.attachment.to_bytes() if query.attachment is not None else None
         try:
-            new = _checked_setting(runner, self._keys.instance(runner.name), key, data, attachment)
+            new = self._checked_setting(runner, key, query.payload, query.attachment)
         except ValueRefused as refused:
-            query.reply_err(str(refused))
-            query.drop()
+            pending.refuse(str(refused))
             return
-        pending = _Pending(name, query)
-        self._pending.append(pending)
 
-        def take() -> None:
-            try:
-                step = set_input(runner, new.variable, new.value, new.time)
-            except ValueRefused as refused:
-                reason = str(refused)
-                self._post(lambda: self._finish(pending, lambda: query.reply_err(reason)))
-                return
-            point = step * runner.plan.step_points
-            answer = SetAnswer(key, point, self._plan.grid.time(point))
-            self._post(
-                lambda: self._finish(
-                    pending, lambda: query.reply(key, msgspec.json.encode(answer), encoding=json_encoding)
-                )
-            )
+        def take() -> Job:
+            point = set_input(runner, *new) * runner.plan.step_points
+            answer = msgspec.json.encode(SetAnswer(key, point, self._plan.grid.time(point)))
+            return lambda: query.reply(key, answer, encoding=json_encoding)
 
-        self._inbox.post(take)
+        self._answer_at_next_point(pending, take)
+
+    def _checked_setting(
+        self, runner: Runner, key: str, payload: zenoh.ZBytes | None, attachment: zenoh.ZBytes | None
+    ) -> tuple[str, Value, float | None]:
+        """The variable of a setting that arrived, its value, and the time in s from which on it holds (None: now).
+
+        Args:
+            runner: the instance.
+            key: the key that the value was sent to.
+            payload: the value as JSON.
+            attachment: the time as JSON, if there is one.
+
+        Raises:
+            ValueRefused: with the reason.
+        """
+        parts = key.removeprefix(f"{self._keys.instance(runner.name)}/").split("/")
+        if len(parts) != 2 or "*" in key:
+            raise ValueRefused(f"'{key}' is not the key of one variable")
+        kind, name = parts[0], unescape(parts[1])
+        variable = runner.instance.description.variable(name)
+        if variable is None or kind_of(variable) != kind:
+            raise ValueRefused(f"'{runner.name}' has no variable '{name}' under '{kind}'")
+        try:
+            check_settable(runner.plan, variable)
+        except ValueRefused as refused:
+            raise ValueRefused(f"'{runner.name}.{name}' {refused}") from refused
+        try:
+            time = decode_time(attachment.to_bytes()) if attachment is not None else None
+            return name, decode_value(payload.to_bytes() if payload is not None else b"", variable), time
+        except ValueRefused as refused:
+            raise ValueRefused(f"'{runner.name}.{name}': {refused}") from refused
 
 
 class _Pending:
@@ -240,40 +273,43 @@ class _Pending:
         self.query.drop()
 
 
-class _Setting(msgspec.Struct, frozen=True):
-    """A value for a variable; ``time`` (s) is from when on, of an input; None: from the next point on."""
-
-    variable: str
-    value: Value
-    time: float | None = None
-
-
-def _checked_setting(runner: Runner, root: str, key: str, data: bytes, attachment: bytes | None) -> _Setting:
-    """The variable, value and time of a setting that arrived for an instance.
-
-    Args:
-        runner: the instance.
-        root: what its keys start with.
-        key: the key that the value was sent to.
-        data: the value as JSON.
-        attachment: the time of the value as JSON, if there is one.
-
-    Raises:
-        ValueRefused: with the reason.
-    """
-    parts = key.removeprefix(root + "/").split("/")
-    if len(parts) != 2 or "*" in key:
-        raise ValueRefused(f"'{key}' is not the key of one variable")
-    kind, name = parts[0], unescape(parts[1])
-    variable = runner.instance.description.variable(name)
-    if variable is None or kind_of(variable) != kind:
-        raise ValueRefused(f"'{runner.name}' has no variable '{name}' under '{kind}'")
-    try:
-        check_settable(runner.plan, variable)
-    except ValueRefused as refused:
-        raise ValueRefused(f"'{runner.name}.{name}' {refused}") from refused
-    try:
-        time = decode_time(attachment) if attachment is not None else None
-        return _Setting(name, decode_value(data, variable), time)
-    except ValueRefused as refused:
-        raise ValueRefused(f"'{runner.name}.{name}': {refused}") from refused
+def instance_info(plan: NodePlan, runner: Runner) -> InstanceInfo:
+    """What `info` answers for an instance of this process."""
+    description, start_values = runner.instance.description, runner.plan.start_values
+    return InstanceInfo(
+        instance=runner.name,
+        model_name=description.model_name,
+        description=description.description,
+        fmi_version=description.fmi_version,
+        kind=description.kind,
+        fmu=runner.plan.fmu,
+        generation_tool=description.generation_tool,
+        capabilities={name: getattr(description, name) for name in _CAPABILITIES},
+        default_experiment=description.default_experiment,
+        step_size=plan.grid.step_size * runner.plan.step_points,
+        variables=tuple(
+            VariableView(
+                v.name,
+                f"{kind}/{escape(v.name)}",
+                v.declared_type or v.type,
+                v.causality,
+                v.variability,
+                v.unit,
+                start_values.get(v.name, to_plain(v.start) if v.start is not None else None),
+                v.description,
+                v.shape,
+            )
+            for v in description.variables
+            if (kind := kind_of(v)) is not None
+        ),
+        connections=tuple(
+            ConnectionView(f"{feed.source}.{source}", f"{runner.name}.{target}", feed.delay, factor, offset)
+            for feed in runner.plan.feeds
+            for source, target, factor, offset in feed.columns
+        ),
+        node=plan.node,
+        pid=os.getpid(),
+        host=socket.gethostname(),
+        problems=description.problems,
+        clocks=description.clocks,
+    )

@@ -4,28 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from functools import partial
-from typing import NamedTuple
 
-from ..rings.host_memory import Counter, HostMemory
-from ..rings.ring import Ring
+from ..rings.host_memory import HostMemory
 from ..rings.transfer import Transfer
 from ..system.plan import Link, NodePlan
-from ..wire.frames import FrameReceiver, of_text
+from ..wire.frames import FrameReceiver, SourceRows, rows_of
 from .stepping import Runner, Source
 
-__all__ = ["SourceRows", "connect", "sources_of"]
-
-
-class SourceRows(NamedTuple):
-    """Rows of an instance.
-
-    Attributes:
-        text: True: only its text is taken from here, because the numbers are in another ring. False: only its numbers.
-    """
-
-    ring: Ring
-    counter: Counter
-    text: bool | None = None
+__all__ = ["connect", "sources_of"]
 
 
 def connect(
@@ -54,17 +40,12 @@ def connect(
         receivers[link.index] = link
         if link.initial_only:
             continue
-        place, found = places[link.source], rows.setdefault(link.source, [])
-        is_shared = link.source_node in shares
-        if is_shared:
-            found.append(SourceRows(memory.ring(place), memory.counter(place.counter), text=False))
-        layout = of_text(link.layout) if is_shared else link.layout
-        if layout.columns:
-            mirror, counter = own_memory.ring(place), own_memory.counter(place.counter)
-            found.append(SourceRows(mirror, counter, text=True if is_shared else None))
-            fits = partial(_fits, runners, link.source)
-            who = f"node '{plan.node}'"
-            receivers[link.index] = FrameReceiver(link, layout, who, mirror, counter, fits)
+        shared = memory if link.source_node in shares else None
+        fits = partial(_fits, runners, link.source)
+        found, receiver = rows_of(link, places[link.source], shared, own_memory, fits)
+        rows.setdefault(link.source, []).extend(found)
+        if receiver is not None:
+            receivers[link.index] = receiver
     points = {name: place.step_points for name, place in places.items()}
     for runner in runners.values():
         runner.connect(sources_of(runner, rows, points))

@@ -12,12 +12,13 @@ from collections.abc import Callable, Collection, Sequence
 
 from ..errors import DeadlineExceeded
 from ..rings.array_elements import element_of, merged, scaled
+from ..simtime import ENDLESS
 from ..system.algebraic_loop import FixedPoint
 from ..system.initialization_plan import Loop
 from ..system.layout import Column
 from ..system.plan import Link, NodePlan
 from ..variables.value_types import Value, split_element
-from ..wire.frames import initial_values, needed_levels
+from ..wire.frames import initial_values
 from .links import OutLink
 from .stepping import Runner
 
@@ -53,9 +54,8 @@ class Initialization:
         for own in plan.instances:
             self._columns |= {(own.name, column.name): column for column in own.outputs.columns}
             self._levels |= {(own.name, name): level for name, level in own.initialization.items()}
-        self._known: dict[Key, Value] = {}
+        self._known: dict[tuple[str, str, int | None], Value] = {}
         self._settled: set[Key] = set()
-        self._sweeps: dict[tuple[str, str, int], Value] = {}
         self._end = 0.0
 
     def take(self, link: Link, tag: int, data: bytes) -> None:
@@ -63,10 +63,7 @@ class Initialization:
         sweep, level = divmod(tag, _SWEEP)
         iterated = any(loop.first <= level <= loop.last for loop in self._plan.loops)
         for name, value in initial_values(link, level, data).items():
-            if iterated:
-                self._sweeps[link.source, name, sweep] = value
-            else:
-                self._known[link.source, name] = value
+            self._known[link.source, name, sweep if iterated else None] = value
 
     def run(self, runners: Collection[Runner]) -> None:
         """Set and get the values of all connections; every instance must be in Initialization Mode.
@@ -87,11 +84,9 @@ class Initialization:
                 for runner in runners:
                     if names := _outputs_at(runner, level):
                         self._set_inputs(runner, level)
-                        values = self._get_outputs(runner, names)
-                        self._known.update({(runner.name, name): value for name, value in values.items()})
-                        self._send(runner, level, values)
+                        self._send(runner, level, self._get_outputs(runner, names))
         for runner in runners:
-            self._set_inputs(runner, None)
+            self._set_inputs(runner, ENDLESS)
         self.out_links.clear()
 
     def _iterate(self, loop: Loop, runners: Collection[Runner]) -> None:
@@ -108,46 +103,38 @@ class Initialization:
         while not consistent:
             sweep = point.sweeps
             for runner, level, names in own:
-                self._set_inputs_of_loop(runner, level, sweep, point, loop)
-                values = self._get_outputs(runner, names)
-                self._sweeps.update({(runner.name, name, sweep): value for name, value in values.items()})
-                self._send(runner, level, values, loop, sweep)
+                self._set_inputs(runner, loop.first, point, level)
+                self._send(runner, level, self._get_outputs(runner, names, sweep), loop, sweep)
             consistent = point.update(
                 [scaled(self._element(t.source, t.output, sweep), t.factor, t.offset) for t in loop.tears]
             )
             if consistent:
-                for key in members & self._levels.keys():
-                    self._known[key] = self._value(*key, sweep)
-            self._sweeps = {
-                k: v for k, v in self._sweeps.items() if k[:2] not in members or (k[2] > sweep and not consistent)
+                self._known |= {(*key, None): self._value(*key, sweep) for key in members & self._levels.keys()}
+            self._known = {
+                k: v
+                for k, v in self._known.items()
+                if k[2] is None or k[:2] not in members or (k[2] > sweep and not consistent)
             }
         self._settled |= point.assumed.keys()
         for runner, level, names in own:
-            self._send(runner, level, {name: self._known[runner.name, name] for name in names}, loop)
+            self._send(runner, level, {name: self._known[runner.name, name, None] for name in names}, loop)
 
-    def _set_inputs(self, runner: Runner, below: int | None) -> None:
-        """Set the inputs whose sources have a level below this one (None: all)."""
+    def _set_inputs(self, runner: Runner, below: int, point: FixedPoint | None = None, within: int = 0) -> None:
+        """Set the inputs whose sources have a level below this one.
+
+        In a sweep of a loop, also set the assumed inputs, and those whose sources have a level below ``within``, to
+        their values of this sweep.
+        """
         values: dict[str, Value] = {}
         for feed in runner.plan.feeds:
             for source, target, factor, offset in feed.columns:
-                early = below is None or self._level_of(feed.source, source) < below
-                if early and (runner.name, target) not in self._settled:
+                level, key = self._levels[feed.source, self._column(feed.source, source).name], (runner.name, target)
+                if point is not None and key in point.assumed:
+                    values[target] = point.assumed[key]
+                elif point is not None and below <= level < within:
+                    values[target] = scaled(self._element(feed.source, source, point.sweeps), factor, offset)
+                elif level < below and key not in self._settled:
                     values[target] = scaled(self._element(feed.source, source), factor, offset)
-        if values:
-            runner.instance.set_values(merged(values, runner.plan.inputs, runner.instance.get_values))
-
-    def _set_inputs_of_loop(self, runner: Runner, level: int, sweep: int, point: FixedPoint, loop: Loop) -> None:
-        """In a sweep of a loop: set the assumed inputs, and those whose sources have a level below this one."""
-        values: dict[str, Value] = {}
-        for feed in runner.plan.feeds:
-            for source, target, factor, offset in feed.columns:
-                own_level = self._level_of(feed.source, source)
-                if (runner.name, target) in point.assumed:
-                    values[target] = point.assumed[runner.name, target]
-                elif own_level < loop.first and (runner.name, target) not in self._settled:
-                    values[target] = scaled(self._element(feed.source, source), factor, offset)
-                elif loop.first <= own_level < level:
-                    values[target] = scaled(self._element(feed.source, source, sweep), factor, offset)
         if values:
             runner.instance.set_values(merged(values, runner.plan.inputs, runner.instance.get_values))
 
@@ -157,40 +144,31 @@ class Initialization:
             return self._columns[instance, parts[0]]
         return self._columns[instance, name]
 
-    def _level_of(self, instance: str, name: str) -> int:
-        return self._levels[instance, self._column(instance, name).name]
-
     def _element(self, instance: str, name: str, sweep: int | None = None) -> Value:
         """The initial value of an output, or of an element of it; in a sweep of a loop, that of the sweep."""
         column = self._column(instance, name)
         return element_of(self._value(instance, column.name, sweep), column, name)
 
     def _value(self, instance: str, variable: str, sweep: int | None = None) -> Value:
-        if sweep is None:
-            while (instance, variable) not in self._known:
-                self._wait_for(instance, variable)
-            return self._known[instance, variable]
-        while (instance, variable, sweep) not in self._sweeps:
-            self._wait_for(instance, variable)
-        return self._sweeps[instance, variable, sweep]
+        while (instance, variable, sweep) not in self._known:
+            left_s = self._end - time.monotonic()
+            if left_s <= 0:
+                text = f"its initial value did not come within {self._plan.timeouts.initialize:g} s"
+                raise DeadlineExceeded(text, instance=instance, variable=variable)
+            self._wait(left_s)
+        return self._known[instance, variable, sweep]
 
-    def _wait_for(self, instance: str, variable: str) -> None:
-        left_s = self._end - time.monotonic()
-        if left_s <= 0:
-            text = f"its initial value did not come within {self._plan.timeouts.initialize:g} s"
-            raise DeadlineExceeded(text, instance=instance, variable=variable)
-        self._wait(left_s)
-
-    def _get_outputs(self, runner: Runner, names: Sequence[str]) -> dict[str, Value]:
-        """Get outputs of an instance."""
-        return dict(zip(names, runner.instance.get_values(names), strict=True))
+    def _get_outputs(self, runner: Runner, names: Sequence[str], sweep: int | None = None) -> dict[str, Value]:
+        values = dict(zip(names, runner.instance.get_values(names), strict=True))
+        self._known |= {(runner.name, name, sweep): value for name, value in values.items()}
+        return values
 
     def _send(
         self, runner: Runner, level: int, values: dict[str, Value], loop: Loop | None = None, sweep: int | None = None
     ) -> None:
         """Send the outputs of a level to the nodes that need them; in a sweep of a loop, to those that take part."""
         for link in (*runner.out_links, *self.out_links):
-            if link.link.source != runner.name or level not in needed_levels(link.link):
+            if link.link.source != runner.name or level not in link.link.levels:
                 continue
             if loop is None or (link.link.target_node in loop.nodes) == (sweep is not None):
                 link.send_initial(level + (sweep or 0) * _SWEEP, values)

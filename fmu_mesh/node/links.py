@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
+import numpy as np
+from numpy.typing import NDArray
+
 from ..errors import FmuMeshError
 from ..rings.ring import Ring
 from ..system.layout import Layout
 from ..system.plan import RECORDER, Link
 from ..variables.value_types import Value
-from ..wire.frames import picks
 from ..wire.messages import FRAME, HEADER, INITIAL, LAST
 from ..wire.rows import encode_frames, encode_rows
 
@@ -38,35 +40,25 @@ class OutLink:
         self._rows = max(1, _FRAME_BYTES // max(layout.row_size, 1))
         self._outputs = outputs
         self._put = put
-        self._picks = picks(outputs.layout, layout)
+        self._picked = _picked(outputs.layout, layout)
 
     @property
     def has_frames(self) -> bool:
         """Whether it sends rows at all."""
-        return bool(self._picks)
+        return bool(self._picked)
 
     def flush(self, end: int) -> None:
         """Send the rows of own steps ``sent .. end - 1``."""
-        first = self.sent
-        if first >= end or not self._picks:
-            return
-        ring = self._outputs
-        if end - first > ring.rows:
-            lost = end - ring.rows - first
-            text = f"{lost} rows for {self.link.target_node} were overwritten before they were sent"
+        ring, first = self._outputs, self.sent
+        if self._picked and end - first > ring.rows:
+            text = f"{end - ring.rows - first} rows for {self.link.target_node} were overwritten before they were sent"
             raise FmuMeshError(text, instance=self.link.source, point=first * self.link.step_points)
-        while first < end:
-            start = first & ring.mask
-            cut = min(end - first, ring.rows - start, self._rows)
-            end_slot = start + cut
-            rows = tuple(
-                ring.parts[part][start:end_slot] if picked is None else ring.parts[part][start:end_slot, picked]
-                for part, picked in self._picks
-            )
+        while self._picked and (first := self.sent) < end:
+            numbers = np.arange(first, min(end, first + self._rows))
+            rows = tuple(ring.parts[part][np.ix_(numbers & ring.mask, elements)] for part, elements in self._picked)
             for message in encode_frames(FRAME, self.link.index, first, rows):
                 self._put(message)
-            first += cut
-        self.sent = end
+            self.sent += len(numbers)
 
     def send_last(self, end: int) -> None:
         """The run ends early: send the remaining rows up to own step ``end - 1``, and that no more will come."""
@@ -80,3 +72,14 @@ class OutLink:
             if name in values:
                 row.put(0, name, values[name])
         self._put(encode_rows(INITIAL, self.link.index, tag, row.parts))
+
+
+def _picked(have: Layout, want: Layout) -> list[tuple[int, NDArray[np.intp]]]:
+    """For each part of the wanted columns: its number in a ring with the columns ``have``, and its elements there."""
+    numbers = {part.type: number for number, part in enumerate(have.parts)}
+    picked = []
+    for part in want.parts:
+        places = [have.place(column.name) for column in part.columns]
+        elements = np.concatenate([np.arange(place.first, place.first + place.size) for place in places])
+        picked.append((numbers[part.type], elements))
+    return picked

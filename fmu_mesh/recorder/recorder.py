@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Collection
 from functools import partial
 from types import TracebackType
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
 import numpy as np
 import zenoh
@@ -20,12 +20,11 @@ from numpy.typing import NDArray
 
 from ..errors import DeadlineExceeded, FmuMeshError, MeshLost, MessageRefused, ProtocolBroken, from_report
 from ..files import unwritable
-from ..rings.host_memory import Counter, HostMemory, Wish
-from ..rings.ring import Ring
+from ..rings.host_memory import HostMemory, Wish
 from ..system.plan import RECORDER, Link, NodePlan
 from ..system.recording import ResultFile
 from ..variables.value_types import is_text
-from ..wire.frames import FrameReceiver, of_text
+from ..wire.frames import FrameReceiver, SourceRows, rows_of
 from ..wire.inbox import Inbox, Message
 from ..wire.membership import Membership
 from ..wire.messages import (
@@ -176,17 +175,9 @@ class Recorder:
         )
 
     def _source(self, link: Link, shares: Collection[str]) -> _Source:
-        """Where the rows of an instance are: in its ring, or in a mirror that frames fill."""
         place = next(place for place in self._plan.rings if place.instance == link.source)
-        is_shared = link.source_node in shares
-        numbers = mirror = receiver = None
-        if is_shared:
-            numbers = _Rows(self._memory.ring(place), self._memory.counter(place.counter))
-        layout = of_text(link.layout) if is_shared else link.layout
-        if layout.columns:
-            mirror = _Rows(self._own_memory.ring(place), self._own_memory.counter(place.counter))
-            receiver = FrameReceiver(link, layout, "the recorder", *mirror, partial(self._fits, link))
-        return _Source(link, numbers, mirror, receiver)
+        shared = self._memory if link.source_node in shares else None
+        return _Source(link, *rows_of(link, place, shared, self._own_memory, partial(self._fits, link)))
 
     def _record(self) -> None:
         """Write rows when there are many, or every few milliseconds, and tell the progress."""
@@ -343,35 +334,25 @@ class _Ended(FmuMeshError):
         super().__init__(cause.message)
 
 
-class _Rows(NamedTuple):
-    """Rows of a source: in its ring, or in a mirror of it."""
-
-    ring: Ring
-    counter: Counter
-
-
 class _Source:
     """Rows of one instance that wait for rows of the others.
 
     Args:
         link: what is recorded of it.
-        numbers: its ring; None if the recorder cannot read it.
-        mirror: the mirror for what comes in frames; None if nothing does.
-        receiver: fills the mirror.
+        rows: where its rows are.
+        receiver: takes its frames; None if nothing comes in frames.
 
     Attributes:
         ended: whether no more rows will come.
     """
 
-    def __init__(self, link: Link, numbers: _Rows | None, mirror: _Rows | None, receiver: FrameReceiver | None) -> None:
+    def __init__(self, link: Link, rows: list[SourceRows], receiver: FrameReceiver | None) -> None:
         self.link = link
         self.name = link.source
         self.receiver = receiver
         self.ended = False
-        self._numbers = numbers
-        self._mirror = mirror
-        self._rows = [rows for rows in (numbers, mirror) if rows is not None]
-        self.counters = [rows.counter for rows in self._rows]
+        self._rows = rows
+        self.counters = [own.counter for own in rows]
 
     def end(self) -> None:
         """Note that no more rows will come."""
@@ -392,7 +373,7 @@ class _Source:
         """
         low, high = first // self.link.step_points, (end - 1) // self.link.step_points + 1
         wanted = np.arange(low + 1, high + 1)
-        for ring, _ in self._rows:
+        for ring, _, _ in self._rows:
             wrong = ring.stamps[(wanted - 1) & ring.mask] != wanted
             if wrong.any():
                 raise ProtocolBroken(
@@ -405,9 +386,7 @@ class _Source:
     def column(self, variable: str) -> Callable[[int, int], NDArray[Any]]:
         """A function that returns the values of a variable at the points first to end - 1, without wrap-around."""
         has_text = is_text(self.link.layout.column(variable).type)
-        rows = self._mirror if has_text or self._numbers is None else self._numbers
-        assert rows is not None
-        ring, step_points = rows.ring, self.link.step_points
+        ring, step_points = next(own.ring for own in self._rows if own.text in (None, has_text)), self.link.step_points
         place = ring.layout.place(variable)
         values, mask = ring.parts[place.part][:, place.first], ring.mask
 

@@ -2,21 +2,54 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from typing import Any
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FrameGap, MessageRefused, ProtocolBroken
-from ..rings.host_memory import Counter
-from ..rings.ring import Ring, Rows
+from ..rings.host_memory import Counter, HostMemory
+from ..rings.ring import Ring
 from ..system.layout import Layout
-from ..system.plan import Link
+from ..system.memory_map import RingPlace
+from ..system.plan import RECORDER, Link
 from ..variables.value_types import Value, is_text
 from .rows import decode_rows
 
-__all__ = ["FrameReceiver", "initial_values", "needed_levels", "of_text", "picks"]
+__all__ = ["FrameReceiver", "SourceRows", "initial_values", "of_text", "rows_of"]
+
+
+class SourceRows(NamedTuple):
+    """Rows of an instance.
+
+    Attributes:
+        text: True: only its text is taken from here, because the numbers are in another ring. False: only its numbers.
+    """
+
+    ring: Ring
+    counter: Counter
+    text: bool | None = None
+
+
+def rows_of(
+    link: Link, place: RingPlace, shared: HostMemory | None, own: HostMemory, fits: Callable[[int], bool]
+) -> tuple[list[SourceRows], FrameReceiver | None]:
+    """Where the target of a link finds the rows of the source, and what takes the frames of the link.
+
+    Args:
+        link: the link.
+        place: where the ring of the source lies.
+        shared: the memory with this ring; None if source and target do not share one: then all columns come in frames.
+        own: the memory of this process, for the counter of a mirror.
+        fits: see `FrameReceiver`.
+    """
+    rows = [SourceRows(shared.ring(place), shared.counter(place.counter), text=False)] if shared is not None else []
+    layout = link.layout if shared is None else of_text(link.layout)
+    if not layout.columns:
+        return rows, None
+    mirror = SourceRows(Ring(layout, place.rows), own.counter(place.counter), None if shared is None else True)
+    return [*rows, mirror], FrameReceiver(link, mirror.ring, mirror.counter, fits)
 
 
 class FrameReceiver:
@@ -24,29 +57,18 @@ class FrameReceiver:
 
     Args:
         link: the link.
-        layout: the columns of its frames.
-        target: the receiver, for errors.
-        ring: the mirror of the ring of the source: gets the rows.
+        ring: the mirror of the ring of the source, with the columns of the frames: gets the rows.
         counter: the number of rows of this mirror.
         fits: whether rows before this own step of the source overwrite no row that is still needed.
     """
 
-    def __init__(  # noqa: PLR0913, PLR0917  both ends of a link
-        self,
-        link: Link,
-        layout: Layout,
-        target: str,
-        ring: Ring,
-        counter: Counter,
-        fits: Callable[[int], bool] = lambda _end: True,
+    def __init__(
+        self, link: Link, ring: Ring, counter: Counter, fits: Callable[[int], bool] = lambda _end: True
     ) -> None:
         self.link = link
-        self._layout = layout
-        self._fits = fits
-        self._target = target
         self._ring = ring
         self._counter = counter
-        self._places = picks(ring.layout, layout)
+        self._fits = fits
 
     @property
     def received(self) -> int:
@@ -61,69 +83,38 @@ class FrameReceiver:
             FrameGap: rows before it are missing, or a row came twice with different values.
             ProtocolBroken: it has more rows than were granted.
         """
-        rows = decode_rows(data, count, self._layout.parts)
-        received = self.received
+        link, ring, received, end = self.link, self._ring, self.received, first + count
+        rows = decode_rows(data, count, ring.layout.parts)
         if first < 0:
             raise MessageRefused(f"a frame from point {first} on has no point of this run")
-        if count > self._ring.rows or (first <= received < first + count and not self._fits(first + count)):
-            last = (first + count - 1) * self.link.step_points
+        target = "the recorder" if link.target_node == RECORDER else f"node '{link.target_node}'"
+        if count > ring.rows or (first <= received < end and not self._fits(end)):
+            last = (end - 1) * link.step_points
             raise ProtocolBroken(
-                f"'{self.link.source}' sends its values up to point {last} to {self._target}, more than was granted",
-                instance=self.link.source,
-                point=first * self.link.step_points,
+                f"'{link.source}' sends its values up to point {last} to {target}, more than was granted",
+                instance=link.source,
+                point=first * link.step_points,
                 hint="Does another process send messages with its name?",
             )
         if first > received:
-            missing, last = received * self.link.step_points, first * self.link.step_points - 1
-            text = f"points {missing} to {last} of '{self.link.source}' never reached {self._target}"
-            raise FrameGap(text, instance=self.link.source, point=missing)
-        if first < received:
-            known = min(received - first, count)
-            self._compare(first, known, rows)
-            if known == count:
-                return
-            first, rows = first + known, tuple(part[known:] for part in rows)
-        self._keep(first, rows)
-        self._counter.raise_to(first + len(rows[0]))
-
-    def _keep(self, first: int, rows: Rows) -> None:
-        ring = self._ring
-        start, count = first & ring.mask, len(rows[0])
-        cut = min(count, ring.rows - start)
-        stamps = np.arange(first + 1, first + count + 1)
-        for part, place, new in [(ring.stamps, None, stamps), *self._into(rows)]:
-            columns = (slice(None),) if place is None else (slice(None), place)
-            part[start : start + cut][columns] = new[:cut]
-            part[: count - cut][columns] = new[cut:]
-
-    def _into(self, rows: Rows) -> Iterator[tuple[NDArray[Any], list[int] | slice, NDArray[Any]]]:
-        """Each part of the ring, its elements that a frame has, and their new values."""
-        for (part, elements), new in zip(self._places, rows, strict=True):
-            yield self._ring.parts[part], slice(None) if elements is None else elements, new
-
-    def _compare(self, first: int, known: int, rows: Rows) -> None:
-        """A row that is received again must have the same bits; this is checked for the rows that are still kept."""
-        for row in range(max(0, self.received - self._ring.rows - first), known):
-            slot = (first + row) & self._ring.mask
-            if any(_bits(part[slot][place]) != _bits(new[row]) for part, place, new in self._into(rows)):
+            missing, last = received * link.step_points, first * link.step_points - 1
+            text = f"points {missing} to {last} of '{link.source}' never reached {target}"
+            raise FrameGap(text, instance=link.source, point=missing)
+        parts = list(zip(ring.parts, rows, strict=True))
+        for row in range(max(first, received - ring.rows), min(end, received)):  # the old ones that are still kept
+            if any(_bits(part[row & ring.mask]) != _bits(new[row - first]) for part, new in parts):
                 raise FrameGap(
-                    f"the values of '{self.link.source}' came twice and differ",
-                    instance=self.link.source,
-                    point=(first + row) * self.link.step_points,
+                    f"the values of '{link.source}' came twice and differ",
+                    instance=link.source,
+                    point=row * link.step_points,
                     hint="Two processes publish as this instance: end one of them.",
                 )
-
-
-def picks(have: Layout, want: Layout) -> list[tuple[int, list[int] | None]]:
-    """For each wanted part: its number in a ring, and the elements to pick, or None if all are wanted."""
-    types = [part.type for part in have.parts]
-    found: list[tuple[int, list[int] | None]] = []
-    for part in want.parts:
-        number = types.index(part.type)
-        places = [have.place(column.name) for column in part.columns]
-        elements = [element for place in places for element in range(place.first, place.first + place.size)]
-        found.append((number, None if len(elements) == have.parts[number].width else elements))
-    return found
+        if end > received:
+            numbers = np.arange(received, end)
+            for part, new in parts:
+                part[numbers & ring.mask] = new[received - first :]
+            ring.stamps[numbers & ring.mask] = numbers + 1
+            self._counter.raise_to(end)
 
 
 def of_text(layout: Layout) -> Layout:
@@ -150,8 +141,3 @@ def initial_values(link: Link, level: int, data: bytes) -> dict[str, Value]:
         part[:] = new
     names = [name for name, own in zip(link.layout.names, link.levels, strict=True) if own == level]
     return {name: row.value(0, name) for name in names}
-
-
-def needed_levels(link: Link) -> frozenset[int]:
-    """The levels of Initialization Mode at which the target of this link expects a message."""
-    return frozenset(level for level in link.levels if level >= 0)

@@ -31,8 +31,6 @@ assert sys.byteorder == "little", "numbers go over the wire as they lie in memor
 def encode_rows(kind: int, link: int, first: int, rows: Rows) -> bytes:
     """A FRAME or INITIAL message with consecutive rows from own step ``first`` on; there is at least one part."""
     header = HEADER.pack(kind, link, len(rows[0]), first)
-    if len(rows) == 1 and rows[0].dtype != np.object_:
-        return header + rows[0].tobytes()
     return b"".join((header, *(_texts(part) if part.dtype == np.object_ else part.tobytes() for part in rows)))
 
 

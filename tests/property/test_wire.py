@@ -326,9 +326,7 @@ def mirrored(layout: Layout, step_points: int = 1) -> tuple[FrameReceiver, Ring]
     map_, places = map_memory(["target", MASTER], {"source": ("source", step_points, layout)}, 16)
     memory, place = HostMemory.private(map_, "target"), places["source"]
     mirror = memory.ring(place)
-    return FrameReceiver(
-        link_of(layout, step_points), layout, "the target", mirror, memory.counter(place.counter)
-    ), mirror
+    return FrameReceiver(link_of(layout, step_points), mirror, memory.counter(place.counter)), mirror
 
 
 @given(layouts, st.lists(st.tuples(st.integers(0, 20), st.integers(1, 16)), max_size=20), st.integers(0, 2**32))
@@ -360,7 +358,7 @@ def test_a_gap_is_an_error_that_names_both_ends(layout: Layout, before: int, mis
 
     assert (caught.value.instance, caught.value.point) == ("source", before * step_points)
     last = (before + missing) * step_points - 1
-    assert f"points {before * step_points} to {last} of 'source' never reached the target" in str(caught.value)
+    assert f"points {before * step_points} to {last} of 'source' never reached node 'target'" in str(caught.value)
 
 
 numbers = layouts.filter(lambda layout: not any(is_text(c.type) or c.type == "Boolean" for c in layout.columns))

@@ -88,9 +88,7 @@ class SimulatedMesh:
             for link in recorder.links_in:
                 place = places[link.source]
                 self._mirrors[link.index] = mirror = memory.ring(place)
-                self._receivers[link.index] = FrameReceiver(
-                    link, link.layout, "the recorder", mirror, memory.counter(place.counter)
-                )
+                self._receivers[link.index] = FrameReceiver(link, mirror, memory.counter(place.counter))
                 self.recorded[link.source] = []
 
     def run(self) -> None:

@@ -125,5 +125,5 @@ def test_a_query_before_the_first_point_waits_for_it_and_not_for_ever(
     activity.state = "running"
     answers.turn(time.monotonic())
     root = "fmu_mesh/lab/unit"
-    assert everything.told == [f"{root}/info 5", f"{root}/status 7", f"{root}/out/y 2.5", "dropped"]
+    assert everything.told == [f"{root}/status 7", f"{root}/info 5", f"{root}/out/y 2.5", "dropped"]
     assert soon.told == ["fmu_mesh/lab/unit/out/y 2.5", "dropped"]

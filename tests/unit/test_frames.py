@@ -10,7 +10,7 @@ from fmu_mesh.rings.host_memory import HostMemory
 from fmu_mesh.system.layout import Layout
 from fmu_mesh.system.memory_map import MASTER, map_memory
 from fmu_mesh.system.plan import Link
-from fmu_mesh.wire.frames import FrameReceiver, initial_values, needed_levels
+from fmu_mesh.wire.frames import FrameReceiver, initial_values, rows_of
 from fmu_mesh.wire.messages import FRAME, HEADER, INITIAL
 from fmu_mesh.wire.rows import encode_rows
 
@@ -28,13 +28,13 @@ def frame(first: int, *rows: tuple[float, float, int]) -> tuple[int, int, bytes]
 class Receiver:
     """A `FrameReceiver` with a mirror of four rows; ``kept`` is the first row that a step still needs."""
 
-    def __init__(self, layout: Layout = LAYOUT) -> None:
+    def __init__(self) -> None:
         map_, places = map_memory(["right", MASTER], {"source": ("left", 2, LAYOUT)}, 4)
         memory = HostMemory.private(map_, "right")
         self.mirror = memory.ring(places["source"])
         counter = memory.counter(places["source"].counter)
         self.kept = 0
-        self._receiver = FrameReceiver(LINK, layout, "node 'right'", self.mirror, counter, self._fits)
+        self._receiver = FrameReceiver(LINK, self.mirror, counter, self._fits)
 
     def take(self, first: int, count: int, message: bytes) -> list[tuple[float, float, int]]:
         """The rows that are new after a frame."""
@@ -102,14 +102,23 @@ def test_a_frame_that_would_overwrite_a_row_in_use_ends_the_run(receiver: Receiv
     assert receiver.row(1) == (1.0, 1.5, 1)
 
 
-def test_columns_that_come_in_frames_leave_the_others_as_they_are() -> None:
-    """Where a ring is shared, only its text comes in frames."""
-    receiver = Receiver(Layout.of([("n", "Int32")]))
-    receiver.mirror.put(0, "b", 2.5)
+def test_where_a_ring_is_shared_only_its_text_comes_in_frames() -> None:
+    layout = Layout.of([("a", "Float64"), ("s", "String")])
+    map_, places = map_memory(["right", MASTER], {"source": ("left", 2, layout)}, 4)
+    shared, own = HostMemory.private(map_, "right"), HostMemory.private(map_, "right")
+    place, link = places["source"], Link(3, "source", "left", "right", 2, layout, (0, -1))
 
-    message = encode_rows(FRAME, LINK.index, 0, (np.array([[7]], dtype=np.int32),))
+    rows, receiver = rows_of(link, place, shared, own, lambda _end: True)
+    assert receiver is not None
+    receiver.take(0, 1, encode_rows(FRAME, link.index, 0, (np.array([["one"]], dtype=np.object_),)))
 
-    assert receiver.take(0, 1, message) == [(0.0, 2.5, 7)]
+    assert [(part.ring.layout.names, part.counter.value, part.text) for part in rows] == [
+        (("a", "s"), 0, False),
+        (("s",), 1, True),
+    ]
+    assert rows[1].ring.value(0, "s") == "one"
+    assert rows_of(LINK, place, shared, own, lambda _end: True)[1] is None
+    assert [part.text for part in rows_of(link, place, None, own, lambda _end: True)[0]] == [None]
 
 
 def test_a_frame_that_came_before_is_dropped(receiver: Receiver) -> None:
@@ -190,4 +199,3 @@ def test_an_initial_message_gives_the_values_of_its_level() -> None:
     assert initial_values(LINK, 0, message) == {"a": 1.5}
     assert initial_values(LINK, 2, message) == {"b": 2.5}
     assert initial_values(LINK, 1, message) == {}
-    assert needed_levels(LINK) == {0, 2}
