@@ -53,7 +53,7 @@ class Transfer:
         self.source = source
         self.rule = CouplingRule(feed.delay, source_points, target_points)
         self.columns = [
-            column for column in feed.columns if text is None or is_text(source.layout.column(column[0]).type) == text
+            column for column in feed.columns if text is None or is_text(inputs.layout.column(column[1]).type) == text
         ]
         self._inputs = inputs
         self._copies = _copies(self.columns, source, inputs)
