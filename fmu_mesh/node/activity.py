@@ -63,29 +63,20 @@ class Activity:
     def status(self, name: str) -> InstanceStatus:
         """What `status` answers for an instance of this process."""
         runner = self.runners.get(name)
-        if runner is None:
-            start = self._plan.grid.time(0)
-            return InstanceStatus(
-                name,
-                self.state,
-                self.state,
-                0,
-                start,
-                0.0,
-                0.0,
-                restarts=self._plan.restarts,
-                refused=self._refusals.count,
-            )
-        step = runner.step  # the main thread continues meanwhile: all values of an answer must belong to one point
-        point = step * runner.plan.step_points
+        # The main thread continues meanwhile: all values of an answer must belong to one point.
+        step, points = (runner.step, runner.plan.step_points) if runner is not None else (0, 1)
+        engine, step_time = self._engine, 0.0
+        if engine is not None and step:
+            spent = zip(engine.units, engine.spent_s, strict=True)
+            step_time = next(spent_s for unit, spent_s in spent if runner in unit) / step
         return InstanceStatus(
             instance=name,
             state=self.state,
-            activity=self._in_words(runner),
-            point=point,
-            time=self._plan.grid.time(point),
-            step_time=self._spent_s(runner) / step if step else 0.0,
-            wait_time=self._engine.waited_s if self._engine is not None else 0.0,
+            activity=self._in_words(runner) if runner is not None and self.state == "running" else self.state,
+            point=step * points,
+            time=self._plan.grid.time(step * points),
+            step_time=step_time,
+            wait_time=engine.waited_s if engine is not None else 0.0,
             restarts=self._plan.restarts,
             refused=self._refusals.count,
             running_time=time.monotonic() - self._started if self._started is not None else 0.0,
@@ -104,8 +95,12 @@ class Activity:
             return None
         under_way_s = now - self._since(runner, now)
         if under_way_s > 0.0:
-            with engine.sending:
-                self._send()
+            try:
+                with engine.sending:
+                    for own in engine.runners:
+                        own.flush()
+            except FmuMeshError as unreachable:  # the main thread will get the same error
+                log.info("rows_not_sent", extra={"error": str(unreachable)})
         else:
             engine.ring_bell()
         if under_way_s <= self._plan.timeouts.step:
@@ -118,16 +113,7 @@ class Activity:
             hint="If it needs that long, raise `timeouts.step` in the configuration.",
         )
 
-    def _send(self) -> None:
-        try:
-            for runner in self.runners.values():
-                runner.flush()
-        except FmuMeshError as unreachable:  # the main thread will get the same error
-            log.info("rows_not_sent", extra={"error": str(unreachable)})
-
     def _in_words(self, runner: Runner) -> str:
-        if self.state != "running":
-            return self.state
         current = self._engine.current if self._engine is not None else None
         if current is None:
             return f"waiting at point {runner.point} for {runner.waits_for}"
@@ -135,13 +121,6 @@ class Activity:
             return f"waiting at point {runner.point} for its turn: '{current.name}' is in doStep"
         now = time.monotonic()
         return f"in doStep at point {runner.point} for {now - self._since(runner, now):.1f} s"
-
-    def _spent_s(self, runner: Runner) -> float:
-        """How long the unit of a runner was stepped, in s."""
-        engine = self._engine
-        if engine is None:
-            return 0.0
-        return next(spent for unit, spent in zip(engine.units, engine.spent_s, strict=True) if runner in unit)
 
     def _since(self, runner: Runner, now: float) -> float:
         """When this thread first saw the running step of a runner; the stepping loop measures no time for this."""

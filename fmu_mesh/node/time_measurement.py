@@ -28,49 +28,42 @@ class Profiler:
 
     def __init__(self, node: str, entries: int) -> None:
         self._node = node
-        self._entries = entries
-        self._started = self._ended = self._looked = perf_counter()
-        self._spent_s: list[float] = []
-        self._steps: list[int] = []
-        self._names: list[tuple[str, ...]] = []
-        self._counts: list[int] = []
-        self._waited_s = 0.0
-        self._wait_s: dict[str, float] = {}
-        self._bursts: list[Burst] = []
-        self._waits: list[Wait] = []
+        self._most = entries
+        self._entries: list[Burst | Wait] = []
         self._cut = 0
+        self._wait_s: dict[str, float] = {}
         self._transport_s = 0.0
 
     def start(self, engine: Engine) -> None:
         """The node is at point 0."""
         self._started = self._ended = self._looked = perf_counter()
-        self._names = [tuple(runner.name for runner in unit) for unit in engine.units]
-        self._counts = [0] * len(engine.units)
-        self._note(engine)
+        self._waited_s = engine.waited_s
+        self._units = [
+            UnitProfile(tuple(runner.name for runner in unit), unit[0].step, 0, spent_s)
+            for unit, spent_s in zip(engine.units, engine.spent_s, strict=True)
+        ]
 
     def look(self, engine: Engine) -> None:
         """After a burst: where the time since the last look went. What is left over is the transport."""
-        now = perf_counter()
-        waited_s = engine.waited_s - self._waited_s
         if not any(runner.step for runner in engine.runners):  # the run begins with the first step
             self.start(engine)
             return
-        begin, busy_s = self._looked, 0.0
-        for number, (unit, spent_s) in enumerate(zip(engine.units, engine.spent_s, strict=True)):
-            steps, lasted_s = unit[0].step - self._steps[number], spent_s - self._spent_s[number]
-            if steps > 0:
-                self._counts[number] += 1
-                self._store(Burst(begin + busy_s, begin + busy_s + lasted_s, number, steps, 0.0))
+        now, at, waited_s = perf_counter(), self._looked, engine.waited_s - self._waited_s
+        for number, (unit, spent_s, old) in enumerate(zip(engine.units, engine.spent_s, self._units, strict=True)):
+            begin, at = at, at + spent_s - old.compute_s
+            steps, stepped = unit[0].step, unit[0].step > old.steps
+            if stepped:
+                self._store(Burst(begin, at, number, steps - old.steps))
                 self._ended = now
-            busy_s += lasted_s
+            self._units[number] = UnitProfile(old.instances, steps, old.bursts + stepped, spent_s)
         if waited_s > 0.0 and any(runner.step < runner.last_step for runner in engine.runners):
             reason = engine.awaited or GRANT
             self._wait_s[reason] = self._wait_s.get(reason, 0.0) + waited_s
-            self._store(Wait(begin + busy_s, begin + busy_s + waited_s, reason))
+            self._store(Wait(at, at + waited_s, reason))
         if self._ended == now:
-            self._transport_s += max(0.0, now - begin - busy_s - waited_s)
+            self._transport_s += max(0.0, now - at - waited_s)
         self._looked = now
-        self._note(engine)
+        self._waited_s = engine.waited_s
 
     def profile(self) -> NodeProfile:
         """What was measured."""
@@ -80,28 +73,16 @@ class Profiler:
             pid=os.getpid(),
             started=self._started,
             ended=self._ended,
-            units=tuple(
-                UnitProfile(names, steps, count, spent_s)
-                for names, steps, count, spent_s in zip(
-                    self._names, self._steps, self._counts, self._spent_s, strict=True
-                )
-            ),
+            units=tuple(self._units),
             transport_s=self._transport_s,
             wait_s=self._wait_s,
-            bursts=tuple(self._bursts),
-            waits=tuple(self._waits),
+            bursts=tuple(entry for entry in self._entries if isinstance(entry, Burst)),
+            waits=tuple(entry for entry in self._entries if isinstance(entry, Wait)),
             cut=self._cut,
         )
 
-    def _note(self, engine: Engine) -> None:
-        self._waited_s = engine.waited_s
-        self._spent_s = list(engine.spent_s)
-        self._steps = [unit[0].step for unit in engine.units]
-
     def _store(self, entry: Burst | Wait) -> None:
-        if len(self._bursts) + len(self._waits) >= self._entries:
-            self._cut += 1
-        elif isinstance(entry, Burst):
-            self._bursts.append(entry)
+        if len(self._entries) < self._most:
+            self._entries.append(entry)
         else:
-            self._waits.append(entry)
+            self._cut += 1

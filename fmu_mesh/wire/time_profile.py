@@ -23,14 +23,12 @@ class Burst(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=
     Attributes:
         unit: index of the unit that stepped, in `NodeProfile.units`.
         steps: own steps of its first instance.
-        sent_s: time at the end of the burst for sending frames.
     """
 
     start: float
     end: float
     unit: int
     steps: int
-    sent_s: float
 
 
 class Wait(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):

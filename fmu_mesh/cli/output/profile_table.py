@@ -224,9 +224,6 @@ def _slices(number: int, node: NodeProfile, origin: float) -> list[dict[str, Any
     found = []
     for burst in node.bursts:
         name = ", ".join(node.units[burst.unit].instances)
-        until = max(burst.start, burst.end - burst.sent_s)
-        found.append({**slice_(name, "compute", burst.start, until), "args": {"steps": burst.steps}})
-        if burst.sent_s > 0.0:
-            found.append(slice_("send", "transport", until, burst.end))
+        found.append({**slice_(name, "compute", burst.start, burst.end), "args": {"steps": burst.steps}})
     found += [slice_(f"wait for {w.reason or 'the grant'}", "wait", w.start, w.end) for w in node.waits]
     return sorted(found, key=lambda event: float(event["ts"]))
