@@ -17,7 +17,7 @@ from ..rings.host_memory import Offer
 from ..system.digest import difference
 from ..system.plan import RECORDER, Plan
 from ..wire.inbox import Inbox
-from ..wire.keys import RunKeys, batched
+from ..wire.keys import RunKeys
 from ..wire.membership import Admission, NodeReady, Registration, Welcome
 from ..wire.messages import HEADER, decode_json, encode_abort
 from ..wire.refusals import payload_of
@@ -68,12 +68,10 @@ class Members:
         self._ready: dict[str, tuple[NodeReady, zenoh.Query]] = {}
         self._welcomed = False
         self.shared: tuple[str, ...] = ()
-        self._grant_keys = {
-            node: key for key, part in zip(keys.grants(self._nodes), batched(self._nodes), strict=True) for node in part
-        }
+        self._grant_keys = keys.grants(self._nodes)
         self._grants = [
             session.declare_publisher(key, congestion_control=zenoh.CongestionControl.BLOCK, express=True)
-            for key in keys.grants(self._nodes)
+            for key in dict.fromkeys(self._grant_keys.values())
         ]
 
     def register(self, query: zenoh.Query) -> None:

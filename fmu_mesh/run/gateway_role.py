@@ -9,7 +9,8 @@ from ..ros.gateway.gateway import Gateway, open_profiles
 from ..ros.gateway.link import RosLink
 from ..ros.gateway.mapping import resolve
 from ..ros.messages.topics import RosPlan
-from ..wire.keys import MASTER, Keys
+from ..system.plan import MASTER
+from ..wire.keys import Keys
 from ..wire.runtime import socket_endpoint
 from ..wire.session import Wiring, close_session, open_session
 from .events import Event, Reachable

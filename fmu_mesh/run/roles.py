@@ -20,8 +20,7 @@ from ..instances.registry import open_instance, prepare
 from ..master.master import Master, MasterSettings
 from ..node.node import Node
 from ..recorder.recorder import Recorder
-from ..system.plan import RECORDER
-from ..wire.keys import MASTER
+from ..system.plan import MASTER, RECORDER
 from ..wire.runtime import MeshNote, fmu_folder, run_folder, write_note
 from ..wire.session import RouterLink, close_session, open_session, own_endpoints
 from ..wire.views import LogLine, MeshStatus

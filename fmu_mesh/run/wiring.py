@@ -12,7 +12,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from ..config.mesh import ZenohConfig
-from ..wire.keys import MASTER
+from ..system.plan import MASTER
 from ..wire.runtime import socket_endpoint
 from ..wire.session import Wiring
 

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import re
 import secrets
-from collections.abc import Iterable
+from collections.abc import Sequence
 from typing import Literal
 
 import msgspec
 
 from ..system.memory_map import MASTER
 
-__all__ = ["MASTER", "RUN_ID_BYTES", "Keys", "RunKeys", "VariableKind", "batched", "escape", "unescape"]
+__all__ = ["RUN_ID_BYTES", "Keys", "RunKeys", "VariableKind", "escape", "unescape"]
 
 VariableKind = Literal["out", "in", "param", "local"]
 
@@ -116,7 +116,7 @@ class RunKeys(msgspec.Struct, frozen=True):
         return f"{self.base}/follower/{name}"
 
     def hello(self, node: str) -> str:
-        """Queryable of a node that answers whether it can open the shared memory of the asking node."""
+        """Queryable of a node that answers when it knows the subscription of the asking node."""
         return f"{self.base}/hello/{_of(node)}"
 
     def ready(self, node: str) -> str:
@@ -139,17 +139,14 @@ class RunKeys(msgspec.Struct, frozen=True):
         """Progress of a node, for the master."""
         return f"{self.base}/progress/{_of(node)}/to={MASTER}"
 
-    def grants(self, nodes: Iterable[str]) -> list[str]:
-        """Keys on which one put each reaches up to 16 nodes."""
-        return [f"{self.base}/grant/" + "/".join(f"to={node}" for node in part) for part in batched(nodes)]
+    def grants(self, nodes: Sequence[str]) -> dict[str, str]:
+        """The key of the master's messages to each node; one put reaches all nodes with the same key, up to 16."""
+        parts = [nodes[first : first + _GRANT_CHUNKS] for first in range(0, len(nodes), _GRANT_CHUNKS)]
+        return {
+            node: f"{self.base}/grant/" + "/".join(f"to={name}" for name in part) for part in parts for node in part
+        }
 
 
 def _of(node: str) -> str:
     """The chunk of a node, or of all nodes. A name may begin with `@`, and wildcards do not match such a chunk."""
     return node if node == "*" else f"of={node}"
-
-
-def batched(nodes: Iterable[str]) -> list[list[str]]:
-    """The nodes that one put of a grant reaches, for each of the keys of `Keys.grants`."""
-    names = list(nodes)
-    return [names[first : first + _GRANT_CHUNKS] for first in range(0, len(names), _GRANT_CHUNKS)]

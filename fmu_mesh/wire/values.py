@@ -18,7 +18,6 @@ __all__ = [
     "Stamp",
     "ValueRefused",
     "attachment",
-    "decode_stamp",
     "decode_time",
     "decode_value",
     "encode_time",
@@ -41,15 +40,6 @@ class Stamp(msgspec.Struct, frozen=True):
 def attachment(point: int, time: float) -> bytes:
     """The attachment of a value at ``point``, whose time is ``time`` s."""
     return msgspec.json.encode(Stamp(point, time))
-
-
-def decode_stamp(data: bytes) -> Stamp:
-    """The point and time in an attachment.
-
-    Raises:
-        MessageRefused: it is not an attachment of a value.
-    """
-    return decode_json(data, Stamp)
 
 
 def decode_time(data: bytes) -> float:

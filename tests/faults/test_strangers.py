@@ -155,7 +155,7 @@ def keys_of(stranger: Stranger) -> list[str]:
     frames = [keys.frames(source, target) for source in ("left", "right") for target in nodes]
     views = [public.mesh_key(what) for what in ("info", "status", "plan", "command")]
     of_left = [f"{public.root}/left/{what}" for what in ("info", "status", "log", "out/y", "in/u", "param/k", "in/no")]
-    return [public.register, keys.master, *of_nodes, *frames, *keys.grants(nodes), *views, *of_left]
+    return [public.register, keys.master, *of_nodes, *frames, *keys.grants(nodes).values(), *views, *of_left]
 
 
 JSON = st.recursive(
@@ -244,7 +244,7 @@ def assert_no_row_is_wrong(place: Place, config: Path, launched: Launched, *name
 
 
 def grant(stranger: Stranger) -> None:
-    for key in stranger.keys.grants(["left", "right", "free", "@record"]):
+    for key in {*stranger.keys.grants(["left", "right", "free", "@record"]).values()}:
         stranger.put(key, HEADER.pack(GRANT, 0, 0, FAR))
 
 

@@ -195,7 +195,7 @@ class SimulatedMesh:
 
     def _tell(self, kind: int, point: int) -> None:
         for node in self._processes:
-            self.send(RUN.grants([node])[0], HEADER.pack(kind, 0, 0, point))
+            self.send(RUN.grants([node])[node], HEADER.pack(kind, 0, 0, point))
 
     def _record(self, data: bytes) -> None:
         kind, number, count, first = HEADER.unpack_from(data)
@@ -366,7 +366,7 @@ class _SimulatedMembership(Membership):
     def join(self) -> Welcome:
         plan = self._plan
         senders = {RUN.frames(link.source, plan.node): link.source_node for link in plan.links_in}
-        senders[RUN.grants([plan.node])[0]] = _MASTER
+        senders[RUN.grants([plan.node])[plan.node]] = _MASTER
         self._inbox.open(self._session, RUN, plan.node, senders)
         return Welcome()
 

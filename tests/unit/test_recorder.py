@@ -60,7 +60,7 @@ class Mesh:
 
     def put(self, message: bytes) -> None:
         """What the master sends."""
-        self._put(self._keys.grants([RECORDER])[0], message)
+        self._put(self._keys.grants([RECORDER])[RECORDER], message)
 
     def put_rows(self) -> None:
         """What the node sends, as soon as the recorder is in the mesh."""
@@ -77,7 +77,9 @@ class Mesh:
             entity.undeclare()
 
     def _register(self, query: zenoh.Query) -> None:
-        query.reply(query.key_expr, msgspec.json.encode(Admission(self._keys.run, self._keys.grants([RECORDER])[0])))
+        query.reply(
+            query.key_expr, msgspec.json.encode(Admission(self._keys.run, self._keys.grants([RECORDER])[RECORDER]))
+        )
 
     def _take_ready(self, query: zenoh.Query) -> None:
         query.reply(query.key_expr, msgspec.json.encode(Welcome()))

@@ -9,12 +9,12 @@ import pytest
 
 from fmu_mesh.errors import MessageRefused
 from fmu_mesh.variables.model_description import Value, Variable, VariableType
+from fmu_mesh.wire.messages import decode_json
 from fmu_mesh.wire.values import (
     MAX_VALUE_SIZE,
     Stamp,
     ValueRefused,
     attachment,
-    decode_stamp,
     decode_value,
     encode_value,
 )
@@ -129,10 +129,10 @@ def test_a_nested_value_is_refused() -> None:
 
 def test_an_attachment_holds_point_and_time() -> None:
     assert msgspec.json.decode(attachment(812, 1.624)) == {"point": 812, "time": 1.624}
-    assert decode_stamp(attachment(812, 1.624)) == Stamp(812, 1.624)
+    assert decode_json(attachment(812, 1.624), Stamp) == Stamp(812, 1.624)
 
 
 @pytest.mark.parametrize("data", [b"", b"{}", b'{"point":"a","time":0.0}', b'{"point":1}', b"\xff", b"[" * 100_000])
 def test_another_attachment_is_refused(data: bytes) -> None:
     with pytest.raises(MessageRefused):
-        decode_stamp(data)
+        decode_json(data, Stamp)

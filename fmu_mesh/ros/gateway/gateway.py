@@ -25,7 +25,7 @@ from ...wire.keys import Keys
 from ...wire.messages import decode_json
 from ...wire.refusals import Refusals
 from ...wire.session import Question, ask, undeclare_all
-from ...wire.values import decode_stamp, encode_time, encode_value, json_encoding
+from ...wire.values import Stamp, encode_time, encode_value, json_encoding
 from ...wire.views import MeshInfo
 from ..messages.assembling import Assembler, Disassembler
 from ..messages.cdr import CdrError
@@ -197,7 +197,7 @@ class Gateway:
 
     def _take_value(self, variable: WatchedVariable, data: bytes, attachment: bytes) -> None:
         try:
-            stamp = decode_stamp(attachment)
+            stamp = decode_json(attachment, Stamp)
         except MessageRefused:  # somebody put it on the key of an input, with a time but without a point
             return
         try:

@@ -12,7 +12,7 @@ import zenoh
 from ...errors import MessageRefused
 from ...variables.model_description import PlainValue
 from ..messages import decode_json
-from ..values import decode_stamp
+from ..values import Stamp
 from ..views import VariableView
 
 __all__ = ["Keeper", "Reading", "Target", "latecomers", "reading_of"]
@@ -49,7 +49,7 @@ def reading_of(target: Target, sample: zenoh.Sample) -> Reading | None:
     if sample.attachment is None:
         return None
     try:
-        stamp = decode_stamp(sample.attachment.to_bytes())
+        stamp = decode_json(sample.attachment.to_bytes(), Stamp)
         value: Any = decode_json(sample.payload.to_bytes(), object)
     except MessageRefused:
         return None
