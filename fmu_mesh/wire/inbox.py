@@ -9,8 +9,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from types import TracebackType
-from typing import Protocol, Self
+from typing import Protocol
 
 import zenoh
 
@@ -52,14 +51,6 @@ class Inbox:
         self._arrived: deque[tuple[str, bytes]] = deque()
         self._subscriber: zenoh.Subscriber[None] | None = None
         self.refusals = Refusals()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def open(self, session: zenoh.Session, keys: RunKeys, name: str, senders: Mapping[str, str]) -> None:
         """From now on the participant ``name`` receives messages.

@@ -14,13 +14,14 @@ import os
 import socket
 import threading
 from collections.abc import Callable
+from concurrent.futures import Future
 from contextlib import ExitStack
 from typing import Annotated, TypeVar
 
 import msgspec
 import zenoh
 
-from ..errors import DeadlineExceeded, FmuMeshError, MeshLost, MessageRefused
+from ..errors import DeadlineExceeded, MeshLost, MessageRefused
 from ..rings.host_memory import HostMemory, Offer
 from ..system.plan import MASTER, NodePlan
 from .inbox import Inbox
@@ -126,10 +127,9 @@ class Membership:
         self._session = session
         self._inbox = inbox
         self._launch = launch
+        self._public = Keys(plan.key_prefix, plan.mesh)
         self._keys: RunKeys | None = None
-        self._admission: Admission | None = None
-        self._refusal: FmuMeshError | None = None
-        self._answered = threading.Event()
+        self._admitted: Future[Admission] = Future()
         self.memory = memory
         self._stack = ExitStack()
         self._master_went = False
@@ -147,14 +147,13 @@ class Membership:
 
         def run() -> None:
             try:
-                self._enter(on_master_gone)
+                admission = self._enter(on_master_gone)
                 on_admitted()
-            except FmuMeshError as error:
-                self._refusal = error
+                self._admitted.set_result(admission)
             except zenoh.ZError as error:  # the session was closed meanwhile
-                self._refusal = MeshLost(f"this process cannot join the mesh: {error}")
-            finally:
-                self._answered.set()
+                self._admitted.set_exception(MeshLost(f"this process cannot join the mesh: {error}"))
+            except Exception as error:  # noqa: BLE001 who waits for the keys gets it
+                self._admitted.set_exception(error)
 
         threading.Thread(target=run, name="register", daemon=True).start()
 
@@ -169,17 +168,15 @@ class Membership:
             DeadlineExceeded: the master did not answer within ``patience_s`` seconds.
             MeshLost: the master refused this node; the message says why.
         """
-        if not self._answered.wait(patience_s):
-            raise DeadlineExceeded(f"the master did not answer within {patience_s:g} s")
-        if self._refusal is not None:
-            raise self._refusal
-        assert self._keys is not None
-        return self._keys
+        try:
+            return self._public.run(self._admitted.result(patience_s).run)
+        except TimeoutError:
+            raise DeadlineExceeded(f"the master did not answer within {patience_s:g} s") from None
 
     @property
     def is_admitted(self) -> bool:
         """Whether the master has admitted this node."""
-        return self._answered.is_set() and self._refusal is None
+        return self._admitted.done() and self._admitted.exception() is None
 
     @property
     def master_is_gone(self) -> bool:
@@ -221,7 +218,7 @@ class Membership:
 
         Call it after `keys` and before `join`.
         """
-        offer = self._admission.offer if self._admission is not None else None
+        offer = self._admitted.result(0).offer
         if self.memory is None and offer is not None and self._plan.shared_memory:
             self.memory = HostMemory.opened(offer, self._plan.memory, self._plan.node)
         return self.memory
@@ -236,15 +233,14 @@ class Membership:
         plan, inbox = self._plan, self._inbox
         deadline_s = plan.timeouts.start
         keys = self.keys(deadline_s + _GRACE_S)
-        assert self._admission is not None
         senders = {keys.frames(link.source, plan.node): link.source_node for link in plan.links_in}
-        inbox.open(self._session, keys, plan.node, {**senders, self._admission.grants: MASTER})
+        inbox.open(self._session, keys, plan.node, {**senders, self._admitted.result(0).grants: MASTER})
         hello = msgspec.json.encode(Hello(plan.node))
         for node in dict.fromkeys(link.source_node for link in plan.links_in):
             question = Question(keys.hello(node), f"node '{node}'", deadline_s, hello)
             ask(self._session, question, self._has_nothing_to_join)
         ready = msgspec.json.encode(NodeReady(shared=self.memory is not None))
-        question = Question(keys.ready(plan.node), "the master", deadline_s, ready, answer_s=2 * deadline_s)
+        question = Question(keys.ready(plan.node), "the master", 2 * deadline_s, ready)  # it waits for all others
         answer = ask(self._session, question, self._has_nothing_to_join)
         self._router.look()
         return _understood(answer, Welcome)
@@ -260,16 +256,14 @@ class Membership:
         self.given_up = True
         self._stack.close()
 
-    def _enter(self, on_master_gone: Callable[[], None]) -> None:
+    def _enter(self, on_master_gone: Callable[[], None]) -> Admission:
         """Register, then declare the token and `hello`: the master notices from now on if this process is lost."""
         plan, stack = self._plan, self._stack
         registration = Registration(plan.node, plan.digest, os.getpid(), socket.gethostname(), self._launch)
-        public = Keys(plan.key_prefix, plan.mesh)
         payload = msgspec.json.encode(registration)
-        question = Question(public.register, "the master", plan.timeouts.start, payload)
-        answer = ask(self._session, question, lambda: self.given_up)
-        self._admission = _understood(answer, Admission)
-        self._keys = keys = public.run(self._admission.run)
+        question = Question(self._public.register, "the master", plan.timeouts.start, payload)
+        admission = _understood(ask(self._session, question, lambda: self.given_up), Admission)
+        self._keys = keys = self._public.run(admission.run)
 
         def master_changed(sample: zenoh.Sample) -> None:
             if sample.kind == zenoh.SampleKind.DELETE:
@@ -281,6 +275,7 @@ class Membership:
         hello = self._session.declare_queryable(keys.hello(plan.node), self._answer_hello)
         stack.callback(hello.undeclare)
         stack.callback(self._session.liveliness().declare_token(keys.node(plan.node)).undeclare)
+        return admission
 
     def _answer_hello(self, query: zenoh.Query) -> None:
         """On a thread of Zenoh: answer a target; its subscription is known here."""

@@ -255,7 +255,6 @@ class Question(msgspec.Struct, frozen=True):
         deadline_s: how long to wait for an answer, in s.
         payload: JSON of the query, if there is any.
         attachment: JSON of the attachment, if there is any.
-        answer_s: how long an existing queryable may take to answer, in s, if that is longer.
         priority: the query overtakes messages of lower priority, and follows earlier ones of the same priority.
     """
 
@@ -264,7 +263,6 @@ class Question(msgspec.Struct, frozen=True):
     deadline_s: float
     payload: bytes | None = None
     attachment: bytes | None = None
-    answer_s: float | None = None
     priority: zenoh.Priority = zenoh.Priority.DEFAULT
 
 
@@ -293,9 +291,8 @@ def answers(
     """
     end = time.monotonic() + question.deadline_s
     changed = threading.Event()
-    timeout_s = question.answer_s or question.deadline_s
     encoding = json_encoding if question.payload is not None else None
-    with session.declare_querier(question.key, timeout=timeout_s, priority=question.priority) as querier:
+    with session.declare_querier(question.key, timeout=question.deadline_s, priority=question.priority) as querier:
         listener = querier.declare_matching_listener(lambda _status: changed.set())
         try:
             while (left := end - time.monotonic()) > 0:

@@ -360,6 +360,9 @@ class _SimulatedMembership(Membership):
     def keys(self, _patience_s: float) -> RunKeys:
         return RUN
 
+    def open_memory(self) -> None:
+        return
+
     def report(self, *_: object, **__: object) -> None:
         return
 
