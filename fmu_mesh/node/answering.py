@@ -47,6 +47,8 @@ _CAPABILITIES = (
 )
 
 Job = Callable[[], None]
+Arrived = tuple[str, zenoh.ZBytes | None, zenoh.ZBytes | None]
+"""Key, value and attachment."""
 
 
 class Answers:
@@ -114,16 +116,24 @@ class Answers:
             query.drop()
             return
 
-        def read() -> Job:
+        pending = self._until_next_point(name, query)
+
+        def read() -> None:
             values = runner.instance.get_values([variable.name for _, variable in unknown])
             pairs = [(key, value) for (key, _), value in zip(unknown, values, strict=True)]
-            return partial(self._reply_values, runner, query, pairs, runner.step)
+            reply = partial(self._reply_values, runner, query, pairs, runner.step)
+            self._post(partial(self._finish, pending, reply))
 
-        self._answer_at_next_point(_Pending(name, query), read)
+        self._inbox.post(read)
 
     def put_arrived(self, runner: Runner, sample: zenoh.Sample) -> None:
         """On a thread of Zenoh: accept a value that was put; if it is refused, the reason is logged."""
-        self._post(partial(self._take_put, runner, str(sample.key_expr), sample.payload, sample.attachment))
+
+        def refuse(reason: str) -> None:
+            self._log(LogLine(runner.name, "warning", "set", reason, runner.point))
+
+        arrived = str(sample.key_expr), sample.payload, sample.attachment
+        self._post(lambda: self._set(runner, arrived, refuse, lambda _point: None))
 
     def turn(self, now: float) -> None:
         """Answer queries that waited for the first point; refuse those that have waited too long for a point."""
@@ -136,14 +146,12 @@ class Answers:
 
     def _variables_matching(self, runner: Runner, asked: zenoh.KeyExpr) -> list[tuple[str, Variable]]:
         """(key, variable) of all variables that a key expression matches."""
-        matching = []
-        for variable in runner.instance.description.variables:
-            kind = kind_of(variable)
-            if kind is not None:
-                key = self._keys.variable(runner.name, kind, variable.name)
-                if asked.intersects(zenoh.KeyExpr(key)):
-                    matching.append((key, variable))
-        return matching
+        return [
+            (key, variable)
+            for variable in runner.instance.description.variables
+            if (kind := kind_of(variable)) is not None
+            and asked.intersects(zenoh.KeyExpr(key := self._keys.variable(runner.name, kind, variable.name)))
+        ]
 
     def _from_rows(self, runner: Runner, wanted: list[tuple[str, Variable]]) -> tuple[list[tuple[str, Value]], int]:
         """The values in the rows of the newest own step, and that step; values that only the FMU has are not included.
@@ -166,82 +174,59 @@ class Answers:
         for key, value in values:
             query.reply(key, encode_value(value), encoding=json_encoding, attachment=stamp)
 
-    def _answer_at_next_point(self, pending: _Pending, action: Callable[[], Job]) -> None:
-        """Let the main thread run ``action`` between two steps; then answer, unless the query was refused meanwhile.
+    def _until_next_point(self, name: str, query: zenoh.Query) -> _Pending:
+        """Keep a query for `_finish`, or until `turn` refuses it."""
+        self._pending.append(_Pending(name, query))
+        return self._pending[-1]
 
-        Args:
-            pending: the query.
-            action: returns what answers it, on the server's thread; a `ValueRefused` is the answer, too.
-        """
-        self._pending.append(pending)
-
-        def act() -> None:
-            try:
-                reply = action()
-            except ValueRefused as refused:
-                reply = partial(pending.query.reply_err, str(refused))
-            self._post(partial(finish, reply))
-
-        def finish(reply: Job) -> None:
-            if pending in self._pending:
-                self._pending.remove(pending)
-                reply()
-                pending.query.drop()
-
-        self._inbox.post(act)
-
-    def _take_put(
-        self, runner: Runner, key: str, payload: zenoh.ZBytes | None, attachment: zenoh.ZBytes | None
-    ) -> None:
-        def refuse(refused: ValueRefused) -> None:
-            self._log(LogLine(runner.name, "warning", "set", str(refused), runner.point))
-
-        def take() -> None:
-            try:
-                set_input(runner, *new)
-            except ValueRefused as refused:
-                self._post(partial(refuse, refused))
-
-        try:
-            new = self._checked_setting(runner, key, payload, attachment)
-        except ValueRefused as refused:
-            refuse(refused)
-        else:
-            self._inbox.post(take)
+    def _finish(self, pending: _Pending, reply: Job) -> None:
+        """Answer a query that waited for a point, unless it was refused in the meantime."""
+        if pending in self._pending:
+            self._pending.remove(pending)
+            reply()
+            pending.query.drop()
 
     def _answer_setting(self, name: str, query: zenoh.Query) -> None:
         """Answer a query that sets a value: from which point on the value holds, or why it was refused."""
-        runner, pending, key = self._activity.runners.get(name), _Pending(name, query), str(query.key_expr)
-        if runner is None:
-            pending.refuse(f"'{name}' is still being loaded")
-            return
-        try:
-            new = self._checked_setting(runner, key, query.payload, query.attachment)
-        except ValueRefused as refused:
-            pending.refuse(str(refused))
-            return
+        runner, key = self._activity.runners.get(name), str(query.key_expr)
+        pending = self._until_next_point(name, query)
 
-        def take() -> Job:
-            point = set_input(runner, *new) * runner.plan.step_points
+        def refuse(reason: str) -> None:
+            self._finish(pending, partial(query.reply_err, reason))
+
+        def confirm(point: int) -> None:
             answer = msgspec.json.encode(SetAnswer(key, point, self._plan.grid.time(point)))
-            return lambda: query.reply(key, answer, encoding=json_encoding)
+            self._finish(pending, partial(query.reply, key, answer, encoding=json_encoding))
 
-        self._answer_at_next_point(pending, take)
+        if runner is None:
+            refuse(f"'{name}' is still being loaded")
+        else:
+            self._set(runner, (key, query.payload, query.attachment), refuse, confirm)
+
+    def _set(
+        self, runner: Runner, arrived: Arrived, refuse: Callable[[str], None], confirm: Callable[[int], None]
+    ) -> None:
+        """Let the main thread set a variable between two steps; then confirm the point from which on the value holds."""
+        try:
+            new = self._checked_setting(runner, *arrived)
+        except ValueRefused as refused:
+            refuse(str(refused))
+            return
+
+        def take() -> None:
+            try:
+                step = set_input(runner, *new)
+            except ValueRefused as refused:
+                self._post(partial(refuse, str(refused)))
+            else:
+                self._post(partial(confirm, step * runner.plan.step_points))
+
+        self._inbox.post(take)
 
     def _checked_setting(
         self, runner: Runner, key: str, payload: zenoh.ZBytes | None, attachment: zenoh.ZBytes | None
     ) -> tuple[str, Value, float | None]:
-        """The variable of a setting that arrived, its value, and the time in s from which on it holds (None: now).
-
-        Args:
-            runner: the instance.
-            key: the key that the value was sent to.
-            payload: the value as JSON.
-            attachment: the time as JSON, if there is one.
-
-        Raises:
-            ValueRefused: with the reason.
-        """
+        """The variable, the value, and the time in s from which on it holds (None: now); or raise `ValueRefused`."""
         parts = key.removeprefix(f"{self._keys.instance(runner.name)}/").split("/")
         if len(parts) != 2 or "*" in key:
             raise ValueRefused(f"'{key}' is not the key of one variable")

@@ -12,6 +12,7 @@ import queue
 import threading
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from functools import partial
 
 import msgspec
@@ -103,11 +104,9 @@ class NodeServer:
     def stepped(self) -> None:
         """Give new rows to the streams that have subscribers."""
         for streams in self._streams:
-            collected = streams.collect(self._waiting_rows)
-            if collected is not None:
-                rows, batch = collected
-                self._waiting_rows += rows
-                self._jobs.put(partial(self._publish_rows, rows, batch))
+            if (batch := streams.collect(self._waiting_rows)) is not None:
+                self._waiting_rows += len(batch[1])
+                self._jobs.put(partial(self._publish_rows, batch))
 
     def started(self) -> None:
         """All streams begin at the first point: find the subscriptions that were made before it."""
@@ -136,12 +135,8 @@ class NodeServer:
     def _run(self) -> None:
         published = 0.0
         while True:
-            try:
-                job = self._jobs.get(timeout=_TICK_S)
-            except queue.Empty:
-                pass
-            else:
-                if job is None:
+            with suppress(queue.Empty):
+                if (job := self._jobs.get(timeout=_TICK_S)) is None:
                     return
                 with self._inbox.refusals.guard("a query or a value"):
                     job()
@@ -178,23 +173,20 @@ class NodeServer:
     # --- queries
 
     def _declare(self) -> None:
-        for instance in self._plan.instances:
-            self._declare_instance(instance.name)
+        for name in (instance.name for instance in self._plan.instances):
+            root = self._keys.instance(name)
+            self._entities.append(self._session.liveliness().declare_token(root))
+            self._entities.append(self._session.declare_queryable(f"{root}/**", partial(self._query_arrived, name)))
+            # A log message must not be lost; the status is published again.
+            for what, publishers, congestion_control in (
+                ("status", self._status_publishers, zenoh.CongestionControl.DROP),
+                ("log", self._log_publishers, zenoh.CongestionControl.BLOCK),
+            ):
+                publishers[name] = self._session.declare_publisher(
+                    f"{root}/{what}", encoding=json_encoding, congestion_control=congestion_control
+                )
         for line in self._early_lines:
             self._publish_log(line)
-
-    def _declare_instance(self, name: str) -> None:
-        root = self._keys.instance(name)
-        self._entities.append(self._session.liveliness().declare_token(root))
-        self._entities.append(self._session.declare_queryable(f"{root}/**", partial(self._query_arrived, name)))
-        # A log message must not be lost; the status is published again.
-        for what, publishers, congestion_control in (
-            ("status", self._status_publishers, zenoh.CongestionControl.DROP),
-            ("log", self._log_publishers, zenoh.CongestionControl.BLOCK),
-        ):
-            publishers[name] = self._session.declare_publisher(
-                f"{root}/{what}", encoding=json_encoding, congestion_control=congestion_control
-            )
 
     def _query_arrived(self, name: str, query: zenoh.Query) -> None:
         def answer() -> None:
@@ -218,11 +210,11 @@ class NodeServer:
 
         self._inbox.post(update)
 
-    def _publish_rows(self, rows: int, batch: Batch) -> None:
-        streams, first, columns = batch
+    def _publish_rows(self, batch: Batch) -> None:
+        streams, steps, columns = batch
         started = time.monotonic()
-        streams.publish(first, columns)
-        self._waiting_rows -= rows
+        streams.publish(steps, columns)
+        self._waiting_rows -= len(steps)
         if self._waiting_rows > MAX_WAITING_ROWS // 2:
             # Subscribers are slower than this run: publishing gets a share of the node's time, and samples are dropped.
             self._closing.wait(_STREAM_SHARE * (time.monotonic() - started))

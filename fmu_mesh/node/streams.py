@@ -27,8 +27,8 @@ MAX_WAITING_ROWS = 1 << 14
 PRIORITY = zenoh.Priority.DATA_LOW
 """Frames and grants must not wait behind samples for subscribers."""
 
-Batch = tuple["InstanceStreams", int, dict[str, NDArray[Any]]]
-"""Streams, first own step, and the values by variable name."""
+Batch = tuple["InstanceStreams", NDArray[np.intp], dict[str, NDArray[Any]]]
+"""Streams, own steps, and the values by variable name."""
 
 
 def kind_of(variable: Variable) -> VariableKind | None:
@@ -87,27 +87,24 @@ class InstanceStreams:
         active = tuple(name for name, publisher in self._publishers.items() if matches(publisher))
         if active == self._active:
             return
-        have = {*self.runner.outputs.layout.names}
-        watched = tuple(name for name in active if name not in have)
+        watched = tuple(name for name in active if name not in self.runner.outputs.layout.names)
         if watched != (self.runner.watched.layout.names if self.runner.watched is not None else ()):
             self.runner.watch(watched)
         if not self._active:
             self._next = self.runner.step
         self._active = active
 
-    def collect(self, waiting_rows: int) -> tuple[int, Batch] | None:
+    def collect(self, waiting_rows: int) -> Batch | None:
         """On the main thread: the rows since the last call, copied; None if there is nothing to publish."""
-        if not self._active:
-            return None
         first, end = self._next, self.runner.step + 1
-        if first >= end:
+        if not self._active or first >= end:
             return None
         self._next = end
         if waiting_rows > MAX_WAITING_ROWS:
             self._dropped += end - first
             return None
         steps = np.arange(first, end)
-        return end - first, (self, first, {name: self._column(name, steps) for name in self._active})
+        return self, steps, {name: self._column(name, steps) for name in self._active}
 
     def _column(self, name: str, steps: NDArray[np.intp]) -> NDArray[Any]:
         ring = self.runner.outputs
@@ -117,12 +114,10 @@ class InstanceStreams:
         values: NDArray[Any] = ring.parts[part][steps & ring.mask, first : first + size]
         return values.reshape(len(steps), *shape)
 
-    def publish(self, first: int, columns: dict[str, NDArray[Any]]) -> None:
+    def publish(self, steps: NDArray[np.intp], columns: dict[str, NDArray[Any]]) -> None:
         """On the server's thread: publish what `collect` returned."""
-        points = self.runner.plan.step_points
         lists = [(self._publishers[name].put, column.tolist()) for name, column in columns.items()]
-        for offset in range(len(next(iter(columns.values())))):
-            point = (first + offset) * points
+        for offset, point in enumerate((steps * self.runner.plan.step_points).tolist()):
             stamp = attachment(point, self._grid.time(point))
             for put, values in lists:
                 put(encode_value(values[offset]), attachment=stamp)

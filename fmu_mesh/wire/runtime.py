@@ -27,7 +27,6 @@ __all__ = [
     "enter_run_folder",
     "fmu_folder",
     "is_alive",
-    "launcher_of",
     "leave_run_folder",
     "meshes",
     "process_state",
@@ -102,7 +101,7 @@ def run_name() -> str:
     return f"{os.getpid()}" if number == 1 else f"{os.getpid()}-{number}"
 
 
-def launcher_of(folder: Path) -> int | None:
+def _launcher_of(folder: Path) -> int | None:
     """The process id of the launcher of the run that a folder belongs to; None without a launcher."""
     pid = folder.suffix.removeprefix(".").partition("-")[0]
     return int(pid) if pid.isdigit() else None
@@ -192,15 +191,9 @@ def leave_run_folder(folder: Path) -> None:
     elif note is not None and not is_alive(note.pid):
         remove_run_folder(folder)  # the launcher was killed
         return
-    elif note is None and (launcher := launcher_of(folder)) is not None and is_alive(launcher):
+    elif note is None and (launcher := _launcher_of(folder)) is not None and is_alive(launcher):
         return  # the run was over before its launcher wrote the note; the launcher removes the folder too
-    for empty in (folder / "fmus", folder):
-        try:
-            empty.rmdir()
-        except FileNotFoundError:
-            continue
-        except OSError:
-            return  # another process still uses it
+    _remove_if_empty(folder)
 
 
 def socket_endpoint(folder: Path, node: str) -> str:
@@ -246,11 +239,15 @@ def remove_stale_folders() -> None:
     for folder in runtime_folder().glob("*.*"):
         if folder.suffix == ".hand":
             tidy_run_folder(folder)
-            for empty in (folder / "fmus", folder):
-                with suppress(OSError):  # somebody uses it
-                    empty.rmdir()
-        elif (pid := launcher_of(folder)) is not None and not (folder / "mesh.json").exists() and not is_alive(pid):
+            _remove_if_empty(folder)
+        elif (pid := _launcher_of(folder)) is not None and not (folder / "mesh.json").exists() and not is_alive(pid):
             remove_run_folder(folder)  # it was killed before it wrote a note, or runs without one
+
+
+def _remove_if_empty(folder: Path) -> None:
+    for empty in (folder / "fmus", folder):
+        with suppress(OSError):  # another process still uses it
+            empty.rmdir()
 
 
 def _read_note(file: Path) -> MeshNote | None:

@@ -12,7 +12,7 @@ from contextlib import contextmanager, suppress
 from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import msgspec
 import zenoh
@@ -57,6 +57,7 @@ _CANNOT_LISTEN = (
 
 
 _CLOSE_S = 1.0
+_OWN_S = 5.0
 _LOOK_S = 0.05
 _TIMEOUT = "Timeout"
 """The reply of Zenoh itself if a queryable did not answer in time."""
@@ -162,13 +163,13 @@ def close_session(session: zenoh.Session) -> None:
     closing.join(_CLOSE_S)
 
 
-def own_endpoints(session: zenoh.Session, deadline_s: float = 5.0) -> tuple[str, ...]:
+def own_endpoints(session: zenoh.Session) -> tuple[str, ...]:
     """The endpoints on which this session listens, with the ports that the system has chosen.
 
     Raises:
-        DeadlineExceeded: they are not known within ``deadline_s`` seconds.
+        DeadlineExceeded: they are not known in time.
     """
-    answer = ask(session, Question(f"@/{session.zid()}/*", "this Zenoh session", deadline_s))
+    answer = ask(session, Question(f"@/{session.zid()}/*", "this Zenoh session", _OWN_S))
     return tuple(str(locator) for locator in json.loads(answer).get("locators", ()))
 
 
@@ -236,11 +237,7 @@ class RouterLink:
         return True
 
 
-class _Declared(Protocol):
-    def undeclare(self) -> object: ...
-
-
-def undeclare_all(*entities: Iterable[_Declared]) -> None:
+def undeclare_all(*entities: Iterable[Any]) -> None:
     """Undeclare publishers, subscribers, queryables and listeners."""
     for entity in chain.from_iterable(entities):
         entity.undeclare()

@@ -9,19 +9,21 @@ import queue
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from types import TracebackType
 from typing import Generic, Self, TypeVar
 
 import zenoh
 
-from ...errors import DeadlineExceeded
+from ...errors import DeadlineExceeded, MessageRefused
 from ..keys import Keys
 from .readings import latecomers
 
 __all__ = ["Follower"]
 
 Item = TypeVar("Item")
+
+_WAITING_SAMPLES = 1 << 16
 
 
 class Follower(Generic[Item]):
@@ -54,8 +56,19 @@ class Follower(Generic[Item]):
     ) -> None:
         self._stack.close()
 
-    def subscribe(self, key: str, take: Callable[[zenoh.Sample], None]) -> None:
-        """From now on ``take`` is called with the samples of a key."""
+    def subscribe(self, key: str, decode: Callable[[zenoh.Sample], Item | None]) -> None:
+        """From now on the samples of a key arrive, as ``decode`` returns them; not those that it refuses.
+
+        A reader that is much too slow loses samples, because a thread of Zenoh must not wait for it.
+        """
+
+        def take(sample: zenoh.Sample) -> None:
+            if str(sample.key_expr) != key or self.arrived.qsize() >= _WAITING_SAMPLES:
+                return
+            with suppress(MessageRefused):
+                if (item := decode(sample)) is not None:
+                    self.arrived.put(item)
+
         self._stack.callback(self._session.declare_subscriber(key, take).undeclare)
 
     def to_the_last(self, deadline: float | None = None) -> Iterator[Item]:

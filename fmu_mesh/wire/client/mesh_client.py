@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from functools import partial
 from itertools import chain
 from typing import Any, TypeVar, cast
 
@@ -36,7 +37,7 @@ from ..views import (
     SetAnswer,
 )
 from .following import Follower
-from .readings import Keeper, Reading, Target, reading_of
+from .readings import Reading, Target, reading_of
 
 __all__ = ["MeshClient", "is_key", "key_expression"]
 
@@ -81,7 +82,7 @@ class MeshClient:
         # This does not wait for a queryable, because a mesh without a gateway has none.
         samples = self._get(f"{self.keys.mesh_key('ros')}/*")
         try:
-            return [decode_json(sample.payload.to_bytes(), RosView) for sample in samples]
+            return [_decoded(sample, RosView) for sample in samples]
         except MessageRefused as error:
             raise _not_understood(f"the gateway of mesh '{self.keys.mesh}'", error) from error
 
@@ -201,12 +202,7 @@ class MeshClient:
         timeout_s = timeout_s if timeout_s is not None else self._timeout_s
         deadline = time.monotonic() + timeout_s
         with Follower[MeshStatus](self._session, self.keys) as follower:
-
-            def take(sample: zenoh.Sample) -> None:
-                with suppress(MessageRefused):
-                    follower.arrived.put(decode_json(sample.payload.to_bytes(), MeshStatus))
-
-            follower.subscribe(self.keys.mesh_key("status"), take)
+            follower.subscribe(self.keys.mesh_key("status"), partial(_decoded, kind=MeshStatus))
             there = follower.there.wait(min(timeout_s, self._timeout_s))
             yield follower.to_the_last(deadline) if there else iter(())
 
@@ -218,7 +214,7 @@ class MeshClient:
         """
         with Follower[Reading](self._session, self.keys) as follower:
             for target in targets:
-                follower.subscribe(target.key, Keeper(target, follower.arrived).keep)
+                follower.subscribe(target.key, partial(reading_of, target))
             there = follower.there.wait(self._timeout_s)
             if there:
                 # An answer of a node comes after the subscribers of this session have come to it.
@@ -230,13 +226,8 @@ class MeshClient:
     def logs(self, *, follow: bool) -> Iterator[Iterator[LogLine]]:
         """The log messages that the mesh has kept, the oldest first; then all new ones until it ends, if ``follow``."""
         with Follower[LogLine](self._session, self.keys) as follower:
-
-            def take(sample: zenoh.Sample) -> None:
-                with suppress(MessageRefused):
-                    follower.arrived.put(decode_json(sample.payload.to_bytes(), LogLine))
-
             if follow:  # from before the question, so that no message is missing between the two
-                follower.subscribe(self.keys.mesh_key("log"), take)
+                follower.subscribe(self.keys.mesh_key("log"), partial(_decoded, kind=LogLine))
             kept = self._view(self.keys.mesh_key("log"), list[LogLine], f"mesh '{self.keys.mesh}'")
             last = kept[-1].number if kept else 0
             there = follow and follower.there.wait(self._timeout_s)
@@ -291,9 +282,9 @@ class MeshClient:
     def _view(
         self, key: str, kind: type[View], who: str, payload: bytes | None = None, attachment: bytes | None = None
     ) -> View:
-        data = self._ask(key, who, payload, attachment)[0].payload.to_bytes()
+        sample = self._ask(key, who, payload, attachment)[0]
         try:
-            return decode_json(data, kind)
+            return _decoded(sample, kind)
         except MessageRefused as error:
             raise _not_understood(who, error) from error
 
@@ -333,6 +324,10 @@ def key_expression(text: str) -> zenoh.KeyExpr:
     except zenoh.ZError as error:
         reason = reason_of(error).rpartition("`: ")[2].removesuffix(".")
         raise ConfigurationError(f"'{text}' is no key expression: {reason}") from error
+
+
+def _decoded(sample: zenoh.Sample, kind: type[View]) -> View:
+    return decode_json(sample.payload.to_bytes(), kind)
 
 
 def _not_understood(who: str, error: MessageRefused) -> ConfigurationError:

@@ -15,9 +15,8 @@ from ..messages import decode_json
 from ..values import Stamp
 from ..views import VariableView
 
-__all__ = ["Keeper", "Reading", "Target", "latecomers", "reading_of"]
+__all__ = ["Reading", "Target", "latecomers", "reading_of"]
 
-_WAITING_SAMPLES = 1 << 16
 _LOOKS = 5
 _LOOK_S = 0.05
 
@@ -55,24 +54,6 @@ def reading_of(target: Target, sample: zenoh.Sample) -> Reading | None:
         return None
     view = target.variable
     return Reading(target.key, target.instance, view.name, value, stamp.point, stamp.time, view.unit)
-
-
-class Keeper:
-    """Puts the samples of one subscriber into the common queue.
-
-    A reader that is much too slow loses samples: this runs on a thread of Zenoh, which must not wait for the reader.
-    """
-
-    def __init__(self, target: Target, arrived: queue.SimpleQueue[Reading | None]) -> None:
-        self._target = target
-        self._arrived = arrived
-
-    def keep(self, sample: zenoh.Sample) -> None:
-        """The subscriber's callback."""
-        if str(sample.key_expr) != self._target.key or self._arrived.qsize() >= _WAITING_SAMPLES:
-            return
-        if (reading := reading_of(self._target, sample)) is not None:
-            self._arrived.put(reading)
 
 
 def latecomers(arrived: queue.SimpleQueue[Item]) -> Iterator[Item]:
