@@ -47,8 +47,8 @@ _CAPABILITIES = (
 )
 
 Job = Callable[[], None]
-Arrived = tuple[str, zenoh.ZBytes | None, zenoh.ZBytes | None]
-"""Key, value and attachment."""
+Setting = tuple[str, Value, float | None]
+"""A variable, its value, and the time in s from which on it holds; None: from the next step on."""
 
 
 class Answers:
@@ -115,8 +115,8 @@ class Answers:
         if not unknown:
             query.drop()
             return
-
-        pending = self._until_next_point(name, query)
+        pending = _Pending(name, query)
+        self._pending.append(pending)
 
         def read() -> None:
             values = runner.instance.get_values([variable.name for _, variable in unknown])
@@ -132,8 +132,15 @@ class Answers:
         def refuse(reason: str) -> None:
             self._log(LogLine(runner.name, "warning", "set", reason, runner.point))
 
-        arrived = str(sample.key_expr), sample.payload, sample.attachment
-        self._post(lambda: self._set(runner, arrived, refuse, lambda _point: None))
+        def take() -> None:
+            try:
+                new = self._checked_setting(runner, str(sample.key_expr), sample.payload, sample.attachment)
+            except ValueRefused as refused:
+                refuse(str(refused))
+            else:
+                self._set(runner, new, refuse, lambda _point: None)
+
+        self._post(take)
 
     def turn(self, now: float) -> None:
         """Answer queries that waited for the first point; refuse those that have waited too long for a point."""
@@ -174,11 +181,6 @@ class Answers:
         for key, value in values:
             query.reply(key, encode_value(value), encoding=json_encoding, attachment=stamp)
 
-    def _until_next_point(self, name: str, query: zenoh.Query) -> _Pending:
-        """Keep a query for `_finish`, or until `turn` refuses it."""
-        self._pending.append(_Pending(name, query))
-        return self._pending[-1]
-
     def _finish(self, pending: _Pending, reply: Job) -> None:
         """Answer a query that waited for a point, unless it was refused in the meantime."""
         if pending in self._pending:
@@ -188,8 +190,7 @@ class Answers:
 
     def _answer_setting(self, name: str, query: zenoh.Query) -> None:
         """Answer a query that sets a value: from which point on the value holds, or why it was refused."""
-        runner, key = self._activity.runners.get(name), str(query.key_expr)
-        pending = self._until_next_point(name, query)
+        runner, pending, key = self._activity.runners.get(name), _Pending(name, query), str(query.key_expr)
 
         def refuse(reason: str) -> None:
             self._finish(pending, partial(query.reply_err, reason))
@@ -199,19 +200,18 @@ class Answers:
             self._finish(pending, partial(query.reply, key, answer, encoding=json_encoding))
 
         if runner is None:
-            refuse(f"'{name}' is still being loaded")
-        else:
-            self._set(runner, (key, query.payload, query.attachment), refuse, confirm)
-
-    def _set(
-        self, runner: Runner, arrived: Arrived, refuse: Callable[[str], None], confirm: Callable[[int], None]
-    ) -> None:
-        """Let the main thread set a variable between two steps; then confirm the point from which on the value holds."""
-        try:
-            new = self._checked_setting(runner, *arrived)
-        except ValueRefused as refused:
-            refuse(str(refused))
+            pending.refuse(f"'{name}' is still being loaded")
             return
+        try:
+            new = self._checked_setting(runner, key, query.payload, query.attachment)
+        except ValueRefused as refused:
+            pending.refuse(str(refused))
+            return
+        self._pending.append(pending)
+        self._set(runner, new, refuse, confirm)
+
+    def _set(self, runner: Runner, new: Setting, refuse: Callable[[str], None], confirm: Callable[[int], None]) -> None:
+        """Let the main thread set a variable between two steps; confirm the point from which on the value holds."""
 
         def take() -> None:
             try:
@@ -225,8 +225,8 @@ class Answers:
 
     def _checked_setting(
         self, runner: Runner, key: str, payload: zenoh.ZBytes | None, attachment: zenoh.ZBytes | None
-    ) -> tuple[str, Value, float | None]:
-        """The variable, the value, and the time in s from which on it holds (None: now); or raise `ValueRefused`."""
+    ) -> Setting:
+        """The setting that arrived for a variable; raises `ValueRefused` with the reason if it is not allowed."""
         parts = key.removeprefix(f"{self._keys.instance(runner.name)}/").split("/")
         if len(parts) != 2 or "*" in key:
             raise ValueRefused(f"'{key}' is not the key of one variable")
