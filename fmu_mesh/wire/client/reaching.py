@@ -9,7 +9,8 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from concurrent.futures import Future
+from contextlib import ExitStack, contextmanager, suppress
 from types import TracebackType
 from typing import NamedTuple, Self, TypeVar
 
@@ -257,17 +258,15 @@ class _Opening:
         self._else = else_
         self._timeout_s = timeout_s
         self._end = 0.0
-        self._sessions: list[zenoh.Session] = []
-        self._errors: list[FmuMeshError] = []
-        self._late = False
-        self._thread: threading.Thread | None = None
+        self._opened: Future[zenoh.Session] | None = None
 
-    def start(self) -> None:
+    def start(self) -> Future[zenoh.Session]:
         """Begin to open the session, unless that has begun already."""
-        if self._thread is None:
+        if self._opened is None:
+            self._opened = Future()
             self._end = time.monotonic() + self._timeout_s
-            self._thread = threading.Thread(target=self._run, name="open", daemon=True)
-            self._thread.start()
+            threading.Thread(target=self._run, args=[self._opened], name="open", daemon=True).start()
+        return self._opened
 
     def session(self) -> zenoh.Session:
         """Wait until the session is open, and return it.
@@ -275,35 +274,31 @@ class _Opening:
         Raises:
             FmuMeshError: it cannot be opened, or not in time.
         """
-        self.start()
-        self._join()
-        if self._sessions:
-            return self._sessions[0]
-        if self._errors and not self._late:
-            raise self._errors[0]
-        where = ", ".join(self._endpoints)
-        raise DeadlineExceeded(
-            f"{self._else} at {where} within {self._timeout_s:g} s.",
-            hint="`launch` and `ls` show where a mesh can be reached, on the host where it runs.",
-        )
+        opened = self.start()
+        try:
+            return opened.result(max(0.0, self._end + _GRACE_S - time.monotonic()))
+        except TimeoutError:
+            raise self._silence() from None
 
     def close(self) -> None:
         """Close the session if it is open."""
-        self._join()
-        for session in self._sessions:
-            close_session(session)
+        if self._opened is not None:
+            with suppress(FmuMeshError):
+                close_session(self.session())
 
-    def _join(self) -> None:
-        if self._thread is not None:
-            self._thread.join(max(0.0, self._end + _GRACE_S - time.monotonic()))
-
-    def _run(self) -> None:
+    def _run(self, opened: Future[zenoh.Session]) -> None:
         try:
             wiring = Wiring(mode="client", connect=self._endpoints, patience_s=self._timeout_s)
-            self._sessions.append(open_session(wiring))
+            opened.set_result(open_session(wiring))
         except FmuMeshError as error:
-            self._errors.append(error)
-            self._late = time.monotonic() >= self._end
+            opened.set_exception(error if time.monotonic() < self._end else self._silence())
+
+    def _silence(self) -> DeadlineExceeded:
+        where = ", ".join(self._endpoints)
+        return DeadlineExceeded(
+            f"{self._else} at {where} within {self._timeout_s:g} s.",
+            hint="`launch` and `ls` show where a mesh can be reached, on the host where it runs.",
+        )
 
 
 class _Found(NamedTuple):
