@@ -31,7 +31,6 @@ class Activity:
         runners: the instances, once all are loaded.
 
     Args:
-        plan: the node's plan.
         refusals: counts the messages that its process refused.
     """
 

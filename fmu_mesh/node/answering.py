@@ -55,9 +55,7 @@ class Answers:
     """Answers for the instances of one node.
 
     Args:
-        plan: what the node has to do.
         inbox: the inbox of the node, to let the main thread do something.
-        activity: what the node is doing.
         post: lets the server thread do something; may be called from any thread.
         log: publishes a log message; on the server's thread.
     """

@@ -21,14 +21,7 @@ def connect(
     own_memory: HostMemory,
     shares: Collection[str],
 ) -> dict[int, FrameReceiver | Link]:
-    """Give all runners their sources.
-
-    Args:
-        plan: the plan of the node.
-        runners: its instances by name.
-        memory: the memory that is shared; ``own_memory`` if there is none.
-        own_memory: the memory of this process, for mirrors.
-        shares: the nodes that share ``memory``.
+    """Give all runners their sources: in ``memory`` for nodes that share it, and in mirrors for all others.
 
     Returns:
         What takes the frames of each link, by its number; the link itself if it brings initial values only.
@@ -48,7 +41,7 @@ def connect(
             receivers[link.index] = receiver
     points = {name: place.step_points for name, place in places.items()}
     for runner in runners.values():
-        runner.connect(sources_of(runner, rows, points))
+        runner.sources.extend(sources_of(runner, rows, points))
     return receivers
 
 

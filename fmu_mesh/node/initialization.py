@@ -34,7 +34,6 @@ class Initialization:
     """Sets inputs and gets outputs while all instances of a node are in Initialization Mode.
 
     Args:
-        plan: the node's plan.
         wait: waits for a message for at most this time in s, and handles it.
 
     Attributes:

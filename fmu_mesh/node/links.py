@@ -24,10 +24,7 @@ class OutLink:
     """Sends rows of one instance to one node; a frame holds all rows since the last one.
 
     Args:
-        link: the link.
         layout: the columns of its frames; none where the target reads the ring itself.
-        outputs: the ring.
-        put: sends a message.
 
     Attributes:
         sent: own steps sent so far; the next frame starts at this step.

@@ -47,10 +47,7 @@ class NodeServer:
     """Serves the instances of one node.
 
     Args:
-        plan: what the node has to do.
         session: the session of this process; stays the caller's.
-        inbox: the inbox of the node.
-        activity: what the node is doing.
         report: tells the master how the node has ended; its argument is the time limit in s.
         on_hang: called on the server thread if a step does not return in time.
     """

@@ -5,7 +5,7 @@ Owns what one step of one instance needs, and nothing about waiting. `fmu_mesh.n
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple, TypeVar
 
 from ..instances.contract import Instance
@@ -69,9 +69,6 @@ class Runner:
     """One instance with its row of inputs and its output ring.
 
     Args:
-        plan: the plan of the instance.
-        instance: the instance.
-        grid: the communication points.
         outputs: its ring.
         counter: the number of complete rows of this ring.
 
@@ -129,10 +126,6 @@ class Runner:
     def follow(self, position: Position) -> None:
         """From now on, ``position`` is where this runner is."""
         self._position = position
-
-    def connect(self, sources: Iterable[Source]) -> None:
-        """Add sources of its inputs."""
-        self.sources += sources
 
     def watch(self, names: Sequence[str]) -> None:
         """From now on also read these outputs after every step; the plan does not contain them."""

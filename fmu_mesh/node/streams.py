@@ -7,7 +7,7 @@ subscriber that stops loses samples (their points show which), and does not slow
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import zenoh
@@ -27,23 +27,21 @@ MAX_WAITING_ROWS = 1 << 14
 PRIORITY = zenoh.Priority.DATA_LOW
 """Frames and grants must not wait behind samples for subscribers."""
 
+_KINDS: Final[dict[str, VariableKind]] = {
+    "output": "out",
+    "input": "in",
+    "parameter": "param",
+    "calculatedParameter": "param",
+    "local": "local",
+}
+
 Batch = tuple["InstanceStreams", NDArray[np.intp], dict[str, NDArray[Any]]]
 """Streams, own steps, and the values by variable name."""
 
 
 def kind_of(variable: Variable) -> VariableKind | None:
     """The part of the key space a variable lives in; None for the independent variable."""
-    match variable.causality:
-        case "output":
-            return "out"
-        case "input":
-            return "in"
-        case "parameter" | "calculatedParameter":
-            return "param"
-        case "local":
-            return "local"
-        case _:
-            return None
+    return _KINDS.get(variable.causality)
 
 
 class InstanceStreams:

@@ -20,7 +20,6 @@ class Profiler:
     """Collects what one node does.
 
     Args:
-        node: name of the node.
         entries: largest number of bursts and waits that are stored; the sums contain all of them.
 
     Call `start` before the first burst and `look` after each; at the end call `profile`.

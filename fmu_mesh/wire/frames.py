@@ -37,12 +37,8 @@ def rows_of(
 ) -> tuple[list[SourceRows], FrameReceiver | None]:
     """Where the target of a link finds the rows of the source, and what takes the frames of the link.
 
-    Args:
-        link: the link.
-        place: where the ring of the source lies.
-        shared: the memory with this ring; None if source and target do not share one: then all columns come in frames.
-        own: the memory of this process, for the counter of a mirror.
-        fits: see `FrameReceiver`.
+    The ring is at ``place`` in the memory that source and target share. If they share none, all columns come in frames;
+    otherwise those with text. The rows of frames are in a mirror, whose counter is in the ``own`` memory of the target.
     """
     rows = [SourceRows(shared.ring(place), shared.counter(place.counter), text=False)] if shared is not None else []
     layout = link.layout if shared is None else of_text(link.layout)
@@ -56,7 +52,6 @@ class FrameReceiver:
     """Checks the frames of one link.
 
     Args:
-        link: the link.
         ring: the mirror of the ring of the source, with the columns of the frames: gets the rows.
         counter: the number of rows of this mirror.
         fits: whether rows before this own step of the source overwrite no row that is still needed.

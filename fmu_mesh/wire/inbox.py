@@ -53,14 +53,7 @@ class Inbox:
         self.refusals = Refusals()
 
     def open(self, session: zenoh.Session, keys: RunKeys, name: str, senders: Mapping[str, str]) -> None:
-        """From now on the participant ``name`` receives messages.
-
-        Args:
-            session: the session of this process.
-            keys: the keys of the run.
-            name: of the node, or of the master.
-            senders: the allowed senders by their keys; a message with any other key is refused.
-        """
+        """From now on the participant ``name`` receives messages; ``senders`` are the allowed ones by their keys."""
 
         def take(sample: zenoh.Sample) -> None:
             """On a thread of Zenoh."""

@@ -97,7 +97,6 @@ class Membership:
     """One participant's part in the mesh.
 
     Args:
-        plan: what the participant has to do.
         session: the session of this process; the caller closes it.
         inbox: its inbox; opened by `join`.
         launch: the launcher that started this process; None if it was started manually.

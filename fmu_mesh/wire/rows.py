@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator, Sequence
+from itertools import pairwise
 from typing import Any, Final
 
 import numpy as np
@@ -95,18 +96,16 @@ def _decode_texts(
     ends = first + np.cumsum(np.frombuffer(data, _LENGTH, size, place), dtype=np.int64)
     if size and ends[-1] > len(data):
         raise _refused(data, count, f"at least {ends[-1]} are expected")
+    bounds = [first, *ends.tolist()]
+    texts: list[Any] = [data[begin:end] for begin, end in pairwise(bounds)]
+    if type_ == "String":
+        try:
+            texts = [text.decode() for text in texts]
+        except UnicodeDecodeError as error:
+            raise MessageRefused(f"a frame has a String that is no UTF-8 ({error.reason})", hint=_HINT) from error
     values = np.empty(size, dtype=np.object_)
-    begin = first
-    for index, end in enumerate(ends.tolist()):
-        value: bytes | str = data[begin:end]
-        if type_ == "String":
-            try:
-                value = data[begin:end].decode()
-            except UnicodeDecodeError as error:
-                raise MessageRefused(f"a frame has a String that is no UTF-8 ({error.reason})", hint=_HINT) from error
-        values[index] = value
-        begin = end
-    return values, begin
+    values[:] = texts
+    return values, bounds[-1]
 
 
 def _refused(data: bytes, count: int, expected: str) -> MessageRefused:

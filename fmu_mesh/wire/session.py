@@ -197,8 +197,7 @@ class RouterLink:
     """Watches the link of a process to the router that connects it to the other processes.
 
     Args:
-        session: the session of this process.
-        endpoints: where it connects to; empty if everything that it needs is on this host.
+        endpoints: where the process connects to; empty if everything that it needs is on this host.
     """
 
     def __init__(self, session: zenoh.Session, endpoints: Iterable[str] = ()) -> None:

@@ -81,7 +81,7 @@ class EngineMesh:
         sources = {name: [SourceRows(*ring)] for name, ring in self.rings.items()}
         for item in node.instances:
             runner = self.runners[item.name]
-            runner.connect(sources_of(runner, sources, step_points))
+            runner.sources.extend(sources_of(runner, sources, step_points))
             runner.instance.enter_initialization(self._plan.grid.start_time, None, item.start_values)
             runner.instance.exit_initialization()
             runner.bind()
