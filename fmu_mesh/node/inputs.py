@@ -166,8 +166,9 @@ def set_input(runner: Runner, name: str, value: Value, time: float | None) -> in
         ValueRefused: too many values wait for their time, or this one is too late.
     """
     if time is not None and not isinstance(runner.instance, TimedInputs):
-        timed = runner.wrap(lambda instance: TimedInputs(instance, "hold"))
+        timed = TimedInputs(runner.instance, "hold")
         timed.start(runner.grid, runner.plan.step_points, runner.step)
+        runner.wrap(timed)
     if isinstance(runner.instance, TimedInputs) and (time is not None or runner.instance.follows(name)):
         return runner.instance.add(name, value, time)
     runner.instance.set_values({name: value})

@@ -5,8 +5,8 @@ Owns what one step of one instance needs, and nothing about waiting. `fmu_mesh.n
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from typing import NamedTuple, TypeVar
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
 from ..instances.contract import Instance
 from ..rings.array_elements import fill_unconnected
@@ -19,8 +19,6 @@ from ..system.plan import InstancePlan
 from .links import OutLink
 
 __all__ = ["Position", "Runner", "Source"]
-
-Wrapped = TypeVar("Wrapped", bound=Instance)
 
 
 class Source(NamedTuple):
@@ -133,11 +131,10 @@ class Runner:
         self.watched = Ring(Layout.of(variables[name] for name in names), self.outputs.rows) if names else None
         self.bind()
 
-    def wrap(self, wrapper: Callable[[Instance], Wrapped]) -> Wrapped:
-        """Replace the instance by what ``wrapper`` makes of it, from the next step on; return the new one."""
-        self.instance = wrapped = wrapper(self.instance)
+    def wrap(self, wrapped: Instance) -> None:
+        """From the next step on, ``wrapped`` is stepped, which has the instance inside."""
+        self.instance = wrapped
         self._position.refit()
-        return wrapped
 
     @property
     def step(self) -> int:

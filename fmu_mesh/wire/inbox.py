@@ -80,8 +80,7 @@ class Inbox:
 
     def poll(self) -> Message | None:
         """The next message if there is one; also runs posted actions."""
-        if self._posted:
-            self._run_posted()
+        self._run_posted()
         while self._arrived:
             if (message := self._decoded(*self._arrived.popleft())) is not None:
                 return message

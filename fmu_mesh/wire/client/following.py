@@ -32,15 +32,17 @@ class Follower(Generic[Item]):
     Args:
         session: a session that reaches the mesh.
         keys: the keys of the mesh.
+        on_end: called on a thread of Zenoh when the mesh ends.
 
     Attributes:
         arrived: what subscribers have received, in order; None marks the end of the mesh.
         there: set when the mesh was found.
     """
 
-    def __init__(self, session: zenoh.Session, keys: Keys) -> None:
+    def __init__(self, session: zenoh.Session, keys: Keys, on_end: Callable[[], None] = lambda: None) -> None:
         self._session = session
         self._keys = keys
+        self._on_end = on_end
         self._stack = ExitStack()
         self._over = False
         self.arrived: queue.SimpleQueue[Item | None] = queue.SimpleQueue()
@@ -98,3 +100,4 @@ class Follower(Generic[Item]):
         else:
             self._over = True
             self.arrived.put(None)
+            self._on_end()

@@ -110,20 +110,16 @@ class MeshClient:
     @contextmanager
     def until_end(self, tell: Callable[[], None] = lambda: None) -> Iterator[threading.Event]:
         """An event that is set when the mesh ends or is gone; then ``tell`` is called, on a thread of Zenoh."""
-        there, ended = threading.Event(), threading.Event()
+        ended = threading.Event()
 
-        def changed(sample: zenoh.Sample) -> None:
-            (there if sample.kind == zenoh.SampleKind.PUT else ended).set()
-            if ended.is_set():
-                tell()
+        def end() -> None:
+            ended.set()
+            tell()
 
-        token = self._session.liveliness().declare_subscriber(self.keys.master, changed, history=True)
-        try:
-            if not there.wait(self._timeout_s):
+        with Follower[None](self._session, self.keys, end) as follower:
+            if not follower.there.wait(self._timeout_s):
                 ended.set()
             yield ended
-        finally:
-            token.undeclare()
 
     def instance_in(self, reference: str) -> str | None:
         """The instance that a reference names; None if the reference means the whole mesh."""
