@@ -23,7 +23,7 @@ from typing import Any, Literal, Self
 from ..errors import FmuError
 from ..instances.call_guard import floating_point_changed, kept_state, restore_floating_point
 from ..instances.fmi import FmuInstance, LogMessage, open_instance, read_description
-from ..instances.input_trajectory import Samples, Trajectory
+from ..instances.input_trajectory import Trajectory
 from ..system.start_values import forbidden
 from ..variables.model_description import ModelDescription, Value
 from ..variables.value_types import is_float
@@ -395,7 +395,7 @@ class FMIAdapter:
     def _begin_trajectory(self, name: str, *, initial: bool) -> Trajectory:
         """A new trajectory; if ``initial`` is true, it starts with the initial value at 0.0."""
         linear = self._interpolate_input and is_float(self._arguments.inputs[name].type)
-        self._trajectories[name] = trajectory = Trajectory(Samples(linear))
+        self._trajectories[name] = trajectory = Trajectory(linear=linear)
         if initial:
             trajectory.add(0.0, self._initial_inputs[name])
         return trajectory

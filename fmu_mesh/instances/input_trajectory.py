@@ -3,46 +3,30 @@
 from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
-from typing import Any
-
-import msgspec
 
 from ..variables.model_description import Value
 
-__all__ = ["Samples", "Trajectory"]
-
-
-class Samples(msgspec.Struct, frozen=True):
-    """The content of a trajectory: values with rising times in s."""
-
-    linear: bool
-    times: tuple[float, ...] = ()
-    values: tuple[Any, ...] = ()
+__all__ = ["Trajectory"]
 
 
 class Trajectory:
     """Values of one input over the FMU's time. Read it at rising times: it forgets values that are past.
 
     Example:
-        >>> trajectory = Trajectory(Samples(linear=True))
+        >>> trajectory = Trajectory(linear=True)
         >>> trajectory.add(0.0, 1.0)
         >>> trajectory.add(2.0, 3.0)
         >>> trajectory.value(1.0, resolution=1e-9)
         2.0
 
     Args:
-        samples: the first values, and whether the input is linear between two times or constant.
+        linear: whether the input is linear between two times, or constant from each time on.
     """
 
-    def __init__(self, samples: Samples) -> None:
-        self._linear = samples.linear
-        self._times: list[float] = list(samples.times)
-        self._values: list[Value] = list(samples.values)
-
-    @property
-    def samples(self) -> Samples:
-        """What is not forgotten yet."""
-        return Samples(self._linear, tuple(self._times), tuple(self._values))
+    def __init__(self, *, linear: bool) -> None:
+        self._linear = linear
+        self._times: list[float] = []
+        self._values: list[Value] = []
 
     def __len__(self) -> int:
         return len(self._times)

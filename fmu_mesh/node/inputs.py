@@ -8,13 +8,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Literal
 
-import msgspec
-
-from ..instances.contract import Instance
-from ..instances.input_trajectory import Samples, Trajectory
-from ..instances.instance_wrapper import AroundInstance, of_kind, packed, unpacked
+from ..errors import FmuError
+from ..instances.contract import Instance, KeepsState
+from ..instances.input_trajectory import Trajectory
+from ..instances.instance_wrapper import AroundInstance
 from ..rings.ring import Ring
 from ..simtime import ENDLESS, TimeGrid
 from ..variables.model_description import Value
@@ -90,7 +89,7 @@ class TimedInputs(AroundInstance[Instance]):
             variable = self.description.variable(name)
             is_input = variable is not None and variable.causality == "input"
             linear = self._linear and variable is not None and is_input and is_float(variable.type)
-            trajectory = Trajectory(Samples(linear))
+            trajectory = Trajectory(linear=linear)
             if when > now:
                 trajectory.add(now, self._instance.get_values([name])[0])
             self._trajectories[name] = trajectory
@@ -104,32 +103,9 @@ class TimedInputs(AroundInstance[Instance]):
         variable = self.description.variable(name)
         return name in self._trajectories or (variable is not None and variable.causality == "input")
 
-    def get_state(self) -> object:
-        """See `KeepsState`; values with a later time are part of the state."""
-        inputs = {name: trajectory.samples for name, trajectory in self._trajectories.items()}
-        return _TimedState(super().get_state(), _Inputs(self._step, dict(self._used), inputs))
-
-    def set_state(self, state: object) -> None:
-        """See `KeepsState`."""
-        own = of_kind(_TimedState, state)
-        super().set_state(own.inner)
-        self._step = own.inputs.step
-        self._used = dict(own.inputs.used)
-        self._trajectories = {name: Trajectory(samples) for name, samples in own.inputs.trajectories.items()}
-
-    def free_state(self, state: object) -> None:
-        """See `KeepsState`."""
-        super().free_state(of_kind(_TimedState, state).inner)
-
-    def serialize_state(self, state: object) -> bytes:
-        """See `KeepsState`."""
-        own = of_kind(_TimedState, state)
-        return packed(own.inputs, super().serialize_state(own.inner))
-
-    def deserialize_state(self, data: bytes) -> object:
-        """See `KeepsState`."""
-        inputs, rest = unpacked(data, _Inputs, None)
-        return _TimedState(super().deserialize_state(rest), inputs)
+    def _keeper(self) -> KeepsState:
+        text = "the state of an instance with inputs over time cannot be kept: the values are not part of it"
+        raise FmuError(text, instance=getattr(self._instance, "name", None))
 
     def _time(self, step: int) -> float:
         assert self._grid is not None
@@ -139,21 +115,6 @@ class TimedInputs(AroundInstance[Instance]):
         """Largest difference of two equal times: the rounding of one multiplication and one addition."""
         assert self._grid is not None
         return 8 * math.ulp(max(abs(self._grid.start_time), abs(time)))
-
-
-class _Inputs(msgspec.Struct, frozen=True):
-    """The inputs over time in a state: own steps done, the values in use, and all values with their times."""
-
-    step: int
-    used: dict[str, Any]
-    trajectories: dict[str, Samples]
-
-
-class _TimedState(NamedTuple):
-    """A state of the inner instance, and the inputs."""
-
-    inner: object
-    inputs: _Inputs
 
 
 def set_input(runner: Runner, name: str, value: Value, time: float | None) -> int:

@@ -1,4 +1,4 @@
-"""States through all that is around an instance: deadlines, inputs over time, linear inputs."""
+"""States through all that is around an instance: deadlines, linear inputs."""
 
 from __future__ import annotations
 
@@ -49,20 +49,16 @@ def no_overrun(error: FmuError) -> None:
 
 
 class Stepped:
-    """``Guarded(TimedInputs(...))`` of an FMU at its first point, with inputs that no ring has."""
+    """A guarded FMU at its first point, with inputs that no ring has: they are set before the step of their time."""
 
     def __init__(self, fmu: Path, folder: Path, kind: Kind, watch: CallWatch, start_values: dict[str, Value]) -> None:
-        self.timed: TimedInputs | None = None
+        self.later: dict[int, dict[str, Value]] = {}
         self.watch = watch
         description = read_description(fmu, kind=kind)
         self.outputs = Ring(Layout.of(description.with_causality("output")), 64)
 
-        def open_() -> Instance:
-            self.timed = TimedInputs(open_instance(fmu, "m", description, folder), "linear")
-            return self.timed
-
         timeouts = TimeoutsConfig(call=DEADLINE_S, step=DEADLINE_S)
-        self.instance = Guarded("m", open_, watch, timeouts)
+        self.instance = Guarded("m", lambda: open_instance(fmu, "m", description, folder), watch, timeouts)
         self.instance.enter_initialization(0.0, 100.0, start_values)
         self.instance.exit_initialization()
         self.instance.bind(Ring(Layout.of([]), 64), (self.outputs,), TimeGrid(0.0, 0.1, 400), 1)
@@ -71,13 +67,14 @@ class Stepped:
         """Take own steps ``first .. end - 1``; the outputs after each of them."""
         found: Rows = []
         for step in range(first, end):
+            if step in self.later:
+                self.instance.set_values(self.later[step])
             self.instance.do_step(step)
             found.append(tuple(self.outputs.value(step + 1, name) for name in self.outputs.layout.names))
         return found
 
-    def set(self, name: str, value: int, time: float | None = None) -> None:
-        assert self.timed is not None
-        self.timed.add(name, float(value) if name == "u" else value, time)
+    def set(self, name: str, value: int, step: int) -> None:
+        self.later[step] = {name: float(value) if name == "u" else value}
 
 
 @contextmanager
@@ -89,16 +86,16 @@ def stepped_fmu(fmu: Path, folder: Path, kind: Kind, **start_values: Value) -> I
 
 
 @pytest.mark.parametrize(("model", "version", "kind", "name"), MODELS)
-def test_a_guarded_instance_with_timed_inputs_goes_back_to_its_state(
+def test_a_guarded_instance_goes_back_to_its_state(
     model: str, version: Version, kind: Kind, name: str, event_fmu: EventFmu, tmp_path: Path
 ) -> None:
     with stepped_fmu(event_fmu(model, version), tmp_path, kind) as one:
-        one.set(name, 2, 0.35)
-        one.set(name, 5, 0.95)
+        one.set(name, 2, 4)
+        one.set(name, 5, 10)
         one.rows(0, 5)
         state = one.instance.get_state()
         there = one.rows(5, 20)
-        one.set(name, 7)  # after the state: the state knows nothing of it
+        one.set(name, 7, 20)  # after the state: the state knows nothing of it
         one.rows(20, 22)
 
         one.instance.set_state(state)
@@ -114,8 +111,8 @@ def test_another_guarded_instance_goes_on_from_a_serialized_state(
 ) -> None:
     fmu = event_fmu(model, version)
     with stepped_fmu(fmu, tmp_path, kind) as one:
-        one.set(name, 2, 0.35)
-        one.set(name, 5, 0.95)
+        one.set(name, 2, 4)
+        one.set(name, 5, 10)
         one.rows(0, 5)
         state = one.instance.get_state()
         data = one.instance.serialize_state(state)
@@ -123,6 +120,7 @@ def test_another_guarded_instance_goes_on_from_a_serialized_state(
         there = one.rows(5, 20)
 
     with stepped_fmu(fmu, tmp_path, kind) as other:
+        other.set(name, 5, 10)
         state = other.instance.deserialize_state(data)
         other.instance.set_state(state)
 
@@ -159,6 +157,13 @@ def test_what_is_no_state_is_refused(event_fmu: EventFmu, tmp_path: Path) -> Non
             one.instance.set_state("no state")
         with pytest.raises(FmuMeshError, match="this is no state of an instance"):
             one.instance.deserialize_state(b"no state")
+
+
+def test_inputs_over_time_are_no_part_of_a_state_so_there_is_none() -> None:
+    timed = TimedInputs(cast("Instance", FmuInstance), "hold")
+
+    with pytest.raises(FmuError, match="the state of an instance with inputs over time cannot be kept"):
+        timed.get_state()
 
 
 def test_a_kind_of_instance_without_states_says_so() -> None:
