@@ -39,7 +39,7 @@ class Activity:
         self.runners: Mapping[str, Runner] = {}
         self._plan = plan
         self._refusals = refusals
-        self._started: float | None = None
+        self._started = 0.0
         self._engine: Engine | None = None
         self._under_way: tuple[str, int, float] | None = None
 
@@ -52,12 +52,9 @@ class Activity:
         self.runners = runners
 
     def steps_with(self, engine: Engine) -> None:
-        """The engine of this node, once there is one."""
-        self._engine = engine
-
-    def started(self) -> None:
-        """The instances are at their first point."""
+        """The instances are at their first point, and this engine steps them."""
         self._started = time.monotonic()
+        self._engine = engine
 
     def status(self, name: str) -> InstanceStatus:
         """What `status` answers for an instance of this process."""
@@ -78,7 +75,7 @@ class Activity:
             wait_time=engine.waited_s if engine is not None else 0.0,
             restarts=self._plan.restarts,
             refused=self._refusals.count,
-            running_time=time.monotonic() - self._started if self._started is not None else 0.0,
+            running_time=time.monotonic() - self._started if engine is not None else 0.0,
         )
 
     def look_at_steps(self, now: float) -> StepFailed | None:

@@ -107,7 +107,6 @@ class NodeServer:
 
     def started(self) -> None:
         """All streams begin at the first point: find the subscriptions that were made before it."""
-        self._activity.started()
         for streams in self._streams:
             streams.update()
         self.stepped()
