@@ -109,10 +109,10 @@ class Runner:
         self._position.refit()
 
     def flush(self, *, lazy: bool = True) -> None:
-        """Send all rows that were not sent yet; those for the recorder only if ``lazy``."""
+        """Send all rows that were not sent yet; those for the recorder only if ``lazy``, or if no more will come."""
         end = self.step + 1
         for link in self.out_links:
-            if lazy or not link.to_recorder:
+            if lazy or not link.to_recorder or self.step >= self.last_step:
                 link.flush(end)
 
     def send_last(self, end: int) -> None:

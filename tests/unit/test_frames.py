@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any, cast
+
 import numpy as np
 import pytest
 
 from fmu_mesh.errors import FmuMeshError, FrameGap, MessageRefused, ProtocolBroken
+from fmu_mesh.node.links import OutLink
+from fmu_mesh.node.stepping import Position, Runner
 from fmu_mesh.rings.host_memory import HostMemory
+from fmu_mesh.simtime import TimeGrid
 from fmu_mesh.system.layout import Layout
 from fmu_mesh.system.memory_map import MASTER, map_memory
-from fmu_mesh.system.plan import Link
+from fmu_mesh.system.plan import RECORDER, Link
 from fmu_mesh.wire.frames import FrameReceiver, initial_values, rows_of
 from fmu_mesh.wire.messages import FRAME, HEADER, INITIAL
 from fmu_mesh.wire.rows import encode_rows
@@ -199,3 +205,22 @@ def test_an_initial_message_gives_the_values_of_its_level() -> None:
     assert initial_values(LINK, 0, message) == {"a": 1.5}
     assert initial_values(LINK, 2, message) == {"b": 2.5}
     assert initial_values(LINK, 1, message) == {}
+
+
+@pytest.mark.parametrize(("step", "sent"), [(9, 0), (10, 11)], ids=["before", "at the end"])
+def test_rows_for_the_recorder_wait_for_more_rows_unless_no_more_will_come(step: int, sent: int) -> None:
+    """Nothing wakes up a node that is done, so rows that wait there would delay the end of the run."""
+    map_, places = map_memory(["left", MASTER], {"source": ("left", 1, LAYOUT)}, 16)
+    memory, place = HostMemory.private(map_, "left"), places["source"]
+    ring, messages = memory.ring(place), list[bytes]()
+    plan = SimpleNamespace(name="source", step_points=1, inputs=Layout())
+    runner = Runner(cast("Any", plan), cast("Any", None), TimeGrid(0.0, 0.1, 10), ring, memory.counter(place.counter))
+    position = Position()
+    runner.follow(position)
+    for _ in range(step):
+        position.count()
+    runner.out_links.append(OutLink(Link(3, "source", "left", RECORDER, 1, LAYOUT, ()), LAYOUT, ring, messages.append))
+
+    runner.flush(lazy=False)
+
+    assert [HEADER.unpack_from(message) for message in messages] == ([(FRAME, 3, sent, 0)] if sent else [])
