@@ -10,8 +10,9 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Collection, Sequence
 
-from ..errors import DeadlineExceeded
+from ..errors import DeadlineExceeded, InitializationFailed
 from ..rings.array_elements import element_of, merged, scaled
+from ..rings.transfer import Narrowing
 from ..system.algebraic_loop import FixedPoint
 from ..system.initialization_plan import Loop
 from ..system.layout import Column
@@ -129,10 +130,11 @@ class Initialization:
         """Set the inputs whose sources have a level below this one (None: all)."""
         values: dict[str, Value] = {}
         for feed in runner.plan.feeds:
-            for source, target, factor, offset in feed.columns:
+            for column in feed.columns:
+                source, target, _, _ = column
                 early = below is None or self._level_of(feed.source, source) < below
                 if early and (runner.name, target) not in self._settled:
-                    values[target] = scaled(self._element(feed.source, source), factor, offset)
+                    values[target] = self._moved(feed.source, column, runner)
         if values:
             runner.instance.set_values(merged(values, runner.plan.inputs, runner.instance.get_values))
 
@@ -140,16 +142,25 @@ class Initialization:
         """In a sweep of a loop: set the assumed inputs, and those whose sources have a level below this one."""
         values: dict[str, Value] = {}
         for feed in runner.plan.feeds:
-            for source, target, factor, offset in feed.columns:
+            for column in feed.columns:
+                source, target, _, _ = column
                 own_level = self._level_of(feed.source, source)
                 if (runner.name, target) in point.assumed:
                     values[target] = point.assumed[runner.name, target]
                 elif own_level < loop.first and (runner.name, target) not in self._settled:
-                    values[target] = scaled(self._element(feed.source, source), factor, offset)
+                    values[target] = self._moved(feed.source, column, runner)
                 elif loop.first <= own_level < level:
-                    values[target] = scaled(self._element(feed.source, source, sweep), factor, offset)
+                    values[target] = self._moved(feed.source, column, runner, sweep)
         if values:
             runner.instance.set_values(merged(values, runner.plan.inputs, runner.instance.get_values))
+
+    def _moved(
+        self, instance: str, column: tuple[str, str, float, float], runner: Runner, sweep: int | None = None
+    ) -> Value:
+        """The initial value that a connection from ``instance`` gives its input."""
+        source, target, factor, offset = column
+        ends = Narrowing(f"{instance}.{source}", runner.name, target, runner.plan.inputs.column(target).type)
+        return ends.checked(scaled(self._element(instance, source, sweep), factor, offset), InitializationFailed)
 
     def _column(self, instance: str, name: str) -> Column:
         """The column of an output, or of the array that ``name`` is an element of."""
