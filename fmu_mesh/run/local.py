@@ -174,10 +174,10 @@ class LocalMesh:
         with suppress(FmuMeshError):  # the process ends now for another reason
             self._save()
 
-    def _position(self) -> tuple[str, int]:
-        """Which instance steps at which point; between two points, the answer changes all the time."""
+    def _position(self) -> tuple[str, int, str]:
+        """See `CallWatch.stepping`; between two points, the answer changes all the time."""
         stepping = self._system.stepping
-        return (stepping, self.point) if stepping else ("", time.monotonic_ns())
+        return (stepping, self.point, self._system.doing(stepping)) if stepping else ("", time.monotonic_ns(), "")
 
     def _loop(self, rows: RowBuffer) -> None:
         plan, system, last_point = self._plan, self._system, self._plan.grid.last_point
