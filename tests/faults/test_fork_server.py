@@ -120,6 +120,23 @@ def test_a_run_whose_fork_server_is_stopped_meanwhile_ends_as_any_other(place: P
     place.assert_nothing_left()
 
 
+@pytest.mark.parametrize(
+    ("victim", "lost"), [("pendulum", "node 'pendulum' was lost"), ("master", "the master was lost")]
+)
+def test_the_end_of_a_process_is_noticed_although_the_fork_server_is_stopped(
+    place: Place, victim: str, lost: str
+) -> None:
+    launched, _ = running(place)
+    launched.child("fork").suspend()
+
+    launched.child(victim).kill()
+
+    assert launched.wait() == 4
+    assert launched.ended_after_s < on_a_busy_machine(6.0)
+    assert f"{lost}: its process has ended, and the fork server does not answer, which knows how. " in launched.message
+    place.assert_nothing_left()
+
+
 @pytest.mark.parametrize("together", [("fork",), ("fork", "master"), ROLES])
 def test_whoever_is_killed_together_with_the_launcher_nothing_is_left(place: Place, together: tuple[str, ...]) -> None:
     launched, _ = running(place)
