@@ -93,8 +93,10 @@ class ForkServer:
         forked = Forked(os.fdopen(output[0], "rb"), os.fdopen(errors[0], "rb"))
         self._forked.append(forked)
         request = msgspec.msgpack.encode(_Request(len(self._forked) - 1, mesh, arguments))
-        with suppress(OSError):  # the server is gone, which its own end tells
+        try:
             socket.send_fds(self._control, [request], [output[1], errors[1]])
+        except OSError:  # the server is gone, which its own end tells
+            forked.orphaned()
         os.close(output[1])
         os.close(errors[1])
         return forked
