@@ -168,6 +168,7 @@ typedef struct {
   int64_t wait_ns;   /* how long to sleep where nothing can step */
   int64_t eager;     /* whether to leave, not to sleep, after a step: its rows have to be sent */
   int64_t spins;     /* whether it spins before it sleeps */
+  int64_t batch;     /* how many rows or points it waits for at once */
   int64_t allowed;
   int64_t patience;
   int64_t waited_ns;
@@ -579,11 +580,11 @@ static int64_t allow(Node *node, int64_t point, Unit *unit) {
 
 /* A sleeper on another core takes up to this time to wake up. Who waits for it for a shorter time falls asleep itself, and
  * both wake each other for ever. */
-enum { SPINS = 60, YIELD_NS = 50000, PATIENCE = 3, REST = 30 };
+enum { SPINS = 60, YIELD_NS = 50000, PATIENCE = 3, REST = 30, LINGER = 80 };
 
 /* For a node with one unit: look a little longer before it sleeps, unless that was in vain the last times. */
 static int soon(Node *node, Counter *counter, int64_t need) {
-  if (!node->spins || node->n_units != 1) return 0;
+  if (!node->spins || node->n_units != 1 || counter == node->ceiling) return 0;
   wake_all(node);
   if (node->patience < 0) {
     node->patience++;
@@ -593,6 +594,8 @@ static int soon(Node *node, Counter *counter, int64_t need) {
   for (int i = 0;; i++) {
     if (value_of(counter) >= need) {
       if (node->patience < PATIENCE) node->patience++;
+      /* A counter that is read after each row moves from core to core for each. */
+      for (int j = 0; i > 0 && j < LINGER && value_of(counter) < need + node->batch - 1; j++) relax();
       return 1;
     }
     if (atomic_load_explicit(&node->attention, memory_order_relaxed)) return 0;
