@@ -1,8 +1,8 @@
 """What the nodes have reached, and what they are granted.
 
-Grants and progress are counters in the memory of the host. The nodes there keep the windows among themselves, and may be
-granted the last point at once, because a grant can be taken back. A node that does not share this memory gets grants by
-messages: they contain the windows, reach about 50 ms ahead, and stay. It tells its progress by messages, too.
+Grants and progress are counters in the memory of the host. The nodes there keep the windows among themselves, and the
+last point can be granted at once, because a grant can be taken back. A node that does not share this memory gets grants
+by messages: they contain the windows, reach about 50 ms ahead, and stay. It tells its progress by messages, too.
 """
 
 from __future__ import annotations

@@ -43,7 +43,7 @@ def recorder_window(window: int, row_sizes: Sequence[int]) -> int:
 
 
 def batch_of(window: int) -> int:
-    """Number of points that a node waits for at once if nobody waits for its next one; ``window`` is that of the mesh."""
+    """Number of points that a node waits for at once if no other waits for its next one; ``window``: of the mesh."""
     return min(_BATCH, max(1, window // 4))
 
 
