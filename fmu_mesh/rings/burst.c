@@ -39,7 +39,8 @@
 typedef struct {
   _Atomic int64_t value;   /* rows of a ring, points that are known of a node, or points that are granted */
   _Atomic int64_t wake_at; /* the lowest need of a sleeper */
-  int64_t unused[6];
+  _Atomic int64_t claimed; /* of a node: it may step below this point without another look at the grant */
+  int64_t unused[5];
   _Atomic int64_t needs[]; /* one for each process: the value that it sleeps for; 0: it does not sleep */
 } Counter;
 
@@ -167,6 +168,7 @@ typedef struct {
   int64_t wait_ns;   /* how long to sleep where nothing can step */
   int64_t eager;     /* whether to leave, not to sleep, after a step: its rows have to be sent */
   int64_t spins;     /* whether it spins before it sleeps */
+  int64_t batch;     /* how many rows or points it waits for at once */
   int64_t allowed;
   int64_t patience;
   int64_t waited_ns;
@@ -248,11 +250,20 @@ PUBLIC void counter_raise(const Place *place, Counter *counter, int64_t value) {
   wake_if_needed(place, counter);
 }
 
-PUBLIC int64_t counter_value(const Counter *counter) { return value_of(counter); }
-
-PUBLIC void counters_values(Counter *const *counters, int64_t n, int64_t *values) {
-  for (int64_t i = 0; i < n; i++) values[i] = value_of(counters[i]);
+/* Take the grant back, and return a point that no node passes without a new one: the master grants it at once, so all
+ * pause there. A node claims, has a fence, and reads the grant; this is the other side. */
+PUBLIC int64_t grant_withdraw(Counter *grant, Counter *const *nodes, int64_t n) {
+  int64_t most = 0;
+  atomic_store(&grant->value, 0);
+  atomic_thread_fence(memory_order_seq_cst);
+  for (int64_t i = 0; i < n; i++) {
+    int64_t claimed = atomic_load(&nodes[i]->claimed);
+    if (claimed > most) most = claimed;
+  }
+  return most;
 }
+
+PUBLIC int64_t counter_value(const Counter *counter) { return value_of(counter); }
 
 /* One value that somebody waits for. */
 typedef struct {
@@ -531,11 +542,23 @@ static void wake_all(Node *node) {
       wake_if_needed(&node->place, node->units[i].members[j].counter);
 }
 
+/* Claim the points of about one burst: the master may take the grant back, but not what is claimed. */
+static inline int64_t claim(Node *node, int64_t point, const Unit *unit) {
+  int64_t claimed = atomic_load_explicit(&node->progress->claimed, memory_order_relaxed);
+  if (claimed <= point) {
+    claimed = point + unit->burst * unit->tick_points;
+    atomic_store_explicit(&node->progress->claimed, claimed, memory_order_relaxed);
+    atomic_thread_fence(memory_order_seq_cst);
+  }
+  return claimed < node->last_point ? claimed : node->last_point;
+}
+
 /* The point up to which the master and the windows allow steps; whom to wait for if it is not above `point`. */
 static int64_t allow(Node *node, int64_t point, Unit *unit) {
+  const int64_t claimed = claim(node, point, unit);
   int64_t allowed = value_of(node->ceiling);
-  if (allowed > node->last_point) allowed = node->last_point;
-  if (allowed <= point) {
+  if (allowed > claimed) allowed = claimed;
+  if (allowed <= point) { /* by the grant: what is claimed is above it */
     unit->blocked_by = node->ceiling;
     unit->need = point + 1;
     return allowed;
@@ -557,11 +580,11 @@ static int64_t allow(Node *node, int64_t point, Unit *unit) {
 
 /* A sleeper on another core takes up to this time to wake up. Who waits for it for a shorter time falls asleep itself, and
  * both wake each other for ever. */
-enum { SPINS = 60, YIELD_NS = 50000, PATIENCE = 3, REST = 30 };
+enum { SPINS = 60, YIELD_NS = 50000, PATIENCE = 3, REST = 30, LINGER = 80 };
 
 /* For a node with one unit: look a little longer before it sleeps, unless that was in vain the last times. */
 static int soon(Node *node, Counter *counter, int64_t need) {
-  if (!node->spins || node->n_units != 1) return 0;
+  if (!node->spins || node->n_units != 1 || counter == node->ceiling) return 0;
   wake_all(node);
   if (node->patience < 0) {
     node->patience++;
@@ -571,6 +594,8 @@ static int soon(Node *node, Counter *counter, int64_t need) {
   for (int i = 0;; i++) {
     if (value_of(counter) >= need) {
       if (node->patience < PATIENCE) node->patience++;
+      /* A counter that is read after each row moves from core to core for each. */
+      for (int j = 0; i > 0 && j < LINGER && value_of(counter) < need + node->batch - 1; j++) relax();
       return 1;
     }
     if (atomic_load_explicit(&node->attention, memory_order_relaxed)) return 0;
