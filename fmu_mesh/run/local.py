@@ -166,7 +166,7 @@ class LocalMesh:
     def _take_hang(self, error: FmuError) -> None:
         """From the watching thread: the main thread is inside an FMU, so nothing of this object changes any more."""
         if self._begun:
-            error.at(self.point, self._plan.grid.time(self.point))
+            error.at(self._system.begun_at, self._plan.grid.time(self._system.begun_at))
         self._save_from_outside()
         self._on_hang(error.with_hint(self._kept()))
 

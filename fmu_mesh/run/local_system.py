@@ -78,18 +78,32 @@ class LocalSystem:
         """Take all steps that end at the next point, in the order of the plan.
 
         Raises:
-            FmuError: a step failed; it has the point and the time.
+            FmuError: a step failed; it has the point at which this step began, and its time.
             TerminationRequested: an FMU asks to end the simulation. All outputs are still those of `point`.
         """
         point, steps = self.point, self._steps
         try:
             for self.stepping, step_from in steps:
                 step_from(point)
-        except (FmuError, TerminationRequested) as error:
-            error.at(point, self._grid.time(point))
+        except FmuError as error:
+            error.at(self.begun_at, self._grid.time(self.begun_at))
+            raise
+        except TerminationRequested as asked:
+            asked.at(point, self._grid.time(point))
             raise
         self.point = point + 1
         self.stepping = ""
+
+    @property
+    def begun_at(self) -> int:
+        """The point at which the step that is under way, or has failed, began; between two points `point`.
+
+        A step of an instance with a step size of its own begins some points before `point`.
+        """
+        if not self.stepping:
+            return self.point
+        member = self._members[self.stepping]
+        return member.step * member.plan.step_points
 
     def doing(self, instance: str) -> str:
         """In words what an instance that steps is doing; from any thread."""

@@ -237,6 +237,21 @@ def test_an_fmu_that_asks_to_end_the_simulation_is_named_and_nothing_has_failed(
     place.assert_nothing_left()
 
 
+@pytest.mark.parametrize("options", [(), ("--local",)], ids=["distributed", "local"])
+def test_a_failed_step_of_several_points_is_told_with_the_point_at_which_it_began(
+    place: Place, faulty: Path, options: tuple[str, ...]
+) -> None:
+    slow = {"fmu": str(faulty), "start_values": {"fail_at": 0.022}, "step_size": 0.01}
+    config = write_config(
+        place.folder, instances={"slow": slow, "gain": {"fmu": "Gain"}}, connections=["slow.y -> gain.u"]
+    )
+
+    launched = place.run("launch", config, *options)
+
+    assert launched.wait() == 3
+    assert launched.message.startswith("fmu-mesh: instance slow, point 20, t = 0.02 s: fmi2DoStep returned error; ")
+
+
 GEARS = """
 import fmu_mesh
 
