@@ -117,7 +117,8 @@ class Transfer:
         Raises:
             StepFailed: see `check_range`.
         """
-        self.check_range(step)
+        if self._narrowings:
+            self.check_range(step)
         slot = self.rule.row_for(step) & self.source.mask
         for copy in self._copies:
             copy.part[0, copy.columns] = copy.convert(self.source.parts[copy.source_part][slot][copy.source_columns])

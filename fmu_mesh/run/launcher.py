@@ -53,7 +53,7 @@ _SILENCE_S = 10.0
 """The master sends an event ten times per second. After this time without one, it counts as lost."""
 
 _TURN_S = 0.25
-_UNTOLD = "has ended, and the fork server does not answer, which knows how"
+_UNTOLD = "has ended; the fork server, which knows how, does not answer"
 
 
 class Launcher:

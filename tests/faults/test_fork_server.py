@@ -134,7 +134,7 @@ def test_the_end_of_a_process_is_noticed_although_the_fork_server_is_stopped(
 
     assert launched.wait() == 4
     assert launched.ended_after_s < on_a_busy_machine(6.0)
-    assert f"{lost}: its process has ended, and the fork server does not answer, which knows how. " in launched.message
+    assert f"{lost}: its process has ended; the fork server, which knows how, does not answer. " in launched.message
     place.assert_nothing_left()
 
 
