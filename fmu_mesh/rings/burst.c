@@ -168,7 +168,8 @@ typedef struct {
   int64_t wait_ns;   /* how long to sleep where nothing can step */
   int64_t eager;     /* whether to leave, not to sleep, after a step: its rows have to be sent */
   int64_t spins;     /* whether it spins before it sleeps */
-  int64_t batch;     /* how many rows or points it waits for at once */
+  int64_t batch;     /* how many rows or points it may sleep for; 1 if others may wait for its next row */
+  int64_t first;     /* tick of its first unit at the start of the call */
   int64_t allowed;
   int64_t patience;
   int64_t waited_ns;
@@ -580,7 +581,7 @@ static int64_t allow(Node *node, int64_t point, Unit *unit) {
 
 /* A sleeper on another core takes up to this time to wake up. Who waits for it for a shorter time falls asleep itself, and
  * both wake each other for ever. */
-enum { SPINS = 60, YIELD_NS = 50000, PATIENCE = 3, REST = 30, LINGER = 80 };
+enum { SPINS = 60, YIELD_NS = 50000, PATIENCE = 3, REST = 30, MANY = 64 };
 
 /* For a node with one unit: look a little longer before it sleeps, unless that was in vain the last times. */
 static int soon(Node *node, Counter *counter, int64_t need) {
@@ -594,8 +595,6 @@ static int soon(Node *node, Counter *counter, int64_t need) {
   for (int i = 0;; i++) {
     if (value_of(counter) >= need) {
       if (node->patience < PATIENCE) node->patience++;
-      /* A counter that is read after each row moves from core to core for each. */
-      for (int j = 0; i > 0 && j < LINGER && value_of(counter) < need + node->batch - 1; j++) relax();
       return 1;
     }
     if (atomic_load_explicit(&node->attention, memory_order_relaxed)) return 0;
@@ -613,10 +612,14 @@ static int soon(Node *node, Counter *counter, int64_t need) {
   return 0;
 }
 
+/* Whether to sleep for a value. Who has just taken many rows then sleeps until as many are there again: others have the
+ * processor meanwhile, and the counter does not move from core to core for each row. */
 static inline int blocked(Node *node, Unit *unit, Counter *counter, int64_t need) {
-  if (soon(node, counter, need)) return 0;
+  const int64_t taken = unit->tick - node->first, most = taken < node->batch ? taken : node->batch;
+  const int is_many = most >= MANY && node->n_units == 1 && counter != node->ceiling;
+  if (is_many ? value_of(counter) >= need : soon(node, counter, need)) return 0;
   unit->blocked_by = counter;
-  unit->need = need;
+  unit->need = is_many ? need + most - 1 : need;
   return 1;
 }
 
@@ -752,6 +755,7 @@ static int64_t await(Node *node, int64_t limit_ns) {
 PUBLIC int64_t node_run(Node *node) {
   int64_t start = now(), begin = start;
   int any = 0;
+  node->first = node->units[0].tick;
   for (;;) {
     int stepped = 0, left = 0;
     for (int64_t i = 0; i < node->n_units; i++) {
