@@ -168,7 +168,7 @@ typedef struct {
   int64_t wait_ns;   /* how long to sleep where nothing can step */
   int64_t eager;     /* whether to leave, not to sleep, after a step: its rows have to be sent */
   int64_t spins;     /* whether it spins before it sleeps */
-  int64_t batch;     /* how many rows or points it may sleep for; 1 if others may wait for its next row */
+  int64_t batch;     /* how many points it may sleep for; 1 if others may wait for its next row */
   int64_t first;     /* tick of its first unit at the start of the call */
   int64_t allowed;
   int64_t patience;
@@ -612,14 +612,15 @@ static int soon(Node *node, Counter *counter, int64_t need) {
   return 0;
 }
 
-/* Whether to sleep for a value. Who has just taken many rows then sleeps until as many are there again: others have the
- * processor meanwhile, and the counter does not move from core to core for each row. */
-static inline int blocked(Node *node, Unit *unit, Counter *counter, int64_t need) {
-  const int64_t taken = unit->tick - node->first, most = taken < node->batch ? taken : node->batch;
+/* Whether to sleep for a value; `points` is what one more of it stands for. Who has just taken many then sleeps until as
+ * many are there again: others have the processor meanwhile, and the counter does not move from core to core for each. */
+static inline int blocked(Node *node, Unit *unit, Counter *counter, int64_t need, int64_t points) {
+  const int64_t taken = (unit->tick - node->first) * unit->tick_points;
+  const int64_t most = (taken < node->batch ? taken : node->batch) / points, last = node->last_point / points + 1;
   const int is_many = most >= MANY && node->n_units == 1 && counter != node->ceiling;
   if (is_many ? value_of(counter) >= need : soon(node, counter, need)) return 0;
   unit->blocked_by = counter;
-  unit->need = is_many ? need + most - 1 : need;
+  unit->need = is_many && need < last ? (need + most < last ? need + most : last) : need;
   return 1;
 }
 
@@ -634,7 +635,7 @@ static inline int open_gates(Node *node, Unit *unit, Member *member) {
     if (gate->points != 1) row /= gate->points;
     while (gate->known <= row) {
       if ((gate->known = value_of(gate->counter)) > row) break;
-      if (blocked(node, unit, gate->counter, row + 1)) return NOT_READY;
+      if (blocked(node, unit, gate->counter, row + 1, gate->points)) return NOT_READY;
     }
     member->bases[FIRST_GATE + i] = (char *)(uintptr_t)gate->rows + (row & gate->mask) * gate->stride;
     if (atomic_load_explicit((_Atomic int64_t *)(void *)member->bases[FIRST_GATE + i], memory_order_acquire) != row + 1)
@@ -672,7 +673,7 @@ static int advance(Node *node, Unit *unit, int64_t *ticks) {
   for (; unit->tick < end; unit->tick++, unit->next = 0) {
     const int64_t point = unit->tick * unit->tick_points;
     while (unit->next == 0 && point >= node->allowed && (node->allowed = allow(node, point, unit)) <= point)
-      if (blocked(node, unit, unit->blocked_by, unit->need)) goto out;
+      if (blocked(node, unit, unit->blocked_by, unit->need, 1)) goto out;
     for (; unit->next < unit->n_members; unit->next++) {
       Member *member = &unit->members[unit->next];
       if (member->every != 1 && (unit->tick + 1) % member->every != 0) continue;
