@@ -168,7 +168,8 @@ typedef struct {
   int64_t wait_ns;   /* how long to sleep where nothing can step */
   int64_t eager;     /* whether to leave, not to sleep, after a step: its rows have to be sent */
   int64_t spins;     /* whether it spins before it sleeps */
-  int64_t batch;     /* how many rows or points it waits for at once */
+  int64_t batch;     /* how many points it may sleep for; 1 if others may wait for its next row */
+  int64_t first;     /* tick of its first unit at the start of the call */
   int64_t allowed;
   int64_t patience;
   int64_t waited_ns;
@@ -580,7 +581,7 @@ static int64_t allow(Node *node, int64_t point, Unit *unit) {
 
 /* A sleeper on another core takes up to this time to wake up. Who waits for it for a shorter time falls asleep itself, and
  * both wake each other for ever. */
-enum { SPINS = 60, YIELD_NS = 50000, PATIENCE = 3, REST = 30, LINGER = 80 };
+enum { SPINS = 60, YIELD_NS = 50000, PATIENCE = 3, REST = 30, MANY = 64 };
 
 /* For a node with one unit: look a little longer before it sleeps, unless that was in vain the last times. */
 static int soon(Node *node, Counter *counter, int64_t need) {
@@ -594,8 +595,6 @@ static int soon(Node *node, Counter *counter, int64_t need) {
   for (int i = 0;; i++) {
     if (value_of(counter) >= need) {
       if (node->patience < PATIENCE) node->patience++;
-      /* A counter that is read after each row moves from core to core for each. */
-      for (int j = 0; i > 0 && j < LINGER && value_of(counter) < need + node->batch - 1; j++) relax();
       return 1;
     }
     if (atomic_load_explicit(&node->attention, memory_order_relaxed)) return 0;
@@ -613,10 +612,15 @@ static int soon(Node *node, Counter *counter, int64_t need) {
   return 0;
 }
 
-static inline int blocked(Node *node, Unit *unit, Counter *counter, int64_t need) {
-  if (soon(node, counter, need)) return 0;
+/* Whether to sleep for a value; `points` is what one more of it stands for. Who has just taken many then sleeps until as
+ * many are there again: others have the processor meanwhile, and the counter does not move from core to core for each. */
+static inline int blocked(Node *node, Unit *unit, Counter *counter, int64_t need, int64_t points) {
+  const int64_t taken = (unit->tick - node->first) * unit->tick_points;
+  const int64_t most = (taken < node->batch ? taken : node->batch) / points, last = node->last_point / points + 1;
+  const int is_many = most >= MANY && node->n_units == 1 && counter != node->ceiling;
+  if (is_many ? value_of(counter) >= need : soon(node, counter, need)) return 0;
   unit->blocked_by = counter;
-  unit->need = need;
+  unit->need = is_many && need < last ? (need + most < last ? need + most : last) : need;
   return 1;
 }
 
@@ -631,7 +635,7 @@ static inline int open_gates(Node *node, Unit *unit, Member *member) {
     if (gate->points != 1) row /= gate->points;
     while (gate->known <= row) {
       if ((gate->known = value_of(gate->counter)) > row) break;
-      if (blocked(node, unit, gate->counter, row + 1)) return NOT_READY;
+      if (blocked(node, unit, gate->counter, row + 1, gate->points)) return NOT_READY;
     }
     member->bases[FIRST_GATE + i] = (char *)(uintptr_t)gate->rows + (row & gate->mask) * gate->stride;
     if (atomic_load_explicit((_Atomic int64_t *)(void *)member->bases[FIRST_GATE + i], memory_order_acquire) != row + 1)
@@ -669,7 +673,7 @@ static int advance(Node *node, Unit *unit, int64_t *ticks) {
   for (; unit->tick < end; unit->tick++, unit->next = 0) {
     const int64_t point = unit->tick * unit->tick_points;
     while (unit->next == 0 && point >= node->allowed && (node->allowed = allow(node, point, unit)) <= point)
-      if (blocked(node, unit, unit->blocked_by, unit->need)) goto out;
+      if (blocked(node, unit, unit->blocked_by, unit->need, 1)) goto out;
     for (; unit->next < unit->n_members; unit->next++) {
       Member *member = &unit->members[unit->next];
       if (member->every != 1 && (unit->tick + 1) % member->every != 0) continue;
@@ -752,6 +756,7 @@ static int64_t await(Node *node, int64_t limit_ns) {
 PUBLIC int64_t node_run(Node *node) {
   int64_t start = now(), begin = start;
   int any = 0;
+  node->first = node->units[0].tick;
   for (;;) {
     int stepped = 0, left = 0;
     for (int64_t i = 0; i < node->n_units; i++) {

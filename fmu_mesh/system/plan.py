@@ -96,7 +96,7 @@ class NodePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         progress_stride: number of points between two progress messages to the master: a quarter of the window, or 1 if
             a single step is that long.
         windows: number of points that each node, and last the recorder, may be behind the others, by name.
-        batch: number of rows that it waits for where it has to wait; 1 if others may wait for its own next row.
+        batch: number of points that it may sleep for at once; 1 if others may wait for its own next row.
         memory: where everything lies in the memory that processes of one host share.
         rings: the output rings of its instances, and of all instances that it has values from.
         loops: the algebraic loops at the start that have instances of this node.

@@ -19,7 +19,7 @@ RECORDER_WINDOW = 32768
 """Largest number of points that the recorder may be behind. It sleeps while rows accumulate."""
 
 _LEAST_RECORDER_WINDOW = 64
-_BATCH = 64
+_BATCH = 1024
 _RECORDER_BYTES = 16 * 2**20
 
 AUTO_WINDOW_POINTS = 16384
@@ -43,7 +43,7 @@ def recorder_window(window: int, row_sizes: Sequence[int]) -> int:
 
 
 def batch_of(window: int) -> int:
-    """Number of points that a node waits for at once if no other waits for its next one; ``window``: of the mesh."""
+    """Number of points that a node may sleep for if no other waits for its next one; ``window``: of the mesh."""
     return min(_BATCH, max(1, window // 4))
 
 

@@ -22,6 +22,7 @@ Job = tuple[str, int, int]
 """Shape, number of nodes, and window."""
 JOBS: list[Job] = [
     ("chain", 2, 1),
+    ("chain", 3, 512),
     ("chain", 8, 64),
     ("cycle", 2, 64),
     ("jacobi", 4, 3),
