@@ -262,15 +262,15 @@ class Master:
         grant = self._last_point if self._hold is None else min(self._hold, self._last_point)
         paced, pause = self._pacer.limit(grant, granting.slowest)
         grant = max(granting.grant, min(grant, paced))
-        if self._watch is not None:
-            told = min(granting.told, grant)
-            at_end = told == self._last_point
-            self._watch.look(None if at_end else granting.holder(told, hold=self._hold, paced=paced))
         if grant > granting.grant:
             if granting.slowest >= granting.grant:  # they had nothing to do until now, because of the wall clock
                 self._moved = time.monotonic()
             granting.raise_to(grant)
         self._tell_grant()
+        if self._watch is not None:
+            told = min(granting.told, grant)
+            at_end = told == self._last_point
+            self._watch.look(None if at_end else granting.holder(told, hold=self._hold, paced=paced))
         return min(pause, STATUS_S, self._heartbeat_s)
 
     def _tell_grant(self) -> None:
