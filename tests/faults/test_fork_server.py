@@ -153,6 +153,24 @@ def test_whoever_is_killed_together_with_the_launcher_nothing_is_left(place: Pla
     place.assert_nothing_left()
 
 
+def test_a_fork_server_that_is_stopped_does_not_outlive_a_launcher_that_is_killed(place: Place) -> None:
+    launched, _ = running(place)
+    launched.child("fork").suspend()
+
+    psutil.Process(launched.pid).kill()
+
+    wait_until(lambda: not place.processes(), "the end of all processes", 15.0)
+
+
+def test_a_fork_server_that_is_stopped_before_it_forks_does_not_outlive_a_launcher_that_is_killed(place: Place) -> None:
+    launched = place.start("launch", write_config(place.folder, stop_time=FAR_S))
+    launched.child("fork").suspend()
+
+    psutil.Process(launched.pid).kill()
+
+    wait_until(lambda: not place.processes(), "the end of all processes", 15.0)
+
+
 def test_a_refused_configuration_leaves_no_fork_server(place: Place) -> None:
     config = write_config(place.folder, instances={"gain": {"fmu": "no.fmu"}}, connections=[])
 
