@@ -319,7 +319,9 @@ class _Source:
         low, high = first // self.link.step_points, (end - 1) // self.link.step_points + 1
         wanted = np.arange(low + 1, high + 1)
         for ring in self._rings:
-            wrong = ring.stamps[(wanted - 1) & ring.mask] != wanted
+            mask = ring.mask
+            slots = slice(low & mask, (high - 1 & mask) + 1) if self.link.step_points == 1 else (wanted - 1) & mask
+            wrong = ring.stamps[slots] != wanted
             if wrong.any():
                 raise ProtocolBroken(
                     f"a row of '{self.link.source}' for the recorder is not the one that was written",
@@ -333,13 +335,6 @@ class _Source:
         ring = self._rings[-1 if is_text(self.link.layout.column(variable).type) else 0]
         step_points, place, mask = self.link.step_points, ring.layout.place(variable), ring.mask
         values = ring.parts[place.part][:, place.first]
-
-        def each(first: int, end: int) -> NDArray[Any]:
-            start = first & mask
-            return values[start : start + end - first]
-
-        def held(first: int, end: int) -> NDArray[Any]:
-            column: NDArray[Any] = values[(np.arange(first, end) // step_points) & mask]
-            return column
-
-        return each if step_points == 1 else held
+        if step_points == 1:
+            return lambda first, end: values[first & mask :][: end - first]
+        return lambda first, end: values[(np.arange(first, end) // step_points) & mask]
