@@ -134,6 +134,7 @@ class BurstEngine(Engine):
             last_point=self._last_point,
             slice_ns=int(_SLICE_S * 1e9),
             spins=spins,
+            batch=plan.batch,
         )
         self._address = ctypes.addressof(self._node)
         for number, unit in enumerate(units):
