@@ -156,7 +156,6 @@ class OwnFile(FileIO):
     def __init__(self, path: Path) -> None:
         descriptor, self._draft = _open_locked(path)
         super().__init__(descriptor, "wb")
-        self._path = path
         self._untouched = stat.S_ISREG(os.fstat(descriptor).st_mode)
         self._failure: OSError | None = None
         self.size = 0
@@ -185,7 +184,7 @@ class OwnFile(FileIO):
     def _begin(self) -> None:
         self._untouched = False
         if self._draft is not None:
-            self._draft.rename(os.path.realpath(self._path))
+            self._draft.rename(str(self._draft).removesuffix(_DRAFT))
         self.truncate(0)
 
 

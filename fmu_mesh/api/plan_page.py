@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from ..rings.library import library_missed, why_no_library
 from ..system.grouping import automatic_nodes
 from ..system.initialization_plan import Loop
 from ..system.plan import Plan
@@ -12,7 +13,7 @@ from ..text import listed, short_number, short_path, shown
 from ..variables.model_description import Variable
 from .tables import pairs, table
 
-__all__ = ["plan_page"]
+__all__ = ["plan_page", "slower_than_it_could_be"]
 
 _PROBLEM_CHARACTERS = 100
 
@@ -37,12 +38,18 @@ def plan_page(plan: Plan) -> list[str]:
     return lines
 
 
+def slower_than_it_could_be() -> str | None:
+    """A warning where the library of C is missing and could be used."""
+    return f"the library of C is {why_no_library()}" if library_missed() else None
+
+
 def _head(plan: Plan) -> list[str]:
     simulation, grid = plan.system.config.simulation, plan.grid
     factor = simulation.real_time_factor
     window = f"{plan.window} points" if plan.window > 1 else "1 point: lockstep"
     end = f"{short_number(grid.stop_time)} s in {grid.last_point}" if grid.stop_time is not None else "an open end in"
     times = f"{short_number(grid.start_time)} s to {end} steps of"
+    without = why_no_library()
     return pairs(
         [
             ("Mesh", plan.system.config.mesh),
@@ -50,6 +57,7 @@ def _head(plan: Plan) -> list[str]:
             ("Algorithm", simulation.algorithm),
             ("Window", window),
             ("Speed", f"{factor:g} times real time" if factor else "as fast as possible"),
+            *([("Library", without)] if without is not None else []),
         ]
     )
 

@@ -6,6 +6,7 @@ import msgspec
 
 from ..config.mesh import SimulationConfig
 from ..errors import Finding
+from ..rings.library import why_no_library
 from ..system.plan import Plan
 from ..variables.value_conversion import to_plain
 from ..variables.value_types import PlainValue
@@ -49,6 +50,7 @@ class PlanView(msgspec.Struct, frozen=True):
         recorded: `instance.variable` of the columns of the result file.
         result_file: the result file; None if nothing is recorded.
         warnings: findings that do not prevent a run.
+        library: why the library of C is not used; None if it is.
     """
 
     mesh: str
@@ -64,6 +66,7 @@ class PlanView(msgspec.Struct, frozen=True):
     recorded: list[str]
     result_file: str | None
     warnings: tuple[Finding, ...]
+    library: str | None
 
 
 def plan_view(plan: Plan) -> PlanView:
@@ -113,4 +116,5 @@ def plan_view(plan: Plan) -> PlanView:
         recorded=[f"{name}.{variable}" for name, variable in system.recorded],
         result_file=system.result_file,
         warnings=system.warnings,
+        library=why_no_library(),
     )

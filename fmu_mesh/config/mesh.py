@@ -233,8 +233,8 @@ class ZenohConfig(Base, frozen=True, kw_only=True):
     shared_memory: Annotated[
         bool,
         Meta(
-            description="true: processes on the same host exchange frames and grants through shared memory; false: "
-            "through Zenoh, as between hosts."
+            description="true: processes on the same host read values, grants and progress in shared memory; false: "
+            "they exchange them through Zenoh, as processes of different hosts do."
         ),
     ] = True
     config: Annotated[

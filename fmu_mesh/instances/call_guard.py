@@ -23,7 +23,7 @@ import msgspec
 
 from ..config.mesh import TimeoutsConfig
 from ..errors import FmuError, InitializationFailed, LoadFailed, StepFailed
-from ..rings.native import NativeStep
+from ..rings.native import NativeStep, Stage
 from ..rings.ring import Ring
 from ..simtime import TimeGrid
 from ..text import short_path
@@ -39,6 +39,7 @@ __all__ = [
     "Unwatched",
     "call_named",
     "current_function",
+    "doing",
     "floating_point_changed",
     "kept_state",
     "lines_shown_of",
@@ -56,6 +57,8 @@ _SIGNALS: Final = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", 
 # because Python evaluates expressions of literals when it compiles.
 DEFAULT_MODE: Final = (1.0, 2.0**-53, 2.0**-54, 5e-324)
 _ONE, _HALF_ULP, _QUARTER_ULP, _TINY = DEFAULT_MODE
+
+_DO_STEP: Final = "doStep"
 
 _functions: dict[int, str] = {}
 """The FMI function that a thread is in, by the identifier of the thread."""
@@ -159,7 +162,7 @@ class CallWatch:
         self._caller = threading.get_ident()
         self._changed = threading.Condition()
         self._call: _Call | None = None
-        self._position: Callable[[], tuple[str, int]] | None = None
+        self._position: Callable[[], tuple[str, int, str]] | None = None
         self._step_limit_s = 0.0
         self._closed = False
         self._thread = threading.Thread(target=self._run, name="call watch", daemon=True)
@@ -177,8 +180,11 @@ class CallWatch:
             self._call = None  # the watching thread reads this when it wakes up
 
     @contextmanager
-    def stepping(self, position: Callable[[], tuple[str, int]], limit_s: float) -> Iterator[None]:
-        """Around many steps: ``position`` (the instance that steps, and its point) has to change every ``limit_s``."""
+    def stepping(self, position: Callable[[], tuple[str, int, str]], limit_s: float) -> Iterator[None]:
+        """Around many steps: ``position`` (who steps, from which point, and `doing`) changes every ``limit_s`` seconds.
+
+        A step has the whole time for all that it does, so the last one is for the error only.
+        """
         self._position, self._step_limit_s = position, limit_s
         self._notify()
         try:
@@ -210,15 +216,16 @@ class CallWatch:
             now = time.monotonic()
             if call is not None:
                 if now - call.started >= call.limit_s:
-                    self._on_overrun(self._overrun(call, now))
+                    self._on_overrun(self._overrun(call, now, "a call"))
                     return
             elif position is not None and position is self._position:
-                place = position()
+                instance, point, call_of_step = position()
+                place = instance, point
                 if place != seen[0]:
                     seen = (place, now)
                 elif now - seen[1] >= self._step_limit_s:
-                    step = _Call(place[0], StepFailed, "step", self._step_limit_s, seen[1])
-                    self._on_overrun(self._overrun(step, now))
+                    step = _Call(instance, StepFailed, "step", self._step_limit_s, seen[1])
+                    self._on_overrun(self._overrun(step, now, call_of_step))
                     return
 
     @staticmethod
@@ -228,8 +235,7 @@ class CallWatch:
             return max(0.0, call.started + call.limit_s - time.monotonic())
         return _LOOK_S if position is not None else None
 
-    def _overrun(self, call: _Call, now: float) -> FmuError:
-        otherwise = "doStep" if call.kind is StepFailed else "a call"
+    def _overrun(self, call: _Call, now: float, otherwise: str) -> FmuError:
         return call.kind(
             not_returned(self._caller, now - call.started, otherwise),
             instance=call.instance,
@@ -260,6 +266,11 @@ class Unwatched:
 def current_function(thread: int) -> str | None:
     """The FMI function that a thread is in; None if it is in none, or in a step that the library takes."""
     return _functions.get(thread)
+
+
+def doing(stage: int) -> str:
+    """In words what a step is doing in this `Stage`."""
+    return {Stage.SETTING: "setting the inputs", Stage.GETTING: "reading the outputs"}.get(Stage(stage), _DO_STEP)
 
 
 def lines_shown_of(file: str | None) -> None:
@@ -337,6 +348,11 @@ class Guarded(AroundInstance[Instance]):
     def native(self) -> NativeStep | None:
         """See `StepsNatively`; None if the inner instance has no such steps."""
         return self._instance.native if isinstance(self._instance, StepsNatively) else None
+
+    @property
+    def stage(self) -> int:
+        """See `StepsNatively`; `IN_PYTHON` if the inner instance has no such steps."""
+        return self._instance.stage if isinstance(self._instance, StepsNatively) else Stage.IN_PYTHON
 
     def finish(self, step: int, outcome: int) -> None:
         """See `StepsNatively`; only called if there is `native`."""

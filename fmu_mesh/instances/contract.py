@@ -256,6 +256,11 @@ class StepsNatively(Protocol):
         """The tables of a step on the rings of the last `bind`; None if `do_step` takes the steps."""
         ...
 
+    @property
+    def stage(self) -> int:
+        """What `do_step` is doing, a `fmu_mesh.rings.native.Stage`; from any thread. A node asks its own tables."""
+        ...
+
     def finish(self, step: int, outcome: int) -> None:
         """Complete own step ``step`` as `do_step` does, after the library has returned ``outcome``, which is not 0.
 

@@ -1,19 +1,21 @@
 """What the nodes have reached, and what they are granted.
 
-Grants and progress are counters in the memory of the host. The nodes there keep the windows among themselves; a node
-that does not share this memory gets grants that contain the windows, and tells its progress by messages.
+Grants and progress are counters in the memory of the host. The nodes there keep the windows among themselves, and the
+last point can be granted at once, because a grant can be taken back. A node that does not share this memory gets grants
+by messages: they contain the windows, reach about 50 ms ahead, and stay. It tells its progress by messages, too.
 """
 
 from __future__ import annotations
 
 import operator
+import time
 from collections.abc import Collection
 
 from ..errors import ProtocolBroken
 from ..rings.host_memory import HostMemory, Wish
 from ..system.plan import RECORDER, Plan
 from .members import spoken
-from .pacing import CLOCK, PAUSE
+from .pacing import CLOCK, PAUSE, Reach
 
 __all__ = ["Granting"]
 
@@ -42,15 +44,16 @@ class Granting:
         self._most_ahead = 2 * max(item.step_points for item in plan.system.instances.values()) - 2
         self._sharing: list[str] = []
         self._told = 0
+        self._reach = Reach(plan.window)
 
     def share(self, nodes: Collection[str]) -> None:
         """From now on, the progress of these nodes is read in the memory."""
         self._sharing = [*nodes]
 
     @property
-    def ahead(self) -> int:
-        """The last point that all nodes with instances know."""
-        return min(point for node, point in self.progress.items() if node != RECORDER)
+    def told(self) -> int:
+        """The point up to which all nodes have a grant, also those that get it by messages."""
+        return self.grant if len(self._sharing) == len(self.progress) else self._told
 
     @property
     def laggard(self) -> str:
@@ -106,25 +109,32 @@ class Granting:
         self.grant = point
         self._memory.grant.raise_to(point)
 
+    def halt(self) -> int:
+        """Take back what nodes have not claimed yet; return the point at which all will pause."""
+        claimed = self._memory.withdraw_grant() if self._sharing else 0
+        self.raise_to(min(self.grant, max(claimed, self._told)))
+        return self.grant
+
     def owed(self) -> tuple[int, bool]:
         """The grant for nodes that cannot read it, and whether it has grown since the last call."""
+        if len(self._sharing) == len(self.progress):
+            return 0, False
         credit = min(map(operator.add, self.progress.values(), self._windows))
-        grown = len(self._sharing) < len(self.progress) and min(self.grant, credit) > self._told
-        if grown:
-            self._told = min(self.grant, credit)
+        ahead = min(point for node, point in self.progress.items() if node != RECORDER)
+        owed = min(self.grant, credit, ahead + self._reach.points(ahead, time.monotonic()))
+        grown = owed > self._told
+        self._told = max(self._told, owed)
         return self._told, grown
 
-    def wishes(self, last_point: int) -> list[Wish]:
+    def wishes(self) -> list[Wish]:
         """Wake up when the slowest node of this host has come so far that there is something to do."""
-        at_end = self.grant >= last_point
-        nodes = [node for node in self._sharing if at_end or node != RECORDER] or self._sharing
-        if not nodes:
+        if not self._sharing:
             return []
-        slowest = min(nodes, key=self.progress.__getitem__)
+        slowest = min(self._sharing, key=self.progress.__getitem__)
         reached = self.progress[slowest]
-        if reached >= self.grant and reached >= 0:
+        if reached >= self.told and reached >= 0:
             return []
-        goal = self.grant if at_end else (reached + self.grant) // 2
+        goal = self.grant if self.told == self.grant else (reached + self.told) // 2
         return [(self._memory.progress[slowest], max(goal, reached + 1) + 1)]
 
     def broken(self, node: str, what: str) -> ProtocolBroken:

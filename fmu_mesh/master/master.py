@@ -5,7 +5,7 @@
     wait until every node has registered; answer them all        (ready/ack)
     wait until every node is at point 0                          (Initialization Mode is over)
     until every node is at the last point, or at the one where an FMU asked to end the simulation:
-        grant what all can step in about 50 ms                   (less if the wall clock or a pause limits it)
+        grant it                                                 (less if the wall clock or a pause limits it)
         wait for progress
     tell the nodes to finish; wait for their reports
 
@@ -45,7 +45,7 @@ from ..wire.views import GOING_ON, Command, CommandAnswer, MeshInfo, MeshState, 
 from .granting import Granting
 from .members import Followers, Members, spoken
 from .mesh_server import STATUS_S, Events, MasterServer, mesh_info
-from .pacing import GrantWatch, Pacer, Reach, RunClock
+from .pacing import GrantWatch, Pacer, RunClock
 
 __all__ = ["Master", "MasterSettings"]
 
@@ -114,7 +114,6 @@ class Master:
         self._hold: int | None = None
         self._watch = GrantWatch() if settings.profile else None
         self._pacer = Pacer(plan, config.simulation.real_time_factor)
-        self._reach = Reach(plan.window)
         self._clock = RunClock()
         self._published = 0.0
         self._moved = time.monotonic()
@@ -260,20 +259,18 @@ class Master:
     def _publish_grant(self) -> float:
         """Raise the grant if it can be increased; return how long to wait until the next check, in s."""
         granting = self._granting
-        ahead = granting.ahead
-        grant = min(ahead + self._reach.points(ahead, time.monotonic()), self._last_point)
-        if self._hold is not None:
-            grant = min(grant, self._hold)
-        paced, pause = self._pacer.limit(grant, self._granting.slowest)
+        grant = self._last_point if self._hold is None else min(self._hold, self._last_point)
+        paced, pause = self._pacer.limit(grant, granting.slowest)
         grant = max(granting.grant, min(grant, paced))
-        if self._watch is not None:
-            at_end = grant == self._last_point
-            self._watch.look(None if at_end else granting.holder(grant, hold=self._hold, paced=paced))
         if grant > granting.grant:
             if granting.slowest >= granting.grant:  # they had nothing to do until now, because of the wall clock
                 self._moved = time.monotonic()
             granting.raise_to(grant)
         self._tell_grant()
+        if self._watch is not None:
+            told = min(granting.told, grant)
+            at_end = told == self._last_point
+            self._watch.look(None if at_end else granting.holder(told, hold=self._hold, paced=paced))
         return min(pause, STATUS_S, self._heartbeat_s)
 
     def _tell_grant(self) -> None:
@@ -309,7 +306,7 @@ class Master:
             FmuMeshError: a node failed or was lost.
         """
         granting, ended = self._granting, self.ended_by is not None
-        wishes = granting.wishes(self._last_point) if self._state != "stopping" else ()
+        wishes = granting.wishes() if self._state != "stopping" else ()
         message, moved = self._inbox.wait(timeout_s, wishes), False
         while message is not None:
             node, kind, _, _, point, _ = message
@@ -397,13 +394,14 @@ class Master:
             return
         match command.command:
             case "pause":
-                self._state, self._hold = "paused", self._granting.grant
+                self._state, self._hold = "paused", self._granting.halt()
             case "resume":
                 self._state, self._hold = "running", None
                 self._clock.start()
                 self._pacer.start(self._granting.slowest)
             case "step":
-                self._state, self._hold = "paused", max(self._hold or 0, self._granting.grant) + max(1, command.points)
+                rest = self._hold if self._hold is not None else self._granting.halt()
+                self._state, self._hold = "paused", rest + max(1, command.points)
                 self._clock.start()
                 self._pacer.start(self._granting.slowest)
             case "stop":
@@ -415,13 +413,13 @@ class Master:
 
     def _stop(self) -> None:
         """End the run: at the granted point if it has no stop time, otherwise as an interruption."""
-        grid, self._hold = self._plan.grid, None
+        grid, point, self._hold = self._plan.grid, self._granting.halt(), None
         if grid.stop_time is not None:
             text = f"stopped by a command before its stop time of {grid.stop_time:.12g} s"
             self._fail(Interrupted(text, point=self._granting.slowest, time=grid.time(self._granting.slowest)))
         elif self.ended_by is None:
             text = "stopped by a command, the normal end of a run without a stop time"
-            self.ended_by = TerminationRequested(text, point=self._granting.grant, time=grid.time(self._granting.grant))
+            self.ended_by = TerminationRequested(text, point=point, time=grid.time(point))
 
     # --- views
 

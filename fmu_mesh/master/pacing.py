@@ -44,10 +44,10 @@ class RunClock:
 
 
 class Reach:
-    """How many points the grant may be ahead of the slowest instance.
+    """How many points a grant that cannot be taken back may be ahead of the slowest instance.
 
-    A pause takes effect at the grant. So more than the window, and more than 1024 points, are granted only if they take
-    less than 50 ms at the present speed.
+    A pause takes effect at such a grant. So more than the window, and more than 1024 points, are granted only if they
+    take less than 50 ms at the present speed.
 
     Args:
         window: of the mesh, in points.

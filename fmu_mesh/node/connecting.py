@@ -55,6 +55,7 @@ def sources_of(
                 feed,
                 ring,
                 runner.inputs,
+                target=runner.name,
                 source_points=step_points[feed.source],
                 target_points=runner.plan.step_points,
                 text=text,

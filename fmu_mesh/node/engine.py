@@ -15,12 +15,12 @@ from threading import Lock
 from time import perf_counter
 from typing import Final, cast
 
-from ..errors import ProtocolBroken, StepFailed, TerminationRequested
+from ..errors import ProtocolBroken, TerminationRequested
 from ..instances.call_guard import floating_point_changed, restore_floating_point
 from ..instances.contract import StepsNatively
 from ..rings import native
 from ..rings.host_memory import HostMemory
-from ..rings.native import BurstEnd, RowBase, Stage, StepKind, table
+from ..rings.native import OUT_OF_RANGE, STAGE_BITS, BurstEnd, RowBase, Stage, StepKind, table
 from ..system.plan import NodePlan
 from .stepping import Position, Runner, Source
 
@@ -134,6 +134,7 @@ class BurstEngine(Engine):
             last_point=self._last_point,
             slice_ns=int(_SLICE_S * 1e9),
             spins=spins,
+            batch=plan.batch,
         )
         self._address = ctypes.addressof(self._node)
         for number, unit in enumerate(units):
@@ -255,10 +256,12 @@ class BurstEngine(Engine):
                 for source in runner.sources:
                     source.transfer.step_text(step)
                 runner.instance.do_step(step)
-            elif member.kind == StepKind.BY_PYTHON:
-                text = "setting the inputs: a value is out of the range of the type of its input"
-                raise StepFailed(text, instance=runner.name)
             else:
+                if divmod(member.outcome, 1 << STAGE_BITS) == (Stage.SETTING, OUT_OF_RANGE):
+                    for source in runner.sources:
+                        source.transfer.check_range(step)
+                if member.kind == StepKind.BY_PYTHON:
+                    raise self._forged(runner)  # it was out of range when the burst has read it
                 cast("StepsNatively", runner.instance).finish(step, member.outcome)
         except TerminationRequested:
             self._units[unit].stopped = 1

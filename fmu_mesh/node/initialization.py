@@ -10,8 +10,9 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Collection, Sequence
 
-from ..errors import DeadlineExceeded
+from ..errors import DeadlineExceeded, InitializationFailed
 from ..rings.array_elements import element_of, merged, scaled
+from ..rings.transfer import Narrowing
 from ..simtime import ENDLESS
 from ..system.algebraic_loop import FixedPoint
 from ..system.initialization_plan import Loop
@@ -126,16 +127,25 @@ class Initialization:
         """
         values: dict[str, Value] = {}
         for feed in runner.plan.feeds:
-            for source, target, factor, offset in feed.columns:
+            for column in feed.columns:
+                source, target, _, _ = column
                 level, key = self._levels[feed.source, self._column(feed.source, source).name], (runner.name, target)
                 if point is not None and key in point.assumed:
                     values[target] = point.assumed[key]
                 elif point is not None and below <= level < within:
-                    values[target] = scaled(self._element(feed.source, source, point.sweeps), factor, offset)
+                    values[target] = self._moved(feed.source, column, runner, point.sweeps)
                 elif level < below and key not in self._settled:
-                    values[target] = scaled(self._element(feed.source, source), factor, offset)
+                    values[target] = self._moved(feed.source, column, runner)
         if values:
             runner.instance.set_values(merged(values, runner.plan.inputs, runner.instance.get_values))
+
+    def _moved(
+        self, instance: str, column: tuple[str, str, float, float], runner: Runner, sweep: int | None = None
+    ) -> Value:
+        """The initial value that a connection from ``instance`` gives its input."""
+        source, target, factor, offset = column
+        ends = Narrowing(f"{instance}.{source}", runner.name, target, runner.plan.inputs.column(target).type)
+        return ends.checked(scaled(self._element(instance, source, sweep), factor, offset), InitializationFailed)
 
     def _column(self, instance: str, name: str) -> Column:
         """The column of an output, or of the array that ``name`` is an element of."""

@@ -6,8 +6,9 @@ change with every version.
 
 from __future__ import annotations
 
+import os
 import struct
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Self
 
@@ -15,10 +16,10 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from ..config.findings import Findings
-from ..files import Kept, open_alone
+from ..files import Kept
 from ..system.recording import Recording
 from ..variables.value_types import DTYPES, VariableType, is_text
+from .block_file import BlockFile
 
 __all__ = ["ENDING", "ArraysFile", "bytes_of_a_row", "read_arrays"]
 
@@ -26,9 +27,6 @@ ENDING = ".arrays"
 
 _HEAD = struct.Struct("<qq")
 """Number of bytes that follow, and number of rows in them."""
-
-_BLOCK_BYTES = 1 << 16
-"""The size of a block: for a larger one, each time, the operating system would give new memory, page by page."""
 
 
 def bytes_of_a_row(types: Sequence[VariableType]) -> int:
@@ -46,45 +44,25 @@ def read_arrays(path: Path, types: Sequence[VariableType]) -> tuple[NDArray[np.f
     Returns:
         The times in s, shape `(rows,)`, and an array of the same shape for each column.
     """
-    data = memoryview(path.read_bytes() if path.exists() else b"")
-    times: list[NDArray[np.float64]] = [np.zeros(0)]
-    columns: list[list[NDArray[Any]]] = [[np.zeros(0, DTYPES[type_])] for type_ in types]
-    offset = 0
-    while offset + _HEAD.size <= len(data):
-        size, _ = _HEAD.unpack_from(data, offset)
-        offset += _HEAD.size
-        if offset + size > len(data):  # the writer was killed within a block
-            break
-        stamps, *parts = msgspec.msgpack.decode(data[offset : offset + size])
-        offset += size
-        times.append(np.frombuffer(stamps))
-        for column, part, type_ in zip(columns, parts, types, strict=True):
+    all_types: tuple[VariableType, ...] = ("Float64", *types)
+    columns: list[list[NDArray[Any]]] = [[np.zeros(0, DTYPES[type_])] for type_ in all_types]
+    for _, _, block in _blocks(path) if path.exists() else ():
+        for column, part, type_ in zip(columns, msgspec.msgpack.decode(block), all_types, strict=True):
             column.append(np.array(part, object) if is_text(type_) else np.frombuffer(part, DTYPES[type_]))
-    return np.concatenate(times), [np.concatenate(column) for column in columns]
+    times, *others = (np.concatenate(column) for column in columns)
+    return times, others
 
 
-class ArraysFile:
+class ArraysFile(BlockFile):
     """Writes rows of results as blocks of arrays.
 
     Args:
         path: the file.
         types: the types of the columns but `time`.
-
-    Attributes:
-        path: the file.
-        rows: rows written so far.
     """
 
     def __init__(self, path: Path, types: Sequence[VariableType]) -> None:
-        self.path = path
-        self.rows = 0
-        self._types = types
-        self._block_rows = max(1, _BLOCK_BYTES // bytes_of_a_row(types))
-        self._file = open_alone(path)
-
-    @classmethod
-    def check(cls, recording: Recording, findings: Findings) -> None:
-        """The file can hold everything."""
+        super().__init__(path, 1 + len(types))
 
     @classmethod
     def open(cls, path: Path, recording: Recording) -> Self:
@@ -92,44 +70,25 @@ class ArraysFile:
         return cls(path, [type_ for _, type_ in recording.columns])
 
     @staticmethod
-    def keep_whole_rows(path: Path, kept: Kept) -> int:
+    def keep_whole_rows(path: Path, kept: Kept) -> int:  # noqa: ARG004  the blocks are found from the first one on
         """Cut a file off after its last whole block; returns the number of its rows."""
-        rows, end, total = kept.rows, kept.size, path.stat().st_size
-        with path.open("r+b") as file:
-            while end + _HEAD.size <= total:
-                file.seek(end)
-                size, more = _HEAD.unpack(file.read(_HEAD.size))
-                if end + _HEAD.size + size > total:
-                    break
-                rows, end = rows + more, end + _HEAD.size + size
-            file.truncate(end)
-        return rows
+        blocks = [(0, 0, memoryview(b"")), *_blocks(path)]
+        os.truncate(path, blocks[-1][0])
+        return sum(rows for _, rows, _ in blocks)
 
-    @property
-    def kept(self) -> Kept:
-        """All rows: each block is written at once."""
-        return Kept(self.rows, self._file.size)
+    def _block(self, columns: Sequence[NDArray[Any]]) -> bytes:
+        block = msgspec.msgpack.encode(
+            [column.tolist() if column.dtype == object else column.tobytes() for column in columns]
+        )
+        return _HEAD.pack(len(block), len(columns[0])) + block
 
-    def write(self, times: NDArray[np.float64], columns: Sequence[NDArray[Any]]) -> None:
-        """Append one row per time; ``columns`` are arrays of the same length."""
-        for first in range(0, len(times), self._block_rows):
-            part = slice(first, first + self._block_rows)
-            self._write(times[part], [column[part] for column in columns])
 
-    def flush(self) -> None:
-        """Do nothing: `write` gives everything to the operating system."""
-
-    def close(self) -> None:
-        """Close the file."""
-        self._file.close()
-
-    def _write(self, times: NDArray[np.float64], columns: Sequence[NDArray[Any]]) -> None:
-        parts = [
-            column.tolist() if is_text(type_) else np.ascontiguousarray(column, DTYPES[type_]).tobytes()
-            for column, type_ in zip(columns, self._types, strict=True)
-        ]
-        block = msgspec.msgpack.encode([np.ascontiguousarray(times).tobytes(), *parts])
-        left = memoryview(_HEAD.pack(len(block), len(times)) + block)
-        while left:
-            left = left[self._file.write(left) :]
-        self.rows += len(times)
+def _blocks(path: Path) -> Iterator[tuple[int, int, memoryview]]:
+    """The end, the number of rows and the bytes of each whole block: the writer may have been killed within one."""
+    data, end = memoryview(path.read_bytes()), 0
+    while (start := end + _HEAD.size) <= len(data):
+        size, rows = _HEAD.unpack_from(data, end)
+        end = start + size
+        if end > len(data):
+            return
+        yield end, rows, data[start:end]

@@ -9,8 +9,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable, Collection
-from functools import partial
+from collections.abc import Callable, Collection, Sequence
 from types import TracebackType
 from typing import Any, Self
 
@@ -18,7 +17,7 @@ import numpy as np
 import zenoh
 from numpy.typing import NDArray
 
-from ..errors import DeadlineExceeded, FmuMeshError, MeshLost, MessageRefused, ProtocolBroken, from_report
+from ..errors import FmuMeshError, MeshLost, MessageRefused, ProtocolBroken
 from ..files import unwritable
 from ..rings.host_memory import HostMemory, Wish
 from ..system.plan import RECORDER, Link, NodePlan
@@ -27,18 +26,7 @@ from ..variables.value_types import is_text
 from ..wire.frames import FrameReceiver, SourceRows, rows_of
 from ..wire.inbox import Inbox, Message
 from ..wire.membership import Membership
-from ..wire.messages import (
-    ABORT,
-    FINISH,
-    FRAME,
-    GRANT,
-    HEADER,
-    INITIAL,
-    LAST,
-    PROGRESS,
-    NodeReport,
-    decode_abort,
-)
+from ..wire.messages import ABORT, FINISH, FRAME, GRANT, HEADER, INITIAL, LAST, PROGRESS, NodeReport
 
 __all__ = ["Recorder"]
 
@@ -54,7 +42,6 @@ and writing many rows at once takes less time."""
 _LAST_S = 0.5
 """How long in s the recorder waits for the last rows of the nodes when a run ends early."""
 
-_TELL_S = 0.1
 _FLUSH_S = 0.2
 
 
@@ -66,6 +53,8 @@ class Recorder:
         session: the session of this process; the caller closes it.
         file: the result file; closed by the recorder.
         has_begun: whether all instances have reached point 0; nothing is written before.
+        launch: the launcher that started this process; None if it was started manually.
+        memory: the shared memory of this host; None if nothing is shared.
 
     Use it as a context manager: the thread runs inside; afterwards the file has all complete rows.
     """
@@ -81,7 +70,6 @@ class Recorder:
         memory: HostMemory | None = None,
     ) -> None:
         self._plan = plan
-        self._session = session
         self._own_memory = HostMemory.private(plan.memory, RECORDER)
         self._memory = memory if memory is not None else self._own_memory
         self._sources: dict[int, _Source] = {}
@@ -90,14 +78,11 @@ class Recorder:
         self._file = file
         self._has_begun = has_begun
         self._written = 0
-        self._leaving = threading.Event()
-        self._progress_sent = -1
-        self._progress_told_at = 0.0
+        self._told = 0
+        self._flushed = 0.0
         self._finished = False
-        # At the end the main thread writes what is left; on a slow disk this thread may still be writing.
-        self._writing = threading.Lock()
-        self._flushed = time.monotonic()
-        self._flushed_rows = 0
+        self._cause: BaseException | None = None
+        self._ended: set[str] = set()
         self._inbox = Inbox(self._memory)
         self._membership = Membership(plan, session, self._inbox, launch, memory=memory)
         self._put_progress: Callable[[bytes], None]
@@ -115,13 +100,14 @@ class Recorder:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._leaving.set()
-        if self._thread.is_alive():
-            self._membership.give_up()
-            self._inbox.post(self._end)
-        self._thread.join(5.0)
+        self._membership.give_up()
+        self._inbox.post(lambda: self._end(error))
+        self._thread.join()  # all its waits have deadlines; a slow disk takes its time
         try:
-            self._finish_file()
+            try:
+                self._write_rows()
+            finally:
+                self._file.close()
         except OSError as failure:
             # The master has already reported a failure during the run; this failure came after the last point.
             if error is None:
@@ -130,75 +116,65 @@ class Recorder:
             self._membership.close()
             self._inbox.close()
 
-    def _finish_file(self) -> None:
-        try:
-            self._write_complete_rows()
-        finally:
-            self._file.close()
-
-    def _end(self) -> None:
-        self._finished = True
+    def _end(self, cause: BaseException | None) -> None:
+        self._finished, self._cause = True, cause
 
     def _run(self) -> None:
+        failure: FmuMeshError | None = None
         try:
             self._membership.register()
-            self._meet_in_time()
+            if not self._meet():
+                return
             self._record()
-            self._report(None)
-        except _Ended:
-            log.info("recording_ended_early", extra={"rows": self._written})
+            if self._cause is not None:
+                self._take_last_rows(self._cause)
+                log.info("recording_ended_early", extra={"rows": self._written})
+                return
         except OSError as error:
-            self._try_to_report(unwritable(self._file.path, error))
+            failure = unwritable(self._file.path, error)
         except Exception as error:  # noqa: BLE001 whatever it is, the master must know that nothing is recorded any more
-            known = error if isinstance(error, FmuMeshError) else FmuMeshError(f"recording failed: {error!r}")
-            self._try_to_report(known)
+            failure = error if isinstance(error, FmuMeshError) else FmuMeshError(f"recording failed: {error!r}")
+        self._report(failure)
 
-    def _meet_in_time(self) -> None:
+    def _meet(self) -> bool:
+        """Join the mesh. If this fails, the master has the same deadline, and names all missing nodes."""
         try:
-            self._meet()
-        except MeshLost as error:
-            # The master has the same deadline, and names all missing nodes; the recorder must not be one of them.
-            patience_s = self._plan.timeouts.stop if isinstance(error, DeadlineExceeded) else 0.0
-            end = time.monotonic() + patience_s
-            while not self._finished and time.monotonic() < end:
-                self._inbox.wait(_LOOK_S)
-            raise _Ended(error) from error
-
-    def _meet(self) -> None:
-        welcome = self._membership.join()
-        shares = {*welcome.shared} if self._memory is not self._own_memory else set()
+            welcome = self._membership.join()
+            progress_key = self._membership.keys(self._plan.timeouts.start).progress(RECORDER)
+        except MeshLost:
+            return False
+        shares = welcome.shared if self._memory is not self._own_memory else ()
         self._sources = {link.index: self._source(link, shares) for link in self._plan.links_in}
         by_name = {source.link.source: source for source in self._sources.values()}
         self._columns = [by_name[instance].column(variable) for instance, variable in self._plan.recorded]
-        self._put_progress = self._membership.sender(
-            self._membership.keys(self._plan.timeouts.start).progress(RECORDER)
-        )
+        self._put_progress = self._membership.sender(progress_key)
+        return True
 
     def _source(self, link: Link, shares: Collection[str]) -> _Source:
+        """Where the rows of an instance are: in its ring, in a mirror that frames fill, or text in the mirror."""
+
+        def fits(end: int) -> bool:
+            """Whether rows of the source before its own step ``end`` overwrite no rows that are not written yet."""
+            return end - self._written // link.step_points <= self._rows
+
         place = next(place for place in self._plan.rings if place.instance == link.source)
         shared = self._memory if link.source_node in shares else None
-        return _Source(link, *rows_of(link, place, shared, self._own_memory, partial(self._fits, link)))
+        rows, receiver = rows_of(link, place, shared, self._own_memory, fits)
+        return _Source(link, self._plan.grid.last_point, rows, receiver)
 
     def _record(self) -> None:
         """Write rows when there are many, or every few milliseconds, and tell the progress."""
-        heard = time.monotonic()
         while not self._finished:
             message = self._inbox.poll()
             if message is None:
-                self._write_complete_rows()
+                self._write_rows()
                 self._tell_progress()
+                self._flush()
                 if (wishes := self._wishes()) is None:
                     continue
                 message = self._inbox.wait(_REST_S if self._complete() >= self._written else _LOOK_S, wishes)
             if message is not None:
-                heard = time.monotonic()
                 self._take(message)
-            elif time.monotonic() - heard > self._plan.timeouts.step:
-                raise DeadlineExceeded("the recorder received nothing from the master")
-        end = time.monotonic() + _LAST_S
-        while self._leaving.is_set() and (left := end - time.monotonic()) > 0:
-            if (message := self._inbox.wait(left)) is not None:
-                self._take(message)  # messages that are under way, above all the reason of the end
 
     def _wishes(self) -> list[Wish] | None:
         """Wake up when many rows can be written, or all that are left; first for point 0. None: they are there."""
@@ -208,7 +184,7 @@ class Recorder:
         due = min(self._written + _WAKE_ROWS if complete >= 0 else 0, last_point)
         if self._written <= complete and complete >= due and (self._written or self._has_begun()):
             return None
-        slowest = min(self._sources.values(), key=lambda source: source.covered(last_point))
+        slowest = min(self._sources.values(), key=lambda source: source.covered)
         rows = due // slowest.link.step_points + 1
         return [(counter, rows) for counter in slowest.counters]
 
@@ -223,40 +199,24 @@ class Recorder:
         if kind == FRAME and source.receiver is not None:
             source.receiver.take(point, count, data)
         elif kind == LAST:
-            source.end()
+            self._ended.add(source.link.source)
         elif kind != INITIAL:
             raise MessageRefused(f"a message of kind {kind} is not one that a node sends")
 
     def _take_from_master(self, message: Message) -> None:
-        _, kind, _, _, _, data = message
+        kind = message[1]
         if kind == FINISH:
             self._finished = True
-        elif kind == ABORT:
-            cause = from_report(decode_abort(data))
-            self._take_last_rows(cause)
-            raise _Ended(cause)
-        elif kind != GRANT:
+        elif kind not in (GRANT, ABORT):  # why the run ends early comes from the master of this process: `__exit__`
             raise MessageRefused(f"a message of kind {kind} is not one that the master sends")
-
-    def _fits(self, link: Link, end: int) -> bool:
-        """Whether rows of a source before its own step ``end`` overwrite no rows that are not written yet."""
-        return end - self._written // link.step_points <= self._rows
 
     def _complete(self) -> int:
         """The last point whose row is complete, or -1."""
-        return min((source.covered(self._plan.grid.last_point) for source in self._sources.values()), default=-1)
-
-    def _write_complete_rows(self) -> None:
-        with self._writing:
-            self._write_rows()
-            rows = self._file.rows
-            if rows > self._flushed_rows and (now := time.monotonic()) - self._flushed > _FLUSH_S:
-                self._flushed_rows, self._flushed = rows, now
-                self._file.flush()
+        return min((source.covered for source in self._sources.values()), default=-1)
 
     def _write_rows(self) -> None:
         rows = self._complete() + 1
-        if rows <= self._written or not (self._written or self._has_begun()):
+        if not (self._written or self._has_begun()):
             return
         while (first := self._written) < rows:
             end = min(rows, first - first % self._rows + self._rows, first + _WRITE_ROWS)  # read without wrap-around
@@ -270,16 +230,28 @@ class Recorder:
         for source in self._sources.values():
             source.check(first, end)
 
-    def _take_last_rows(self, cause: FmuMeshError) -> None:
+    def _flush(self) -> None:
+        if self._written and (now := time.monotonic()) - self._flushed > _FLUSH_S:
+            self._flushed = now
+            self._file.flush()
+
+    def _tell_progress(self) -> None:
+        """Tell how many points are written; the first one before, because nothing is written until all are there."""
+        known = max(self._written, min(self._complete() + 1, 1))
+        if known > self._told:
+            self._told = known
+            if self._memory is not self._own_memory:
+                self._memory.progress[RECORDER].raise_to(known)
+            else:
+                self._put_progress(HEADER.pack(PROGRESS, 0, 0, known - 1))
+
+    def _take_last_rows(self, cause: BaseException) -> None:
         """When a run ends early, wait for the last frames; the rows that they complete are written at the end.
 
         Wait until every live node has reported that it has sent its last rows; lost nodes send nothing more.
         """
         if isinstance(cause, MeshLost):
-            lost = (cause.instance or "").split(", ")
-            for source in self._sources.values():
-                if source.name in lost:
-                    source.end()
+            self._ended.update((cause.instance or "").split(", "))
         deadline = time.monotonic() + _LAST_S
         while True:
             message = self._inbox.poll()
@@ -293,45 +265,17 @@ class Recorder:
 
     def _rows_are_missing(self) -> bool:
         """Whether rows are still missing that would complete rows of the sources that have ended."""
-        last_point, sources = self._plan.grid.last_point, self._sources.values()
-        end = min((source.covered(last_point) for source in sources if source.ended), default=last_point)
-        return any(not source.ended and source.covered(last_point) < end for source in sources)
+        known = {source.link.source: source.covered for source in self._sources.values()}
+        end = min((known[name] for name in known if name in self._ended), default=self._plan.grid.last_point)
+        return any(point < end for name, point in known.items() if name not in self._ended)
 
-    def _tell_progress(self) -> None:
-        """Tell how many points are written; the first one before, because nothing is written until all are there."""
-        known = max(self._written, min(self._complete() + 1, 1))
-        if self._memory is not self._own_memory:
-            self._memory.progress[RECORDER].raise_to(known)
-            return
-        complete, now = known - 1, time.monotonic()
-        due = complete - self._progress_sent >= self._plan.progress_stride or now - self._progress_told_at > _TELL_S
-        if complete > self._progress_sent and (due or complete == self._plan.grid.last_point):
-            self._progress_sent = complete
-            self._progress_told_at = now
-            self._put_progress(HEADER.pack(PROGRESS, 0, 0, complete))
-
-    def _report(self, error: FmuMeshError | None) -> None:
+    def _report(self, failure: FmuMeshError | None) -> None:
         """Report to the master how recording ended. A master that ends accepts no reports; it waits for this thread."""
-        report = NodeReport(RECORDER, max(self._written - 1, 0), error.report() if error is not None else None)
-        patience_s, left = self._plan.timeouts.stop, self._leaving.is_set
+        report = NodeReport(RECORDER, max(self._written - 1, 0), failure.report() if failure is not None else None)
         try:
-            self._membership.report(report, patience_s, left)
-        except MeshLost:
-            if not left():
-                raise
-
-    def _try_to_report(self, error: FmuMeshError) -> None:
-        try:
-            self._report(error)
+            self._membership.report(report, self._plan.timeouts.stop, lambda: self._membership.given_up)
         except FmuMeshError as unreachable:
-            log.info("failure_not_reported", extra={"error": str(unreachable)})
-
-
-class _Ended(FmuMeshError):
-    """The run ended before its last point; the written rows are kept."""
-
-    def __init__(self, cause: FmuMeshError) -> None:
-        super().__init__(cause.message)
+            log.info("end_not_reported", extra={"error": str(unreachable)})
 
 
 class _Source:
@@ -339,31 +283,23 @@ class _Source:
 
     Args:
         link: what is recorded of it.
-        rows: where its rows are.
-        receiver: takes its frames; None if nothing comes in frames.
-
-    Attributes:
-        ended: whether no more rows will come.
+        last_point: of the run.
+        rows: its ring, if the recorder can read it; then the mirror for what comes in frames, if something does.
+        receiver: fills the mirror.
     """
 
-    def __init__(self, link: Link, rows: list[SourceRows], receiver: FrameReceiver | None) -> None:
+    def __init__(self, link: Link, last_point: int, rows: Sequence[SourceRows], receiver: FrameReceiver | None) -> None:
         self.link = link
-        self.name = link.source
         self.receiver = receiver
-        self.ended = False
-        self._rows = rows
         self.counters = [own.counter for own in rows]
+        self._rings = [own.ring for own in rows]
+        self._last_point = last_point
 
-    def end(self) -> None:
-        """Note that no more rows will come."""
-        self.ended = True
-
-    def covered(self, last_point: int) -> int:
+    @property
+    def covered(self) -> int:
         """The last point for which the value is known; it holds until the next own point."""
-        received, points = min(counter.value for counter in self.counters), self.link.step_points
-        if received * points > last_point:
-            return last_point
-        return received * points - 1
+        received = min(counter.value for counter in self.counters) * self.link.step_points
+        return self._last_point if received > self._last_point else received - 1
 
     def check(self, first: int, end: int) -> None:
         """The rows for the points first to end - 1 are complete.
@@ -373,29 +309,23 @@ class _Source:
         """
         low, high = first // self.link.step_points, (end - 1) // self.link.step_points + 1
         wanted = np.arange(low + 1, high + 1)
-        for ring, _, _ in self._rows:
-            wrong = ring.stamps[(wanted - 1) & ring.mask] != wanted
+        for ring in self._rings:
+            mask = ring.mask
+            slots = slice(low & mask, (high - 1 & mask) + 1) if self.link.step_points == 1 else (wanted - 1) & mask
+            wrong = ring.stamps[slots] != wanted
             if wrong.any():
                 raise ProtocolBroken(
-                    f"a row of '{self.name}' for the recorder is not the one that was written",
-                    instance=self.name,
+                    f"a row of '{self.link.source}' for the recorder is not the one that was written",
+                    instance=self.link.source,
                     point=(low + int(wrong.argmax())) * self.link.step_points,
                     hint="Does another process write to the memory of this run?",
                 )
 
     def column(self, variable: str) -> Callable[[int, int], NDArray[Any]]:
         """A function that returns the values of a variable at the points first to end - 1, without wrap-around."""
-        has_text = is_text(self.link.layout.column(variable).type)
-        ring, step_points = next(own.ring for own in self._rows if own.text in (None, has_text)), self.link.step_points
-        place = ring.layout.place(variable)
-        values, mask = ring.parts[place.part][:, place.first], ring.mask
-
-        def each(first: int, end: int) -> NDArray[Any]:
-            start = first & mask
-            return values[start : start + end - first]
-
-        def held(first: int, end: int) -> NDArray[Any]:
-            column: NDArray[Any] = values[(np.arange(first, end) // step_points) & mask]
-            return column
-
-        return each if step_points == 1 else held
+        ring = self._rings[-1 if is_text(self.link.layout.column(variable).type) else 0]
+        step_points, place, mask = self.link.step_points, ring.layout.place(variable), ring.mask
+        values = ring.parts[place.part][:, place.first]
+        if step_points == 1:
+            return lambda first, end: values[first & mask :][: end - first]
+        return lambda first, end: values[(np.arange(first, end) // step_points) & mask]

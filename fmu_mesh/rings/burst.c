@@ -39,7 +39,8 @@
 typedef struct {
   _Atomic int64_t value;   /* rows of a ring, points that are known of a node, or points that are granted */
   _Atomic int64_t wake_at; /* the lowest need of a sleeper */
-  int64_t unused[6];
+  _Atomic int64_t claimed; /* of a node: it may step below this point without another look at the grant */
+  int64_t unused[5];
   _Atomic int64_t needs[]; /* one for each process: the value that it sleeps for; 0: it does not sleep */
 } Counter;
 
@@ -167,6 +168,8 @@ typedef struct {
   int64_t wait_ns;   /* how long to sleep where nothing can step */
   int64_t eager;     /* whether to leave, not to sleep, after a step: its rows have to be sent */
   int64_t spins;     /* whether it spins before it sleeps */
+  int64_t batch;     /* how many points it may sleep for; 1 if others may wait for its next row */
+  int64_t first;     /* tick of its first unit at the start of the call */
   int64_t allowed;
   int64_t patience;
   int64_t waited_ns;
@@ -248,11 +251,20 @@ PUBLIC void counter_raise(const Place *place, Counter *counter, int64_t value) {
   wake_if_needed(place, counter);
 }
 
-PUBLIC int64_t counter_value(const Counter *counter) { return value_of(counter); }
-
-PUBLIC void counters_values(Counter *const *counters, int64_t n, int64_t *values) {
-  for (int64_t i = 0; i < n; i++) values[i] = value_of(counters[i]);
+/* Take the grant back, and return a point that no node passes without a new one: the master grants it at once, so all
+ * pause there. A node claims, has a fence, and reads the grant; this is the other side. */
+PUBLIC int64_t grant_withdraw(Counter *grant, Counter *const *nodes, int64_t n) {
+  int64_t most = 0;
+  atomic_store(&grant->value, 0);
+  atomic_thread_fence(memory_order_seq_cst);
+  for (int64_t i = 0; i < n; i++) {
+    int64_t claimed = atomic_load(&nodes[i]->claimed);
+    if (claimed > most) most = claimed;
+  }
+  return most;
 }
+
+PUBLIC int64_t counter_value(const Counter *counter) { return value_of(counter); }
 
 /* One value that somebody waits for. */
 typedef struct {
@@ -531,11 +543,23 @@ static void wake_all(Node *node) {
       wake_if_needed(&node->place, node->units[i].members[j].counter);
 }
 
+/* Claim the points of about one burst: the master may take the grant back, but not what is claimed. */
+static inline int64_t claim(Node *node, int64_t point, const Unit *unit) {
+  int64_t claimed = atomic_load_explicit(&node->progress->claimed, memory_order_relaxed);
+  if (claimed <= point) {
+    claimed = point + unit->burst * unit->tick_points;
+    atomic_store_explicit(&node->progress->claimed, claimed, memory_order_relaxed);
+    atomic_thread_fence(memory_order_seq_cst);
+  }
+  return claimed < node->last_point ? claimed : node->last_point;
+}
+
 /* The point up to which the master and the windows allow steps; whom to wait for if it is not above `point`. */
 static int64_t allow(Node *node, int64_t point, Unit *unit) {
+  const int64_t claimed = claim(node, point, unit);
   int64_t allowed = value_of(node->ceiling);
-  if (allowed > node->last_point) allowed = node->last_point;
-  if (allowed <= point) {
+  if (allowed > claimed) allowed = claimed;
+  if (allowed <= point) { /* by the grant: what is claimed is above it */
     unit->blocked_by = node->ceiling;
     unit->need = point + 1;
     return allowed;
@@ -557,11 +581,11 @@ static int64_t allow(Node *node, int64_t point, Unit *unit) {
 
 /* A sleeper on another core takes up to this time to wake up. Who waits for it for a shorter time falls asleep itself, and
  * both wake each other for ever. */
-enum { SPINS = 60, YIELD_NS = 50000, PATIENCE = 3, REST = 30 };
+enum { SPINS = 60, YIELD_NS = 50000, PATIENCE = 3, REST = 30, MANY = 64 };
 
 /* For a node with one unit: look a little longer before it sleeps, unless that was in vain the last times. */
 static int soon(Node *node, Counter *counter, int64_t need) {
-  if (!node->spins || node->n_units != 1) return 0;
+  if (!node->spins || node->n_units != 1 || counter == node->ceiling) return 0;
   wake_all(node);
   if (node->patience < 0) {
     node->patience++;
@@ -588,10 +612,15 @@ static int soon(Node *node, Counter *counter, int64_t need) {
   return 0;
 }
 
-static inline int blocked(Node *node, Unit *unit, Counter *counter, int64_t need) {
-  if (soon(node, counter, need)) return 0;
+/* Whether to sleep for a value; `points` is what one more of it stands for. Who has just taken many then sleeps until as
+ * many are there again: others have the processor meanwhile, and the counter does not move from core to core for each. */
+static inline int blocked(Node *node, Unit *unit, Counter *counter, int64_t need, int64_t points) {
+  const int64_t taken = (unit->tick - node->first) * unit->tick_points;
+  const int64_t most = (taken < node->batch ? taken : node->batch) / points, last = node->last_point / points + 1;
+  const int is_many = most >= MANY && node->n_units == 1 && counter != node->ceiling;
+  if (is_many ? value_of(counter) >= need : soon(node, counter, need)) return 0;
   unit->blocked_by = counter;
-  unit->need = need;
+  unit->need = is_many && need < last ? (need + most < last ? need + most : last) : need;
   return 1;
 }
 
@@ -606,7 +635,7 @@ static inline int open_gates(Node *node, Unit *unit, Member *member) {
     if (gate->points != 1) row /= gate->points;
     while (gate->known <= row) {
       if ((gate->known = value_of(gate->counter)) > row) break;
-      if (blocked(node, unit, gate->counter, row + 1)) return NOT_READY;
+      if (blocked(node, unit, gate->counter, row + 1, gate->points)) return NOT_READY;
     }
     member->bases[FIRST_GATE + i] = (char *)(uintptr_t)gate->rows + (row & gate->mask) * gate->stride;
     if (atomic_load_explicit((_Atomic int64_t *)(void *)member->bases[FIRST_GATE + i], memory_order_acquire) != row + 1)
@@ -644,7 +673,7 @@ static int advance(Node *node, Unit *unit, int64_t *ticks) {
   for (; unit->tick < end; unit->tick++, unit->next = 0) {
     const int64_t point = unit->tick * unit->tick_points;
     while (unit->next == 0 && point >= node->allowed && (node->allowed = allow(node, point, unit)) <= point)
-      if (blocked(node, unit, unit->blocked_by, unit->need)) goto out;
+      if (blocked(node, unit, unit->blocked_by, unit->need, 1)) goto out;
     for (; unit->next < unit->n_members; unit->next++) {
       Member *member = &unit->members[unit->next];
       if (member->every != 1 && (unit->tick + 1) % member->every != 0) continue;
@@ -727,6 +756,7 @@ static int64_t await(Node *node, int64_t limit_ns) {
 PUBLIC int64_t node_run(Node *node) {
   int64_t start = now(), begin = start;
   int any = 0;
+  node->first = node->units[0].tick;
   for (;;) {
     int stepped = 0, left = 0;
     for (int64_t i = 0; i < node->n_units; i++) {

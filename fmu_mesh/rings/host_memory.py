@@ -153,6 +153,12 @@ class HostMemory:
         """The ring of an instance; text is beside it, in this process."""
         return Ring(place.layout, place.rows, self._view[place.offset :])
 
+    def withdraw_grant(self) -> int:
+        """Of shared memory: take the grant back, and return a point that no node passes before the next grant."""
+        assert native.library is not None
+        nodes = (ctypes.c_void_p * len(self.progress))(*(counter.address for counter in self.progress.values()))
+        return int(native.library.grant_withdraw(self.grant.address, nodes, len(nodes)))
+
     # --- waiting
 
     def seen(self) -> int:

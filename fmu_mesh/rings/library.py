@@ -16,13 +16,16 @@ from typing import Final
 
 from ..errors import ConfigurationError
 
-__all__ = ["LIBRARY_VARIABLE", "load_library", "why_no_library"]
+__all__ = ["LIBRARY_VARIABLE", "library_missed", "load_library", "why_no_library"]
 
 LIBRARY_VARIABLE: Final = "FMU_MESH_LIBRARY"
 """An environment variable: `none` runs without the library; a path is that of another library."""
 
 TRIED_ON: Final = ("linux-x86_64",)
 """The platforms whose library is used by default: those on which all tests have run."""
+
+_COULD_BE: Final = ("linux-x86_64", "linux-aarch64")
+"""The platforms that it can be built for, with glibc."""
 
 _PACKAGE: Final = Path(__file__).resolve().parents[1]
 
@@ -38,27 +41,45 @@ def load_library() -> str | None:
 
 
 def why_no_library() -> str | None:
-    """A sentence that says why `load_library` gives None; None if there is a library."""
-    return _found()[1]
+    """Why `load_library` gives None, what this costs and what to do, in words; None if there is a library.
+
+    It goes on from "the library of C is".
+    """
+    why = _found()[1]
+    if why is None:
+        return None
+    return (
+        f"not used: {why}. Results are the same, and steps are slower. See 'The library of C' in docs/installation.md."
+    )
+
+
+def library_missed() -> bool:
+    """Whether there is no library, although there could be one here, and nobody has chosen to run without it."""
+    could_be = _here() in _COULD_BE and platform.libc_ver()[0] == "glibc"
+    return could_be and os.environ.get(LIBRARY_VARIABLE) != "none" and load_library() is None
+
+
+def _here() -> str:
+    return f"{sys.platform}-{platform.machine()}"
 
 
 def _found() -> tuple[str | None, str | None]:
     chosen = os.environ.get(LIBRARY_VARIABLE)
     if chosen == "none":
-        return None, f"The environment variable {LIBRARY_VARIABLE} is none."
+        return None, f"the environment variable {LIBRARY_VARIABLE} is none"
     if chosen:
         path = Path(chosen).resolve()
     else:
-        here = f"{sys.platform}-{platform.machine()}"
+        here = _here()
         if here not in TRIED_ON:
-            return None, f"The library is for {', '.join(TRIED_ON)}, and this is {here}."
+            return None, f"it is for {', '.join(TRIED_ON)}, and this is {here}"
         path = Path(__file__).with_name(f"burst-{here}.so")
     try:
         loaded = ctypes.CDLL(str(path))
     except OSError as error:
         if chosen:
             raise ConfigurationError(f"{LIBRARY_VARIABLE} names a library that cannot be loaded: {error}") from error
-        return None, f"The library cannot be loaded: {error}."
+        return None, f"it cannot be loaded: {error}"
     for line in _sources_of(loaded, path).splitlines():
         digest, _, name = line.partition("  ")
         source = _PACKAGE / name

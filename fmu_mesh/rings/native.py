@@ -282,6 +282,8 @@ class NodeTable(Structure):
         ("wait_ns", c_int64),
         ("eager", c_int64),
         ("spins", c_int64),
+        ("batch", c_int64),
+        ("first", c_int64),
         ("allowed", c_int64),
         ("patience", c_int64),
         ("waited_ns", c_int64),
@@ -348,6 +350,7 @@ class _Library:
         self.bell_seen = PYFUNCTYPE(c_uint32, address)(("bell_seen", quick))
         self.counter_raise = PYFUNCTYPE(None, address, address, c_int64)(("counter_raise", quick))
         self.counter_value = PYFUNCTYPE(c_int64, address)(("counter_value", quick))
+        self.grant_withdraw = PYFUNCTYPE(c_int64, address, address, c_int64)(("grant_withdraw", quick))
         sizes = (c_int64 * len(_STRUCTURES))()
         count = PYFUNCTYPE(c_int64, address)(("structure_sizes", quick))(sizes)
         if count != len(_STRUCTURES) or list(sizes) != [ctypes.sizeof(structure) for structure in _STRUCTURES]:

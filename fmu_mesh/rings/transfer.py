@@ -7,20 +7,66 @@ in Python are `step`, which is also the only way for text.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..errors import FmuError, StepFailed
 from ..system.coupling_rule import CouplingRule
 from ..system.plan import Feed
-from ..variables.value_types import is_text
+from ..variables.value_types import INTEGERS, Value, VariableType, is_text
 from .native import NUMBER_TYPES, Move, RowBase
 from .ring import Ring
 
-__all__ = ["Transfer"]
+__all__ = ["Narrowing", "Transfer"]
 
 Index = slice | NDArray[np.intp]
+
+
+class Narrowing(NamedTuple):
+    """The two ends of a connection whose input may be unable to take a number of its output.
+
+    An Enumeration may be connected to an integer that can be each of its items; a model may put out other numbers.
+
+    Attributes:
+        source: the output, as `instance.variable`.
+        target: the instance of the input.
+        variable: the input.
+        input_type: its type.
+    """
+
+    source: str
+    target: str
+    variable: str
+    input_type: VariableType
+
+    @staticmethod
+    def is_between(source: VariableType, target: VariableType) -> bool:
+        """Whether an input of type ``target`` cannot be each number that an output of type ``source`` can be."""
+        if source not in INTEGERS or target not in INTEGERS:
+            return False
+        have, want = INTEGERS[source], INTEGERS[target]
+        return have[0] not in want or have[-1] not in want
+
+    def checked(self, value: Value, kind: type[FmuError] = StepFailed) -> Value:
+        """``value``, which may be an array; an error of ``kind`` if the input cannot be this number.
+
+        Example:
+            >>> Narrowing("engine.gear", "clutch", "gear", "Int8").checked([1, 300])
+            Traceback (most recent call last):
+            fmu_mesh.errors.StepFailed: instance clutch.gear: 'engine.gear' is 300, which is out of the range of Int8...
+        """
+        if isinstance(value, list):
+            return [self.checked(element, kind) for element in value]
+        if self.input_type in INTEGERS and value not in INTEGERS[self.input_type]:
+            raise kind(
+                f"'{self.source}' is {value!r}, which is out of the range of {self.input_type}",
+                instance=self.target,
+                variable=self.variable,
+                hint="Its model declares no such item.",
+            )
+        return value
 
 
 class Transfer:
@@ -30,6 +76,7 @@ class Transfer:
         feed: the source, the delay and the columns.
         source: the ring of the source.
         inputs: the row of inputs of the target.
+        target: the name of the target.
         source_points: base points per step of the source.
         target_points: base points per step of the target.
         text: True takes the columns with text only, False those with numbers; None takes all.
@@ -45,6 +92,7 @@ class Transfer:
         source: Ring,
         inputs: Ring,
         *,
+        target: str,
         source_points: int,
         target_points: int,
         text: bool | None = None,
@@ -57,12 +105,33 @@ class Transfer:
         ]
         self._inputs = inputs
         self._copies = _copies(self.columns, source, inputs)
+        self._narrowings = [
+            (have, Narrowing(f"{feed.source}.{have}", target, want, inputs.layout.column(want).type))
+            for have, want, _, _ in self.columns
+            if Narrowing.is_between(source.layout.column(have).type, inputs.layout.column(want).type)
+        ]
 
     def step(self, step: int) -> None:
-        """Move the values for own step ``step`` of the target."""
+        """Move the values for own step ``step`` of the target.
+
+        Raises:
+            StepFailed: see `check_range`.
+        """
+        if self._narrowings:
+            self.check_range(step)
         slot = self.rule.row_for(step) & self.source.mask
         for copy in self._copies:
             copy.part[0, copy.columns] = copy.convert(self.source.parts[copy.source_part][slot][copy.source_columns])
+
+    def check_range(self, step: int) -> None:
+        """Check the values for own step ``step``: the burst ends where one does not fit, and does not say which one.
+
+        Raises:
+            StepFailed: an input cannot be the number that its output is.
+        """
+        row = self.rule.row_for(step)
+        for source_name, narrowing in self._narrowings:
+            narrowing.checked(self.source.value(row, source_name))
 
     def step_text(self, step: int) -> None:
         """As `step`, for the columns with text."""

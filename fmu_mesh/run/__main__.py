@@ -6,6 +6,7 @@ needs another Python is started by exec. The process ends with the process that 
 
 from __future__ import annotations
 
+import signal
 import sys
 from functools import partial
 from pathlib import Path
@@ -43,8 +44,8 @@ def _run(role: str, *arguments: str) -> int:
     from .fork_server import serve  # noqa: PLC0415 as above
     from .process import die_with_parent  # noqa: PLC0415 as above
 
+    die_with_parent(signal.SIGKILL)  # which also ends a process that is stopped
     setproctitle("fmu-mesh fork server")
-    die_with_parent()
     job = serve(int(arguments[0]), partial(_job, forks=True))
     if job is not None:  # this is a process that the server has forked
         job()

@@ -93,8 +93,10 @@ class ForkServer:
         forked = Forked(os.fdopen(output[0], "rb"), os.fdopen(errors[0], "rb"))
         self._forked.append(forked)
         request = msgspec.msgpack.encode(_Request(len(self._forked) - 1, mesh, arguments))
-        with suppress(OSError):  # the server is gone, which its own end tells
+        try:
             socket.send_fds(self._control, [request], [output[1], errors[1]])
+        except OSError:  # the server is gone, which its own end tells
+            forked.orphaned()
         os.close(output[1])
         os.close(errors[1])
         return forked
@@ -267,6 +269,8 @@ class _Server:
         """Fork a process; returns its job there, and None in the server."""
         from setproctitle import setproctitle  # noqa: PLC0415 the launcher does without it
 
+        from .process import die_with_parent  # noqa: PLC0415 as above
+
         data, descriptors, _, _ = socket.recv_fds(self._control, _REQUEST_BYTES, 2)
         if not data:
             self._accepting = False
@@ -276,6 +280,7 @@ class _Server:
             os.waitpid(self._ended.pop(request.number), 0)
             return None
         setproctitle(f"fmu-mesh fork server {request.mesh}")
+        die_with_parent()  # no longer by SIGKILL: the signal is passed on
         job = self._job(*request.arguments)
         # A signal for the server must not run the handler of the server in the new process.
         signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)
@@ -297,14 +302,14 @@ class _Server:
 
     def _become(self, request: _Request, descriptors: list[int], server: int) -> None:
         """In the new process: keep nothing of the server but its memory and its standard input."""
-        from .process import die_with_parent  # noqa: PLC0415 as above
+        from .process import forked_by  # noqa: PLC0415 as above
 
         os.setsid()
         signal.set_wakeup_fd(-1)
         for number, handler in self._before.items():
             signal.signal(number, handler)
         signal.pthread_sigmask(signal.SIG_UNBLOCK, _SIGNALS)
-        die_with_parent()
+        forked_by(server)
         if os.getppid() != server:  # it has died before
             os._exit(0)
         self._control.close()

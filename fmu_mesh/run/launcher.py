@@ -53,6 +53,7 @@ _SILENCE_S = 10.0
 """The master sends an event ten times per second. After this time without one, it counts as lost."""
 
 _TURN_S = 0.25
+_UNTOLD = "has ended; the fork server, which knows how, does not answer"
 
 
 class Launcher:
@@ -205,7 +206,7 @@ class Launcher:
 
     def _take_exit(self, name: str, code: int) -> None:
         if not self._signalled:  # afterwards the signal is the reason
-            self._how[name] = how_it_ended(code)
+            self._how.setdefault(name, how_it_ended(code))
         if self._ending:
             return
         if self._outcome is None and (code != 0 or name == _MASTER):
@@ -242,6 +243,8 @@ class Launcher:
             return True
         if self._interrupted_at is not None and now - self._interrupted_at > _INTERRUPT_S:
             return True
+        if silent_s > _REPORT_S and not self._processes[_MASTER].running:
+            return True  # a fork server that is stopped does not tell this
         return silent_s > (_SILENCE_S if self._point is not None else self._timeouts.start)
 
     # --- the end
@@ -268,6 +271,9 @@ class Launcher:
         self._wait_for_end(server, grace_s)
         for process in server:
             self._server_killed = process.running
+            if self._server_killed:
+                self._take_all()
+                self._how = dict.fromkeys(self._processes, _UNTOLD) | self._how
             process.signal(signal.SIGKILL)
         self._wait_for_end(server, grace_s)
         self._close_all()
@@ -285,6 +291,9 @@ class Launcher:
             process.close()
         if self._server is not None:
             self._server.close()
+        self._take_all()
+
+    def _take_all(self) -> None:
         while not self._happened.empty():
             self._happened.get()()
 
@@ -322,7 +331,7 @@ class Launcher:
         # A node that ends with this code only says that another process is missing.
         named = [loss for loss in self._lost if loss[0] in (_MASTER, _SERVER) or loss[1] != MeshLost.exit_code]
         if not named:
-            return MeshLost("the master was lost: its process does not answer any more")
+            return MeshLost(f"the master was lost: its process {self._how.get(_MASTER, 'does not answer any more')}")
         name, code, _ = named[0]
         if name in (_MASTER, _GATEWAY, _SERVER):
             hint = "Was it stopped for some seconds? Then the mesh lets go of it." if not code else None

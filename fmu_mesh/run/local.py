@@ -166,7 +166,7 @@ class LocalMesh:
     def _take_hang(self, error: FmuError) -> None:
         """From the watching thread: the main thread is inside an FMU, so nothing of this object changes any more."""
         if self._begun:
-            error.at(self.point, self._plan.grid.time(self.point))
+            error.at(self._system.begun_at, self._plan.grid.time(self._system.begun_at))
         self._save_from_outside()
         self._on_hang(error.with_hint(self._kept()))
 
@@ -174,10 +174,10 @@ class LocalMesh:
         with suppress(FmuMeshError):  # the process ends now for another reason
             self._save()
 
-    def _position(self) -> tuple[str, int]:
-        """Which instance steps at which point; between two points, the answer changes all the time."""
+    def _position(self) -> tuple[str, int, str]:
+        """See `CallWatch.stepping`; between two points, the answer changes all the time."""
         stepping = self._system.stepping
-        return (stepping, self.point) if stepping else ("", time.monotonic_ns())
+        return (stepping, self.point, self._system.doing(stepping)) if stepping else ("", time.monotonic_ns(), "")
 
     def _loop(self, rows: RowBuffer) -> None:
         plan, system, last_point = self._plan, self._system, self._plan.grid.last_point

@@ -14,13 +14,15 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-from ..errors import ConfigurationError, FmuError, TerminationRequested
-from ..instances.call_guard import Guarded, floating_point_changed, restore_floating_point
+from ..errors import ConfigurationError, FmuError, InitializationFailed, TerminationRequested
+from ..instances.call_guard import Guarded, doing, floating_point_changed, restore_floating_point
 from ..instances.contract import LogMessage, Opening, Showing
 from ..rings.array_elements import element_of, scaled
 from ..rings.ring import Ring, Rows
+from ..rings.transfer import Narrowing
 from ..simtime import TimeGrid
 from ..system.algebraic_loop import FixedPoint
+from ..system.connections import Connection
 from ..system.coupling_rule import CouplingRule
 from ..system.initialization_plan import Loop, Tear
 from ..system.layout import Layout
@@ -76,18 +78,36 @@ class LocalSystem:
         """Take all steps that end at the next point, in the order of the plan.
 
         Raises:
-            FmuError: a step failed; it has the point and the time.
+            FmuError: a step failed; it has the point at which this step began, and its time.
             TerminationRequested: an FMU asks to end the simulation. All outputs are still those of `point`.
         """
         point, steps = self.point, self._steps
         try:
             for self.stepping, step_from in steps:
                 step_from(point)
-        except (FmuError, TerminationRequested) as error:
-            error.at(point, self._grid.time(point))
+        except FmuError as error:
+            error.at(self.begun_at, self._grid.time(self.begun_at))
+            raise
+        except TerminationRequested as asked:
+            asked.at(point, self._grid.time(point))
             raise
         self.point = point + 1
         self.stepping = ""
+
+    @property
+    def begun_at(self) -> int:
+        """The point at which the step that is under way, or has failed, began; between two points `point`.
+
+        A step of an instance with a step size of its own begins some points before `point`.
+        """
+        if not self.stepping:
+            return self.point
+        member = self._members[self.stepping]
+        return member.step * member.plan.step_points
+
+    def doing(self, instance: str) -> str:
+        """In words what an instance that steps is doing; from any thread."""
+        return doing(self._members[instance].instance.stage)
 
     def reader(self, instance: str, variable: str) -> tuple[Callable[[int], Value], int]:
         """A function that reads an output of the plan or an element of it, and the points of an own step.
@@ -237,6 +257,7 @@ class _Member:
                 value = assumed[own]
             elif key in known and c.target_name not in self.settled:
                 value = scaled(_at(known[key], c.source_index), c.factor, c.offset)
+                value = _ends_of(c).checked(value, InitializationFailed)
             else:
                 continue
             if not c.target_index:
@@ -261,8 +282,11 @@ class _Member:
         for c in self.connections:
             read, points = members[c.source_instance].reader(c.source_name)
             lead = CouplingRule(c.delay or 0, points, self._points).lead
-            same = (c.factor, c.offset) == (1.0, 0.0)
-            change = None if same else partial(scaled, factor=c.factor, offset=c.offset)
+            change: Callable[[Value], Value] | None = None
+            if (c.factor, c.offset) != (1.0, 0.0):
+                change = partial(scaled, factor=c.factor, offset=c.offset)
+            elif Narrowing.is_between(c.source.type, c.target.type):
+                change = _ends_of(c).checked
             self._feeds.append(_Feed(read, points, lead, change, self._inputs.writer(c.target_name)))
 
     def reader(self, variable: str) -> tuple[Callable[[int], Value], int]:
@@ -364,6 +388,10 @@ def opening_of(
 
 def _instance_plan(plan: Plan, name: str) -> InstancePlan:
     return plan.nodes[plan.node_of(name)].instance(name)
+
+
+def _ends_of(c: Connection) -> Narrowing:
+    return Narrowing(f"{c.source_instance}.{c.source_name}", c.target_instance, c.target_name, c.target.type)
 
 
 def _at(value: Value, index: tuple[int, ...]) -> Value:

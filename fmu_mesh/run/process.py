@@ -13,7 +13,7 @@ import socket
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from types import FrameType, TracebackType
 from typing import Self
 
@@ -27,13 +27,16 @@ from ..wire.runtime import (
 )
 from .run_plan import MANUAL
 
-__all__ = ["GRACE_S", "Interruption", "RunProcess", "die_with_parent", "ended_by_signals"]
+__all__ = ["GRACE_S", "Interruption", "RunProcess", "die_with_parent", "ended_by_signals", "forked_by"]
 
 GRACE_S = 1.0
 """How long the main thread may take to end the process before another thread does."""
 
 _SIGNAL_RECEIVED = " was received"
 _PR_SET_PDEATHSIG = 1
+
+_servers: list[int] = []
+"""The process id of the fork server that has forked this process; empty if it was started by exec."""
 
 
 class Interruption:
@@ -174,6 +177,7 @@ def ended_by_signals(
         while os.read(0, 4096):
             pass
         if not left.is_set():
+            _wake_server()
             end("the process that started this one is gone")
 
     # The C handler writes the number at once, whichever thread gets the signal and whatever that thread is doing.
@@ -195,6 +199,13 @@ def ended_by_signals(
         os.close(reading)
 
 
+def _wake_server() -> None:
+    """Let a fork server that is stopped take its signal to end."""
+    if (server := os.getppid()) in _servers:
+        with suppress(ProcessLookupError):
+            os.kill(server, signal.SIGCONT)
+
+
 def _exit(reason: str, *, reported: bool) -> None:
     """End the process although its main thread does not return; say why, unless the launcher does."""
     if not reported:
@@ -202,10 +213,16 @@ def _exit(reason: str, *, reported: bool) -> None:
     os._exit(130)
 
 
-def die_with_parent() -> None:
-    """Ask the kernel to terminate this process when its parent dies; standard input tells if it died before."""
+def die_with_parent(number: signal.Signals = signal.SIGTERM) -> None:
+    """Ask the kernel for this signal when the parent dies; standard input tells if it died before."""
     if sys.platform.startswith("linux"):
-        ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+        ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, number)
+
+
+def forked_by(server: int) -> None:
+    """Note that the parent is a fork server with this process id, and die with it."""
+    _servers[:] = [server]
+    die_with_parent()
 
 
 def _ignore(_number: int, _frame: FrameType | None) -> None:

@@ -2,8 +2,8 @@
 
 Knows no format: `fmu_mesh.system.recording` finds the format by the name of the file.
 
-A run in processes keeps a note in its folder: how many rows the operating system has. The note is made before the first
-row is written. So without a note, the result file is not that of this run.
+A run in processes keeps a note in its folder: how many rows the operating system has. The note is written before the
+first row. So while it is empty, the result file is not that of this run.
 """
 
 from __future__ import annotations
@@ -112,9 +112,8 @@ class _NotedFile:
 
     def __init__(self, file: ResultFile, folder: Path) -> None:
         self._file = file
-        self._note = folder / _NAME
-        self._descriptor: int | None = None
-        self._noted = Kept()
+        self._descriptor = os.open(folder / _NAME, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o600)  # slow, so not later
+        self._noted: Kept | None = None
 
     @property
     def path(self) -> Path:
@@ -129,9 +128,8 @@ class _NotedFile:
         return self._file.kept
 
     def write(self, times: NDArray[np.float64], columns: Sequence[NDArray[Any]]) -> None:
-        if self._descriptor is None:
-            self._descriptor = os.open(self._note, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o600)
-            os.pwrite(self._descriptor, _NOTE.pack(*self._noted), 0)
+        if self._noted is None:
+            self._note(Kept())
         self._file.write(times, columns)
         self._note_kept()
 
@@ -144,11 +142,12 @@ class _NotedFile:
             self._file.close()
         finally:
             self._note_kept()
-            if self._descriptor is not None:
-                os.close(self._descriptor)
-                self._descriptor = None
+            os.close(self._descriptor)
 
     def _note_kept(self) -> None:
-        if self._descriptor is not None and (kept := self._file.kept) != self._noted:
-            self._noted = kept
-            os.pwrite(self._descriptor, _NOTE.pack(*kept), 0)
+        if self._noted is not None and (kept := self._file.kept) != self._noted:
+            self._note(kept)
+
+    def _note(self, kept: Kept) -> None:
+        self._noted = kept
+        os.pwrite(self._descriptor, _NOTE.pack(*kept), 0)

@@ -24,7 +24,7 @@ from .layout import Layout, row_bytes, rows_for
 from .linear_inputs import LinearInput, linear_inputs
 from .memory_map import MASTER, RECORDER, MemoryMap, RingPlace, map_memory
 from .system import Connection, ResolvedSystem, SystemInstance
-from .window import recorder_window, window_of
+from .window import batch_of, recorder_window, window_of
 
 __all__ = ["MASTER", "RECORDER", "Feed", "InstancePlan", "Link", "NodePlan", "Plan", "make_plan"]
 
@@ -96,6 +96,7 @@ class NodePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         progress_stride: number of points between two progress messages to the master: a quarter of the window, or 1 if
             a single step is that long.
         windows: number of points that each node, and last the recorder, may be behind the others, by name.
+        batch: number of points that it may sleep for at once; 1 if others may wait for its own next row.
         memory: where everything lies in the memory that processes of one host share.
         rings: the output rings of its instances, and of all instances that it has values from.
         loops: the algebraic loops at the start that have instances of this node.
@@ -114,6 +115,7 @@ class NodePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     window: int
     progress_stride: int
     windows: tuple[tuple[str, int], ...]
+    batch: int
     memory: MemoryMap
     rings: tuple[RingPlace, ...]
     timeouts: TimeoutsConfig
@@ -301,6 +303,7 @@ def _nodes(plan: Plan) -> dict[str, NodePlan]:
             window=windows[node],
             progress_stride=windows[node] // 4 if windows[node] >= 4 * longest_step else 1,
             windows=tuple(windows.items()),
+            batch=batch_of(plan.window) if not _in_cycle(plan, members, within) else 1,
             memory=memory,
             rings=tuple(
                 places[name]
@@ -332,6 +335,11 @@ def _units(plan: Plan, node: str, members: list[str]) -> dict[str, tuple[str, ..
             unit = tuple(name for name in plan.order if name in cycle)
             units.update(dict.fromkeys(unit, unit))
     return units
+
+
+def _in_cycle(plan: Plan, members: list[str], units: dict[str, tuple[str, ...]]) -> bool:
+    """Whether a member of a node belongs to a cycle over several nodes."""
+    return any(name in cycle and len(units[name]) < len(cycle) for name in members for cycle in plan.cycles)
 
 
 def _output_layout(plan: Plan, name: str) -> Layout:

@@ -10,6 +10,7 @@ from .system import ResolvedSystem
 __all__ = [
     "AUTO_WINDOW_POINTS",
     "STEADY_POINTS",
+    "batch_of",
     "recorder_window",
     "window_of",
 ]
@@ -18,6 +19,7 @@ RECORDER_WINDOW = 32768
 """Largest number of points that the recorder may be behind. It sleeps while rows accumulate."""
 
 _LEAST_RECORDER_WINDOW = 64
+_BATCH = 1024
 _RECORDER_BYTES = 16 * 2**20
 
 AUTO_WINDOW_POINTS = 16384
@@ -38,6 +40,11 @@ def recorder_window(window: int, row_sizes: Sequence[int]) -> int:
     """
     most = min(RECORDER_WINDOW, _RECORDER_BYTES // max(sum(row_sizes), 1))
     return max(window, _LEAST_RECORDER_WINDOW, most)
+
+
+def batch_of(window: int) -> int:
+    """Number of points that a node may sleep for if no other waits for its next one; ``window``: of the mesh."""
+    return min(_BATCH, max(1, window // 4))
 
 
 def window_of(system: ResolvedSystem) -> int:

@@ -42,6 +42,32 @@ def test_a_run_is_set_paused_stepped_resumed_and_stopped() -> None:
     assert result.outcome.rows == len(result.times)
 
 
+def test_pauses_at_any_moment_hold_all_instances_at_one_point_and_change_no_float() -> None:
+    mesh = built(stop_time=None)
+    with mesh.start(record=None) as run:
+        for _ in range(20):
+            paused = run.pause()
+            assert {*run.status.progress.values()} == {paused.point}
+            assert run.step(3).point == paused.point + 3
+            run.resume()
+        paused = run.pause()
+        samples = {sample.name: sample.value for sample in run.samples("pendulum.a", "delay.y")}
+        run.resume()
+        run.stop()
+    with mesh.open() as system:
+        system.step(paused.point)
+        assert {name: system.get(name) for name in samples} == samples
+
+
+def test_a_pause_takes_effect_after_the_steps_under_way_however_large_the_window_is(tmp_path: Path) -> None:
+    mesh = fmu_mesh.Mesh("slow", step_size=0.1, stop_time=1000.0)
+    mesh.add("slow", fmu=find_fmu("Faulty", tmp_path), start_values={"slow": 0.02})
+    with mesh.start(record=None) as run:
+        run.wait_for("running")
+        assert run.pause().point < 200
+        run.stop()
+
+
 def test_a_run_that_is_left_is_stopped() -> None:
     with steered(stop_time=None).start(record="memory") as run:
         assert run.status.state in ("starting", "initializing", "running")

@@ -62,3 +62,12 @@ def test_a_master_by_hand_asks_nodes_by_hand_for_their_profile(place: Place) -> 
 
     assert [master.wait(), *(node.wait() for node in nodes)] == [0, 0, 0], master.errors
     assert master.output.startswith("Profile\n  node      instance  steps")
+
+
+def test_a_profile_of_a_run_by_the_wall_clock_names_the_wall_clock(place: Place) -> None:
+    config = write_config(place.folder, stop_time=0.5, simulation={"real_time_factor": 1})
+
+    run = place.run("launch", config, "--profile")
+
+    assert run.wait() == 0, run.errors
+    assert " for the grant, which the wall clock holds back" in run.output

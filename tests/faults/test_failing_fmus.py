@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from fmu_mesh.instances.fmi.co_simulation.discarded_steps import RETRY
+from fmu_mesh.rings.library import LIBRARY_VARIABLE
 from tests.fmus.helpers import find_fmu
 from tests.helpers import Place, row_count, rows_of, wait_until, write_config
 
@@ -233,4 +234,80 @@ def test_an_fmu_that_asks_to_end_the_simulation_is_named_and_nothing_has_failed(
     assert "instance stairs, point 39, t = 0.039 s: the FMU asked to end the simulation" in launched.errors
     rows = rows_of(config.with_suffix(".csv"))
     assert [row[0] for row in rows] == [point * 0.001 for point in range(40)]
+    place.assert_nothing_left()
+
+
+@pytest.mark.parametrize("options", [(), ("--local",)], ids=["distributed", "local"])
+def test_a_failed_step_of_several_points_is_told_with_the_point_at_which_it_began(
+    place: Place, faulty: Path, options: tuple[str, ...]
+) -> None:
+    slow = {"fmu": str(faulty), "start_values": {"fail_at": 0.022}, "step_size": 0.01}
+    config = write_config(
+        place.folder, instances={"slow": slow, "gain": {"fmu": "Gain"}}, connections=["slow.y -> gain.u"]
+    )
+
+    launched = place.run("launch", config, *options)
+
+    assert launched.wait() == 3
+    assert launched.message.startswith("fmu-mesh: instance slow, point 20, t = 0.02 s: fmi2DoStep returned error; ")
+
+
+GEARS = """
+import fmu_mesh
+
+class Gears(fmu_mesh.Component):
+    gear = fmu_mesh.Output(type="Enumeration", items={"low": 1, "many": 300})
+    first = fmu_mesh.Parameter(1)
+
+    def initialize(self):
+        self.gear = self.first
+
+    def step(self, time, step_size):
+        self.gear = 1 if time < 0.0025 else 300
+
+class Clutch(fmu_mesh.Component):
+    int8_in = fmu_mesh.Input(type="Int8")
+    int8_out = fmu_mesh.Output(type="Int8")
+
+    def step(self, time, step_size):
+        self.int8_out = self.int8_in
+"""
+
+
+@pytest.mark.parametrize("clutch", ["FMU", "component"])
+@pytest.mark.parametrize("first", [1, 300], ids=["at a point", "at the start"])
+@pytest.mark.parametrize("way", ["in C", "in Python", "local"])
+def test_a_number_beyond_the_type_of_its_input_ends_the_run_with_both_ends(
+    place: Place, tmp_path: Path, clutch: str, first: int, way: str
+) -> None:
+    """A model puts out an Enumeration that is none of its items, and an Int8 can be each of these."""
+    (place.folder / "gears.py").write_text(GEARS)
+    config = write_config(
+        place.folder,
+        instances={
+            "gears": {"fmu": "", "python": "gears.py:Gears", "start_values": {"first": first}},
+            "through": {"fmu": str(find_fmu("AllTypes", tmp_path))},
+            "clutch": {"fmu": str(find_fmu("AllTypes3", tmp_path))},
+        },
+        connections=["gears.gear -> through.enumeration_in", "through.enumeration_out -> clutch.int8_in"],
+        stop_time=0.01,
+        record={"file": "pair.csv", "variables": ["clutch.int8_out"]},
+    )
+    text = config.read_text().replace("    fmu: ''\n", "")
+    if clutch == "component":
+        text = text.replace(f"fmu: {find_fmu('AllTypes3', tmp_path)}", "python: gears.py:Clutch")
+    config.write_text(text)
+    if way == "in Python":
+        place.environment[LIBRARY_VARIABLE] = "none"
+
+    launched = place.run("launch", config, *(["--local"] if way == "local" else []))
+
+    assert launched.wait() == 3
+    where = "instance clutch.int8_in" + (", point 3, t = 0.003 s" if first == 1 else "")
+    assert launched.message.startswith(
+        f"fmu-mesh: {where}: 'through.enumeration_out' is 300, which is out of the range of Int8. "
+        "Its model declares no such item."
+    )
+    if first == 1:
+        assert len(rows_of(config.with_suffix(".csv"))) == 4
     place.assert_nothing_left()

@@ -78,6 +78,7 @@ def test_a_fork_server_that_is_killed_before_it_has_forked_is_named(place: Place
     launched.child("fork").kill()
 
     assert launched.wait() == 4
+    assert launched.ended_after_s < on_a_busy_machine(5.0)
     assert "the fork server was lost: its process was ended by SIGKILL" in launched.message
     place.assert_nothing_left()
 
@@ -120,6 +121,23 @@ def test_a_run_whose_fork_server_is_stopped_meanwhile_ends_as_any_other(place: P
     place.assert_nothing_left()
 
 
+@pytest.mark.parametrize(
+    ("victim", "lost"), [("pendulum", "node 'pendulum' was lost"), ("master", "the master was lost")]
+)
+def test_the_end_of_a_process_is_noticed_although_the_fork_server_is_stopped(
+    place: Place, victim: str, lost: str
+) -> None:
+    launched, _ = running(place)
+    launched.child("fork").suspend()
+
+    launched.child(victim).kill()
+
+    assert launched.wait() == 4
+    assert launched.ended_after_s < on_a_busy_machine(6.0)
+    assert f"{lost}: its process has ended; the fork server, which knows how, does not answer. " in launched.message
+    place.assert_nothing_left()
+
+
 @pytest.mark.parametrize("together", [("fork",), ("fork", "master"), ROLES])
 def test_whoever_is_killed_together_with_the_launcher_nothing_is_left(place: Place, together: tuple[str, ...]) -> None:
     launched, _ = running(place)
@@ -133,6 +151,24 @@ def test_whoever_is_killed_together_with_the_launcher_nothing_is_left(place: Pla
     # If all were killed at once, the next run removes their files.
     assert place.run("launch", write_config(place.folder, name="next", stop_time=0.01)).wait() == 0
     place.assert_nothing_left()
+
+
+def test_a_fork_server_that_is_stopped_does_not_outlive_a_launcher_that_is_killed(place: Place) -> None:
+    launched, _ = running(place)
+    launched.child("fork").suspend()
+
+    psutil.Process(launched.pid).kill()
+
+    wait_until(lambda: not place.processes(), "the end of all processes", 15.0)
+
+
+def test_a_fork_server_that_is_stopped_before_it_forks_does_not_outlive_a_launcher_that_is_killed(place: Place) -> None:
+    launched = place.start("launch", write_config(place.folder, stop_time=FAR_S))
+    launched.child("fork").suspend()
+
+    psutil.Process(launched.pid).kill()
+
+    wait_until(lambda: not place.processes(), "the end of all processes", 15.0)
 
 
 def test_a_refused_configuration_leaves_no_fork_server(place: Place) -> None:

@@ -59,13 +59,15 @@ HANGS = [
     ("fmi2Terminate", "fmi2Terminate", "terminate", ", point 10, t = 0.01 s"),
     ("fmi2FreeInstance", "fmi2FreeInstance", "terminate", ", point 10, t = 0.01 s"),
     ("fmi2DoStep", "doStep", "step", ", point 4, t = 0.004 s"),
+    ("fmi2GetReal", "reading the outputs", "step", ", point 4, t = 0.004 s"),
+    ("fmi2SetReal", "setting the inputs", "step", ", point 5, t = 0.005 s"),
 ]
 
 
 # A step that hangs in a node is in `test_failing_fmus`; freeing is guarded as terminating is.
 @pytest.mark.parametrize(
     ("options", "hang"),
-    [*(((), hang) for hang in HANGS[:3]), *((("--local",), hang) for hang in HANGS)],
+    [*(((), hang) for hang in (*HANGS[:3], *HANGS[5:])), *((("--local",), hang) for hang in HANGS)],
     ids=lambda value: value[0] if value else "distributed",
 )
 def test_an_fmu_that_hangs_in_a_call_is_ended_with_its_name_the_call_and_the_point(
@@ -73,7 +75,7 @@ def test_an_fmu_that_hangs_in_a_call_is_ended_with_its_name_the_call_and_the_poi
 ) -> None:
     function, said, setting, point = hang
     name = f"hang_{function}"
-    config = mesh_of(place, hostile, [name], timeouts=SHORT)
+    config = mesh_of(place, hostile, ["first", name], timeouts=SHORT)
 
     launched = place.run("launch", config, *options)
 

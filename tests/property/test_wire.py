@@ -6,6 +6,7 @@ import math
 import struct
 import tempfile
 import tracemalloc
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -426,7 +427,7 @@ recorded_rows = st.tuples(any_float, any_float, st.integers(-(2**31), 2**31 - 1)
 def test_floats_of_a_result_file_read_back_to_the_same_bits(rows: list[tuple[float, float, int, bool]]) -> None:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "result.csv"
-        with CsvFile(path, [("a", "Float64"), ("n", "Int32"), ("b", "Boolean")]) as file:
+        with closing(CsvFile(path, [("a", "Float64"), ("n", "Int32"), ("b", "Boolean")])) as file:
             times, reals = (np.array([row[place] for row in rows], dtype=np.float64) for place in (0, 1))
             integers = np.array([row[2] for row in rows], dtype=np.int32)
             booleans = np.array([row[3] for row in rows], dtype=np.bool_)

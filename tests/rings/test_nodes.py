@@ -22,6 +22,7 @@ Job = tuple[str, int, int]
 """Shape, number of nodes, and window."""
 JOBS: list[Job] = [
     ("chain", 2, 1),
+    ("chain", 3, 512),
     ("chain", 8, 64),
     ("cycle", 2, 64),
     ("jacobi", 4, 3),
@@ -69,6 +70,7 @@ def test_every_float_is_that_of_a_plain_loop_and_no_wake_up_is_lost(build: Build
 
     assert done.returncode == 0, done.stdout + done.stderr
     assert " late 0 wrong 0 " in done.stdout
+    assert mode == "quiet" or int(done.stdout.split()[-1]) > 0  # pauses, and nobody was beyond one
 
 
 @pytest.mark.parametrize("sanitizer", ["thread", "address,undefined"])
@@ -108,6 +110,16 @@ def changed(folder: Path, *lines: tuple[str, str]) -> Path:
     copy = folder / "burst.c"
     copy.write_text(text)
     return copy
+
+
+def test_a_node_that_claims_nothing_would_be_found_beyond_a_pause(build: Build, tmp_path: Path) -> None:
+    line = "atomic_store_explicit(&node->progress->claimed, claimed, memory_order_relaxed);"
+    burst = changed(tmp_path, (line, ""))
+
+    done = run(build("", burst), ("chain", 2, 1), 500, "disturbed")
+
+    assert done.returncode == 1
+    assert " overrun 0 " not in done.stdout
 
 
 def test_a_lost_wake_up_would_be_found(build: Build, tmp_path: Path) -> None:

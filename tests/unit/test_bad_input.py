@@ -7,6 +7,7 @@ import subprocess
 import sys
 import zipfile
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -351,7 +352,7 @@ def test_a_port_in_use_is_told_and_is_no_loss_of_the_master(
 def test_two_runs_do_not_write_into_one_result_file(tmp_path: Path) -> None:
     kept = b"time,gain.y\n0.0,1.0\n"
     file = tmp_path / "result.csv"
-    with CsvFile(file, [("gain.y", "Float64")]) as first:
+    with closing(CsvFile(file, [("gain.y", "Float64")])) as first:
         first.flush()
 
         with pytest.raises(ConfigurationError, match="another run is writing the result file"):
@@ -359,7 +360,7 @@ def test_two_runs_do_not_write_into_one_result_file(tmp_path: Path) -> None:
 
         first.write(np.array([0.0]), [np.array([1.0])])
     assert file.read_bytes() == kept
-    with CsvFile(file, [("gain.y", "Float64")]) as second:
+    with closing(CsvFile(file, [("gain.y", "Float64")])) as second:
         second.write(np.array([0.5]), [np.array([2.0])])
     assert file.read_bytes() == b"time,gain.y\n0.5,2.0\n"
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
+from contextlib import closing
 from pathlib import Path
 from resource import RLIMIT_FSIZE, getrlimit, setrlimit
 
@@ -26,7 +27,7 @@ COLUMNS: list[tuple[str, VariableType]] = [
 def write(path: Path, times: list[float], reals: list[float]) -> None:
     count = len(times)
     integers = np.arange(count, dtype=np.int32)
-    with CsvFile(path, COLUMNS) as file:
+    with closing(CsvFile(path, COLUMNS)) as file:
         file.write(np.array(times), [np.array(reals), integers, integers % 2 == 1, integers + 10])
         assert file.rows == count
 
@@ -62,7 +63,7 @@ def test_every_float_reads_back_with_the_same_bits_and_is_as_short_as_repr(
     reals = bits.view(np.float64)[:, np.isfinite(bits.view(np.float64)).all(axis=0)]
     times, a, b = np.hstack([reals, [[1e16], [1e22], [-1e-5]]])
 
-    with CsvFile(tmp_path / "a.csv", [("p.a", "Float64"), ("p.b", "Float64"), *others]) as file:
+    with closing(CsvFile(tmp_path / "a.csv", [("p.a", "Float64"), ("p.b", "Float64"), *others])) as file:
         file.write(times, [a, b, *(np.zeros(len(times), np.int32) for _ in others)])
 
     rows = [line.split(",") for line in (tmp_path / "a.csv").read_text().splitlines()[1:]]
@@ -73,7 +74,7 @@ def test_every_float_reads_back_with_the_same_bits_and_is_as_short_as_repr(
 
 
 def test_a_name_with_a_comma_is_quoted(tmp_path: Path) -> None:
-    with CsvFile(tmp_path / "a.csv", [("p.der(a,2)", "Float64"), ('p."x"', "Float64")]) as file:
+    with closing(CsvFile(tmp_path / "a.csv", [("p.der(a,2)", "Float64"), ('p."x"', "Float64")])) as file:
         file.write(np.array([0.0]), [np.array([1.0]), np.array([2.0])])
 
     with (tmp_path / "a.csv").open(newline="") as written:
@@ -90,7 +91,7 @@ def test_many_rows_at_once_are_all_written(tmp_path: Path) -> None:
 
 
 def test_a_result_may_hold_the_time_only(tmp_path: Path) -> None:
-    with CsvFile(tmp_path / "a.csv", []) as file:
+    with closing(CsvFile(tmp_path / "a.csv", [])) as file:
         file.write(np.array([0.0, 0.5]), [])
 
     assert (tmp_path / "a.csv").read_text() == "time\n0.0\n0.5\n"
@@ -105,10 +106,9 @@ def test_the_folder_is_made_and_an_older_file_is_replaced(tmp_path: Path) -> Non
     assert len(path.read_text().splitlines()) == 2
 
 
-def test_what_was_flushed_survives_the_end_of_the_process(tmp_path: Path) -> None:
-    with CsvFile(tmp_path / "a.csv", []) as file:
+def test_what_was_written_survives_the_end_of_the_process(tmp_path: Path) -> None:
+    with closing(CsvFile(tmp_path / "a.csv", [])) as file:
         file.write(np.array([0.0]), [])
-        file.flush()
         assert (tmp_path / "a.csv").read_text() == "time\n0.0\n"
 
 
@@ -126,7 +126,7 @@ def test_text_is_quoted_and_binary_is_base64(tmp_path: Path) -> None:
     data = np.array([b"", b"\xff\0", b"abc"], dtype=np.object_)
     numbers = np.array([2**64 - 1, 0, 1], dtype=np.uint64)
 
-    with CsvFile(tmp_path / "a.csv", columns) as file:
+    with closing(CsvFile(tmp_path / "a.csv", columns)) as file:
         file.write(np.array([0.0, 0.1, math.inf]), [texts, data, numbers, numbers == 0])
 
     with (tmp_path / "a.csv").open(newline="") as written:
@@ -139,20 +139,20 @@ def test_text_is_quoted_and_binary_is_base64(tmp_path: Path) -> None:
 
 def test_until_the_first_row_nothing_changes(tmp_path: Path) -> None:
     path = tmp_path / "a.csv"
-    with CsvFile(path, []) as file:
+    with closing(CsvFile(path, [])) as file:
         file.flush()
         assert not path.exists()
     assert list(tmp_path.iterdir()) == []
 
     path.write_text("an older result")
-    with CsvFile(path, []) as file:
+    with closing(CsvFile(path, [])) as file:
         file.flush()
     assert path.read_text() == "an older result"
 
 
 def test_every_look_at_the_file_while_it_is_written_shows_whole_rows(tmp_path: Path) -> None:
     path = tmp_path / "a.csv"
-    with CsvFile(path, COLUMNS) as file:
+    with closing(CsvFile(path, COLUMNS)) as file:
         for _ in range(40):
             numbers = np.arange(700, dtype=np.int32)
             file.write(numbers / 3, [numbers / 7, numbers, numbers % 2 == 1, numbers])
@@ -177,9 +177,8 @@ def test_what_a_full_disk_leaves_ends_with_a_whole_row_and_nothing_follows_when_
             file.write(times, [])
     finally:
         setrlimit(RLIMIT_FSIZE, before)
-    file.write(times[:1], [])
     with pytest.raises(OSError, match="too large"):
-        file.flush()
+        file.write(times[:1], [])
     file.close()
 
     lines = path.read_text().splitlines(keepends=True)

@@ -115,7 +115,7 @@ def test_calls_in_time_are_not_told_however_many_they_are(watch: CallWatch, over
 
 
 def test_a_step_that_meets_its_deadline_is_told(watch: CallWatch, overruns: Overruns) -> None:
-    with watch.stepping(lambda: ("plant", 7), 0.05):
+    with watch.stepping(lambda: ("plant", 7, "doStep"), 0.05):
         assert overruns.there.wait(DEADLINE_S)
 
     (error,) = overruns.found

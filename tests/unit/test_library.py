@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ctypes
+import json
+import os
 import re
 import shutil
 import subprocess
@@ -17,10 +19,12 @@ from hatchling.builders.wheel import WheelBuilder
 
 import build_library
 from fmu_mesh.errors import ConfigurationError
-from fmu_mesh.rings.library import LIBRARY_VARIABLE, TRIED_ON, load_library, why_no_library
+from fmu_mesh.rings.library import LIBRARY_VARIABLE, TRIED_ON, library_missed, load_library, why_no_library
+from tests.helpers import write_config
 
 LIBRARY = build_library.library_path("linux-x86_64")
 NAME = "fmu_mesh/rings/burst-linux-x86_64.so"
+COST = "Results are the same, and steps are slower. See 'The library of C' in docs/installation.md."
 ASK = "from fmu_mesh.rings.library import *; print(load_library(), why_no_library(), sep='\\n')"
 
 
@@ -128,7 +132,8 @@ def test_a_variable_of_the_environment_switches_the_library_off(monkeypatch: pyt
     monkeypatch.setenv(LIBRARY_VARIABLE, "none")
 
     assert load_library() is None
-    assert why_no_library() == "The environment variable FMU_MESH_LIBRARY is none."
+    assert why_no_library() == f"not used: the environment variable FMU_MESH_LIBRARY is none. {COST}"
+    assert not library_missed()
 
 
 def test_on_a_platform_that_was_never_tried_a_library_is_used_only_if_it_is_named(
@@ -139,10 +144,24 @@ def test_on_a_platform_that_was_never_tried_a_library_is_used_only_if_it_is_name
     monkeypatch.setattr("platform.machine", lambda: "aarch64")
 
     assert load_library() is None
-    assert why_no_library() == "The library is for linux-x86_64, and this is linux-aarch64."
+    assert why_no_library() == f"not used: it is for linux-x86_64, and this is linux-aarch64. {COST}"
+    assert library_missed()
     monkeypatch.setenv(LIBRARY_VARIABLE, str(named))
     assert load_library() == str(named)
     assert why_no_library() is None
+    assert not library_missed()
+
+
+@pytest.mark.parametrize(("machine", "libc"), [("riscv64", "glibc"), ("x86_64", "")])
+def test_where_nobody_has_the_library_nobody_misses_it(
+    monkeypatch: pytest.MonkeyPatch, machine: str, libc: str
+) -> None:
+    monkeypatch.setattr("platform.machine", lambda: machine)
+    monkeypatch.setattr("platform.libc_ver", lambda: (libc, ""))
+    monkeypatch.setattr("fmu_mesh.rings.library.TRIED_ON", ())
+
+    assert why_no_library() is not None
+    assert not library_missed()
 
 
 def test_a_library_that_is_named_and_cannot_be_loaded_is_an_error(
@@ -189,7 +208,9 @@ def test_where_the_library_cannot_be_loaded_a_sentence_says_why(clone: Path, con
 
     asked = ask_in(clone)
 
-    assert re.fullmatch(rf"None\nThe library cannot be loaded: {clone / NAME}: .+\.\n", asked.stdout), asked
+    assert re.fullmatch(
+        rf"None\nnot used: it cannot be loaded: {clone / NAME}: .+\. {re.escape(COST)}\n", asked.stdout
+    ), asked
 
 
 def test_a_wheel_for_linux_has_the_library_of_the_tree(tmp_path: Path) -> None:
@@ -230,3 +251,24 @@ def test_the_source_distribution_has_the_library_and_what_builds_it(tmp_path: Pa
     with tarfile.open(sdist) as archive:
         names = {name.partition("/")[2] for name in archive.getnames()}
     assert {NAME, "fmu_mesh/rings/burst.c", "build_library.py"} <= names
+
+
+@pytest.mark.parametrize("chosen", [False, True], ids=["missing", "switched off"])
+def test_a_mesh_without_the_library_is_told_so_by_check_and_if_nobody_chose_it_by_launch(
+    clone: Path,
+    chosen: bool,  # noqa: FBT001 a parameter of a test
+) -> None:
+    (clone / NAME).unlink()
+    config = write_config(clone, instances={"gain": {"fmu": "Gain"}}, connections=[], stop_time=0.01)
+    environment = os.environ | ({LIBRARY_VARIABLE: "none"} if chosen else {})
+
+    def run(*arguments: str) -> subprocess.CompletedProcess[str]:
+        command = [sys.executable, "-m", "fmu_mesh", *arguments, str(config)]
+        return subprocess.run(command, cwd=clone, env=environment, capture_output=True, text=True, check=True)
+
+    said = json.loads(run("check", "--json").stdout)["plan"]["library"]
+    assert said.startswith("not used: ")
+    assert said.endswith(COST)
+    assert said in run("check").stdout
+    launched = run("launch", "--local", "--no-progress").stderr
+    assert launched == ("" if chosen else f"fmu-mesh: warning: the library of C is {said}\n")

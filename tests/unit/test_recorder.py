@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import ExitStack, suppress
 from pathlib import Path
@@ -20,7 +21,7 @@ from fmu_mesh.rings.ring import Ring
 from fmu_mesh.system.plan import RECORDER, NodePlan
 from fmu_mesh.wire.keys import Keys, RunKeys
 from fmu_mesh.wire.membership import Admission, Welcome
-from fmu_mesh.wire.messages import FINISH, FRAME, HEADER, encode_abort
+from fmu_mesh.wire.messages import FINISH, FRAME, HEADER, LAST, encode_abort
 from fmu_mesh.wire.rows import encode_rows
 from fmu_mesh.wire.session import Wiring, close_session, open_session
 from tests.helpers import DEADLINE_S, wait_until
@@ -62,12 +63,15 @@ class Mesh:
         """What the master sends."""
         self._put(self._keys.grants([RECORDER])[RECORDER], message)
 
-    def put_rows(self) -> None:
-        """What the node sends, as soon as the recorder is in the mesh."""
+    def put_rows(self, *, last: bool = False) -> None:
+        """What the node sends, as soon as the recorder is in the mesh; ``last``: and that no more rows come."""
         assert self._welcomed.wait(DEADLINE_S)
         for link in self.plan.links_in:
             rows = encode_rows(FRAME, link.index, 0, Ring(link.layout, ROWS).parts)
-            self._put(self._keys.frames(link.source, RECORDER), rows)
+            key = self._keys.frames(link.source, RECORDER)
+            self._put(key, rows)
+            if last:
+                self._put(key, HEADER.pack(LAST, link.index, 0, ROWS))
 
     def _put(self, key: str, message: bytes) -> None:
         self.session.put(key, message, congestion_control=zenoh.CongestionControl.BLOCK)
@@ -131,16 +135,31 @@ def test_a_recorder_that_reports_ends_with_a_master_that_takes_no_reports_any_mo
     assert_has_ended(recorder)
 
 
-def test_a_recorder_hears_why_a_run_ends_although_its_end_is_told_first(mesh: Mesh) -> None:
-    """The master's message comes on a thread of Zenoh; the end of the context does not wait for it."""
-    error = MeshLost("node 'n' was lost", instance="a, b")
-    reason = threading.Timer(0.1, mesh.put, [encode_abort(error.report())])
+@pytest.mark.parametrize(("lost", "sends_last"), [("a, b", False), (None, True)])
+def test_a_recorder_waits_for_no_rows_of_a_node_that_is_lost_or_has_sent_its_last(
+    mesh: Mesh, monkeypatch: pytest.MonkeyPatch, *, lost: str | None, sends_last: bool
+) -> None:
+    monkeypatch.setattr(module, "_LAST_S", DEADLINE_S)
+    started = time.monotonic()
 
     with suppress(MeshLost), Recorder(mesh.plan, mesh.session, mesh.file()) as recorder:
-        mesh.put_rows()
-        reason.start()
-        raise error
+        mesh.put_rows(last=sends_last)
+        wait_until(lambda: recorder.rows == ROWS, "its rows are written")
+        raise MeshLost("node 'n' was lost", instance=lost)
 
-    reason.join(DEADLINE_S)
+    assert time.monotonic() - started < DEADLINE_S
     assert_has_ended(recorder)
     assert not mesh.reported.is_set()
+
+
+def test_a_recorder_takes_rows_that_come_after_the_end_of_the_run(mesh: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "_LAST_S", DEADLINE_S)
+
+    rows = threading.Timer(0.1, mesh.put_rows, kwargs={"last": True})
+    with suppress(MeshLost), Recorder(mesh.plan, mesh.session, mesh.file()) as recorder:
+        wait_until(lambda: recorder._columns, "it is in the mesh")
+        rows.start()
+        raise MeshLost("node 'm' was lost", instance="c")
+
+    rows.join(DEADLINE_S)
+    assert_has_ended(recorder)

@@ -42,7 +42,8 @@ def transfer(
     text: bool | None = None,
 ) -> Transfer:
     feed = Feed("source", delay, columns)
-    return Transfer(feed, source, inputs, source_points=source_points, target_points=target_points, text=text)
+    points = {"source_points": source_points, "target_points": target_points}
+    return Transfer(feed, source, inputs, target="target", **points, text=text)
 
 
 def filled(rows: int) -> Ring:

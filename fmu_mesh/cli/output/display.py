@@ -13,6 +13,7 @@ from typing import Final, Self
 
 from rich.markup import escape
 
+from ...api.plan_page import slower_than_it_could_be
 from ...api.result import summary_of
 from ...errors import ErrorReport, FmuMeshError, from_report
 from ...run.events import Event, Log, OutputLine, Reachable, Restarted, Status
@@ -182,7 +183,9 @@ def teller(*, quiet: bool) -> Callable[[str], None]:
 
 
 def warn(plan: Plan) -> None:
-    """Print the first five warnings about a system on standard error before it runs."""
+    """Print the first five warnings about a system on standard error before it runs, and that it could be faster."""
+    if (slower := slower_than_it_could_be()) is not None:
+        say(f"warning: {slower}")
     for warning in plan.system.warnings[:_WARNINGS]:
         say(f"warning: {warning}")
     if (rest := len(plan.system.warnings) - _WARNINGS) > 0:

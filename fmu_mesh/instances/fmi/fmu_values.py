@@ -14,13 +14,13 @@ from typing import Any, Final, Literal, NamedTuple
 from numpy.typing import NDArray
 
 from ...errors import InitializationFailed, StepFailed
-from ...rings.native import Call, RowBase, Said
+from ...rings.native import Call, RowBase, Said, Stage
 from ...rings.ring import Ring
 from ...simtime import TimeGrid
 from ...system.layout import Part
 from ...variables.model_description import ModelDescription, Variable
 from ...variables.value_types import Value, VariableType, flattened, nested
-from ..call_guard import call_named
+from ..call_guard import call_named, doing
 from .buffers import Buffer
 from .calls import Function, Pointer, RowPointers, address_of, cffi_function, memory
 
@@ -32,7 +32,7 @@ _STATUS_NAMES: Final = ("ok", "warning", "discard", "error", "fatal", "pending")
 
 Verb = Literal["Get", "Set"]
 
-_DOING: Final[dict[Verb, str]] = {"Set": "setting the inputs", "Get": "reading the outputs"}
+_DOING: Final[dict[Verb, str]] = {"Set": doing(Stage.SETTING), "Get": doing(Stage.GETTING)}
 _OWN_ROWS: Final = (RowBase.OUTPUT, RowBase.WATCHED)
 
 
@@ -222,7 +222,8 @@ class FmuValues(ABC):
 
     def _call_part(self, verb: Verb, part: PartCall, slot: int) -> None:
         """Call a function of the FMU on the memory of a ring."""
-        status = self._call_direct(part.function, part.references, len(part.variables), part.rows[slot], part.size)
+        arguments = part.function, part.references, len(part.variables), part.rows[slot], part.size
+        status = call_named(_DOING[verb], self._call_direct, *arguments)
         if status > WARNING:
             raise self._part_failed(verb, part, status)
 

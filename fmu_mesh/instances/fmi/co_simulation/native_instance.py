@@ -36,16 +36,23 @@ class NativeInstance(FmuInstance):
     """The function of the FMU, as cffi calls it."""
 
     _native: NativeStep | None = None
+    _member: MemberTable | None = None
+    """The member that takes the steps of `do_step`."""
 
     @property
     def native(self) -> NativeStep | None:
         """See `StepsNatively`."""
         return self._native
 
+    @property
+    def stage(self) -> int:
+        """See `StepsNatively`."""
+        return int(self._member.stage) if self._member is not None else Stage.IN_PYTHON
+
     def bind(self, inputs: Ring, outputs: Sequence[Ring], grid: TimeGrid, points: int, step: int = 0) -> None:
         """Let `do_step` work on these rings, ``points`` of ``grid`` each; write the current outputs as row ``step``."""
         super().bind(inputs, outputs, grid, points, step)
-        self._native = None
+        self._native = self._member = None
         self._in_step: tuple[Callable[[Pointer, int], int], Pointer] = self._in_python, None
         # A setter of the library has one address to read from; in a ring with more rows, it changes in every step.
         if native.library is None or inputs.rows > 1 or self._needs_python():
@@ -55,8 +62,7 @@ class NativeInstance(FmuInstance):
             return
         self._native = self._tables()
         self._keep += self._native.kept
-        member = self._member(self._native, outputs)
-        self._keep.append(member)
+        self._member = member = self._table(self._native, outputs)
         take = cffi_function(native.library.member_step, _MEMBER_STEP)
         self._in_step = take, pointer(ctypes.addressof(member))
 
@@ -119,7 +125,7 @@ class NativeInstance(FmuInstance):
             kept=(self._said, *self._setters, *self._getters),
         )
 
-    def _member(self, tables: NativeStep, outputs: Sequence[Ring]) -> MemberTable:
+    def _table(self, tables: NativeStep, outputs: Sequence[Ring]) -> MemberTable:
         """The member that takes the steps in this process."""
         own = [OutputTable(ring.address, ring.stride, ring.mask) for ring in outputs]
         return MemberTable(

@@ -2,7 +2,7 @@
  *
  * An FMU that does what its instance name says, in the call that it names: `hang_fmi2Terminate`,
  * `segfault_fmi2DoStep`, `rounding_fmi2Instantiate`, ... With any other name, such as `polite`, it does nothing.
- * What follows an `@` is not looked at. Its outputs tell what the process it runs in looks like, so that a neighbour shows what another instance did.
+ * Steps, setters and getters have the fault only after some steps. What follows an `@` is not looked at. Its outputs tell what the process it runs in looks like, so that a neighbour shows what another instance did.
  *
  * Not on the skeleton: the skeleton owns the life cycle, and this misbehaves in it.
  */
@@ -34,6 +34,7 @@ enum { U, THIRD, SUBNORMAL, PLAIN_LOCALE, FOLDER, COUNT };
 typedef struct {
     char name[64];
     double values[COUNT];
+    int late; /* a step has ended after the time of the fault */
 } Hostile;
 
 static void flood(void)
@@ -202,7 +203,7 @@ fmi2Status fmi2GetReal(fmi2Component c, const fmi2ValueReference vr[], size_t nv
 {
     size_t i;
 
-    CALLED(c);
+    if (((Hostile *)c)->late) CALLED(c);
     for (i = 0; i < nvr; i++) value[i] = ((Hostile *)c)->values[vr[i]];
     return fmi2OK;
 }
@@ -211,7 +212,7 @@ fmi2Status fmi2SetReal(fmi2Component c, const fmi2ValueReference vr[], size_t nv
 {
     size_t i;
 
-    CALLED(c);
+    if (((Hostile *)c)->late) CALLED(c);
     for (i = 0; i < nvr; i++) ((Hostile *)c)->values[vr[i]] = value[i];
     return fmi2OK;
 }
@@ -221,7 +222,8 @@ fmi2Status fmi2DoStep(fmi2Component c, fmi2Real currentCommunicationPoint, fmi2R
 {
     (void)noSetFMUStatePriorToCurrentPoint;
     look_around(c);
-    if (currentCommunicationPoint + communicationStepSize > FAULT_TIME) CALLED(c);
+    ((Hostile *)c)->late = currentCommunicationPoint + communicationStepSize > FAULT_TIME;
+    if (((Hostile *)c)->late) CALLED(c);
     return fmi2OK;
 }
 
