@@ -1,7 +1,7 @@
 """`--profile`: where the time of a run went, as a table and as a trace file for Chrome and Perfetto.
 
 Owns how a `MeshProfile` is shown. A trace file is JSON in the Trace Event Format: one process per node, with
-its bursts of steps, the sending at the end of each, and its waits; the summary is in it as `otherData.fmu_mesh`.
+its bursts of steps and its waits; the summary is in it as `otherData.fmu_mesh`.
 """
 
 from __future__ import annotations
