@@ -62,7 +62,7 @@ _LOOK_S = 0.05
 _TIMEOUT = "Timeout"
 """The reply of Zenoh itself if a queryable did not answer in time."""
 _TOKENS_S = 2.0
-_TOKENS_TRIES = 3
+_TOKENS_TRIES = 10
 _LINK_S = 1.0
 _UNLINK_S = 0.2
 _LINK_LOOK_S = 0.01

@@ -87,7 +87,7 @@ class SimulatedMesh:
             places = {place.instance: place for place in recorder.rings}
             for link in recorder.links_in:
                 place = places[link.source]
-                self._mirrors[link.index] = mirror = memory.ring(place)
+                self._mirrors[link.index] = mirror = Ring(link.layout, place.rows)
                 self._receivers[link.index] = FrameReceiver(link, mirror, memory.counter(place.counter))
                 self.recorded[link.source] = []
 
