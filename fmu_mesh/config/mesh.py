@@ -82,7 +82,7 @@ class SimulationConfig(Base, frozen=True, kw_only=True):
         Literal["auto"] | Annotated[int, Meta(ge=1, le=MAX_WINDOW)],
         Meta(
             description="How many points a node may run ahead of the slowest; 1 is strict lockstep; "
-            "auto: up to 16384 points, fewer for slow instances."
+            "auto: up to 32768 points, fewer for many instances or large rows."
         ),
     ] = "auto"
     real_time_factor: Annotated[

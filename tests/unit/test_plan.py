@@ -110,7 +110,7 @@ def test_rings_hold_what_can_be_under_way(window: int, slowest: int) -> None:
 def test_an_automatic_window_is_large_and_one_that_is_given_counts() -> None:
     system = Scenario(("a -> b",)).plan().system
 
-    assert make_plan(system).window == 16384
+    assert make_plan(system).window == 32768
     assert make_plan(system, window=3).window == 3
 
 
@@ -134,7 +134,7 @@ def test_the_automatic_window_of_many_instances_is_smaller() -> None:
     names = [f"i{number}" for number in range(50)]
     system = Scenario(tuple(f"{a} -> {b}" for a, b in pairwise(names))).plan().system
 
-    assert make_plan(system).window == 65536 // 50
+    assert make_plan(system).window == 262144 // 50
 
 
 @pytest.mark.parametrize("window", [1, 4, 5, 12, 13, 100, 1024])
