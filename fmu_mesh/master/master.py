@@ -233,11 +233,10 @@ class Master:
         self._granting.share(self._members.shared)
 
     def _grant_to_the_end(self) -> None:
-        if self._settings.paused:
-            self._hold = 0
-        else:
-            self._clock.start()
+        self._hold = 0 if self._settings.paused else None
         self._enter("paused" if self._settings.paused else "running")
+        if self._hold is None:
+            self._clock.start()
         self._pacer.start(0)
         self._moved = time.monotonic()
         # Each instance has its own deadline for a step; the instances of a group step one after the other.

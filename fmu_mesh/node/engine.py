@@ -135,6 +135,7 @@ class BurstEngine(Engine):
             slice_ns=int(_SLICE_S * 1e9),
             spins=spins,
             batch=plan.batch,
+            stride=1,
         )
         self._address = ctypes.addressof(self._node)
         for number, unit in enumerate(units):

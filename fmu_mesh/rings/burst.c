@@ -169,7 +169,7 @@ typedef struct {
   int64_t eager;     /* whether to leave, not to sleep, after a step: its rows have to be sent */
   int64_t spins;     /* whether it spins before it sleeps */
   int64_t batch;     /* how many points it may sleep for; 1 if others may wait for its next row */
-  int64_t first;     /* tick of its first unit at the start of the call */
+  int64_t stride;    /* how many it sleeps for now */
   int64_t allowed;
   int64_t patience;
   int64_t waited_ns;
@@ -581,7 +581,7 @@ static int64_t allow(Node *node, int64_t point, Unit *unit) {
 
 /* A sleeper on another core takes up to this time to wake up. Who waits for it for a shorter time falls asleep itself, and
  * both wake each other for ever. */
-enum { SPINS = 60, YIELD_NS = 50000, PATIENCE = 3, REST = 30, MANY = 64 };
+enum { SPINS = 60, YIELD_NS = 50000, PATIENCE = 3, REST = 30, QUICK_NS = 200000 };
 
 /* For a node with one unit: look a little longer before it sleeps, unless that was in vain the last times. */
 static int soon(Node *node, Counter *counter, int64_t need) {
@@ -612,15 +612,24 @@ static int soon(Node *node, Counter *counter, int64_t need) {
   return 0;
 }
 
-/* Whether to sleep for a value; `points` is what one more of it stands for. Who has just taken many then sleeps until as
- * many are there again: others have the processor meanwhile, and the counter does not move from core to core for each. */
+/* After a wait: who gets many rows in a short time sleeps for twice as many the next time. Then others have the processor
+ * meanwhile, and the counter does not move from core to core for each row. */
+static inline void adapt(Node *node, int is_there, int64_t elapsed_ns) {
+  if (!is_there || elapsed_ns > node->slice_ns)
+    node->stride = 1;
+  else if (elapsed_ns < QUICK_NS && node->stride < node->batch && node->n_units == 1)
+    node->stride *= 2;
+}
+
+/* Whether to sleep for a value; `points` is what one more of it stands for. */
 static inline int blocked(Node *node, Unit *unit, Counter *counter, int64_t need, int64_t points) {
-  const int64_t taken = (unit->tick - node->first) * unit->tick_points;
-  const int64_t most = (taken < node->batch ? taken : node->batch) / points, last = node->last_point / points + 1;
-  const int is_many = most >= MANY && node->n_units == 1 && counter != node->ceiling;
-  if (is_many ? value_of(counter) >= need : soon(node, counter, need)) return 0;
+  const int64_t more = counter != node->ceiling ? node->stride / points : 0, last = node->last_point / points + 1;
+  if (more > 1 ? value_of(counter) >= need : soon(node, counter, need)) {
+    if (more == 1) adapt(node, 1, 0);
+    return 0;
+  }
   unit->blocked_by = counter;
-  unit->need = is_many && need < last ? (need + most < last ? need + most : last) : need;
+  unit->need = more > 1 && need < last ? (need + more < last ? need + more : last) : need;
   return 1;
 }
 
@@ -746,9 +755,11 @@ static int64_t await(Node *node, int64_t limit_ns) {
     else if (limit_ns > 1000000)
       limit_ns = 1000000;
   }
+  if (node->stride > 1 && limit_ns > node->slice_ns) limit_ns = node->slice_ns;
   int64_t start = now();
-  int64_t is_granted = sleep_for(&node->place, seen, wishes, n, limit_ns, &node->late);
-  node->waited_ns += now() - start;
+  int64_t is_granted = sleep_for(&node->place, seen, wishes, n, limit_ns, &node->late), elapsed = now() - start;
+  node->waited_ns += elapsed;
+  if (n == 1 && wishes[0].counter != node->ceiling) adapt(node, is_granted != 0, elapsed);
   return is_granted || bell_seen(&node->place) != seen;
 }
 
@@ -756,7 +767,6 @@ static int64_t await(Node *node, int64_t limit_ns) {
 PUBLIC int64_t node_run(Node *node) {
   int64_t start = now(), begin = start;
   int any = 0;
-  node->first = node->units[0].tick;
   for (;;) {
     int stepped = 0, left = 0;
     for (int64_t i = 0; i < node->n_units; i++) {

@@ -283,7 +283,7 @@ class NodeTable(Structure):
         ("eager", c_int64),
         ("spins", c_int64),
         ("batch", c_int64),
-        ("first", c_int64),
+        ("stride", c_int64),
         ("allowed", c_int64),
         ("patience", c_int64),
         ("waited_ns", c_int64),

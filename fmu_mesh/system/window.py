@@ -19,7 +19,6 @@ RECORDER_WINDOW = 32768
 """Largest number of points that the recorder may be behind. It sleeps while rows accumulate."""
 
 _LEAST_RECORDER_WINDOW = 64
-_BATCH = 1024
 _RECORDER_BYTES = 16 * 2**20
 
 AUTO_WINDOW_POINTS = 32768
@@ -44,7 +43,7 @@ def recorder_window(window: int, row_sizes: Sequence[int]) -> int:
 
 def batch_of(window: int) -> int:
     """Number of points that a node may sleep for if no other waits for its next one; ``window``: of the mesh."""
-    return min(_BATCH, max(1, window // 4))
+    return max(1, window // 16)
 
 
 def window_of(system: ResolvedSystem) -> int:

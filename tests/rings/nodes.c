@@ -167,7 +167,7 @@ static void set_up(Participant *p, int64_t own, int64_t wait_ns, int64_t spins) 
   p->peers[0] = (Peer){progress_of((own + 1) % n_nodes), window};
   p->node = (Node){.place = {bells(), n_nodes + 1, own}, .units = &p->unit, .n_units = 1, .peers = p->peers,
                    .n_peers = readers, .ceiling = ceiling(), .progress = progress_of(own), .last_point = points,
-                   .slice_ns = 1000000, .wait_ns = wait_ns, .spins = spins, .batch = is_chain ? window : 1};
+                   .slice_ns = 1000000, .wait_ns = wait_ns, .spins = spins, .batch = is_chain ? window : 1, .stride = 1};
 }
 
 /* What a sleeper leaves that was killed. */
