@@ -110,6 +110,7 @@ class Node:
         self._open_instance = open_instance
         self._make_engine = engine
         self._finished = False
+        self._token_went = False
         self.failure_is_known = False
         self._heard = time.monotonic()
         self._lazy_sent = 0.0
@@ -353,6 +354,7 @@ class Node:
     def _master_token_went(self) -> None:
         """On a thread of Zenoh: the token of the master is gone, or a token with its key from another process."""
         if not self._finished:
+            self._token_went = True
             self._inbox.post(self._end_without_master)
 
     def _end_without_master(self) -> None:
@@ -424,7 +426,10 @@ class Node:
         profile = self._profiler.profile() if self._profiler is not None and error is None else None
         report = NodeReport(self._plan.node, point, error.report() if error is not None else None, profile)
         # After the last samples: the master routes them to clients, and ends when it has all reports.
-        self._membership.report(report, timeout_s, priority=PRIORITY)
+        self._membership.report(report, timeout_s, self._has_no_master, priority=PRIORITY)
+
+    def _has_no_master(self) -> bool:
+        return self._token_went and self._membership.master_is_gone
 
 
 class _Aborted(FmuMeshError):

@@ -158,15 +158,17 @@ def ended_by_signals(
     If the main thread has not left the block `GRACE_S` later, ``clean_up`` is called and the process exits with 130.
     Use it on the main thread.
     """
-    left = threading.Event()
+    left, ending = threading.Event(), threading.Lock()
     reading, writing = os.pipe()
     os.set_blocking(writing, False)
 
     def end(reason: str) -> None:
         interrupt(reason)
         if not left.wait(GRACE_S):
-            clean_up()
-            _exit(reason, reported=watch_stdin)
+            with ending:  # a second thread would end the process while the first one still cleans up
+                if not left.is_set():
+                    clean_up()
+                    _exit(reason, reported=watch_stdin)
 
     def wait_for_signal() -> None:
         number = os.read(reading, 1)
@@ -190,7 +192,8 @@ def ended_by_signals(
     try:
         yield
     finally:
-        left.set()
+        with ending:
+            left.set()
         for number, handler in handlers.items():
             signal.signal(number, handler)
         signal.set_wakeup_fd(wakeup)

@@ -188,11 +188,10 @@ def leave_run_folder(folder: Path) -> None:
     note = _read_note(folder / "mesh.json")
     if note is not None and note.pid == os.getpid():  # the master of processes that were started manually
         (folder / "mesh.json").unlink(missing_ok=True)
-    elif note is not None and not is_alive(note.pid):
-        remove_run_folder(folder)  # the launcher was killed
+    elif (launcher := note.pid if note is not None else _launcher_of(folder)) is not None:
+        if not is_alive(launcher):  # it was killed, and so may be a process that has begun to remove the folder
+            remove_run_folder(folder)
         return
-    elif note is None and (launcher := _launcher_of(folder)) is not None and is_alive(launcher):
-        return  # the run was over before its launcher wrote the note; the launcher removes the folder too
     _remove_if_empty(folder)
 
 

@@ -181,13 +181,13 @@ def test_the_address_is_shown_when_all_instances_answer(place: Place) -> None:
     node = launched.child("pendulum")
     node.suspend()
     wait_until(lambda: node.status() == psutil.STATUS_STOPPED, "a stopped node")
+    assert place.run("wait", "--state", "starting").wait() == 0
+    assert "mesh 'pair' at" not in launched.errors
+    node.resume()
+
+    launched.wait_for_error_line("mesh 'pair' at")
+
     with place.session() as session:
-        assert place.run("wait", "--state", "starting").wait() == 0
-        assert "mesh 'pair' at" not in launched.errors
-        node.resume()
-
-        launched.wait_for_error_line("mesh 'pair' at")
-
         replies = session.get("fmu_mesh/pair/pendulum/out/a", timeout=DEADLINE_S)
         assert [str(reply.ok.key_expr) for reply in replies if reply.ok is not None] == ["fmu_mesh/pair/pendulum/out/a"]
 
