@@ -11,6 +11,7 @@ import hashlib
 import itertools
 import os
 import shutil
+import signal
 import stat
 import tempfile
 from collections.abc import Iterator
@@ -41,6 +42,9 @@ __all__ = [
 ]
 
 _SOCKET_PATH_LIMIT = 100
+_PF_EXITING = 0x4
+_KILLED = 1 << (signal.SIGKILL - 1)
+"""Bits of a process in /proc."""
 _NAME_LIMIT = 40
 """Largest length of a mesh's name in the name of its folder; a longer name is cut, and a hash is added."""
 
@@ -257,22 +261,31 @@ def _read_note(file: Path) -> MeshNote | None:
 
 
 def is_alive(pid: int) -> bool:
-    """Whether this process still runs; a zombie process does not."""
+    """Whether this process still runs; one that has ended, or is about to end because it was killed, does not."""
     try:
         os.kill(pid, 0)
     except ProcessLookupError:
         return False
     except PermissionError:
         return True
-    state = process_state(pid)
-    if state is None:  # it has ended meanwhile, or the system has no /proc
+    try:
+        # Its children are told that it was killed before its state says so.
+        status = Path(f"/proc/{pid}/status").read_text(encoding="ascii", errors="replace")
+        pending = int(status.partition("SigPnd:")[2].split()[0], 16)
+        state, *_, flags = _stat(pid)[:7]
+    except (OSError, IndexError, ValueError):  # it has ended meanwhile, or the system has no /proc
         return not Path("/proc/self/stat").exists()
-    return state not in {"Z", "X"}
+    return state not in {"Z", "X"} and not int(flags) & _PF_EXITING and not pending & _KILLED
 
 
 def process_state(pid: int) -> str | None:
     """The state of a process as one letter (proc(5): R runs, S sleeps, T is stopped, Z has ended); None if unknown."""
     try:
-        return Path(f"/proc/{pid}/stat").read_text(encoding="ascii", errors="replace").rpartition(")")[2].split()[0]
+        return _stat(pid)[0]
     except (OSError, IndexError):
         return None
+
+
+def _stat(pid: int) -> list[str]:
+    """The fields of a process in /proc from its state on (proc(5))."""
+    return Path(f"/proc/{pid}/stat").read_text(encoding="ascii", errors="replace").rpartition(")")[2].split()
