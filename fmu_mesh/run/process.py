@@ -166,9 +166,8 @@ def ended_by_signals(
         interrupt(reason)
         if not left.wait(GRACE_S):
             with ending:  # a second thread would end the process while the first one still cleans up
-                if not left.is_set():
-                    clean_up()
-                    _exit(reason, reported=watch_stdin)
+                clean_up()
+                _exit(reason, reported=watch_stdin)
 
     def wait_for_signal() -> None:
         number = os.read(reading, 1)
