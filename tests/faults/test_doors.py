@@ -20,7 +20,7 @@ from fmu_mesh.run.wiring import leaves_host
 from fmu_mesh.wire.runtime import run_folder, runtime_folder
 from tests.helpers import Launched, Place, row_count, wait_until, write_config
 
-FAR_S = 10_000.0
+FAR_S = 1_000_000.0
 NOBODY = 65534
 
 _AS_NOBODY = """

@@ -25,7 +25,7 @@ from tests.helpers import (
     write_config,
 )
 
-FAR_S = 10_000.0
+FAR_S = 1_000_000.0
 ROLES = ("fork", "master", "pendulum", "delay")
 
 
