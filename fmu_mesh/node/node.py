@@ -401,7 +401,7 @@ class Node:
             self._tell_end(self._as_others_see(error), self._patience_s())
         except FmuMeshError as unreachable:
             log.info("failure_not_reported", extra={"error": str(unreachable)})
-            return False
+            return self._has_no_master()
         return True
 
     def _as_others_see(self, error: FmuMeshError) -> FmuMeshError:
