@@ -53,7 +53,12 @@ class Granting:
     @property
     def told(self) -> int:
         """The point up to which all nodes have a grant, also those that get it by messages."""
-        return self.grant if len(self._sharing) == len(self.progress) else self._told
+        return self.grant if self._all_share else self._told
+
+    @property
+    def _all_share(self) -> bool:
+        """Whether no node needs a message with its grant."""
+        return len(self._sharing) == len(self.progress)
 
     @property
     def laggard(self) -> str:
@@ -117,7 +122,7 @@ class Granting:
 
     def owed(self) -> tuple[int, bool]:
         """The grant for nodes that cannot read it, and whether it has grown since the last call."""
-        if len(self._sharing) == len(self.progress):
+        if self._all_share:
             return 0, False
         credit = min(map(operator.add, self.progress.values(), self._windows))
         ahead = min(point for node, point in self.progress.items() if node != RECORDER)

@@ -267,9 +267,8 @@ class Master:
             granting.raise_to(grant)
         self._tell_grant()
         if self._watch is not None:
-            told = min(granting.told, grant)
-            at_end = told == self._last_point
-            self._watch.look(None if at_end else granting.holder(told, hold=self._hold, paced=paced))
+            at_end = granting.told == self._last_point
+            self._watch.look(None if at_end else granting.holder(granting.told, hold=self._hold, paced=paced))
         return min(pause, STATUS_S, self._heartbeat_s)
 
     def _tell_grant(self) -> None:
@@ -411,7 +410,7 @@ class Master:
         query.drop()
 
     def _stop(self) -> None:
-        """End the run: at the granted point if it has no stop time, otherwise as an interruption."""
+        """End the run: where a pause would be if it has no stop time, otherwise as an interruption."""
         grid, point, self._hold = self._plan.grid, self._granting.halt(), None
         if grid.stop_time is not None:
             text = f"stopped by a command before its stop time of {grid.stop_time:.12g} s"

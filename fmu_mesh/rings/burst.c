@@ -7,7 +7,8 @@
  * the values, writes the stamp, and then counts the row (release). A reader looks at the counter (acquire), and at the
  * stamp before and after it has read: a counter that is wrong, or a row that was overwritten, never becomes a value.
  *
- * Waiting. A counter only grows, and has one writer. Who waits for it spins, yields, and then sleeps on its own bell:
+ * Waiting. A counter has one writer and only grows; only a pause lowers the grant. Who waits for it spins, yields, and
+ * then sleeps on its own bell:
  *
  *   sleeper:  seen = bell; need = goal; lower wake_at; FENCE; counter >= goal? otherwise futex_wait(bell, seen)
  *   writer:   counter = value; FENCE; wake_at <= value? then for each need that is met: clear it (compare and swap),

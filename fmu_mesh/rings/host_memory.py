@@ -205,7 +205,7 @@ class HostMemory:
 
 
 class Counter:
-    """A number in a `HostMemory` that only grows and has one writer.
+    """A number in a `HostMemory` that has one writer and only grows; only a pause lowers the grant.
 
     Args:
         memory: the memory.

@@ -49,8 +49,8 @@ def batch_of(window: int) -> int:
 def window_of(system: ResolvedSystem) -> int:
     """The window of the configuration in points; `auto` is as large as the memory for the rows allows.
 
-    A large window costs memory only. Values do not depend on it; a node flushes a frame when a consumer could be
-    waiting; and slow instances are granted only a part of the window, so that a pause takes effect soon.
+    A large window costs memory only. Values do not depend on it, and a pause takes effect soon at every window: see
+    `fmu_mesh.master.granting`.
     """
     configured = system.config.simulation.window
     if configured != "auto":

@@ -60,7 +60,6 @@ class Display:
         self._endpoints: Sequence[str] = ()
 
     def __enter__(self) -> Self:
-        self._console.print(end="")  # the first print of rich takes some milliseconds: not when the nodes step
         self._progress.start()
         return self
 
@@ -82,6 +81,8 @@ class Display:
                 self._warn()
                 if not self._waits_for_nodes:
                     self._show_address()
+                elif self._endpoints:
+                    self._console.print(end="")  # the first print takes some milliseconds: not when the nodes step
             case Status(status):
                 self._status(status)
             case Log(line):
