@@ -20,6 +20,7 @@ from ..rings.ring import Ring
 from ..simtime import TimeGrid
 from ..system.linear_inputs import LinearInput
 from ..variables.model_description import ModelDescription, Value
+from .kept_models import KeptModels
 
 __all__ = ["Instance", "KeepsFiles", "KeepsState", "Kind", "LogMessage", "Opening", "Showing", "StepsNatively"]
 
@@ -71,6 +72,8 @@ class Opening(msgspec.Struct, Generic[Section], frozen=True):
         linear_inputs: the inputs that change linearly within a step; only where the description allows it.
         log: call it with every message of the model, on the thread that calls the instance.
         showing: only given to a kind with `can_be_shown`.
+        kept: where an instance may leave what the next one of its name can use again, in a process that runs a mesh
+            again and again; None: nothing is used again.
     """
 
     name: str
@@ -83,6 +86,7 @@ class Opening(msgspec.Struct, Generic[Section], frozen=True):
     linear_inputs: tuple[LinearInput, ...] = ()
     log: Callable[[LogMessage], None] = lambda _message: None
     showing: Showing = Showing()
+    kept: KeptModels | None = None
 
 
 class Kind(ABC, Generic[Section]):

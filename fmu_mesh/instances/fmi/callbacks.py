@@ -43,10 +43,10 @@ _registered: dict[int, tuple[bytes, Logged]] = {}
 """Names and instances, by the identity of the instance."""
 
 
-def register(name: str, instance: Logged) -> None:
-    """Messages of the instance called ``name`` go to ``instance`` from now on."""
+def register(name: str, instance: Logged, environment: int) -> None:
+    """Messages with the address ``environment``, or of the instance called ``name``, go to ``instance`` from now on."""
     _registered[id(instance)] = name.encode(), instance
-    _by_address[id(instance)] = instance
+    _by_address[environment] = instance
 
 
 def register_component(component: int, instance: Logged) -> None:
@@ -61,10 +61,10 @@ def unregister(instance: Logged) -> None:
         del _by_address[address]
 
 
-def fmi2_callbacks(instance: Logged) -> fmi2CallbackFunctions:
-    """The callbacks for a registered instance of FMI 2.0; they must live as long as it does."""
+def fmi2_callbacks(environment: int) -> fmi2CallbackFunctions:
+    """The callbacks for an instance of FMI 2.0 with a registered environment; they must live as long as it does."""
     callbacks = fmi2CallbackFunctions.from_buffer_copy(_FMI2_CALLBACKS)
-    callbacks.componentEnvironment = id(instance)
+    callbacks.componentEnvironment = environment
     return callbacks
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ctypes
 from abc import abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -18,7 +18,7 @@ from .calls import Function, Pointer
 from .fmu_instance import FmuInstance
 from .fmu_values import Verb
 
-__all__ = ["Fmi1Values", "Fmi2Values", "Fmi3Values"]
+__all__ = ["FMI2_NAMES", "Fmi1Values", "Fmi2Values", "Fmi3Values"]
 
 _GET_OR_SET = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_size_t, ctypes.c_void_p)
 _GET_OR_SET_3 = ctypes.CFUNCTYPE(
@@ -40,6 +40,15 @@ _SUFFIX: Final[dict[VariableType, str]] = {
     "Boolean": "Boolean",
     "String": "String",
 }
+FMI2_NAMES: Final = {
+    "instantiate": "fmi2Instantiate",
+    "getFMUState": "fmi2GetFMUstate",
+    "setFMUState": "fmi2SetFMUstate",
+    "freeFMUState": "fmi2FreeFMUstate",
+    "serializeFMUState": "fmi2SerializeFMUstate",
+    "deserializeFMUState": "fmi2DeSerializeFMUstate",
+}
+"""FMI functions whose name does not follow from the name of FMPy's method, by that name."""
 _DIRECT: Final = ("Float64", "Int32")
 """The types that a ring stores as in C; an Enumeration is an `int` in FMI 1.0 and 2.0 (2.1.2)."""
 
@@ -56,23 +65,19 @@ class _Fmi1And2Values(FmuInstance):
         unregister(self)
 
     def _instantiate(self) -> None:
-        register(self.name, self)
-        self._instantiate_registered()
+        register(self.name, self, id(self._model))
+        super()._instantiate()
         register_component(self._fmu.component, self)
 
-    @abstractmethod
-    def _instantiate_registered(self) -> None:
-        """Make the instance, whose log messages arrive from now on."""
-
     def _function_name(self, verb: Verb, type_: VariableType) -> str:
-        return f"{self._prefix}{verb}{_SUFFIX[type_]}"
+        return f"{self._functions.prefix}{verb}{_SUFFIX[type_]}"
 
     def _function(self, verb: Verb, type_: VariableType) -> Callable[..., int]:
         return _GET_OR_SET((self._symbol(f"{verb}{_SUFFIX[type_]}"), self._fmu.dll))
 
     def _symbol(self, function: str) -> str:
         """The name of a function in the library."""
-        return f"{self._prefix}{function}"
+        return f"{self._functions.prefix}{function}"
 
     def _buffer(self, type_: VariableType, variables: Sequence[Variable]) -> Buffer:
         if type_ == "String":
@@ -101,7 +106,6 @@ class Fmi1Values(_Fmi1And2Values):
     Mode is left; inputs that are set later hold from the first step on.
     """
 
-    _prefix = "fmi"
     _boolean = np.int8  # a `char` in FMI 1.0 (ME, 2.1.2)
     _initialized = False
 
@@ -111,10 +115,8 @@ class Fmi1Values(_Fmi1And2Values):
             self._initialize_once()
         return super().get_values(names)
 
-    def _instantiate_registered(self) -> None:
+    def _make_instance(self) -> None:
         self._fmu.instantiate(functions=FMI1_CALLBACKS, loggingOn=False)
-        if not self._fmu.component:
-            raise RuntimeError(f"{self._function_names['instantiate']} returned no instance")
 
     def _enter_initialization(self, start_time: float, stop_time: float | None, start_values: dict[str, Value]) -> None:
         self._times = start_time, stop_time
@@ -136,29 +138,25 @@ class Fmi1Values(_Fmi1And2Values):
     def _terminate_initialized(self) -> None:
         """Call the function of FMI that terminates."""
 
+    def _end_run(self, *, resets: bool) -> bool:
+        """As in the state machine of FMI 1.0 for co-simulation, fmiResetSlave takes the place of fmiTerminateSlave."""
+        return (resets and self._model.reset()) or super()._end_run(resets=False)
+
     def _terminate(self) -> None:
         if self._initialized:
             self._terminate_initialized()
 
     def _symbol(self, function: str) -> str:
-        return f"{self._description.model_identifier}_{self._prefix}{function}"
+        return f"{self._description.model_identifier}_{super()._symbol(function)}"
 
 
 class Fmi2Values(_Fmi1And2Values):
     """An FMI 2.0 instance."""
 
-    _prefix = "fmi2"
     _boolean = np.intc
-    _function_names: Mapping[str, str] = {
-        "getFMUState": "fmi2GetFMUstate",
-        "setFMUState": "fmi2SetFMUstate",
-        "freeFMUState": "fmi2FreeFMUstate",
-        "serializeFMUState": "fmi2SerializeFMUstate",
-        "deserializeFMUState": "fmi2DeSerializeFMUstate",
-    }
 
-    def _instantiate_registered(self) -> None:
-        self._fmu.instantiate(callbacks=fmi2_callbacks(self), loggingOn=False)
+    def _make_instance(self) -> None:
+        self._fmu.instantiate(callbacks=fmi2_callbacks(id(self._model)), loggingOn=False)
 
     def _enter_initialization(self, start_time: float, stop_time: float | None, start_values: dict[str, Value]) -> None:
         """FMI 2.0, 2.1.6 and 4.2.1."""
@@ -177,18 +175,14 @@ class Fmi2Values(_Fmi1And2Values):
 class Fmi3Values(FmuInstance):
     """An FMI 3.0 instance."""
 
-    _prefix = "fmi3"
     _direct_declaration = "int (*)(void *, void *, size_t, void *, size_t)"
 
-    def _instantiate(self) -> None:
-        self._fmu.instantiate(loggingOn=False, logMessage=self._message_came, **self._uses())
+    def _make_instance(self) -> None:
+        self._fmu.instantiate(loggingOn=False, logMessage=self._model.message_came, **self._uses())
 
     def _uses(self) -> dict[str, bool]:
         """Arguments of the instantiation: the features of co-simulation that are used."""
         return {}
-
-    def _message_came(self, _environment: int | None, status: int, category: bytes, message: bytes) -> None:
-        self.logged(status, category or b"", message or b"")
 
     def _enter_initialization(self, start_time: float, stop_time: float | None, start_values: dict[str, Value]) -> None:
         """Structural parameters in Configuration Mode, then all others (FMI 3.0, 2.3.3 and 2.3.2)."""

@@ -6,11 +6,10 @@ A version of FMI and a kind of FMU add the calls: how an instance is made, initi
 from __future__ import annotations
 
 import math
-import shutil
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from fmpy.fmi1 import FMICallException
 
@@ -19,12 +18,12 @@ from ...rings.native import Said
 from ...variables.model_description import ModelDescription
 from ...variables.value_conversion import to_value
 from ...variables.value_types import Value
-from ..call_guard import FOLDER
 from ..contract import LogMessage
+from ..kept_models import KeptModels
 from .archive.archive import Terms
-from .archive.sources import extract
-from .calls import FmpyCalls, pointer
+from .calls import pointer
 from .fmu_values import OK, FmuValues, status_name
+from .loaded_fmu import FmuFunctions, FmuToLoad, LoadedFmu, quietly
 from .state import Bookkeeping, KeepsFmuState
 from .step_options import StepOptions
 
@@ -45,19 +44,14 @@ class FmuInstance(KeepsFmuState, FmuValues):
         log: called with every log message, on the thread that calls the FMU.
         terms: limits and checks for the archive.
         options: how the instance is stepped.
+        kept: has what earlier instances of this name have left, and gets what this one leaves.
 
     Raises:
         LoadFailed: the FMU cannot be extracted, loaded or instantiated.
     """
 
-    _library: type[Any]
-    """FMPy's class for this version of FMI and this kind of FMU."""
-
-    _prefix: str
-    """The prefix of FMI functions in this version, such as `fmi2`."""
-
-    _function_names: Mapping[str, str] = {}
-    """FMI functions whose name does not follow from the name of FMPy's method, by that name."""
+    _functions: FmuFunctions
+    """Those of this version of FMI and this kind of FMU."""
 
     _component: int
     """The address of the instance, for functions called through ctypes; ``_self`` is the same for cffi."""
@@ -71,6 +65,7 @@ class FmuInstance(KeepsFmuState, FmuValues):
         log: LogSink = lambda _message: None,
         terms: Terms = Terms(),  # noqa: B008 a frozen Struct
         options: StepOptions = StepOptions(),  # noqa: B008 a frozen Struct
+        kept: KeptModels | None = None,
     ) -> None:
         self.name = name
         self._options = options
@@ -81,18 +76,14 @@ class FmuInstance(KeepsFmuState, FmuValues):
         self._live = False
         self._keep = []
         self._describe(description)
-        self._extracted = extract(path, folder, terms, model=description)
+        self._kept = kept
+        fmu = FmuToLoad(path, name, description, terms, self._functions)
+        self._model = LoadedFmu(fmu, folder) if kept is None else LoadedFmu.kept(fmu, kept)
         try:
-            with FOLDER:  # FMPy loads a library from its own folder
-                fmu = self._library(
-                    guid=description.guid,
-                    modelIdentifier=description.model_identifier,
-                    unzipDirectory=str(self._extracted),
-                    instanceName=name,
-                )
-            self._fmu: Any = FmpyCalls(fmu, self._prefix, self._function_names)
+            self._model.load()
+            self._fmu = self._model.calls
             self._instantiate()
-            self._component = fmu.component
+            self._component = self._fmu.component
             self._self = pointer(self._component)
             self._instantiated()
             self._live = True
@@ -137,18 +128,19 @@ class FmuInstance(KeepsFmuState, FmuValues):
         """Terminate if allowed, free the instance and remove its files. Never raises; may be called twice."""
         if self._state == "closed":
             return
-        if self._live:
-            if self._state == "stepping":
-                _quietly(self._terminate)
-            _quietly(self._free)
+        was_reset = False
+        if self._live and self._state == "stepping":
+            was_reset = self._end_run(resets=self._kept is not None and (self._kept.resets or self._only_once))
+        elif self._live:
+            quietly(self._release)
+        self._leave_model(was_reset=was_reset)
         self._live = False
         self._state = "closed"
         self._keep = []
-        self.remove_files()
 
     def remove_files(self) -> None:
         """From any thread, when the process is about to be ended: remove the extracted files."""
-        shutil.rmtree(self._extracted, ignore_errors=True)
+        self._model.remove_files()
 
     def logged(self, status: int, category: bytes, message: bytes) -> None:
         """Take a message from the FMU's logger; the last ones become part of an error that follows."""
@@ -161,8 +153,12 @@ class FmuInstance(KeepsFmuState, FmuValues):
     # --- what a version of FMI adds
 
     @abstractmethod
-    def _instantiate(self) -> None:
+    def _make_instance(self) -> None:
         """Make the instance; any exception says why it cannot be made."""
+
+    def _instantiate(self) -> None:
+        """Make the instance, unless there is one that was reset."""
+        self._model.instantiate(self, self._make_instance)
 
     def _instantiated(self) -> None:
         """Look up what the steps need, now that the instance exists."""
@@ -179,11 +175,34 @@ class FmuInstance(KeepsFmuState, FmuValues):
         """End the simulation."""
         self._fmu.terminate()
 
-    def _free(self) -> None:
-        """Free the instance."""
-        self._fmu.freeInstance()
+    def _release(self) -> None:
+        """Free what this object has allocated in the FMU."""
 
     # --- shared by the versions
+
+    def _end_run(self, *, resets: bool) -> bool:
+        """End the simulation; with ``resets`` also reset the instance, and return whether that was done."""
+        quietly(self._terminate)
+        quietly(self._release)
+        return resets and self._model.reset()
+
+    def _leave_model(self, *, was_reset: bool) -> None:
+        """Leave the FMU to the next instance of this name; after a failure nothing of it is used again.
+
+        A library that allows one instance is unloaded with it.
+        """
+        model = self._model
+        if self._kept is None or not self._live or self._state == "failed" or (self._only_once and not was_reset):
+            model.close()
+            return
+        if not was_reset:
+            model.free()
+        model.leave()
+        self._kept.keep(self.name, model)
+
+    @property
+    def _only_once(self) -> bool:
+        return self._description.only_once_per_process
 
     def _tolerance(self) -> float | None:
         """The tolerance for the FMU (FMI 2.0, 2.1.6; FMI 3.0, 2.3.2)."""
@@ -225,11 +244,3 @@ class FmuInstance(KeepsFmuState, FmuValues):
     def _message(self) -> str:
         messages, self._last_messages = self._last_messages, []
         return f"; the FMU says: {' | '.join(messages)}." if messages else "; the FMU gave no message."
-
-
-def _quietly(call: Callable[[], object]) -> None:
-    """Call a function of the FMU at the end, where a failure has no consequence."""
-    try:
-        call()
-    except (FMICallException, OSError):
-        return

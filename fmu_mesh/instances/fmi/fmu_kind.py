@@ -194,7 +194,7 @@ class FmuKind(Kind[FmuConfig]):
             linear_inputs=opening.linear_inputs,
         )
         path, folder, terms = opening.path, opening.folder, _terms(opening)
-        instance = open_instance(path, opening.name, description, folder, opening.log, terms, options)
+        instance = open_instance(path, opening.name, description, folder, opening.log, terms, options, opening.kept)
         return stepped(instance, options)
 
 

@@ -7,6 +7,7 @@ from typing import Final, cast
 
 from ...variables.model_description import Kind, ModelDescription
 from ..contract import Instance
+from ..kept_models import KeptModels
 from .archive.archive import Terms
 from .co_simulation.extrapolation import LinearInputs, TakesDerivatives
 from .co_simulation.fmi1 import Fmi1Instance
@@ -36,16 +37,17 @@ def open_instance(  # noqa: PLR0913, PLR0917 the parameters of `FmuInstance`
     log: LogSink = lambda _message: None,
     terms: Terms = Terms(),  # noqa: B008 a frozen Struct
     options: StepOptions = StepOptions(),  # noqa: B008 a frozen Struct
+    kept: KeptModels | None = None,
 ) -> FmuInstance:
     """Extract the FMU at ``path`` below ``folder``, load it, and make the instance called ``name``.
 
-    It has to keep to ``terms``.
+    It has to keep to ``terms``. What an earlier instance of this name has ``kept`` is used again.
 
     Raises:
         LoadFailed: the FMU cannot be extracted, loaded or instantiated.
     """
     kind = cast("Kind", description.kind)
-    return _CLASSES[description.fmi_version[0], kind](path, name, description, folder, log, terms, options)
+    return _CLASSES[description.fmi_version[0], kind](path, name, description, folder, log, terms, options, kept)
 
 
 def stepped(instance: FmuInstance, options: StepOptions) -> Instance:

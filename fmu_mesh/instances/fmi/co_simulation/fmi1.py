@@ -15,6 +15,7 @@ from ...call_guard import call_named
 from ..calls import cffi_function
 from ..fmi_versions import Fmi1Values
 from ..fmu_values import WARNING, status_name
+from ..loaded_fmu import FmuFunctions
 from .discarded_steps import DISCARD, PENDING, SMALLER_STEPS, SMALLEST, StepStatus, discarded, take_sub_steps
 from .native_instance import NativeInstance
 
@@ -26,6 +27,11 @@ _TERMINATE = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p)
 _SET_DERIVATIVES = ctypes.CFUNCTYPE(
     ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_size_t, ctypes.c_void_p, ctypes.c_void_p
 )
+_NAMES = {
+    "instantiate": "fmiInstantiateSlave",
+    "fmi1FreeSlaveInstance": "fmiFreeSlaveInstance",
+    "reset": "fmiResetSlave",
+}
 _NEW, _REPEATED = b"\x01", b"\x00"
 """`newStep` of fmiDoStep."""
 
@@ -34,8 +40,7 @@ class Fmi1Instance(NativeInstance, Fmi1Values):
     """One instance of an FMI 1.0 co-simulation FMU."""
 
     _kind = StepKind.FMI1
-    _library = FMU1Slave
-    _function_names: Mapping[str, str] = {"instantiate": "fmiInstantiateSlave", "freeInstance": "fmiFreeSlaveInstance"}
+    _functions = FmuFunctions(FMU1Slave, "fmi", "fmi1FreeSlaveInstance", _NAMES)
     _derivatives: Mapping[str, float] = {}
 
     def advance(self, time: float, step_size: float) -> None:

@@ -13,8 +13,9 @@ from ....errors import TerminationRequested
 from ....rings.native import StepKind
 from ....variables.value_types import Value
 from ..calls import cffi_function
-from ..fmi_versions import Fmi2Values
+from ..fmi_versions import FMI2_NAMES, Fmi2Values
 from ..fmu_values import WARNING, status_name
+from ..loaded_fmu import FmuFunctions
 from ..model_exchange.solver import resolvable
 from ..state import Bookkeeping
 from .discarded_steps import DISCARD, PENDING, RETRY, SMALLER_STEPS, SMALLEST, RetriedSteps, StepStatus, discarded
@@ -29,7 +30,7 @@ class Fmi2Instance(NativeInstance, Fmi2Values):
     """One instance of an FMI 2.0 co-simulation FMU."""
 
     _kind = StepKind.FMI2
-    _library = FMU2Slave
+    _functions = FmuFunctions(FMU2Slave, "fmi2", "fmi2FreeInstance", FMI2_NAMES)
     _retrying: RetriedSteps | None = None
     _derivatives: Mapping[str, float] = {}
     _terminated = False
@@ -145,7 +146,6 @@ class Fmi2Instance(NativeInstance, Fmi2Values):
         self._terminated = False
         self._said.note(quiet_until=math.inf)
 
-    def _free(self) -> None:
+    def _release(self) -> None:
         if self._retrying is not None:
             self._retrying.free()
-        super()._free()

@@ -22,6 +22,7 @@ from ....variables.value_types import Value
 from ..calls import Pointer, cffi_function
 from ..fmi_versions import Fmi3Values
 from ..fmu_values import PartCall, Verb, status_name
+from ..loaded_fmu import FmuFunctions
 from ..model_exchange.solver import SolverFailed, resolvable
 from ..state import Bookkeeping
 from .fmi3_steps import Fmi3Steps
@@ -38,8 +39,7 @@ class Fmi3Instance(NativeInstance, Fmi3Values):
     """One instance of an FMI 3.0 co-simulation FMU."""
 
     _kind = StepKind.FMI3
-    _library = FMU3Slave
-    _function_names: Mapping[str, str] = {"instantiate": "fmi3InstantiateCoSimulation"}
+    _functions = FmuFunctions(FMU3Slave, "fmi3", "fmi3FreeInstance", {"instantiate": "fmi3InstantiateCoSimulation"})
     _steps: Fmi3Steps
     _discrete_row: tuple[bytes | list[Any], ...] = ()
 

@@ -2,26 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 from fmpy.fmi1 import FMU1Model
 from fmpy.fmi2 import FMU2Model
 from fmpy.fmi3 import FMU3Model
 
 from ....variables.value_types import Value
 from ..clocks import Clocks
-from ..fmi_versions import Fmi1Values, Fmi2Values, Fmi3Values
+from ..fmi_versions import FMI2_NAMES, Fmi1Values, Fmi2Values, Fmi3Values
+from ..loaded_fmu import FmuFunctions
 from .continuous import ContinuousInstance
 from .model_calls import Fmi1Calls, Fmi3Calls, ModelCalls
 
 __all__ = ["Fmi1ModelInstance", "Fmi2ModelInstance", "Fmi3ModelInstance"]
 
 
+_NAMES = {"instantiate": "fmiInstantiateModel", "fmi1FreeModelInstance": "fmiFreeModelInstance"}
+
+
 class Fmi1ModelInstance(ContinuousInstance, Fmi1Values):
     """One instance of an FMI 1.0 FMU for model exchange (FMI 1.0, 2.8)."""
 
-    _library = FMU1Model
-    _function_names: Mapping[str, str] = {"instantiate": "fmiInstantiateModel", "freeInstance": "fmiFreeModelInstance"}
+    _functions = FmuFunctions(FMU1Model, "fmi", "fmi1FreeModelInstance", _NAMES)
 
     def _instantiated(self) -> None:
         self._calls = Fmi1Calls(self._fmu, self._description.continuous_states, self._description.event_indicators)
@@ -41,7 +42,7 @@ class Fmi1ModelInstance(ContinuousInstance, Fmi1Values):
 class Fmi2ModelInstance(ContinuousInstance, Fmi2Values):
     """One instance of an FMI 2.0 FMU for model exchange (FMI 2.0, 3.2)."""
 
-    _library = FMU2Model
+    _functions = FmuFunctions(FMU2Model, "fmi2", "fmi2FreeInstance", FMI2_NAMES)
 
     def _model_calls(self) -> ModelCalls:
         return ModelCalls(self._fmu, self._description.continuous_states, self._description.event_indicators, "fmi2")
@@ -50,8 +51,7 @@ class Fmi2ModelInstance(ContinuousInstance, Fmi2Values):
 class Fmi3ModelInstance(ContinuousInstance, Fmi3Values):
     """One instance of an FMI 3.0 FMU for model exchange (FMI 3.0, 3.2)."""
 
-    _library = FMU3Model
-    _function_names: Mapping[str, str] = {"instantiate": "fmi3InstantiateModelExchange"}
+    _functions = FmuFunctions(FMU3Model, "fmi3", "fmi3FreeInstance", {"instantiate": "fmi3InstantiateModelExchange"})
 
     def _enter_initialization(self, start_time: float, stop_time: float | None, start_values: dict[str, Value]) -> None:
         super()._enter_initialization(start_time, stop_time, start_values)

@@ -113,6 +113,13 @@ EXPORT const char *NAME(fmiGetVersion)(void)
     return "1.0";
 }
 
+static void start(Model *m)
+{
+    m->state = INSTANTIATED;
+    m->real[PARAMETER] = 2.5;
+    strcpy(m->string[PARAMETER], "start");
+}
+
 EXPORT fmi1Component NAME(fmiInstantiateSlave)(fmi1String name, fmi1String guid, fmi1String location, fmi1String type,
                                                fmi1Real timeout, fmi1Boolean visible, fmi1Boolean interactive,
                                                fmi1CallbackFunctions functions, fmi1Boolean logging)
@@ -121,12 +128,23 @@ EXPORT fmi1Component NAME(fmiInstantiateSlave)(fmi1String name, fmi1String guid,
     if (strcmp(guid, FMU_GUID) != 0 || strlen(name) >= TEXT_SIZE)
         return NULL;
     Model *m = functions.allocateMemory(1, sizeof *m);
-    m->state = INSTANTIATED;
     strcpy(m->name, name);
     m->functions = functions;
-    m->real[PARAMETER] = 2.5;
-    strcpy(m->string[PARAMETER], "start");
+    start(m);
     return m;
+}
+
+EXPORT fmi1Status NAME(fmiResetSlave)(fmi1Component c)
+{
+    Model *m = c;
+    if (m->state != INITIALIZED)
+        return fail(m, "fmiResetSlave");
+    const Model old = *m;
+    memset(m, 0, sizeof *m);
+    strcpy(m->name, old.name);
+    m->functions = old.functions;
+    start(m);
+    return fmi1OK;
 }
 
 EXPORT fmi1Status NAME(fmiInitializeSlave)(fmi1Component c, fmi1Real start, fmi1Boolean stop_defined, fmi1Real stop)
@@ -172,7 +190,6 @@ EXPORT void NAME(fmiFreeSlaveInstance)(fmi1Component c)
     }
 
 EXPORT fmi1Status NAME(fmiSetDebugLogging)(fmi1Component c, fmi1Boolean on) REFUSED((void)on)
-EXPORT fmi1Status NAME(fmiResetSlave)(fmi1Component c) REFUSED((void)c)
 EXPORT fmi1Status NAME(fmiCancelStep)(fmi1Component c) REFUSED((void)c)
 EXPORT fmi1Status NAME(fmiSetRealInputDerivatives)(fmi1Component c, const fmi1ValueReference vr[], size_t n,
                                                    const fmi1Integer order[], const fmi1Real value[])

@@ -136,8 +136,17 @@ fmi2Status fmi2Terminate(fmi2Component c)
 
 fmi2Status fmi2Reset(fmi2Component c)
 {
-    (void)c;
-    return fmi2Error;
+    Instance *instance = called(c, "fmi2Reset", INSTANTIATED | INITIALIZATION | TERMINATED | STEP_FAILED | RUNNING);
+    const Instance old = *instance;
+
+    memset(instance, 0, sizeof *instance);
+    instance->name = old.name;
+    instance->logger = old.logger;
+    instance->environment = old.environment;
+    instance->type = old.type;
+    instance->mode = INSTANTIATED;
+    model_start(&instance->model);
+    return fmi2OK;
 }
 
 /* ---- values ---- */

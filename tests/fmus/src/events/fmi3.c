@@ -113,6 +113,23 @@ void fmi3FreeInstance(fmi3Instance c)
     free(instance);
 }
 
+fmi3Status fmi3Reset(fmi3Instance c)
+{
+    Instance *instance = called(c, "fmi3Reset", INSTANTIATED | INITIALIZATION | INITIALIZED | TERMINATED);
+    const Instance old = *instance;
+
+    memset(instance, 0, sizeof *instance);
+    instance->name = old.name;
+    instance->log = old.log;
+    instance->environment = old.environment;
+    instance->co_simulation = old.co_simulation;
+    instance->event_mode_used = old.event_mode_used;
+    instance->early_return_allowed = old.early_return_allowed;
+    instance->mode = INSTANTIATED;
+    model_start(&instance->model);
+    return fmi3OK;
+}
+
 fmi3Status fmi3EnterInitializationMode(fmi3Instance c, fmi3Boolean tolerance_defined, fmi3Float64 tolerance,
                                        fmi3Float64 start, fmi3Boolean stop_defined, fmi3Float64 stop)
 {
@@ -487,7 +504,6 @@ fmi3Status fmi3DoStep(fmi3Instance c, fmi3Float64 time, fmi3Float64 step_size, f
     fmi3Status name(void) { return fmi3Error; }
 
 DENIED(fmi3SetDebugLogging)
-DENIED(fmi3Reset)
 DENIED(fmi3GetFloat32)
 DENIED(fmi3GetInt8)
 DENIED(fmi3GetUInt8)

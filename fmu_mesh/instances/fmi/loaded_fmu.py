@@ -1,0 +1,171 @@
+"""An extracted FMU with its library, loaded: instances are made with it one after another.
+
+Owns the files, the library and the instance as FMPy has it; `FmuInstance` calls them.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Hashable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol, cast
+
+from fmpy.fmi1 import FMICallException
+
+from ...variables.model_description import ModelDescription
+from ..call_guard import FOLDER
+from ..kept_models import KeptModels
+from .archive.archive import Terms
+from .archive.sources import extract
+from .calls import FmpyCalls
+
+__all__ = ["FmuFunctions", "LoadedFmu", "quietly"]
+
+
+class FmuFunctions(NamedTuple):
+    """The functions of one version of FMI and one kind of FMU.
+
+    Attributes:
+        library: FMPy's class for them.
+        prefix: the prefix of their names, such as `fmi2`.
+        free: FMPy's method that frees an instance.
+        names: FMI functions whose name does not follow from the name of FMPy's method, by that name.
+    """
+
+    library: type[Any]
+    prefix: str
+    free: str
+    names: Mapping[str, str] = {}
+
+
+class Logs(Protocol):
+    """Receives log messages."""
+
+    def logged(self, status: int, category: bytes, message: bytes) -> None:
+        """Take a message."""
+        ...
+
+
+class FmuToLoad(NamedTuple):
+    """What is loaded.
+
+    Attributes:
+        path: the .fmu file.
+        name: instance name.
+        description: what `read_description` returned for it.
+        terms: limits and checks for the archive.
+        functions: of this version of FMI.
+    """
+
+    path: Path
+    name: str
+    description: ModelDescription
+    terms: Terms
+    functions: FmuFunctions
+
+    @property
+    def key(self) -> Hashable:
+        """Two FMUs with the same key are the same, for instances of one name."""
+        own = self.description
+        return self.path, self.terms, own.guid, own.model_identifier, self.functions.library
+
+
+class LoadedFmu:
+    """One FMU with a folder and a library of its own.
+
+    Args:
+        fmu: what is loaded.
+        folder: an existing private folder; the FMU is extracted below it.
+
+    Attributes:
+        key: what it was made from.
+        calls: FMPy's object, once it is loaded.
+        has_instance: whether the FMU is instantiated.
+
+    Raises:
+        LoadFailed: the FMU cannot be extracted.
+    """
+
+    def __init__(self, fmu: FmuToLoad, folder: Path) -> None:
+        self.key = fmu.key
+        self.calls: Any = None
+        self.has_instance = False
+        self._fmu = fmu
+        self._folder = extract(fmu.path, folder, fmu.terms, model=fmu.description)
+        self._user: Logs | None = None
+
+    @classmethod
+    def kept(cls, fmu: FmuToLoad, kept: KeptModels) -> LoadedFmu:
+        """The FMU as the last instance of this name has left it, where it can be used again; if not, a new one."""
+        return cast("LoadedFmu | None", kept.take(fmu.name, fmu.key)) or cls(fmu, kept.folder)
+
+    def load(self) -> None:
+        """Load the library, if it is not loaded."""
+        if self.calls is not None:
+            return
+        functions, description = self._fmu.functions, self._fmu.description
+        with FOLDER:  # FMPy loads a library from its own folder
+            loaded = functions.library(
+                guid=description.guid,
+                modelIdentifier=description.model_identifier,
+                unzipDirectory=str(self._folder),
+                instanceName=self._fmu.name,
+            )
+        self.calls = FmpyCalls(loaded, functions.prefix, functions.names)
+
+    def instantiate(self, user: Logs, make: Callable[[], None]) -> None:
+        """Give the FMU to its next user; ``make`` makes an instance, if none is there that was reset.
+
+        Raises:
+            RuntimeError: there is no instance.
+        """
+        self._user = user
+        if not self.has_instance:
+            make()
+            self.has_instance = bool(self.calls.component)
+            if not self.has_instance:
+                raise RuntimeError(f"{self._fmu.functions.names['instantiate']} returned no instance")
+
+    def message_came(self, _environment: int | None, status: int, category: bytes, message: bytes) -> None:
+        """Pass a message of FMI 3.0 on to the instance that uses the FMU now."""
+        if self._user is not None:
+            self._user.logged(status, category or b"", message or b"")
+
+    def reset(self) -> bool:
+        """Reset the instance, so that it is as a new one; False if the FMU refuses, or this version of FMI cannot."""
+        try:
+            self.calls.reset()
+        except (AttributeError, FMICallException, OSError):
+            return False
+        return True
+
+    def leave(self) -> None:
+        """The user needs the FMU no more."""
+        self._user = None
+
+    def free(self) -> None:
+        """Free the instance; the library stays."""
+        if self.has_instance:
+            self.has_instance = False
+            quietly(lambda: getattr(self.calls, self._fmu.functions.free)(self.calls.component))
+
+    def close(self) -> None:
+        """Free the instance, unload the library and remove the files. Never raises; may be called twice."""
+        self.free()
+        self.leave()
+        if self.calls is not None:
+            quietly(self.calls.freeLibrary)
+            self.calls = None
+        self.remove_files()
+
+    def remove_files(self) -> None:
+        """From any thread, when the process is about to be ended: remove the extracted files."""
+        shutil.rmtree(self._folder, ignore_errors=True)
+
+
+def quietly(call: Callable[[], object]) -> None:
+    """Call a function of an FMU at the end, where a failure has no consequence."""
+    try:
+        call()
+    except (FMICallException, OSError):
+        return
