@@ -277,8 +277,8 @@ ALLOWED: dict[str, dict[str, str]] = {
     },
     "private_names_of_others": {
         'api/mesh_builder.py: mesh._take(read_text(text, Path(folder).absolute() / "<text>"))': "its own class",
-        "api/mesh_builder.py: mesh._take(read_file(Path(path)))": "its own class",
-        "api/mesh_builder.py: mesh._take(PlainConfig(data, file), {own_name: description})": "its own class",
+        "api/mesh_builder.py: mesh._take(configuration, KnownModels(keeps_code=keeps_code))": "its own class",
+        "api/mesh_builder.py: mesh._take(PlainConfig(data, file), known)": "its own class",
         "instances/call_guard.py: frame = sys._current_frames().get(thread)": "documented; nothing else tells the line",
         "ros/node/variable_parameters.py: overrides = node._parameter_overrides": "rclpy has no public way to read it",
     },

@@ -12,22 +12,23 @@ import msgspec
 
 from ..config.instance_sections import KIND
 from ..config.loading import PlainConfig, read_file, read_text
+from ..config.mesh import LimitsConfig
 from ..config.yaml_text import written
-from ..errors import CallRefused, ConfigurationError, LoadFailed
+from ..errors import CallRefused, ConfigurationError, FmuError, LoadFailed
 from ..instances.configuration import examine_data
 from ..instances.python.importing import being_imported, component_section
-from ..instances.registry import KINDS, check_engines, describe
+from ..instances.registry import KINDS, check_engines
 from ..run.options import with_config_values
-from ..run.preparing import planned
+from ..run.preparing import KnownModels, planned
 from ..run.run_plan import RunPlan
 from ..text import listed, shown
-from ..variables.model_description import ModelDescription
 from .mesh_check import Check
 from .plan_options import PlanOptions, RunOptions, StartOptions, options_of, plain
 from .run_handle import Run
 
 if TYPE_CHECKING:
     from .open_system import System
+    from .repeated_mesh import RepeatedMesh
     from .result import Result
 
 __all__ = ["Mesh", "load"]
@@ -86,11 +87,22 @@ class Mesh:
         return mesh
 
     @classmethod
+    def from_configuration(cls, configuration: PlainConfig, *, keeps_code: bool = False) -> Self:
+        """A mesh from the values of a configuration, such as those of `configuration`.
+
+        Args:
+            configuration: the values.
+            keeps_code: whether components in Python are described once, and not for each plan; right where their code
+                does not change between two plans.
+        """
+        mesh = cls.__new__(cls)
+        mesh._take(configuration, KnownModels(keeps_code=keeps_code))  # noqa: SLF001  its own method
+        return mesh
+
+    @classmethod
     def from_file(cls, path: str | Path) -> Self:
         """As `load`."""
-        mesh = cls.__new__(cls)
-        mesh._take(read_file(Path(path)))  # noqa: SLF001  its own method
-        return mesh
+        return cls.from_configuration(read_file(Path(path)))
 
     @classmethod
     def from_fmu(
@@ -122,9 +134,10 @@ class Mesh:
             CallRefused: neither the FMU nor ``simulation`` has a step size.
         """
         file = Path(path)
-        own = msgspec.convert({KIND: "fmu", "fmu": str(path)}, KINDS.section("fmu"))
+        own = msgspec.convert({KIND: "fmu", "fmu": str(file.absolute())}, KINDS.section("fmu"))
+        known = KnownModels()
         try:
-            description = describe(file, own, tell=on_notice)
+            description = known.describe(file, own, LimitsConfig(), on_notice)
         except LoadFailed as error:
             from .inspection import with_way_out  # noqa: PLC0415  it imports FMPy
 
@@ -143,12 +156,12 @@ class Mesh:
             "record": {"file": None},
         }
         mesh = cls.__new__(cls)
-        mesh._take(PlainConfig(data, file), {own_name: description})  # noqa: SLF001  its own method
+        mesh._take(PlainConfig(data, file), known)  # noqa: SLF001  its own method
         return mesh
 
-    def _take(self, values: PlainConfig, known: Mapping[str, ModelDescription] = MappingProxyType({})) -> None:
+    def _take(self, values: PlainConfig, known: KnownModels | None = None) -> None:
         self._plain = values
-        self._known = known
+        self._known = known or KnownModels()
 
     # --- building
 
@@ -156,6 +169,11 @@ class Mesh:
     def name(self) -> str:
         """Name of the mesh."""
         return str(self._data.get("mesh"))
+
+    @property
+    def configuration(self) -> PlainConfig:
+        """The values of the configuration, as a file has them, and where they come from."""
+        return self._plain
 
     @property
     def instances(self) -> list[str]:
@@ -374,6 +392,17 @@ class Mesh:
         from .open_system import System  # noqa: PLC0415  only this needs it
 
         return System(self.plan(start_values=start_values or {}))
+
+    def repeated(self, *, reset: bool = False, on_hang: Callable[[FmuError], None] = log.error) -> RepeatedMesh:
+        """Keep the models loaded for many runs in this process, one after another: optimizers, calibration.
+
+        Args:
+            reset: reset the instances of FMUs between two runs, and do not make new ones (fmi2Reset; FMI 2.0, 2.1.6).
+            on_hang: called on another thread if an FMU does not return in time; by default, the log gets the error.
+        """
+        from .repeated_mesh import RepeatedMesh  # noqa: PLC0415  only this needs it
+
+        return RepeatedMesh(self, reset=reset, on_hang=on_hang)
 
     @property
     def _shown_file(self) -> Path:

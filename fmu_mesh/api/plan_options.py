@@ -18,7 +18,7 @@ from ..text import shown
 from ..wire.runtime import run_name, runtime_folder
 from ..wire.views import MeshStatus
 
-__all__ = ["PlanOptions", "RunOptions", "StartOptions", "memory_of", "options_of", "plain"]
+__all__ = ["PlanOptions", "RunOptions", "StartOptions", "memory_of", "options_of", "plain", "texts_of"]
 
 _MEMORY = "memory."
 
@@ -109,13 +109,13 @@ def options_of(given: PlanOptions) -> Options:
     for name in ("output", "video"):
         fields[name] = Path(fields[name]) if fields.get(name) is not None else None
     for name, what in (("start_values", "start value"), ("config_values", "value")):
-        fields[name] = _written(fields.get(name, ()), what)
+        fields[name] = texts_of(fields.get(name, ()), what)
     for name in ("listen", "connect"):
         fields[name] = tuple(fields.get(name, ()))
     return Options(**fields)
 
 
-def _written(values: Mapping[str, object] | Sequence[str], what: str) -> tuple[str, ...]:
+def texts_of(values: Mapping[str, object] | Sequence[str], what: str) -> tuple[str, ...]:
     """Values as the command line has them; JSON is YAML, and its floats are exact."""
     if not isinstance(values, Mapping):
         return tuple(values)

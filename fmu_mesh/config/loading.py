@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from collections.abc import Set as AbstractSet
+from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -178,13 +179,19 @@ def examine_data(plain: PlainConfig, overrides: Sequence[str], kinds: Kinds) -> 
         data = _with_long_connections(data, findings)
         data = _with_kinds(_with_overrides(data, overrides, replaced, findings), sections, kinds, findings)
     type_ = config_type(tuple(sections.values()))
-    check(data, inspect.type_info(type_), "", findings)
+    check(data, _type_info(type_), "", findings)
     config = partial_configuration(data, findings.places, sections) if len(findings) else msgspec.convert(data, type_)
     if config is None:
         findings.raise_any()
     assert config is not None  # without a finding there is a configuration
     # The kinds have done their part: from here on, a configuration is a plain `Config`, in every process.
     return LoadedConfig(Config(**structs.asdict(config)), path, lines, replaced), findings
+
+
+@lru_cache(maxsize=8)
+def _type_info(type_: type[Config]) -> inspect.Type:
+    """The fields of a type as msgspec sees them; to find them takes longer than to check a configuration."""
+    return inspect.type_info(type_)
 
 
 def _right(loaded: LoadedConfig, findings: Findings) -> LoadedConfig:

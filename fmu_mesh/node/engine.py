@@ -15,7 +15,7 @@ from threading import Lock
 from time import perf_counter
 from typing import Final, cast
 
-from ..errors import ProtocolBroken, TerminationRequested
+from ..errors import FmuMeshError, ProtocolBroken, TerminationRequested
 from ..instances.call_guard import floating_point_changed, restore_floating_point
 from ..instances.contract import StepsNatively
 from ..rings import native
@@ -67,7 +67,9 @@ class Engine(ABC):
 
         Raises:
             FmuMeshError: a step failed, or a ring has something that its writer never wrote.
-            TerminationRequested: an FMU asks to end the simulation; its unit is not stepped any more.
+            TerminationRequested: an FMU asks to end the simulation.
+
+        The unit of an instance that raised one of them is not stepped any more.
         """
 
     @abstractmethod
@@ -81,8 +83,8 @@ class Engine(ABC):
 
     @property
     def current(self) -> Runner | None:
-        """The runner whose step is under way; from any thread."""
-        return next((runner for runner in self.runners if runner.stage in _BUSY), None)
+        """The runner whose step is under way, or has failed; from any thread."""
+        return next((own for own in self.runners if own.stage in _BUSY and own.step < own.last_step), None)
 
     @property
     @abstractmethod
@@ -264,9 +266,10 @@ class BurstEngine(Engine):
                 if member.kind == StepKind.BY_PYTHON:
                     raise self._forged(runner)  # it was out of range when the burst has read it
                 cast("StepsNatively", runner.instance).finish(step, member.outcome)
-        except TerminationRequested:
+        except FmuMeshError as error:
             self._units[unit].stopped = 1
-            member.stage = Stage.WAITING
+            if isinstance(error, TerminationRequested):
+                member.stage = Stage.WAITING
             raise
         if floating_point_changed():
             restore_floating_point()
@@ -412,12 +415,12 @@ class PlainEngine(Engine):
     def _step(self, number: int, runner: Runner) -> None:
         position = self._positions[runner.name]
         step = position.step
-        for source in runner.sources:
-            source.transfer.step(step)
-        position.enter(Stage.IN_PYTHON)
         try:
+            for source in runner.sources:
+                source.transfer.step(step)
+            position.enter(Stage.IN_PYTHON)
             runner.instance.do_step(step)
-        except TerminationRequested:
+        except FmuMeshError:
             self._stopped.add(number)
             raise
         finally:

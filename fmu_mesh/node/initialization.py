@@ -66,13 +66,17 @@ class Initialization:
             self._known[link.source, name, sweep if iterated else None] = value
 
     def run(self, runners: Collection[Runner]) -> None:
-        """Set and get the values of all connections; every instance must be in Initialization Mode.
+        """Take all instances through Initialization Mode; afterwards their outputs are those of point 0.
 
         Raises:
             DeadlineExceeded: the initial value of another node did not come in time.
             FmuError: an FMU refused a value.
             LoopNotConverged: a loop has no consistent values.
         """
+        grid = self._plan.grid
+        for runner in runners:
+            stop_time = grid.told_stop_time(runner.plan.step_points)
+            runner.instance.enter_initialization(grid.start_time, stop_time, runner.plan.start_values)
         self._end = time.monotonic() + self._plan.timeouts.initialize
         loops = {loop.first: loop for loop in self._plan.loops}
         iterated = {level for loop in self._plan.loops for level in range(loop.first, loop.last + 1)}
@@ -88,6 +92,9 @@ class Initialization:
         for runner in runners:
             self._set_inputs(runner, ENDLESS)
         self.out_links.clear()
+        for runner in runners:
+            runner.instance.exit_initialization()
+            runner.bind()
 
     def _iterate(self, loop: Loop, runners: Collection[Runner]) -> None:
         """Iterate the levels of a loop until its values are consistent."""

@@ -222,14 +222,8 @@ class Node:
     def _initialize(self) -> Engine:
         """Initialization Mode: set, get and exchange values level by level; then the outputs are those of point 0."""
         self._activity.enter("initializing")
-        plan, grid = self._plan, self._plan.grid
-        for runner in self._runners.values():
-            stop_time = grid.told_stop_time(runner.plan.step_points)
-            runner.instance.enter_initialization(grid.start_time, stop_time, runner.plan.start_values)
+        plan = self._plan
         self._initialization.run(self._runners.values())
-        for runner in self._runners.values():
-            runner.instance.exit_initialization()
-            runner.bind()
         units = [[self._runners[name] for name in names] for names in plan.units]
         shared = self._memory is not self._own_memory
         self._engine = engine = self._make_engine(plan, units, self._memory, shared=shared, spins=not ONE_CORE)

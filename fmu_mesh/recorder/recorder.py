@@ -28,7 +28,7 @@ from ..wire.inbox import Inbox, Message
 from ..wire.membership import Membership
 from ..wire.messages import ABORT, FINISH, FRAME, GRANT, HEADER, INITIAL, LAST, PROGRESS, NodeReport
 
-__all__ = ["Recorder"]
+__all__ = ["RecordedSource", "Recorder"]
 
 log = logging.getLogger(__name__)
 
@@ -72,7 +72,7 @@ class Recorder:
         self._plan = plan
         self._own_memory = HostMemory.private(plan.memory, RECORDER)
         self._memory = memory if memory is not None else self._own_memory
-        self._sources: dict[int, _Source] = {}
+        self._sources: dict[int, RecordedSource] = {}
         self._columns: list[Callable[[int, int], NDArray[Any]]] = []
         self._rows = plan.rings[0].rows
         self._file = file
@@ -150,7 +150,7 @@ class Recorder:
         self._put_progress = self._membership.sender(progress_key)
         return True
 
-    def _source(self, link: Link, shares: Collection[str]) -> _Source:
+    def _source(self, link: Link, shares: Collection[str]) -> RecordedSource:
         """Where the rows of an instance are: in its ring, in a mirror that frames fill, or text in the mirror."""
 
         def fits(end: int) -> bool:
@@ -160,7 +160,7 @@ class Recorder:
         place = next(place for place in self._plan.rings if place.instance == link.source)
         shared = self._memory if link.source_node in shares else None
         rows, receiver = rows_of(link, place, shared, self._own_memory, fits)
-        return _Source(link, self._plan.grid.last_point, rows, receiver)
+        return RecordedSource(link, self._plan.grid.last_point, rows, receiver)
 
     def _record(self) -> None:
         """Write rows when there are many, or every few milliseconds, and tell the progress."""
@@ -278,7 +278,7 @@ class Recorder:
             log.info("end_not_reported", extra={"error": str(unreachable)})
 
 
-class _Source:
+class RecordedSource:
     """Rows of one instance that wait for rows of the others.
 
     Args:

@@ -23,6 +23,7 @@ RUN_MIB = 1700
 """Need of a master, a node, and of what starts them. Measured: 1540, of which about a tenth is used."""
 _WITHOUT_SESSION = ("check", "completion", "inspect", "new", "plot", "schema")
 _RUNS = ("launch", "run", "node", "master", "gateway")
+_SWEEP = "sweep"
 _NO_MEMORY = ("can't start new thread", "failed to map segment", "Cannot allocate memory")
 """Texts in other errors than MemoryError that mean a lack of memory."""
 
@@ -31,6 +32,8 @@ def needed_mib(command: str, *, local: bool) -> int:
     """The address space that each process of a command needs, in MiB; ``local`` is a run in one process."""
     if command in _WITHOUT_SESSION:
         return FEWEST_MIB
+    if command == _SWEEP:  # its workers need as much
+        return _LOCAL_MIB
     if command in _RUNS:
         return _LOCAL_MIB if local else RUN_MIB
     return _SESSION_MIB

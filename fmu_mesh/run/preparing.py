@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import os
 import pwd
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from collections.abc import Set as AbstractSet
+from contextlib import suppress
 from pathlib import Path
-from types import MappingProxyType
 
 import msgspec
 from msgspec.structs import replace
@@ -16,6 +16,7 @@ from .. import files
 from ..config.findings import Findings
 from ..config.instance_sections import InstanceSection, key_of, placed
 from ..config.loading import LoadedConfig, read_file
+from ..config.mesh import LimitsConfig
 from ..errors import Finding, LoadFailed
 from ..instances.configuration import examine_data
 from ..instances.registry import check_showing, content, describe, expected_model
@@ -28,7 +29,58 @@ from .options import Options, with_config_values, with_options
 from .results import check_results
 from .run_plan import RunPlan
 
-__all__ = ["plan_run", "planned", "prepare"]
+__all__ = ["KnownModels", "plan_run", "planned", "prepare"]
+
+_MOST_KNOWN = 256
+
+
+class KnownModels:
+    """Model descriptions that were read before, for plans of the same models: a model is read again if it has changed.
+
+    Example:
+        >>> from fmu_mesh.config.mesh import LimitsConfig
+        >>> from fmu_mesh.instances.registry import KINDS
+        >>> section = KINDS.section("fmu")(fmu="fmus/Gain.fmu")
+        >>> known = KnownModels()
+        >>> first = known.describe(Path("fmus/Gain.fmu"), section, LimitsConfig())
+        >>> known.describe(Path("fmus/Gain.fmu"), section, LimitsConfig()) is first
+        True
+
+    Args:
+        keeps_code: whether components are known, too: right where the code of a process stays as it was imported. The
+            content of a component does not cover what it imports, so otherwise it is described anew for each plan.
+    """
+
+    def __init__(self, *, keeps_code: bool = False) -> None:
+        self._keeps_code = keeps_code
+        self._models: dict[tuple[str, bytes], tuple[str, ModelDescription]] = {}
+
+    def describe(
+        self,
+        path: Path,
+        section: InstanceSection,
+        limits: LimitsConfig,
+        tell: Callable[[str], None] = lambda _text: None,
+    ) -> ModelDescription:
+        """The model description of an instance; see `fmu_mesh.instances.registry.describe`.
+
+        Raises:
+            LoadFailed: the model cannot be read.
+        """
+        if section.names_code and not self._keeps_code:
+            return describe(path, section, limits, tell)
+        model = os.path.realpath(path), msgspec.json.encode((section, limits))
+        if model in self._models:
+            version, description = self._models[model]
+            with suppress(LoadFailed):  # `describe` says why
+                if content(path, section) == version:
+                    return description
+        description = describe(path, section, limits, tell)
+        with suppress(LoadFailed):  # whoever needs its content says why
+            self._models[model] = content(path, section), description
+        if len(self._models) > _MOST_KNOWN:
+            del self._models[next(iter(self._models))]
+        return description
 
 
 def prepare(
@@ -64,7 +116,7 @@ def planned(
     findings: Findings,
     options: Options,
     tell: Callable[[str], None] = lambda _text: None,
-    known: Mapping[str, ModelDescription] = MappingProxyType({}),
+    known: KnownModels | None = None,
 ) -> RunPlan:
     """Check and plan a configuration whose structure was examined.
 
@@ -73,7 +125,7 @@ def planned(
         findings: those of its structure.
         options: what the command line changes.
         tell: called before something that takes long, such as compiling an FMU.
-        known: model descriptions that were read before, by instance name.
+        known: model descriptions that were read before; those that are read now are added. None: all are read.
 
     Raises:
         ConfigurationError: the configuration or an FMU is wrong; carries all findings.
@@ -83,7 +135,7 @@ def planned(
         _check_owner(loaded, findings)
     if not len(findings):  # otherwise the world may be what is wrong
         check_showing(loaded.config.instances, options.showing)
-    descriptions, unreadable = _descriptions(loaded, findings.places, tell, known)
+    descriptions, unreadable = _descriptions(loaded, findings.places, tell, known or KnownModels())
     findings.merge(unreadable)
     resolve_ros(loaded, descriptions, findings)
     system = build(loaded, descriptions, tuple(findings))
@@ -98,7 +150,7 @@ def _descriptions(
     loaded: LoadedConfig,
     known_places: AbstractSet[str],
     tell: Callable[[str], None],
-    known: Mapping[str, ModelDescription],
+    known: KnownModels,
 ) -> tuple[dict[str, ModelDescription], Sequence[Finding]]:
     """The description of every instance whose model can be read, and a finding for every other.
 
@@ -120,7 +172,7 @@ def _descriptions(
         model = (path, msgspec.json.encode(own))
         if model not in cache:
             try:
-                cache[model] = known[name] if name in known else describe(path, own, loaded.config.limits, tell)
+                cache[model] = known.describe(path, own, loaded.config.limits, tell)
             except LoadFailed as error:
                 cache[model] = error
         found = cache[model]

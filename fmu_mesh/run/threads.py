@@ -7,13 +7,15 @@ variables have to be set before numpy is imported.
 
 from __future__ import annotations
 
+import ctypes
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
+from functools import cache
 from threading import Lock
 from typing import Any, Final
 
-__all__ = ["ONE_THREAD", "one_thread_from_now_on", "one_thread_meanwhile"]
+__all__ = ["ONE_THREAD", "LimitedThreads", "one_thread_from_now_on", "one_thread_meanwhile"]
 
 ONE_THREAD: Final = dict.fromkeys(
     (
@@ -69,3 +71,54 @@ def one_thread_meanwhile() -> Iterator[None]:
         yield
     finally:
         _limits.end()
+
+
+class LimitedThreads:
+    """As `one_thread_meanwhile`, from the first `limit` to `close`, for many runs: to look for libraries takes long."""
+
+    def __init__(self) -> None:
+        self._stack = ExitStack()
+        self._seen = -1
+
+    def limit(self) -> None:
+        """Limit all libraries that are loaded by now, if there are new ones."""
+        if _libraries_loaded() != self._seen:
+            self._stack.enter_context(one_thread_meanwhile())
+            self._seen = _libraries_loaded()
+
+    def close(self) -> None:
+        """Lift the limits."""
+        self._stack.close()
+        self._seen = -1
+
+
+class _Library(ctypes.Structure):
+    """The first fields of `dl_phdr_info` (dl_iterate_phdr(3))."""
+
+    _fields_ = (
+        ("address", ctypes.c_void_p),
+        ("name", ctypes.c_char_p),
+        ("headers", ctypes.c_void_p),
+        ("n_headers", ctypes.c_uint16),
+        ("loaded", ctypes.c_ulonglong),
+    )
+
+
+_Look = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.POINTER(_Library), ctypes.c_size_t, ctypes.c_void_p)
+
+
+def _libraries_loaded() -> int:
+    """How many libraries this process has loaded since its start: the dynamic linker counts them."""
+    found: list[int] = []
+
+    def look(library: Any, _size: int, _data: int | None) -> int:  # noqa: ANN401  a pointer of ctypes
+        found.append(library.contents.loaded)
+        return 1  # the first one is enough: the count is that of the process
+
+    _linker().dl_iterate_phdr(_Look(look), None)
+    return found[0]
+
+
+@cache
+def _linker() -> ctypes.CDLL:
+    return ctypes.CDLL(None)

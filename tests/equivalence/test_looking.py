@@ -30,6 +30,7 @@ from tests.helpers import DEADLINE_S, Place, wait_until, write_config
 
 FMUS = Path(__file__).parents[2] / "fmus"
 ROOT = "fmu_mesh/looked_at"
+_RUNS = 20
 
 CONFIG = """\
 mesh: looked_at
@@ -593,6 +594,16 @@ def test_a_stream_is_what_is_recorded_point_by_point() -> None:
 
 
 def test_what_a_get_answers_is_the_row_of_the_point_that_it_tells() -> None:
+    read = 0
+    for _ in range(_RUNS):  # on a busy machine, a run is over after few questions
+        read += read_and_compared()
+        if read > 300:
+            return
+    pytest.fail(f"only {read} values were read in {_RUNS} runs")
+
+
+def read_and_compared() -> int:
+    """Read values while a mesh runs at full speed, and compare them with its rows; returns how many were read."""
     with running(stop_time=4000.0, factor=0) as mesh, plain_session(mesh) as session:
         read: list[tuple[str, Stamped]] = []
         while mesh.process.poll() is None and len(read) < 200_000:
@@ -603,13 +614,13 @@ def test_what_a_get_answers_is_the_row_of_the_point_that_it_tells() -> None:
         with mesh.result.open(encoding="utf-8", newline="") as file:
             rows = list(csv.DictReader(file))
 
-    assert len(read) > 300
     wrong = [
         (name, point)
         for name, (point, time, value) in read
         if (float(rows[point]["time"]), float(rows[point][f"pendulum.{name}"])) != (time, value)
     ]
     assert not wrong, f"{len(wrong)} of {len(read)} values are not of their point"
+    return len(read)
 
 
 def test_a_stopped_subscriber_holds_nobody_up() -> None:

@@ -7,8 +7,10 @@ shares nothing with the code of the mesh but the delays and the tears, which `te
 from __future__ import annotations
 
 import math
+import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -18,12 +20,20 @@ from hypothesis import HealthCheck, event, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from fmu_mesh import files
 from fmu_mesh.config.instance_sections import KIND
+from fmu_mesh.config.loading import LoadedConfig
 from fmu_mesh.config.mesh import Config
-from fmu_mesh.errors import LoopNotConverged
+from fmu_mesh.errors import LoopNotConverged, StepFailed, TerminationRequested
 from fmu_mesh.instances.registry import decode_section
+from fmu_mesh.rings import native
 from fmu_mesh.rings.ring import Ring
 from fmu_mesh.run.local import LocalMesh
+from fmu_mesh.run.options import Options
+from fmu_mesh.run.outcome import Outcome
+from fmu_mesh.run.repeated import RepeatedRuns
+from fmu_mesh.run.results import open_result
+from fmu_mesh.run.run_plan import RunPlan
 from fmu_mesh.simtime import TimeGrid
 from fmu_mesh.system.connections import Connection
 from fmu_mesh.system.plan import Plan, make_plan
@@ -432,6 +442,143 @@ def test_any_system_gives_the_reference_result_in_one_process(drawn: Drawn) -> N
     result = run(drawn, plan, lambda open_instance: LocalMesh(plan, open_instance=open_instance).run())
 
     assert bits(result) == bits(expected)
+
+
+class Kept:
+    """A result file that keeps what it gets."""
+
+    path = Path("kept.csv")
+    kept = files.Kept()
+
+    def __init__(self) -> None:
+        self.columns: list[list[NDArray[Any]]] = []
+        self.rows = 0
+
+    def write(self, times: NDArray[np.float64], columns: Sequence[NDArray[Any]]) -> None:
+        self.columns.append([np.array(column) for column in (times, *columns)])
+        self.rows += len(times)
+
+    def flush(self) -> None:
+        return
+
+    def close(self) -> None:
+        return
+
+
+LIBRARIES = pytest.mark.parametrize(
+    "library",
+    [pytest.param(True, marks=pytest.mark.skipif(native.library is None, reason="no library")), False],
+    ids=["C", "Python"],
+)
+
+
+@LIBRARIES
+@given(st.one_of(systems(), looped()))
+@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+def test_any_system_gives_the_reference_result_in_each_of_many_runs(library: bool, drawn: Drawn) -> None:  # noqa: FBT001 a parameter of tests
+    plan = planned(drawn)
+    run_plan = RunPlan(LoadedConfig(plan.system.config, Path()), Options(), plan, {})
+    opened: dict[str, Mixer] = {}
+
+    def open_instance(name: str) -> Mixer:
+        opened[name] = Mixer(drawn, plan, int(name[1:]))
+        return opened[name]
+
+    with pytest.MonkeyPatch.context() as patch, tempfile.TemporaryDirectory() as folder:
+        if not library:
+            patch.setattr(native, "library", None)
+        runs = RepeatedRuns(Path(folder), open_instance=open_instance)
+        try:
+            expected = expected_of(drawn, plan)
+        except LoopNotConverged:
+            expected = []
+        for _ in range(2):
+            kept = Kept()
+            if not expected:
+                with pytest.raises(LoopNotConverged):
+                    runs.run(run_plan, kept)
+                continue
+            outcome = runs.run(run_plan, kept)
+
+            assert (outcome.point, outcome.rows) == (drawn.last_point, drawn.last_point + 1 if drawn.recorded else 0)
+            assert bits([opened[name_of(number)].rows for number in range(len(drawn.steps))]) == bits(expected)
+            if drawn.recorded:
+                columns = [np.concatenate(parts) for parts in zip(*kept.columns, strict=True)]
+                assert_recorded(drawn, expected, columns)
+        runs.close()
+
+
+class Ending(Mixer):
+    """A mixer that fails in one of its steps, or asks to end the simulation there."""
+
+    def __init__(self, drawn: Drawn, plan: Plan, number: int, end: tuple[int, bool] | None) -> None:
+        super().__init__(drawn, plan, number)
+        self._end = end
+
+    def do_step(self, step: int) -> None:
+        if self._end is not None and step == self._end[0]:
+            name = name_of(self._number)
+            raise (
+                StepFailed("it fails here", instance=name) if self._end[1] else TerminationRequested("", instance=name)
+            )
+        super().do_step(step)
+
+
+@st.composite
+def ending_systems(draw: st.DrawFn) -> tuple[Drawn, list[tuple[int, bool] | None]]:
+    """A system, and of each instance the step in which it ends, if it does, and whether it fails there."""
+    drawn = msgspec.structs.replace(draw(systems()), recorded=True)
+    end = st.none() | st.tuples(st.integers(0, 12), st.booleans())
+    return drawn, [draw(end) for _ in drawn.steps]
+
+
+@pytest.mark.parametrize("slow", [False, True])
+@LIBRARIES
+@given(ending_systems())
+@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+def test_many_runs_end_where_a_run_point_by_point_ends(
+    library: bool,  # noqa: FBT001 a parameter of tests
+    slow: bool,  # noqa: FBT001 as above
+    ending: tuple[Drawn, list[tuple[int, bool] | None]],
+) -> None:
+    """``slow``: each step takes longer than a slice, so instances are at several points when one ends."""
+    drawn, ends = ending
+    plan = planned(drawn)
+
+    def instance(name: str) -> Ending:
+        return Ending(drawn, plan, int(name[1:]), ends[int(name[1:])])
+
+    def ended(run: Callable[[], Outcome]) -> tuple[object, ...]:
+        try:
+            outcome = run()
+        except StepFailed as error:
+            return error.instance, error.point, error.time
+        return outcome.state, outcome.point, outcome.time, outcome.ended_by
+
+    with pytest.MonkeyPatch.context() as patch, tempfile.TemporaryDirectory() as folder:
+        if not library:
+            patch.setattr(native, "library", None)
+        if slow:
+            patch.setattr("fmu_mesh.node.engine._SLICE_S", 1e-7)
+        file = Path(folder, "rows.csv")
+        plan = msgspec.structs.replace(plan, system=msgspec.structs.replace(plan.system, result_file=str(file)))
+        loaded = LoadedConfig(plan.system.config, Path())
+        expected = ended(LocalMesh(plan, open_instance=instance, loaded=loaded).run), file.read_bytes()
+        runs = RepeatedRuns(Path(folder), open_instance=instance)
+        run_plan = RunPlan(loaded, Options(), plan, {})
+        for _ in range(2):
+            result = open_result(loaded, plan.system)
+            assert (ended(lambda result=result: runs.run(run_plan, result)), file.read_bytes()) == expected  # type: ignore[misc]  # the result of this loop
+        runs.close()
+    event("ended early" if len(expected[0]) == 3 or expected[0][3] is not None else "to the end")
+
+
+def assert_recorded(drawn: Drawn, expected: list[list[Row]], columns: list[NDArray[Any]]) -> None:
+    """The times, and then `y` of every instance at every point: it holds between its own points."""
+    points = range(drawn.last_point + 1)
+    assert columns[0].tolist() == [point * STEP_SIZE for point in points]
+    for found, rows, own in zip(columns[1:], expected, drawn.steps, strict=True):
+        assert [y.hex() for y in found.tolist()] == [rows[point // own][0].hex() for point in points]
 
 
 @pytest.mark.parametrize("window", [1, 7, 256])

@@ -1,0 +1,171 @@
+"""`RepeatedMesh`: many runs of one mesh in this process, with the models kept loaded; `Mesh.repeated` makes it."""
+
+from __future__ import annotations
+
+import threading
+import weakref
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Self, Unpack
+
+import numpy as np
+from msgspec.structs import replace
+from numpy.typing import NDArray
+
+from ..errors import CallRefused, FmuError, FmuMeshError
+from ..files import Kept
+from ..run.outcome import Outcome
+from ..run.repeated import RepeatedRuns
+from ..run.results import open_result
+from ..run.run_plan import RunPlan
+from ..variables.value_types import DTYPES
+from ..wire.runtime import fmu_folder, remove_run_folder, remove_stale_folders, run_folder, run_name
+from .plan_options import PlanOptions, memory_of
+from .result import Result, types_of
+from .result_reading import Columns
+
+if TYPE_CHECKING:
+    from .mesh_builder import Mesh
+
+__all__ = ["RepeatedMesh"]
+
+
+class RepeatedMesh:
+    """Runs of one mesh, one after another, in this process and on one thread.
+
+    Models are unpacked and loaded once. Each run makes new instances, and its floats are those of any run of the mesh.
+    A call that hangs in an FMU cannot be ended, and an FMU that crashes takes the program with it: `fmu_mesh.sweep`
+    puts its runs into processes of their own.
+
+    Example:
+        >>> import fmu_mesh
+        >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
+        >>> with mesh.repeated() as runs:
+        ...     ends = [
+        ...         float(runs.run(start_values={"pendulum.d": d}, stop_time=10.0)["pendulum.a"][-1])
+        ...         for d in (0.1, 0.5, 0.1)
+        ...     ]
+        >>> ends[0] == ends[2] != ends[1]
+        True
+
+    Args:
+        mesh: the mesh.
+        reset: reset the instances of FMUs between two runs, and do not make new ones.
+        on_hang: called on another thread if an FMU does not return in time.
+    """
+
+    def __init__(self, mesh: Mesh, *, reset: bool, on_hang: Callable[[FmuError], None]) -> None:
+        self._mesh = mesh.from_configuration(mesh.configuration, keeps_code=True)
+        self._thread = threading.get_ident()
+        self._make = partial(RepeatedRuns, on_hang=on_hang, reset=reset)
+        self._loaded: list[tuple[RepeatedRuns, Path]] = []
+        self._release = weakref.finalize(self, _release, self._loaded, self._thread)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def run(self, **options: Unpack[PlanOptions]) -> Result:
+        """Run the mesh to its end, and return what it has recorded.
+
+        The result stays in memory, unless `output` names a file: then it is in both.
+
+        Args:
+            options: see `PlanOptions`.
+
+        Raises:
+            ConfigurationError: the configuration, a model or an option is wrong; carries all findings.
+            CallRefused: this is not the thread that made this object, or it is closed.
+            FmuMeshError: the run ended early; its `result` has what was recorded up to then.
+        """
+        if not self._release.alive or threading.get_ident() != self._thread:
+            why = "it belongs to the thread that made it" if self._release.alive else "it is closed"
+            raise CallRefused(f"run is not possible, because {why}.")
+        if options.get("output") is None:
+            options["record"] = "memory"
+        plan = self._mesh.plan(**options)
+        rows, runs = _CollectedRows(plan), self._runs(plan.mesh)
+        try:
+            outcome = runs.run(plan, rows)
+        except FmuMeshError as error:
+            point = runs.point
+            outcome = Outcome("failed", point, plan.plan.grid.time(point), 0.0, rows.rows, None, error.report())
+            raise error.with_result(rows.result(outcome)) from error.__cause__
+        return rows.result(outcome)
+
+    def close(self) -> None:
+        """Free all models, and remove their files. May be called twice."""
+        self._release()
+
+    def _runs(self, mesh: str) -> RepeatedRuns:
+        """What runs a plan; made for the first one, whose configuration is right."""
+        if not self._loaded:
+            remove_stale_folders()
+            folder = run_folder(mesh, run_name())
+            models = fmu_folder(folder)
+            models.mkdir()
+            self._loaded.append((self._make(models), folder))
+        return self._loaded[0][0]
+
+
+class _CollectedRows:
+    """The rows of a run in memory, and in its result file if it has one; see `ResultFile`.
+
+    Args:
+        plan: the plan of the run.
+    """
+
+    def __init__(self, plan: RunPlan) -> None:
+        self._plan = plan
+        self._file = open_result(plan.loaded, plan.plan.system) if memory_of(plan) is None else None
+        self._times: list[NDArray[np.float64]] = []
+        self._blocks: list[list[NDArray[Any]]] = []
+        self.rows = 0
+
+    @property
+    def path(self) -> Path:
+        return self._file.path if self._file is not None else Path()
+
+    @property
+    def kept(self) -> Kept:
+        return self._file.kept if self._file is not None else Kept()
+
+    def write(self, times: NDArray[np.float64], columns: Sequence[NDArray[Any]]) -> None:
+        self._times.append(np.array(times))
+        self._blocks.append([np.array(column) for column in columns])
+        self.rows += len(times)
+        if self._file is not None:
+            self._file.write(times, columns)
+
+    def flush(self) -> None:
+        if self._file is not None:
+            self._file.flush()
+
+    def close(self) -> None:
+        if self._file is not None:
+            self._file.close()
+
+    def result(self, outcome: Outcome) -> Result:
+        """What was recorded."""
+        system, file = self._plan.plan.system, self._file.path if self._file is not None else None
+        types = types_of(system) or {}
+        parts = zip(*self._blocks, strict=True) if self._blocks else [[np.zeros(0, DTYPES[t])] for t in types.values()]
+        columns = {name: np.concatenate(part) for name, part in zip(types, parts, strict=True)}
+        times = np.concatenate(self._times) if self._times else np.zeros(0)
+        outcome = replace(outcome, file=str(file) if file is not None else None)
+        return Result(self._plan.mesh, file=file, outcome=outcome, system=system, columns=Columns(times, columns))
+
+
+def _release(loaded: list[tuple[RepeatedRuns, Path]], thread: int) -> None:
+    """Free everything. On another thread only the files: an FMU is only called on its own."""
+    for runs, folder in loaded:
+        if threading.get_ident() == thread:
+            runs.close()
+        remove_run_folder(folder)
+    loaded.clear()

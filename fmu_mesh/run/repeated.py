@@ -1,0 +1,365 @@
+"""Many runs of one mesh in this process, one after another: for sweeps, optimizers and calibration.
+
+The instances of a run are stepped as those of one node, in bursts, and their rows go from the rings to the result file
+as those of a recorder do. So a run takes milliseconds, and gives bit-for-bit the result of `LocalMesh`. Between two
+runs there are no instances, but the libraries of their models stay loaded (`fmu_mesh.instances.kept_models`).
+"""
+
+from __future__ import annotations
+
+import logging
+import shutil
+import threading
+import time
+from collections.abc import Callable
+from contextlib import ExitStack, suppress
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+from msgspec.structs import replace
+
+from ..config.mesh import TimeoutsConfig
+from ..errors import FmuError, FmuMeshError, Interrupted, ProtocolBroken, TerminationRequested
+from ..instances.call_guard import CallWatch, Guarded, doing
+from ..instances.contract import Instance, LogMessage
+from ..instances.kept_models import KeptModels
+from ..instances.registry import open_instance
+from ..master.pacing import Pacer
+from ..node.connecting import connect
+from ..node.engine import Engine, make_engine
+from ..node.initialization import Initialization
+from ..node.stepping import Position, Runner
+from ..rings import native
+from ..rings.host_memory import HostMemory
+from ..system.plan import Plan, make_plan
+from ..system.recording import ResultFile
+from .local_system import check_one_process, opening_of
+from .outcome import Outcome
+from .row_writer import RowWriter
+from .run_plan import RunPlan
+from .threads import LimitedThreads
+
+__all__ = ["RepeatedRuns"]
+
+log = logging.getLogger(__name__)
+
+_NODE = "instances"
+_SCRATCH = "scratch"
+_WRITE_ROWS = 2048
+_LOOK_S = 0.5
+
+
+class RepeatedRuns:
+    """Runs plans one after another in this process and on one thread, with the libraries of their models kept loaded.
+
+    Each run has new instances; an FMU that allows one instance per process is reset instead. What a model keeps in
+    variables of its library, or writes into its own folder, stays from run to run; after a failure of an instance its
+    FMU is loaded anew. Until `close`, the numeric libraries of this process use one thread.
+
+    Example:
+        >>> import tempfile, fmu_mesh
+        >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     runs = RepeatedRuns(Path(folder))
+        ...     for damping in (0.001, 0.1):
+        ...         print(runs.run(mesh.plan(start_values={"pendulum.d": damping}, stop_time=1.0), None).point)
+        ...     runs.close()
+        500
+        500
+
+    Args:
+        folder: an existing private folder; FMUs are extracted below it.
+        log: called with every log message of a model.
+        on_hang: called on another thread if a model does not return in time. All complete rows are in the result file.
+            The thread that is inside the model cannot be stopped, so the caller has to end the process.
+        reset: whether instances stay between runs and are reset, where their models can be reset.
+        open_instance: opens an instance by name, instead of the model of the plan; it is closed here.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        *,
+        log: Callable[[LogMessage], None] = lambda _message: None,
+        on_hang: Callable[[FmuError], None] = lambda error: log.error("%s", error),
+        reset: bool = False,
+        open_instance: Callable[[str], Instance] | None = None,
+    ) -> None:
+        self._around = _Surroundings(folder / _SCRATCH, KeptModels(folder, resets=reset), log, open_instance)
+        self._on_hang = on_hang
+        self._threads = LimitedThreads()
+        self._watch: CallWatch | None = None
+        self._thread = 0
+        self._run: _Run | None = None
+        self._stop: str | None = None
+
+    def run(self, run: RunPlan, result: ResultFile | None) -> Outcome:
+        """Run a plan from the first to the last point.
+
+        Args:
+            run: the plan; its nodes and its window are not used.
+            result: gets a row for each point, and is closed here; None: nothing is recorded.
+
+        Raises:
+            FmuMeshError: a model failed, the run was interrupted, or this system cannot run in one process. The rows
+                that were recorded before are kept.
+        """
+        writer = RowWriter(result)
+        try:
+            if self._around.open_instance is None:
+                check_one_process(run.plan)
+            self._run = current = _Run(run, writer, self._around)
+            if self._stop is not None:
+                current.interrupt(self._stop)
+            self._around.scratch.mkdir(mode=0o700, exist_ok=True)
+            return current.run(self._watch_here(), self._threads)
+        except FmuMeshError as error:
+            writer.close()
+            error.with_hint(writer.kept())
+            raise
+        finally:
+            self._stop = None
+            writer.close()
+            if self._around.scratch.is_dir() and any(self._around.scratch.iterdir()):
+                shutil.rmtree(self._around.scratch, ignore_errors=True)
+
+    def interrupt(self, reason: str) -> None:
+        """From any thread: end the run under way with `Interrupted` within about a millisecond, or after one step.
+
+        Between two runs this ends the next one.
+        """
+        self._stop = reason
+        if self._run is not None:
+            self._run.interrupt(reason)
+
+    @property
+    def point(self) -> int:
+        """The last point that all instances of the last run reached."""
+        return self._run.point if self._run is not None else 0
+
+    @property
+    def rows(self) -> int:
+        """Rows of the last run."""
+        return self._run.writer.rows if self._run is not None else 0
+
+    def close(self) -> None:
+        """Free all models, and remove their files; on the thread of the runs. May be called twice."""
+        run = self._run
+        if run is not None:
+            with self._watch_here().calling(run.names, FmuError, "terminate", run.timeouts.terminate):
+                self._around.models.close()
+        if self._watch is not None:
+            self._watch.close()
+            self._watch = None
+        shutil.rmtree(self._around.scratch, ignore_errors=True)
+        self._threads.close()
+
+    def _watch_here(self) -> CallWatch:
+        """What watches the calls of this thread; to start a thread for each run would take longer than to load it."""
+        if self._watch is None or self._thread != threading.get_ident():
+            if self._watch is not None:
+                self._watch.close()
+            self._watch, self._thread = CallWatch(self._take_hang), threading.get_ident()
+        return self._watch
+
+    def _take_hang(self, error: FmuError) -> None:
+        """From the watching thread, which ends then."""
+        self._watch = None
+        if self._run is not None:
+            self._run.save(error)
+        self._on_hang(error)
+
+
+class _Surroundings(NamedTuple):
+    """What the instances of all runs get.
+
+    Attributes:
+        scratch: a folder for files that are removed after each run.
+    """
+
+    scratch: Path
+    models: KeptModels
+    log: Callable[[LogMessage], None]
+    open_instance: Callable[[str], Instance] | None
+
+
+class _Run:
+    """One run: its instances, what steps them, and how it ended.
+
+    Attributes:
+        point: the last point that all instances reached.
+        writer: writes its rows.
+    """
+
+    def __init__(self, run: RunPlan, writer: RowWriter, surroundings: _Surroundings) -> None:
+        self.point = 0
+        self._run = run
+        self._plan = plan = _in_one_node(run.plan)
+        self._node = plan.nodes[_NODE]
+        self._last = plan.grid.last_point
+        self.writer = writer
+        self._around = surroundings
+        self._stop: str | None = None
+        self._runners: dict[str, Runner] = {}
+        self._engine: Engine | None = None
+        self._first: tuple[tuple[int, int], FmuError | TerminationRequested] | None = None
+
+    @property
+    def names(self) -> str:
+        """The names of all instances, for errors."""
+        return ", ".join(self._plan.order)
+
+    @property
+    def timeouts(self) -> TimeoutsConfig:
+        """The deadlines."""
+        return self._node.timeouts
+
+    def run(self, watch: CallWatch, threads: LimitedThreads) -> Outcome:
+        """See `RepeatedRuns.run`."""
+        with ExitStack() as stack:
+            stack.callback(self._forget)
+            memory = HostMemory.private(self._node.memory, _NODE)
+            threads.limit()
+            self._open(memory, watch, stack)
+            threads.limit()  # with the libraries that a component has imported
+            stack.callback(self.writer.close)  # before the instances are closed
+            engine = self._initialize(memory)
+            self.writer.begin(self._plan, self._runners)
+            stack.callback(self._write_rest, engine)
+            started = time.perf_counter()
+            with watch.stepping(self._position, self._node.timeouts.step):
+                self._step_to_the_end(engine, memory)
+            seconds = time.perf_counter() - started
+        event = self._first[1] if self._first is not None else None
+        if isinstance(event, FmuError):
+            raise event
+        plan, writer = self._plan, self.writer
+        ended_by = event.report() if event is not None else None
+        time_s = plan.grid.time(self.point)
+        return Outcome("done", self.point, time_s, seconds, writer.rows, writer.file, ended_by=ended_by)
+
+    def interrupt(self, reason: str) -> None:
+        """From any thread: see `RepeatedRuns.interrupt`."""
+        self._stop = reason
+        if (engine := self._engine) is not None:
+            engine.ring_bell()
+
+    def _open(self, memory: HostMemory, watch: CallWatch, stack: ExitStack) -> None:
+        node = self._node
+        places = {place.instance: place for place in node.rings}
+        for item in node.instances:
+            instance = Guarded(item.name, partial(self._instance, item.name), watch, node.timeouts)
+            stack.callback(instance.close)
+            place = places[item.name]
+            ring, counter = memory.ring(place), memory.counter(place.counter)
+            self._runners[item.name] = Runner(item, instance, node.grid, ring, counter)
+        connect(node, self._runners, memory, memory, ())
+
+    def _instance(self, name: str) -> Instance:
+        run, around = self._run, self._around
+        if around.open_instance is not None:
+            return around.open_instance(name)
+        opening = opening_of(self._plan, name, around.scratch, around.log, run.options.showing)
+        return open_instance(replace(opening, content=run.contents.get(name), kept=around.models))
+
+    def _initialize(self, memory: HostMemory) -> Engine:
+        """Initialization Mode, as `Node` does it; then the outputs are those of point 0."""
+        node, runners = self._node, self._runners.values()
+        Initialization(node, _nothing_comes).run(runners)
+        units = [[self._runners[name] for name in names] for names in node.units]
+        engine = make_engine(node, units, memory, shared=False, spins=False)
+        for runner in runners:
+            runner.begin()
+        self._engine = engine
+        return engine
+
+    def _step_to_the_end(self, engine: Engine, memory: HostMemory) -> None:
+        """Grant points, step and write rows; rows that are not written yet are never overwritten."""
+        writer, window = self.writer, self._plan.window
+        pacer = Pacer(self._plan, self._plan.system.config.simulation.real_time_factor)
+        pacer.start(0)
+        many = min(_WRITE_ROWS, window // 2)
+        stepped_at = time.monotonic()
+        while True:
+            self.point = point = min(engine.covered, self._last)
+            writer.write(point + 1, many)
+            if self._stop is not None:
+                raise Interrupted(self._stop, point=point, time=self._node.grid.time(point))
+            if point >= self._last:
+                return
+            granted, pause_s = pacer.limit(min(self._last, writer.written - 1 + window), point)
+            memory.grant.raise_to(granted)
+            try:
+                stepped = engine.run(min(pause_s, _LOOK_S), eager=True)
+            except (FmuError, TerminationRequested) as event:
+                self._end_at(event, engine, memory)
+                continue
+            if stepped or granted <= point:
+                stepped_at = time.monotonic()
+            elif time.monotonic() - stepped_at > self._node.timeouts.step:
+                raise ProtocolBroken(f"no instance can step from point {point}, although point {granted} is granted")
+
+    def _end_at(self, event: FmuError | TerminationRequested, engine: Engine, memory: HostMemory) -> None:
+        """The run ends at the point of ``event``, unless another instance ends it before: all others go on to there.
+
+        Within a burst, an instance is ahead of those behind it; point by point, the first event would end the run.
+        """
+        runner = self._runners.get(event.instance or "") or engine.current
+        if runner is None:
+            raise event
+        point = runner.covered
+        begun = runner.point if isinstance(event, FmuError) else point
+        event.at(begun, self._node.grid.time(begun))
+        for member in next(unit for unit in engine.units if runner in unit):
+            member.stop()
+        place = point, self._plan.order.index(runner.name)
+        if self._first is None or place < self._first[0]:
+            self._first = place, event
+            self._last = point
+            if native.library is not None:
+                memory.withdraw_grant()
+            memory.grant.raise_to(point)
+
+    def _position(self) -> tuple[str, int, str]:
+        """See `CallWatch.stepping`; between two steps, the answer changes all the time."""
+        runner = self._engine.current if self._engine is not None else None
+        return (runner.name, runner.step, doing(runner.stage)) if runner else ("", time.monotonic_ns(), "")
+
+    def _write_rest(self, engine: Engine) -> None:
+        """However the run ends: write the rows that are complete."""
+        self.point = min(engine.covered, self._last)
+        self.writer.write(self.point + 1, 1)
+
+    def save(self, error: FmuError) -> None:
+        """From the watching thread: the main thread is inside a model, so nothing of this object changes any more."""
+        engine = self._engine
+        if engine is not None:
+            runner = engine.current
+            point, covered = (runner.point, runner.covered) if runner is not None else (self.point, self.point)
+            error.at(point, self._node.grid.time(point))
+            with suppress(FmuMeshError):  # the process ends now for another reason
+                self.writer.write(min(self.writer.complete, covered, self._last) + 1, 1)
+        with suppress(FmuMeshError):
+            self.writer.close()
+        error.with_hint(self.writer.kept())
+
+    def _forget(self) -> None:
+        """The memory of the run is freed now: it is in no cycle of objects any more."""
+        for runner in self._runners.values():
+            runner.follow(Position())
+        self._runners.clear()
+        self._engine = None
+
+
+def _in_one_node(plan: Plan) -> Plan:
+    """The plan of the same system with all instances in one node; a run in one process needs no window."""
+    system = plan.system
+    config = replace(system.config, simulation=replace(system.config.simulation, window="auto"))
+    instances = {name: replace(own, node=_NODE) for name, own in system.instances.items()}
+    return make_plan(replace(system, config=config, instances=instances))
+
+
+def _nothing_comes(_left_s: float) -> None:
+    """In the place of a wait for other nodes."""
+    raise ProtocolBroken("an initial value has no source in this process")
