@@ -10,7 +10,6 @@ import math
 import warnings
 from collections.abc import Mapping, Sequence
 from io import BytesIO
-from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,18 +25,33 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from matplotlib.legend import Legend
+    from matplotlib.lines import Line2D
 
-__all__ = ["FLAGS", "VALUE", "Curve", "draw", "figure_of", "reduced", "require_matplotlib"]
+__all__ = [
+    "COLOURS",
+    "DASHES",
+    "FLAGS",
+    "MAX_POINTS",
+    "VALUE",
+    "Curve",
+    "add_legend",
+    "draw",
+    "empty_figure",
+    "figure_of",
+    "reduced",
+    "require_matplotlib",
+    "short",
+]
 
 FLAGS = "true (1) or false (0)"
 """Label of the axis of Booleans."""
 VALUE = "value"
 """Label of the axis of numbers whose unit is unknown or that have none."""
 
-_MAX_POINTS = 4000
+MAX_POINTS = 4000
 """Points per line: more than twice the width of the picture in pixels would not be visible."""
-_COLOURS = 10
-_DASHES: tuple[Any, ...] = (
+COLOURS = 10
+DASHES: tuple[Any, ...] = (
     "solid",
     (0, (5, 2)),
     (0, (1, 1.2)),
@@ -118,7 +132,6 @@ def figure_of(results: Columns, title: str, curves: Mapping[str, Curve]) -> Figu
     Raises:
         ConfigurationError: matplotlib is not installed.
     """
-    require_matplotlib()
     groups: dict[str, list[str]] = {}
     for name, values in results.values.items():
         if values.dtype == object:
@@ -127,54 +140,67 @@ def figure_of(results: Columns, title: str, curves: Mapping[str, Curve]) -> Figu
         axis = curve.axis if curve is not None else FLAGS if values.dtype == bool else VALUE
         groups.setdefault(axis, []).append(name)
     groups = groups or {VALUE: []}
+    figure = empty_figure()
     # A character that is not in the font is drawn as a box, without a word.
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        return _laid_out(results, title, curves, groups)
+        _lay_out(figure, results, title, curves, groups)
+    return figure
 
 
-def _laid_out(results: Columns, title: str, curves: Mapping[str, Curve], groups: Mapping[str, Sequence[str]]) -> Figure:
+def empty_figure() -> Figure:
+    """A figure without axes, as all pictures begin.
+
+    Raises:
+        ConfigurationError: matplotlib is not installed.
+    """
+    require_matplotlib()
     # The object interface: no window, no global state of pyplot.
     from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415  matplotlib is an extra, and slow to import
     from matplotlib.figure import Figure  # noqa: PLC0415  matplotlib is an extra, and slow to import
 
     figure = Figure(dpi=120, layout="constrained")
     FigureCanvasAgg(figure)
+    return figure
+
+
+def _lay_out(
+    figure: Figure, results: Columns, title: str, curves: Mapping[str, Curve], groups: Mapping[str, Sequence[str]]
+) -> None:
     least = _AXES_INCHES[1] * min(1.0, _FEW_AXES / len(groups))
     heights = [max(least, 0.4 + 0.18 * _legend_rows(len(names))) for names in groups.values()]
     all_axes = figure.subplots(len(groups), 1, sharex=True, squeeze=False, height_ratios=heights)[:, 0]
-    all_axes[0].set_title(_short(title), fontweight="bold", parse_math=False)
+    all_axes[0].set_title(short(title), fontweight="bold", parse_math=False)
     legend_width = 0.0
     for axes, (label, names) in zip(all_axes, groups.items(), strict=True):
         _draw_axes(axes, results, names, label)
         axes.label_outer()
         if names:
-            legend = _add_legend(axes, [_short(name) + (curves[name].note if name in curves else "") for name in names])
+            labels = [short(name) + (curves[name].note if name in curves else "") for name in names]
+            legend = add_legend(axes, axes.lines, labels)
             legend_width = max(legend_width, legend.get_window_extent().width / figure.dpi)
     all_axes[-1].set_xlabel("time in s")
     figure.set_size_inches(_AXES_INCHES[0] + legend_width, 1.2 + sum(heights) + (1.0 if len(groups) == 1 else 0.0))
-    return figure
 
 
 def _draw_axes(axes: Axes, results: Columns, names: Sequence[str], label: str) -> None:
     lone = "o" if len(results.times) == 1 else None  # a line of one point is invisible
     for number, (name, below) in enumerate(zip(names, _lines_below(results, names), strict=True)):
-        times, values = reduced(results.times, results.values[name].astype(np.float64), _MAX_POINTS)
-        values = np.clip(values, -_GREATEST, _GREATEST)
-        dashes = _DASHES[number // _COLOURS % len(_DASHES)]
+        times, values = reduced(results.times, results.values[name].astype(np.float64), MAX_POINTS)
+        dashes = DASHES[number // COLOURS % len(DASHES)]
         if below:
             on = _OVER[min(below, len(_OVER)) - 1]
             dashes = (0, (on, 8.0 - on))
         axes.plot(
             times,
             values,
-            color=f"C{number % _COLOURS}",
+            color=f"C{number % COLOURS}",
             linestyle=dashes,
             drawstyle="default" if results.values[name].dtype.kind == "f" else "steps-post",
             linewidth=1.8 if below else 1.4,
             marker=lone,
         )
-    axes.set_ylabel(_short(label), parse_math=False)
+    axes.set_ylabel(short(label), parse_math=False)
     axes.grid(visible=True, alpha=0.35)
     axes.margins(x=0.01)
     if names and all(results.values[name].dtype == bool for name in names):
@@ -189,9 +215,9 @@ def _lines_below(results: Columns, names: Sequence[str]) -> list[int]:
 
     All 0 if the lines differ in their dashes anyway.
     """
-    if not 1 < len(names) <= _COLOURS or len(results.times) < 2:
+    if not 1 < len(names) <= COLOURS or len(results.times) < 2:
         return [0] * len(names)
-    stride = 1 + len(results.times) // _MAX_POINTS
+    stride = 1 + len(results.times) // MAX_POINTS
     table = np.array([results.values[name][::stride].astype(np.float64) for name in names]).clip(-_GREATEST, _GREATEST)
     near = _SAME * float(np.nan_to_num(table).max() - np.nan_to_num(table).min())
     return [
@@ -209,12 +235,11 @@ def _legend_rows(count: int) -> int:
     return math.ceil(min(count, _NAMES + 1) / _legend_columns(count))
 
 
-def _add_legend(axes: Axes, labels: Sequence[str]) -> Legend:
-    """Add a legend beside the axes, where it covers no line."""
+def add_legend(axes: Axes, lines: Sequence[Line2D], labels: Sequence[str], title: str | None = None) -> Legend:
+    """Add a legend beside the axes, where it covers no line; of very many lines it names the first ones."""
     from matplotlib.lines import Line2D  # noqa: PLC0415  matplotlib is an extra, and slow to import
 
-    lines = list(axes.lines)[: len(labels)]
-    shown = list(labels)
+    lines, shown = list(lines)[: len(labels)], list(labels)
     if len(shown) > _NAMES:
         lines, shown = (
             [*lines[:_NAMES], Line2D([], [], linestyle="none")],
@@ -229,17 +254,19 @@ def _add_legend(axes: Axes, labels: Sequence[str]) -> Legend:
         borderaxespad=0.0,
         frameon=False,
         ncols=_legend_columns(len(labels)),
-        fontsize=9 if len(shown) > 2 * _COLOURS else 10,
+        fontsize=9 if len(shown) > 2 * COLOURS else 10,
         labelspacing=0.35,
         handlelength=2.6,
+        title=title,
+        alignment="left",
     )
-    for text in legend.get_texts():
+    for text in (*legend.get_texts(), legend.get_title()):
         text.set_parse_math(False)  # a dollar sign in a name does not start a formula
     return legend
 
 
-def _short(text: str) -> str:
-    """A long name without its middle: both ends of a structured name matter."""
+def short(text: str) -> str:
+    """A name as a picture shows it: a long one without its middle: both ends of a structured name matter."""
     half = _CHARACTERS // 2
     return text if len(text) <= _CHARACTERS else f"{text[: half - 1]}…{text[-half:]}"
 
@@ -248,16 +275,14 @@ def reduced(
     times: NDArray[np.float64], values: NDArray[np.float64], most: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """About ``most`` points that look like all of them: the minimum and maximum of every section."""
-    values = np.where(np.isinf(values), np.nan, values)
+    values = np.clip(np.where(np.isinf(values), np.nan, values), -_GREATEST, _GREATEST)
     if len(times) <= most:
         return times, values
-    edges = np.linspace(0, len(times), most // 2 + 1).astype(int)
-    kept = {0, len(times) - 1}
-    for first, end in pairwise(edges):
-        stretch = values[first:end]
-        if np.isnan(stretch).all():
-            kept.add(int(first))  # keeps the gap visible
-        else:
-            kept.update((int(first + np.nanargmin(stretch)), int(first + np.nanargmax(stretch))))
-    picked = np.array(sorted(kept))
+    size = -(-len(times) // (most // 2))
+    sections = np.pad(values, (0, -len(values) % size), constant_values=np.nan).reshape(-1, size)
+    first = np.arange(len(sections)) * size
+    # Of a section without any value the first row is taken, which keeps the gap visible.
+    lowest = first + np.where(np.isnan(sections), np.inf, sections).argmin(axis=1)
+    highest = first + np.where(np.isnan(sections), -np.inf, sections).argmax(axis=1)
+    picked = np.unique(np.concatenate(([0, len(times) - 1], lowest, highest)))
     return times[picked], values[picked]

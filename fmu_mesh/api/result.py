@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from functools import cached_property
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
-__all__ = ["Result", "result_of", "summary_of", "types_of"]
+__all__ = ["Result", "imported_pandas", "result_of", "summary_of", "types_of"]
 
 _DIMENSIONLESS = ("1", "-")
 """Units that mean no unit."""
@@ -114,12 +115,7 @@ class Result(Mapping[str, NDArray[Any]]):
         Raises:
             ConfigurationError: pandas is not installed.
         """
-        try:
-            import pandas as pd  # noqa: PLC0415  an extra, and slow to import
-        except ImportError as error:
-            raise ConfigurationError(
-                "pandas is not installed.", hint="Install it with `pip install pandas`."
-            ) from error
+        pd = imported_pandas()
         return pd.DataFrame(dict(self), index=pd.Index(self.times, name="time"))
 
     def plot(self, *names: str, title: str | None = None) -> Figure:
@@ -183,6 +179,20 @@ class Result(Mapping[str, NDArray[Any]]):
         if unit is None or unit in _DIMENSIONLESS:
             return Curve(VALUE)
         return Curve(f"value in {unit}", note="" if variable.unit else " (no unit)")
+
+
+def imported_pandas() -> ModuleType:
+    """The module pandas.
+
+    Raises:
+        ConfigurationError: it is not installed.
+    """
+    try:
+        import pandas as pd  # noqa: PLC0415  an extra, and slow to import
+    except ImportError as error:
+        raise ConfigurationError("pandas is not installed.", hint="Install it with `pip install pandas`.") from error
+    module: ModuleType = pd
+    return module
 
 
 def summary_of(outcome: Outcome, step_size: float) -> str:
