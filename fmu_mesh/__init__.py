@@ -40,6 +40,9 @@ if TYPE_CHECKING:
     )
     from .instances.python.component import Component, component
     from .instances.python.declarations import Input, Output, Parameter
+    from .sweeps.sweep_result import SweepResult
+    from .sweeps.sweeping import Sweep, sweep
+    from .sweeps.variants import Range
 
 __all__ = [
     "CallRefused",
@@ -64,10 +67,13 @@ __all__ = [
     "Output",
     "Parameter",
     "ProtocolBroken",
+    "Range",
     "Result",
     "Run",
     "Sample",
     "StepFailed",
+    "Sweep",
+    "SweepResult",
     "System",
     "SystemState",
     "UnknownName",
@@ -77,6 +83,7 @@ __all__ = [
     "inspect",
     "load",
     "meshes",
+    "sweep",
 ]
 
 _PLACES = {
@@ -90,6 +97,7 @@ _PLACES = {
     "Parameter": "instances.python.declarations",
     "Result": "api.result",
     "Run": "api.run_handle",
+    "Range": "sweeps.variants",
     "Sample": "api.samples",
     "System": "api.open_system",
     "SystemState": "api.open_system",
@@ -98,6 +106,9 @@ _PLACES = {
     "inspect": "api.inspection",
     "meshes": "api.attaching",
     "component": "instances.python.component",
+    "Sweep": "sweeps.sweeping",
+    "SweepResult": "sweeps.sweep_result",
+    "sweep": "sweeps.sweeping",
 }
 """The modules of the public names; all others are exceptions."""
 

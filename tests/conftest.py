@@ -6,6 +6,7 @@ import os
 import signal
 import sys
 from collections.abc import Callable, Generator, Iterator
+from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,9 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
 
 session_folder()  # before there are workers
+
+# It lives as long as this process. If a test started it in a place of its own, that place would end it.
+resource_tracker.ensure_running()
 
 # How long an example takes says more about the machine than about the code; a failure must be the same everywhere.
 settings.register_profile("fmu_mesh", deadline=None, derandomize=True, print_blob=True)

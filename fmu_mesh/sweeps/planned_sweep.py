@@ -1,0 +1,337 @@
+"""From what a user asks to a planned sweep: variants with their ids, what every worker gets, and the folder.
+
+All that is wrong with the mesh, the parameters, or the columns is told here, before anything runs.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, TypedDict, Unpack, cast
+
+import msgspec
+from msgspec.structs import replace
+
+from .. import __version__
+from ..api.mesh_builder import Mesh, load
+from ..api.plan_options import PlanOptions, options_of
+from ..api.result import Result, types_of
+from ..config.loading import PlainConfig
+from ..config.mesh import Config
+from ..errors import ConfigurationError, Finding, FmuError
+from ..run.options import Options
+from ..run.run_plan import RunPlan
+from ..text import listed, nearest
+from .reductions import check_reductions, read_reduction
+from .sweep_folder import SweepFolder, Wanted, identity_of, is_sweep
+from .variant_run import OwnReductions, Row, SweepTask, encoded_task, options_of_variant
+from .variants import Parameters, variants_of
+
+__all__ = ["Own", "PlannedSweep", "SweepOptions", "continued_sweep", "planned_sweep"]
+
+log = logging.getLogger("fmu_mesh.run")
+
+Own = Callable[[Result], object]
+"""A reduction of the user: a function of a module, since workers import it."""
+
+_PLAN_KEYS = PlanOptions.__annotations__.keys()
+
+
+class SweepOptions(TypedDict, total=False):
+    """What `fmu_mesh.sweep` takes beside the mesh and what varies.
+
+    Attributes:
+        sampler: "lhs:64", "sobol:64", "halton:64" or "random:64": so many variants, spread over the ranges; without it,
+            every combination of all values.
+        seed: of the sampler; the same seed gives the same variants (0).
+        reduce: columns of the table: texts such as "max(pendulum.a)", or functions of a `Result` that return a number,
+            a truth value or a text; by default the last value of each recorded variable.
+        folder: the folder of the sweep; by default `<mesh>_sweep` beside the result file of the configuration.
+        curves: whether the recorded variables of each run are kept as a CSV (True).
+        resume: keep the runs that are in the folder already, and run what is missing.
+        processes: start the processes of the mesh for each run, as `Mesh.run` does; by default each run takes place in
+            one process.
+        reset: reset the instances of FMUs between two runs, and do not make new ones (fmi2Reset; FMI 2.0, 2.1.6).
+        max_instances: by the file name of a model, how many instances of it may exist at a time: a licence server may
+            allow no more.
+        start_values: start values of all runs by `instance.variable`; or texts as `--set` has them.
+        config_values: values of any keys for all runs; or texts as `--set-config` has them.
+        algorithm: "jacobi" or "gauss_seidel".
+        step_size: base communication step size in s.
+        stop_time: time of the last communication point in s.
+        window: how many points a node may run ahead of the slowest one, or "auto".
+        allow_code: run the Python code that a configuration names although another user owns the file.
+        on_notice: called with a sentence before something that takes long, such as compiling an FMU.
+    """
+
+    sampler: str | None
+    seed: int
+    reduce: Sequence[str | Own]
+    folder: str | Path | None
+    curves: bool
+    resume: bool
+    processes: bool
+    reset: bool
+    max_instances: Mapping[str, int]
+    start_values: Mapping[str, Any] | Sequence[str]
+    config_values: Mapping[str, Any] | Sequence[str]
+    algorithm: str | None
+    step_size: float | None
+    stop_time: float | None
+    window: int | Literal["auto"] | None
+    allow_code: bool
+    on_notice: Callable[[str], None]
+
+
+class PlannedSweep(NamedTuple):
+    """A sweep that can run.
+
+    Attributes:
+        wanted: what was asked.
+        folder: where everything goes.
+        plan: the plan of a variant, for what all have in common.
+        columns: what is calculated from the curves of each run.
+        functions: the columns that functions of the user calculate.
+        task: what every worker gets.
+        at_once: how many variants may be under way, because of `max_instances`; None: any number.
+        found: the rows that are in the folder already, by their id.
+    """
+
+    wanted: Wanted
+    folder: SweepFolder
+    plan: RunPlan
+    columns: tuple[str, ...]
+    functions: OwnReductions
+    task: bytes
+    at_once: int | None
+    found: dict[str, Row]
+
+
+def planned_sweep(
+    mesh: Mesh | str | Path,
+    vary: Mapping[str, Any] | Iterable[Mapping[str, Any]],
+    **options: Unpack[SweepOptions],
+) -> PlannedSweep:
+    """Plan a sweep.
+
+    Args:
+        mesh: the mesh, or its configuration file.
+        vary: values by the name of a parameter, or the parameters of each variant.
+        options: see `SweepOptions`.
+
+    Raises:
+        ConfigurationError: the mesh, a parameter, or a column is wrong; or the folder holds another sweep.
+    """
+    own = mesh if isinstance(mesh, Mesh) else load(mesh)
+    variants = variants_of(vary, options.get("sampler"), options.get("seed", 0))
+    _check_names(own, list(variants[0]))
+    base = options_of(cast("PlanOptions", {key: value for key, value in options.items() if key in _PLAN_KEYS}))
+    given, reductions = options.get("folder"), options.get("reduce", ())
+    folder = SweepFolder(Path(given).absolute() if given is not None else _usual_folder(own, base))
+    if is_sweep(folder.path) and not options.get("resume", False):
+        hint = "Continue it with `resume` (`--resume`), or choose another folder with `folder` (`--folder`)."
+        raise ConfigurationError(f"there is a sweep in '{folder.path}' already", hint=hint)
+    wanted = Wanted(
+        version=__version__,
+        mesh=own.name,
+        file=str(own.configuration.file.absolute()),
+        data=own.configuration.data,
+        options=base,
+        names=tuple(variants[0]),
+        variants=tuple(tuple(variant.values()) for variant in variants),
+        curves=options.get("curves", True),
+        processes=options.get("processes", False),
+        reset=options.get("reset", False),
+        most_instances=dict(options.get("max_instances", {})),
+    )
+    plan = _any_plan(own, base, wanted, options.get("on_notice", log.info))
+    recorded = types_of(plan.plan.system) or {}
+    asked = reductions or [f"last({name})" for name in recorded]
+    texts = [one for one in asked if isinstance(one, str)]
+    check_reductions([read_reduction(text) for text in texts], recorded)
+    wanted = replace(wanted, recorded=tuple(recorded), reductions=tuple(texts), units=_units(plan, wanted.names))
+    functions = {_column(one): one for one in reductions if not isinstance(one, str)}
+    return _planned(own, plan, wanted, folder, functions)
+
+
+def continued_sweep(folder: Path, *, allow_code: bool = False) -> PlannedSweep:
+    """Plan what is missing of the sweep in a folder.
+
+    Args:
+        folder: the folder.
+        allow_code: run the Python code that it names although another user owns it.
+
+    Raises:
+        ConfigurationError: there is no sweep in the folder, another user has made it, or its mesh cannot run any more.
+    """
+    own = SweepFolder(folder.absolute())
+    wanted = own.wanted()
+    if own.owner() not in {os.getuid(), 0} and not allow_code:
+        hint = "`--allow-code` continues it, with the Python code that it may name."
+        raise ConfigurationError(f"the sweep in '{own.path}' belongs to another user", hint=hint)
+    mesh = Mesh.from_configuration(PlainConfig(wanted.data, Path(wanted.file)))
+    return _planned(mesh, _any_plan(mesh, wanted.options, wanted), wanted, own, {})
+
+
+def _planned(mesh: Mesh, plan: RunPlan, wanted: Wanted, folder: SweepFolder, functions: OwnReductions) -> PlannedSweep:
+    wanted = replace(wanted, identities=_identities(mesh, plan, wanted))
+    columns = (*wanted.reductions, *functions)
+    task = SweepTask(
+        version=wanted.version,
+        data=wanted.data,
+        file=Path(wanted.file),
+        options=wanted.options,
+        reductions=wanted.reductions,
+        curves=folder.curves if wanted.curves else None,
+        processes=wanted.processes,
+        reset=wanted.reset,
+    )
+
+    def is_kept(row: Row) -> bool:
+        """What failed may be right now, unless an FMU failed: that would fail again."""
+        has_curves = not wanted.curves or folder.curves_of(row.id).is_file()
+        is_whole = row.exit_code == 0 and has_curves and set(columns) <= {*row.values}
+        return is_whole or row.exit_code == FmuError.exit_code
+
+    return PlannedSweep(
+        wanted=wanted,
+        folder=folder,
+        plan=plan,
+        columns=columns,
+        functions=functions,
+        task=encoded_task(task),
+        at_once=_at_once(plan, wanted.most_instances),
+        found={identity: row for identity, row in folder.rows().items() if is_kept(row)},
+    )
+
+
+def _check_names(mesh: Mesh, names: Sequence[str]) -> None:
+    """Check that each parameter names a start value or a key of the configuration."""
+    sections = [field.encode_name for field in msgspec.structs.fields(Config)]
+    for name in names:
+        first, dot, rest = name.partition(".")
+        if first in mesh.instances and dot and rest:
+            continue
+        if first not in sections:
+            found = f"'{name}' is neither a variable of an instance nor a key of the configuration"
+            near = nearest(first, [*mesh.instances, *sections])
+            there = f"There are the instances {listed(mesh.instances)}."
+            raise ConfigurationError(f"{found}.", hint=f"Did you mean '{near}{dot}{rest}'?" if near else there)
+
+
+def _any_plan(mesh: Mesh, base: Options, wanted: Wanted, tell: Callable[[str], None] = log.info) -> RunPlan:
+    """The plan of the first variant, or of the last one: one of them may have values that are refused.
+
+    Args:
+        mesh: the mesh.
+        base: the options of each run.
+        wanted: what was asked.
+        tell: called before something that takes long, such as compiling an FMU.
+
+    Raises:
+        ConfigurationError: neither can run; that of the first.
+    """
+    first: ConfigurationError | None = None
+    for number in (0, len(wanted.variants) - 1):
+        options = options_of_variant(base, mesh.instances, wanted.parameters(number))
+        options["record"], options["on_notice"] = "memory", tell
+        try:
+            return mesh.plan(**options)
+        except ConfigurationError as error:
+            first = first or error
+    assert first is not None
+    raise _as_asked(first, wanted.names)
+
+
+def _as_asked(error: ConfigurationError, names: Sequence[str]) -> ConfigurationError:
+    """The error of a variant as one about what varies: nobody has written `--set` or `--set-config`."""
+    findings: list[Finding] = []
+    for finding in error.findings:
+        option, _, rest = finding.path.partition(" ")
+        name = rest.partition("=")[0]
+        is_asked = option in {"--set", "--set-config"} and name in names
+        findings.append(replace(finding, path=f"--vary {rest}") if is_asked else finding)
+    if len(findings) != 1:
+        return ConfigurationError(error.message, findings=tuple(findings), hint=error.hint)
+    return ConfigurationError(str(findings[0]), findings=tuple(findings), hint=error.hint)
+
+
+def _identities(mesh: Mesh, plan: RunPlan, wanted: Wanted) -> tuple[str, ...]:
+    """The id of each variant; where a parameter changes which models there are, their files are looked at, too."""
+    contents: dict[tuple[Any, ...], Mapping[str, str]] = {}
+    identities = []
+    for number, values in enumerate(wanted.variants):
+        parameters = wanted.parameters(number)
+        models = tuple(str(value) for name, value in zip(wanted.names, values, strict=True) if _names_model(mesh, name))
+        if models not in contents:
+            contents[models] = _contents(mesh, wanted, parameters) if models else plan.contents
+        identities.append(identity_of(wanted, parameters, contents[models]))
+    return tuple(identities)
+
+
+def _names_model(mesh: Mesh, name: str) -> bool:
+    return name.startswith("instances.") and "instances" not in mesh.instances
+
+
+def _contents(mesh: Mesh, wanted: Wanted, parameters: Parameters) -> Mapping[str, str]:
+    try:
+        return mesh.plan(**options_of_variant(wanted.options, mesh.instances, parameters)).contents
+    except ConfigurationError:
+        return {}  # its row will say so
+
+
+def _at_once(plan: RunPlan, most_instances: Mapping[str, int]) -> int | None:
+    """How many variants may be under way.
+
+    Raises:
+        ConfigurationError: no instance has such a model, or one variant needs more instances of it.
+    """
+    limits = []
+    models = [Path(own.fmu).name for own in plan.plan.system.instances.values() if own.fmu]
+    for name, most in most_instances.items():
+        needed = models.count(name)
+        if not needed:
+            near = nearest(name, models)
+            hint = f"Did you mean '{near}'?" if near else f"There are {listed(sorted({*models}))}."
+            raise ConfigurationError(f"no instance has the model '{name}'", hint=hint)
+        if most < needed:
+            text = f"one run needs {needed} instances of '{name}', and {most} may exist at a time"
+            raise ConfigurationError(text, hint=f"Allow {needed} or more.")
+        limits.append(most // needed)
+    return min(limits, default=None)
+
+
+def _usual_folder(mesh: Mesh, base: Options) -> Path:
+    """`<mesh>_sweep` beside the result file of the configuration; without one in the current folder."""
+    options = options_of_variant(base, mesh.instances, {})
+    try:
+        file = mesh.plan(**options).plan.system.result_file
+    except ConfigurationError:  # it can run with the parameters of its variants only
+        file = None
+    return (Path(file).parent if file is not None else Path.cwd()) / f"{mesh.name}_sweep"
+
+
+def _units(plan: RunPlan, names: Sequence[str]) -> dict[str, str | None]:
+    """The units of what is recorded, and of the parameters that are start values."""
+    units = Result(plan.mesh, system=plan.plan.system).units
+    for name in names:
+        instance, _, variable = name.partition(".")
+        own = plan.plan.system.instances.get(instance)
+        found = own.description.variable_of(variable) if own is not None else None
+        units[name] = found.unit if found is not None else None
+    return units
+
+
+def _column(function: Own) -> str:
+    """The name of the column of a function of the user.
+
+    Raises:
+        ConfigurationError: workers could not import it.
+    """
+    name = getattr(function, "__qualname__", "")
+    if not name or "<" in name:
+        found = f"the reduction '{name or type(function).__name__}' cannot be imported by the workers"
+        raise ConfigurationError(found, hint="Write it as a function of a module.")
+    return str(name)

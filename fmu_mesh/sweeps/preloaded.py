@@ -1,0 +1,18 @@
+"""What all workers of this host import before they run anything: they start fast, and share its memory.
+
+The fork server of `multiprocessing` imports it, and a worker of Dask.
+"""
+
+import signal
+
+from ..instances.registry import preload
+from . import variant_run  # noqa: F401  its imports are what this is for
+
+__all__ = ["dask_setup"]
+
+preload()
+
+
+def dask_setup(_worker: object) -> None:
+    """In a worker of Dask on this host: Ctrl-C is for the process that uses it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)

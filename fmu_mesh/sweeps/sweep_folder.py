@@ -1,0 +1,296 @@
+"""The folder of a sweep: what was asked, a line for each run that has ended, the curves, and the table.
+
+```
+sweep.json       what was asked: configuration, options, variants, columns
+rows.jsonl       a line for each run, in the order in which they ended; a part of an array of jobs has a file of its own
+table.csv        all rows in the order of the variants; written at the end
+runs/<id>.csv    the curves of each run, as `launch` writes them
+```
+
+A line is written at once, and whole lines survive whatever ends the process. A run without a line is missing.
+"""
+
+from __future__ import annotations
+
+import csv
+import fcntl
+import hashlib
+import io
+import json
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Final
+
+import msgspec
+from msgspec.structs import replace
+
+from ..errors import ConfigurationError
+from ..files import is_file, replaced
+from ..run.options import Options
+from .variant_run import Cell, Row, path_of
+from .variants import Parameters
+
+__all__ = ["RowFile", "SweepFolder", "Wanted", "cells_of", "identity_of", "is_sweep"]
+
+_WANTED: Final = "sweep.json"
+_ROWS: Final = "rows"
+_TABLE: Final = "table.csv"
+_CURVES: Final = "runs"
+
+
+class Wanted(msgspec.Struct, frozen=True):
+    """What was asked: `sweep.json`.
+
+    Attributes:
+        version: version of fmu_mesh.
+        mesh: name of the mesh.
+        file: file of the configuration, absolute.
+        data: the values of the configuration.
+        options: the options of each run.
+        names: names of the parameters.
+        variants: for each variant the values of the parameters, in this order.
+        recorded: names of the recorded variables.
+        reductions: columns that are calculated from the curves.
+        identities: the id of each variant.
+        units: unit of each recorded variable and of each parameter; None without one.
+        curves: whether the curves of each run are kept.
+        processes: whether each run starts processes.
+        reset: whether instances are reset between two runs.
+        most_instances: by the name of a model file, how many instances there may be at a time.
+    """
+
+    version: str
+    mesh: str
+    file: str
+    data: Any
+    options: Options
+    names: tuple[str, ...]
+    variants: tuple[tuple[Any, ...], ...]
+    recorded: tuple[str, ...] = ()
+    reductions: tuple[str, ...] = ()
+    units: dict[str, str | None] = {}
+    identities: tuple[str, ...] = ()
+    curves: bool = True
+    processes: bool = False
+    reset: bool = False
+    most_instances: dict[str, int] = {}
+
+    def parameters(self, number: int) -> Parameters:
+        """The parameters of a variant."""
+        return dict(zip(self.names, self.variants[number], strict=True))
+
+
+class SweepFolder:
+    """One folder; see above.
+
+    Args:
+        path: the folder; it may not exist yet.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    @property
+    def table(self) -> Path:
+        """The file of the table."""
+        return self.path / _TABLE
+
+    @property
+    def curves(self) -> Path:
+        """The folder of the curves."""
+        return self.path / _CURVES
+
+    def curves_of(self, identity: str) -> Path:
+        """The file with the curves of a run."""
+        return self.curves / f"{identity}.csv"
+
+    def owner(self) -> int:
+        """The user who has made the sweep."""
+        return (self.path / _WANTED).stat().st_uid
+
+    def begin(self, wanted: Wanted) -> None:
+        """Make the folder, and write down what is asked.
+
+        Raises:
+            ConfigurationError: it cannot be written.
+        """
+        try:
+            (self.curves if wanted.curves else self.path).mkdir(parents=True, exist_ok=True)
+            with replaced(self.path / _WANTED) as draft:
+                draft.write_bytes(msgspec.json.format(msgspec.json.encode(wanted, enc_hook=str)))
+        except OSError as error:
+            raise self._unwritable(error) from error
+
+    def wanted(self) -> Wanted:
+        """What was asked.
+
+        Raises:
+            ConfigurationError: there is no sweep in this folder, or another version has written it.
+        """
+        file = self.path / _WANTED
+        try:
+            return msgspec.json.decode(file.read_bytes(), type=Wanted, dec_hook=path_of)
+        except OSError as error:
+            text = f"there is no sweep in '{self.path}': '{file}' cannot be read ({error.strerror})"
+            raise ConfigurationError(text) from error
+        except msgspec.MsgspecError as error:
+            raise ConfigurationError(f"'{file}' is not what this version of fmu_mesh writes: {error}") from error
+
+    def rows(self) -> dict[str, Row]:
+        """The rows of all runs that have ended, by their id; of several the last one."""
+        rows: dict[str, Row] = {}
+        for file in sorted(self.path.glob(f"{_ROWS}*.jsonl")):
+            rows |= {row.id: row for row in _lines(file)}
+        return rows
+
+    @contextmanager
+    def writing(self, part: int | None = None) -> Iterator[RowFile]:
+        """In the block, rows can be added; one process at a time may do so for each part.
+
+        Raises:
+            ConfigurationError: another process does so, or the file cannot be written.
+        """
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise self._unwritable(error) from error
+        name = _ROWS if part is None else f"{_ROWS}-{part}"
+        file = RowFile(self.path / f"{name}.jsonl")
+        try:
+            yield file
+        finally:
+            file.close()
+
+    def _unwritable(self, error: OSError) -> ConfigurationError:
+        return ConfigurationError(f"the folder '{self.path}' cannot be written: {error.strerror}")
+
+    def write_table(self, wanted: Wanted, rows: Sequence[Row | None], columns: Sequence[str]) -> None:
+        """Write the table; a variant without a row is left out.
+
+        Args:
+            wanted: what was asked.
+            rows: the row of each variant.
+            columns: what is calculated from the curves.
+
+        Raises:
+            ConfigurationError: it cannot be written.
+        """
+        text = io.StringIO()
+        writer = csv.writer(text, lineterminator="\n")
+        writer.writerow(["variant", *wanted.names, "exit_code", "message", *columns, "id", "seconds", "worker"])
+        for number, row in enumerate(rows):
+            if row is not None:
+                cells = cells_of(wanted, number, row, columns) | {"seconds": f"{row.seconds:.4f}"}
+                writer.writerow(map(_cell, cells.values()))
+        try:
+            with replaced(self.table) as draft:
+                draft.write_text(text.getvalue(), encoding="utf-8")
+        except OSError as error:
+            raise ConfigurationError(f"the table '{self.table}' cannot be written: {error.strerror}") from error
+
+
+class RowFile:
+    """A file to which rows are added.
+
+    Args:
+        path: the file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        try:
+            self._descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o666)
+        except OSError as error:
+            raise self._unwritable(error) from error
+        try:
+            fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            self.close()
+            hint = "Wait for its end, or choose another folder."
+            raise ConfigurationError(f"another sweep is writing into '{path.parent}'", hint=hint) from error
+        except OSError:
+            pass  # the file system has no locks: some that clusters share have none
+        size = os.fstat(self._descriptor).st_size
+        if size and os.pread(self._descriptor, 1, size - 1) != b"\n":  # its process was killed within a line
+            self._write(b"\n")
+
+    def add(self, row: Row) -> None:
+        """Add a row.
+
+        Raises:
+            ConfigurationError: the file cannot be written.
+        """
+        self._write(json.dumps(msgspec.to_builtins(row)).encode() + b"\n")
+
+    def close(self) -> None:
+        """Close the file."""
+        os.close(self._descriptor)
+
+    def _write(self, line: bytes) -> None:
+        try:
+            while line:
+                line = line[os.write(self._descriptor, line) :]
+        except OSError as error:
+            raise self._unwritable(error) from error
+
+    def _unwritable(self, error: OSError) -> ConfigurationError:
+        hint = "All rows before are kept: `--resume` runs what is missing."
+        return ConfigurationError(f"'{self._path}' cannot be written: {error.strerror}", hint=hint)
+
+
+def cells_of(wanted: Wanted, number: int, row: Row, columns: Sequence[str]) -> dict[str, Any]:
+    """A row of the table, by the names of its columns."""
+    return {
+        "variant": number,
+        **wanted.parameters(number),
+        "exit_code": row.exit_code,
+        "message": row.message,
+        **{name: row.values.get(name) for name in columns},
+        "id": row.id,
+        "seconds": row.seconds,
+        "worker": row.worker,
+    }
+
+
+def is_sweep(path: Path) -> bool:
+    """Whether a path is the folder of a sweep."""
+    return is_file(path / _WANTED)
+
+
+def identity_of(wanted: Wanted, parameters: Parameters, contents: Mapping[str, str]) -> str:
+    """The id of a variant: the same configuration, options, parameters and models have the same one.
+
+    Args:
+        wanted: what was asked.
+        parameters: those of the variant.
+        contents: SHA-256 of the model of each instance.
+    """
+    options = replace(wanted.options, allow_code=False)  # not what is calculated
+    asked = [wanted.data, options, sorted(parameters.items()), sorted(contents.items())]
+    return hashlib.sha256(msgspec.json.encode(asked, enc_hook=str)).hexdigest()[:16]
+
+
+def _lines(file: Path) -> Iterator[Row]:
+    """The rows of a file; a line that is no row is one within which its process was killed."""
+    for line in file.read_bytes().splitlines():
+        try:
+            yield msgspec.convert(json.loads(line), Row)
+        except ValueError:
+            continue
+
+
+def _cell(value: Cell | Sequence[Any]) -> str:
+    """A value as text: a float with the digits that give the same bits again, an array as JSON."""
+    match value:
+        case None:
+            return ""
+        case bool():
+            return "true" if value else "false"
+        case float():
+            return repr(value)
+        case str() | int():
+            return str(value)
+        case _:
+            return json.dumps(value)

@@ -1,0 +1,401 @@
+"""`sweep` and `Sweep`: run the variants of a mesh on an executor, and follow them.
+
+A sweep, in pseudocode::
+
+    for each variant without a row, while few are under way:
+        executor.submit(run_variant, task, ...)            # fmu_mesh.sweeps.variant_run, in a worker
+    as each ends:
+        its worker is lost: submit it once again           # fmu_mesh.sweeps.worker_pool
+        otherwise:          add its row to the folder      # fmu_mesh.sweeps.sweep_folder
+    at the end: write the table
+
+What schedules is the executor: processes of this host by default, or any `concurrent.futures.Executor`.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from abc import ABC, abstractmethod
+from collections import Counter, deque
+from collections.abc import Iterable, Iterator, Mapping
+from concurrent.futures import BrokenExecutor, Executor, Future
+from contextlib import contextmanager, nullcontext
+from pathlib import Path
+from queue import Empty, SimpleQueue
+from types import TracebackType
+from typing import Any, Final, NamedTuple, Self, Unpack
+
+from ..api.mesh_builder import Mesh
+from ..errors import DeadlineExceeded, FmuMeshError, Interrupted, KeyboardInterrupted, MeshLost
+from ..wire.runtime import remove_stale_folders
+from .planned_sweep import PlannedSweep, SweepOptions, planned_sweep
+from .sweep_folder import RowFile
+from .sweep_result import SweepResult
+from .variant_run import Row, run_variant
+from .worker_pool import WorkerLost, WorkerPool
+
+__all__ = ["ExecutorSweep", "Sweep", "SweepPart", "SweepProgress", "sweep"]
+
+_TRIES: Final = 2
+_LOOK_S: Final = 0.2
+_JOIN_S: Final = 10.0
+_AHEAD: Final = 2
+"""Variants under way for each worker: one waits, so that the worker never does."""
+_ELSEWHERE: Final = 64
+"""Variants under way on an executor of the user, whose number of workers is not known."""
+_KILLED: Final = "KilledWorker"
+"""The class with which Dask says that a job has ended several workers."""
+_GUARD: Final = (
+    'Write `if __name__ == "__main__":` before what your program does, if it has none: workers import it. '
+    "What else it may be is on standard error."
+)
+
+
+class SweepPart(NamedTuple):
+    """One of several parts of a sweep, such as a task of an array of jobs.
+
+    Attributes:
+        number: from 1 on.
+        of: how many there are.
+    """
+
+    number: int
+    of: int
+
+
+class SweepProgress(NamedTuple):
+    """How far a sweep is.
+
+    Attributes:
+        total: number of variants.
+        done: how many have a row, those of an earlier sweep included.
+        failed: how many of these have failed.
+        seconds: wall-clock time since the start in s.
+        left: estimated time to the end in s; None while nothing is known.
+    """
+
+    total: int
+    done: int
+    failed: int
+    seconds: float
+    left: float | None
+
+
+class Sweep(ABC):
+    """A sweep that goes on; `fmu_mesh.sweep` starts it.
+
+    Use it as a context manager, or call `wait` or `close`.
+
+    Example:
+        >>> import fmu_mesh
+        >>> vary = {"pendulum.d": fmu_mesh.Range(0.1, 0.8, 4)}
+        >>> options = {"stop_time": 1.0, "folder": "results/four"}
+        >>> with fmu_mesh.sweep("configs/pendulum_delay.yaml", vary, **options) as running:
+        ...     result = running.wait()
+        ...     running.progress.done, running.progress.total, len(result)
+        (4, 4, 4)
+
+    Args:
+        planned: the sweep.
+        part: which part of the variants runs here; None: all.
+    """
+
+    def __init__(self, planned: PlannedSweep, part: SweepPart | None = None) -> None:
+        self._planned = planned
+        self._part = part
+        count = len(planned.wanted.identities)
+        self._numbers = range(count) if part is None else range(part.number - 1, count, part.of)
+        self._rows = {row.id: row for one in planned.wanted.identities if (row := planned.found.get(one)) is not None}
+        self._waiting = deque(n for n in self._numbers if planned.wanted.identities[n] not in self._rows)
+        self._left = self._to_do = len(self._waiting)
+        self._failed = sum(1 for n in self._numbers if (row := self._row_at(n)) is not None and row.exit_code)
+        self._started = time.monotonic()
+        self._ended_at: float | None = None
+        self._cancelled = threading.Event()
+        self._interrupted = False
+        self._end: Future[SweepResult] = Future()
+        self._thread = threading.Thread(target=self._work, name=f"sweep of {self.mesh}", daemon=True)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    @property
+    def mesh(self) -> str:
+        """Name of the mesh."""
+        return self._planned.wanted.mesh
+
+    @property
+    def ran(self) -> int:
+        """How many variants have ended since the start."""
+        return self._to_do - self._left
+
+    @property
+    def folder(self) -> Path:
+        """The folder of the sweep."""
+        return self._planned.folder.path
+
+    @property
+    def progress(self) -> SweepProgress:
+        """How far it is."""
+        seconds = (self._ended_at or time.monotonic()) - self._started
+        total = len(self._numbers)
+        left = 0.0 if not self._left else seconds / self.ran * self._left if self.ran else None
+        return SweepProgress(total, total - self._left, self._failed, seconds, left)
+
+    @property
+    def result(self) -> SweepResult:
+        """What has ended by now."""
+        planned = self._planned
+        return SweepResult(planned.wanted, planned.folder, self._so_far(), planned.columns, planned.plan.plan.system)
+
+    def wait(self, timeout: float | None = None) -> SweepResult:
+        """Wait for the end; a failed run is a row, and no error.
+
+        Ctrl-C ends the sweep, and raises `KeyboardInterrupt`.
+
+        Args:
+            timeout: the longest time to wait in s; None: no limit.
+
+        Raises:
+            DeadlineExceeded: it goes on after this time.
+            MeshLost: the executor runs nothing any more.
+            ConfigurationError: the folder cannot be written.
+            Interrupted: `interrupt` has ended it. Its `result` has the rows up to then, as that of the others.
+        """
+        try:
+            return self._end.result(timeout)
+        except TimeoutError:
+            if self._end.done():
+                raise
+            text = f"the sweep has not ended within {timeout:g} s"
+            raise DeadlineExceeded(text, hint="It goes on; wait again, or cancel it.") from None
+        except KeyboardInterrupt as error:
+            if isinstance(error, FmuMeshError):
+                raise
+            self.interrupt()
+            self.close()
+            raise KeyboardInterrupted("interrupted", hint=self._way_on()).with_result(self.result) from None
+
+    def cancel(self) -> None:
+        """End it without an error: variants that are under way are lost, and `wait` returns the rows of the others."""
+        self._cancelled.set()
+
+    def interrupt(self) -> None:
+        """As `cancel`, and `wait` raises `Interrupted`. It may be called in a signal handler."""
+        self._interrupted = True
+        self._cancelled.set()
+
+    def close(self) -> None:
+        """Let go of the sweep; if it goes on, it is cancelled. May be called twice."""
+        self._cancelled.set()
+        self._thread.join(_JOIN_S)
+
+    def _so_far(self) -> list[Row | None]:
+        return [self._row_at(number) for number in range(len(self._planned.wanted.identities))]
+
+    def _row_at(self, number: int) -> Row | None:
+        return self._rows.get(self._planned.wanted.identities[number])
+
+    def _way_on(self) -> str:
+        done, total = len(self._numbers) - self._left, len(self._numbers)
+        return f"{done} of {total} runs are in '{self.folder}'; `resume` (`--resume`) runs the others."
+
+    def _take(self, row: Row) -> None:
+        """Count the row of a variant that has ended."""
+        self._rows[row.id] = row
+        self._left -= 1
+        self._failed += row.exit_code != 0
+
+    @contextmanager
+    def _table(self) -> Iterator[None]:
+        """Write down what was asked; however the block ends, write the table of what is there then."""
+        planned = self._planned
+        planned.folder.begin(planned.wanted)
+        try:
+            yield
+        finally:
+            if self._rows:
+                planned.folder.write_table(planned.wanted, self._so_far(), planned.columns)
+
+    @abstractmethod
+    def _run(self) -> None:
+        """Run what is missing, until it has ended or the sweep is cancelled."""
+
+    def _work(self) -> None:
+        error: BaseException | None = None
+        try:
+            self._run()
+            if self._interrupted and self._left:
+                error = Interrupted("interrupted", hint=self._way_on())
+        except BaseException as caught:  # noqa: BLE001  whoever waits gets it
+            error = caught
+        self._ended_at = time.monotonic()
+        if error is None:
+            self._end.set_result(self.result)
+            return
+        self._end.set_exception(error.with_result(self.result) if isinstance(error, FmuMeshError) else error)
+
+
+class ExecutorSweep(Sweep):
+    """A sweep whose variants run on an executor.
+
+    Args:
+        planned: the sweep.
+        executor: where variants run; it is not shut down here. None: processes of this host.
+        workers: number of these processes; None: one for each processor.
+        part: which part of the variants runs here; None: all.
+    """
+
+    def __init__(
+        self,
+        planned: PlannedSweep,
+        *,
+        executor: Executor | None = None,
+        workers: int | None = None,
+        part: SweepPart | None = None,
+    ) -> None:
+        super().__init__(planned, part)
+        self._executor = executor
+        self._workers = max(
+            1, min(workers or usual_workers(planned), len(self._waiting), planned.at_once or len(self._waiting))
+        )
+        self._tries: Counter[int] = Counter()
+        self._ended: SimpleQueue[Future[Row]] = SimpleQueue()
+        self._thread.start()
+
+    def _run(self) -> None:
+        part = self._part.number if self._part is not None else None
+        with (
+            self._planned.folder.writing(part) as rows,
+            self._table() if part is None else nullcontext(),
+            self._running() as executor,
+        ):
+            self._run_variants(executor, rows)
+
+    @contextmanager
+    def _running(self) -> Iterator[Executor]:
+        """The executor; one of our own ends with the block, and at once if the sweep was cancelled."""
+        if self._executor is not None:
+            yield self._executor
+            return
+        pool = WorkerPool(self._workers)
+        try:
+            yield pool
+        finally:
+            pool.shutdown(cancel_futures=self._cancelled.is_set() or bool(self._waiting))
+            remove_stale_folders()
+
+    def _run_variants(self, executor: Executor, rows: RowFile) -> None:
+        """The loop of the module's docstring."""
+        under_way: dict[Future[Row], int] = {}
+        most = _ELSEWHERE if self._executor is not None else self._workers * _AHEAD
+        most = min(most, self._planned.at_once or most)
+        try:
+            while (self._waiting or under_way) and not self._cancelled.is_set():
+                while self._waiting and len(under_way) < most:
+                    number = self._waiting.popleft()
+                    under_way[self._submit(executor, number)] = number
+                try:
+                    future = self._ended.get(timeout=_LOOK_S)
+                except Empty:
+                    continue
+                number = under_way.pop(future)
+                if (row := self._row_of(future, number)) is None:
+                    self._waiting.appendleft(number)
+                    continue
+                rows.add(row)
+                self._take(row)
+                if row.stuck and isinstance(executor, WorkerPool):
+                    executor.replace(int(row.worker.rpartition(":")[2]))
+        finally:
+            for future in under_way:
+                future.cancel()
+
+    def _submit(self, executor: Executor, number: int) -> Future[Row]:
+        planned = self._planned
+        identity, parameters = planned.wanted.identities[number], planned.wanted.parameters(number)
+        try:
+            future = executor.submit(run_variant, planned.task, planned.functions, identity, parameters)
+        except RuntimeError as error:  # it is shut down, or broken
+            raise self._executor_lost(error) from error
+        future.add_done_callback(self._ended.put)
+        return future
+
+    def _row_of(self, future: Future[Row], number: int) -> Row | None:
+        """The row of a variant that has ended; None if it runs again, because its worker was lost.
+
+        Raises:
+            MeshLost: the executor runs nothing any more.
+        """
+        try:
+            return future.result()
+        except Exception as error:  # noqa: BLE001  `run_variant` itself raises nothing
+            lost = error
+        if isinstance(lost, WorkerLost) and not lost.began:
+            text = f"the workers do not start: {lost.message} before it was ready"
+            raise MeshLost(text, hint=_GUARD) from lost
+        self._tries[number] += 1
+        if self._tries[number] < _TRIES and not isinstance(lost, BrokenExecutor):
+            return None
+        if isinstance(lost, WorkerLost) or type(lost).__name__ == _KILLED:
+            text = f"{lost.message} in each of {_TRIES} attempts" if isinstance(lost, WorkerLost) else str(lost)
+            return Row(self._planned.wanted.identities[number], MeshLost.exit_code, text, {}, 0.0, "")
+        raise self._executor_lost(lost) from lost
+
+    def _executor_lost(self, error: BaseException) -> MeshLost:
+        text = f"the executor runs no more variants: {type(error).__name__}: {error}".rstrip(": ")
+        return MeshLost(text, hint=self._way_on())
+
+
+def sweep(
+    mesh: Mesh | str | Path,
+    vary: Mapping[str, Any] | Iterable[Mapping[str, Any]],
+    *,
+    executor: Executor | None = None,
+    workers: int | None = None,
+    **options: Unpack[SweepOptions],
+) -> Sweep:
+    """Run a mesh many times, with other values of its parameters; returns at once.
+
+    Every run is a row of one table: parameters, exit code, message, and what `reduce` calculates from its curves. The
+    floats of each run are those of `Mesh.run` with the same values, wherever it runs.
+
+    Example:
+        >>> import fmu_mesh
+        >>> vary = {"pendulum.d": [0.1, 0.2, 0.4], "simulation.algorithm": ["jacobi", "gauss_seidel"]}
+        >>> with fmu_mesh.sweep(
+        ...     "configs/pendulum_delay.yaml", vary, stop_time=1.0, reduce=["min(pendulum.a)"], folder="results/six"
+        ... ) as running:
+        ...     result = running.wait()
+        >>> len(result), result.columns
+        (6, ('min(pendulum.a)',))
+        >>> result[0].parameters, result[0].exit_code
+        ({'pendulum.d': 0.1, 'simulation.algorithm': 'jacobi'}, 0)
+
+    Args:
+        mesh: the mesh, or its configuration file.
+        vary: the values of each parameter, of which all combinations run: a list, a numpy array, or a `Range`. Or a
+            list with the parameters of each variant. `instance.variable` is a start value, and any
+            other name a key of the configuration.
+        executor: where the variants run, such as `dask.distributed.Client(...).get_executor()`; it is not shut down.
+            By default, processes of this host.
+        workers: number of these processes; by default one for each processor.
+        options: see `SweepOptions`.
+
+    Raises:
+        ConfigurationError: the mesh, a parameter, or a column is wrong; or the folder holds another sweep.
+    """
+    return ExecutorSweep(planned_sweep(mesh, vary, **options), executor=executor, workers=workers)
+
+
+def usual_workers(planned: PlannedSweep) -> int:
+    """One worker for each processor that this process may use; fewer where a run has several processes."""
+    processors = len(os.sched_getaffinity(0))
+    return processors // (len(planned.plan.plan.nodes) + 1) if planned.wanted.processes else processors

@@ -1,0 +1,275 @@
+"""One variant of a sweep in a worker: from its parameters to its row of the table.
+
+A worker keeps the models of the sweep that it works for loaded, one set for each thread that asks for runs. Each set
+has a thread of its own, because an FMU may not return: then the row says so, and that thread is left.
+"""
+
+from __future__ import annotations
+
+import base64
+import os
+import socket
+import threading
+import time
+import weakref
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future
+from pathlib import Path
+from queue import SimpleQueue
+from typing import Any, NamedTuple, cast
+
+import msgspec
+import numpy as np
+from msgspec.structs import asdict
+
+from .. import __version__
+from ..api.mesh_builder import Mesh
+from ..api.plan_options import PlanOptions, texts_of
+from ..api.result import Result
+from ..config.loading import PlainConfig
+from ..errors import ConfigurationError, ErrorReport, FmuError, FmuMeshError, from_report
+from ..run.options import Options
+from .reductions import read_reduction, reduced_value
+from .variants import Parameters
+
+__all__ = ["Row", "SweepTask", "encoded_task", "options_of_variant", "path_of", "run_variant"]
+
+Cell = float | int | bool | str | None
+"""One value of the table."""
+
+OwnReductions = Mapping[str, Callable[[Result], object]]
+"""Functions of the user by the name of their column."""
+
+
+class SweepTask(msgspec.Struct, frozen=True):
+    """What all variants of a sweep have in common.
+
+    Attributes:
+        version: that of fmu_mesh, which all workers must have.
+        data: the values of the configuration.
+        file: the file of the configuration.
+        options: the options of each run.
+        reductions: what is calculated from the curves of each run.
+        curves: the folder for the curves of each run; None: they are not kept.
+        processes: whether each run starts processes, as `launch` does.
+        reset: whether instances are reset between two runs, and not made anew.
+    """
+
+    version: str
+    data: Any
+    file: Path
+    options: Options
+    reductions: tuple[str, ...] = ()
+    curves: Path | None = None
+    processes: bool = False
+    reset: bool = False
+
+
+class Row(msgspec.Struct, frozen=True):
+    """How one variant ended: a row of the table.
+
+    Attributes:
+        id: SHA-256 of the configuration, the parameters, and the files of all models.
+        exit_code: 0, or that of `launch` for the same error.
+        message: why it failed; empty if it did not.
+        values: by the name of the column, what was calculated from its curves; None where there is nothing.
+        seconds: wall-clock time of the run in s, with its planning.
+        worker: host and process id of the worker.
+        stuck: whether an FMU has not returned, so that the worker has a thread less.
+    """
+
+    id: str
+    exit_code: int
+    message: str
+    values: dict[str, Cell]
+    seconds: float
+    worker: str
+    stuck: bool = False
+
+
+def encoded_task(task: SweepTask) -> bytes:
+    """A task for `run_variant`."""
+    return msgspec.msgpack.encode(task, enc_hook=str)
+
+
+def options_of_variant(options: Options, instances: Sequence[str], parameters: Parameters) -> PlanOptions:
+    """The options of the run of one variant.
+
+    Args:
+        options: those of each run.
+        instances: names of the instances of the mesh.
+        parameters: `instance.variable` is a start value, and any other name a key of the configuration.
+    """
+    start = {name: value for name, value in parameters.items() if name.partition(".")[0] in instances}
+    keys = {name: value for name, value in parameters.items() if name not in start}
+    given = {name: value for name, value in asdict(options).items() if value}
+    given["start_values"] = [*options.start_values, *texts_of(start, "start value")]
+    given["config_values"] = [*options.config_values, *texts_of(keys, "value")]
+    return cast("PlanOptions", given)
+
+
+def run_variant(task: bytes, functions: OwnReductions, identity: str, parameters: Parameters) -> Row:
+    """Run one variant. Called in a worker, by whichever executor.
+
+    Args:
+        task: what `encoded_task` returned.
+        functions: reductions that are functions of the user.
+        identity: `Row.id`.
+        parameters: the parameters of this variant.
+
+    Returns:
+        The row; also of a run that failed.
+    """
+    own = _mine.loaded_for(task)
+    started = time.perf_counter()
+    values: dict[str, Cell] = {}
+    error: ErrorReport | None = None
+    try:
+        values = own.run(functions, identity, parameters)
+    except FmuMeshError as failure:
+        error = failure.report()
+    except Exception as failure:  # noqa: BLE001  the other variants go on
+        error = ErrorReport("FmuMeshError", f"{type(failure).__name__}: {failure}", FmuMeshError.exit_code)
+    return Row(
+        id=identity,
+        exit_code=error.exit_code if error is not None else 0,
+        message=_line(error) if error is not None else "",
+        values=values,
+        seconds=time.perf_counter() - started,
+        worker=f"{socket.gethostname()}:{os.getpid()}",
+        stuck=own.stuck,
+    )
+
+
+class _Mine(threading.local):
+    """What the thread that asks for runs has loaded; it is let go with the thread."""
+
+    def __init__(self) -> None:
+        self._loaded: _Loaded | None = None
+
+    def loaded_for(self, task: bytes) -> _Loaded:
+        """The models of a task."""
+        if self._loaded is None or self._loaded.task != task or self._loaded.stuck:
+            self._loaded = _Loaded(task)
+        return self._loaded
+
+
+_mine = _Mine()
+
+
+class _Loaded:
+    """The models of a sweep in this process, and the thread that runs them; it ends with this object."""
+
+    def __init__(self, task: bytes) -> None:
+        self.task = task
+        self._task = msgspec.msgpack.decode(task, type=SweepTask, dec_hook=path_of)
+        self._reductions = [read_reduction(text) for text in self._task.reductions]
+        self._mesh = Mesh.from_configuration(PlainConfig(self._task.data, self._task.file))
+        self._jobs: SimpleQueue[_Job | None] = SimpleQueue()
+        self._hung = _Hung()
+        arguments = self._mesh, self._jobs, self._hung
+        threading.Thread(
+            target=_work, args=arguments, kwargs={"reset": self._task.reset}, name="variants", daemon=True
+        ).start()
+        weakref.finalize(self, self._jobs.put, None)
+
+    @property
+    def stuck(self) -> bool:
+        """Whether its thread is inside an FMU that does not return."""
+        return self._hung.stuck
+
+    def run(self, functions: OwnReductions, identity: str, parameters: Parameters) -> dict[str, Cell]:
+        """Run a variant; returns the values of its row.
+
+        Raises:
+            FmuMeshError: it failed.
+        """
+        task = self._task
+        if task.version != __version__:
+            raise ConfigurationError(f"this worker has fmu_mesh {__version__}, and the sweep {task.version}")
+        options = options_of_variant(task.options, self._mesh.instances, parameters)
+        if task.curves is not None:
+            options["output"] = task.curves / f"{identity}.csv"
+        else:
+            options["record"] = "memory"
+        if task.processes:
+            return self._values(self._mesh.run(**options), functions)
+        ended: Future[Result] = Future()
+        self._jobs.put(_Job(options, ended))
+        return self._values(ended.result(), functions)
+
+    def _values(self, result: Result, functions: OwnReductions) -> dict[str, Cell]:
+        values = {one.text: _cell(reduced_value(one, result)) for one in self._reductions}
+        for name, function in functions.items():
+            try:
+                values[name] = _cell(function(result))
+            except Exception as error:
+                text = f"the reduction '{name}' raised {type(error).__name__}: {error}"
+                raise FmuMeshError(text) from error
+        return values
+
+
+class _Job(NamedTuple):
+    options: PlanOptions
+    ended: Future[Result]
+
+
+class _Hung:
+    """Tells whoever waits for a run that an FMU does not return.
+
+    Attributes:
+        ended: the run under way.
+        stuck: whether it has not returned.
+    """
+
+    def __init__(self) -> None:
+        self.ended: Future[Result] = Future()
+        self.stuck = False
+
+    def begin(self, ended: Future[Result]) -> None:
+        """A run begins."""
+        self.ended = ended
+
+    def tell(self, error: FmuError) -> None:
+        """An FMU has not returned in time."""
+        self.stuck = True
+        self.ended.set_exception(error)
+
+
+def _work(mesh: Mesh, jobs: SimpleQueue[_Job | None], hung: _Hung, *, reset: bool) -> None:
+    """Run variants in this process, until there is none; on a thread of its own."""
+    with mesh.repeated(reset=reset, on_hang=hung.tell) as runs:
+        while (job := jobs.get()) is not None:
+            hung.begin(job.ended)
+            try:
+                job.ended.set_result(runs.run(**job.options))
+            except BaseException as error:  # noqa: BLE001  whoever waits gets it
+                if not hung.stuck:
+                    job.ended.set_exception(error)
+
+
+def path_of(type_: type, value: object) -> object:
+    """The `dec_hook` of msgspec for what holds a path, which is written as text."""
+    if type_ is Path:
+        return Path(str(value))
+    raise NotImplementedError(type_)
+
+
+def _cell(value: object) -> Cell:
+    """A value of a function of the user as the table has it.
+
+    Raises:
+        TypeError: it is no single value.
+    """
+    plain = value.item() if isinstance(value, np.generic | np.ndarray) else value
+    if isinstance(plain, bytes):
+        return base64.b64encode(plain).decode()
+    if not isinstance(plain, float | int | bool | str | None):
+        msg = f"expected a number, a truth value or a text, and got {type(plain).__name__}"
+        raise TypeError(msg)
+    return plain
+
+
+def _line(error: ErrorReport) -> str:
+    """An error in one line, without the way out: that names files of this run."""
+    return " ".join(str(from_report(error).instead_of_hint("")).split())
