@@ -28,6 +28,7 @@ __all__ = ["COMMANDS", "command_parser", "main"]
 COMMANDS: Final[Mapping[str, tuple[str, str]]] = {
     "launch": ("running", "run a mesh: one process per node, and the master"),
     "run": ("free_running", "run one FMU as a free-running node, without a file"),
+    "sweep": ("sweep", "run a mesh many times with other values, into one table"),
     "new": ("new_mesh", "write a configuration for FMUs, with suggested connections"),
     "check": ("checking", "check a configuration and show its plan, without running it"),
     "inspect": ("inspecting", "show the properties of an FMU, without running it"),

@@ -1,29 +1,46 @@
-"""`plot`: draws a result file; and the option `--plot` of the commands that run a mesh."""
+"""`plot`: draws a result file or a sweep; and the option `--plot` of the commands that run a mesh."""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from ..api.drawing import draw, require_matplotlib
 from ..api.result import Result
 from ..api.result_reading import require_csv
 from ..errors import ConfigurationError, FmuMeshError
+from ..sweeps.sweep_folder import is_sweep
+from ..sweeps.sweep_result import SweepResult
 from ..system.plan import Plan
+from ..text import listed
 from .arguments import CommandParser, Parsers, add_quiet
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 __all__ = ["PARSERS", "check_plot", "plot_results", "plotted_where_it_ends"]
 
 
 def _add_plot(parser: CommandParser) -> None:
-    parser.add_argument("results", type=Path, metavar="RESULTS.csv", help="the result file")
+    parser.add_argument("results", type=Path, metavar="RESULTS.csv", help="the result file, or the folder of a sweep")
     parser.add_argument(
         "--output", type=Path, metavar="FILE.png", help="file of the picture; default: beside the result file"
     )
     parser.add_argument(
         "--variables", nargs="+", metavar="INSTANCE.VARIABLE", help="plot only these; default: all of the file"
+    )
+    sweep = parser.add_argument_group("of a sweep")
+    sweep.add_argument(
+        "--colour", metavar="NAME", help="the parameter or column that colours the curves; default: the first parameter"
+    )
+    sweep.add_argument(
+        "--heat-map", metavar="COLUMN", help="draw a column over two parameters, such as max(pendulum.a)"
+    )
+    sweep.add_argument(
+        "--axes", nargs=2, metavar="NAME", help="the two parameters of the heat map; default: the first two"
     )
     add_quiet(parser)
     parser.set_defaults(run_command=_plot)
@@ -31,10 +48,37 @@ def _add_plot(parser: CommandParser) -> None:
 
 def _plot(arguments: argparse.Namespace) -> int:
     require_matplotlib()
-    output = arguments.output if arguments.output is not None else arguments.results.with_suffix(".png")
-    draw(Result.read(arguments.results).plot(*arguments.variables or ()), output)
+    results, variables = arguments.results, arguments.variables or ()
+    if is_sweep(results):
+        figure, name = _of_sweep(SweepResult.read(results), arguments)
+        default = results / f"{name.replace('/', '_')}.png"
+    elif arguments.colour or arguments.heat_map or arguments.axes:
+        raise ConfigurationError(f"'{results}' is not the folder of a sweep, which --colour and --heat-map are for.")
+    else:
+        figure, default = Result.read(results).plot(*variables), results.with_suffix(".png")
+    output = arguments.output if arguments.output is not None else default
+    draw(figure, output)
     print(f"plot: {output}")
     return 0
+
+
+def _of_sweep(sweep: SweepResult, arguments: argparse.Namespace) -> tuple[Figure, str]:
+    """A picture of a sweep, and what it shows.
+
+    Raises:
+        ConfigurationError: it is not said which variable, or two options cannot be combined.
+        CallRefused: there is no such column or parameter.
+    """
+    variables: Sequence[str] = arguments.variables or ()
+    if arguments.heat_map is not None:
+        if variables or arguments.colour:
+            raise ConfigurationError("--heat-map draws no curves", hint="Leave --variables and --colour out.")
+        x, y = arguments.axes or (None, None)
+        return sweep.heat_map(arguments.heat_map, x=x, y=y), arguments.heat_map
+    if len(variables) != 1:
+        hint = f"There are {listed(sweep.variables)}."
+        raise ConfigurationError("--variables has to name the one variable whose curves to draw.", hint=hint)
+    return sweep.plot(variables[0], colour=arguments.colour), variables[0]
 
 
 def check_plot(plot: Path, result: str | None) -> None:

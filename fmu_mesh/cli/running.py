@@ -11,6 +11,7 @@ from contextlib import contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
 from types import FrameType
+from typing import TYPE_CHECKING
 
 from ..api.mesh_builder import Mesh, load
 from ..api.plan_options import PlanOptions, StartOptions
@@ -31,7 +32,10 @@ from .output.reports import RunReporter
 from .plotting import check_plot, plot_results, plotted_where_it_ends
 from .run_options import add_configuration, add_options, given_options
 
-__all__ = ["PARSERS", "add_output", "run_mesh"]
+if TYPE_CHECKING:
+    from ..sweeps.sweeping import Sweep
+
+__all__ = ["PARSERS", "add_output", "interrupted_by_signals", "run_mesh"]
 
 
 def _add_launch(parser: CommandParser) -> None:
@@ -127,11 +131,12 @@ def run_mesh(
         plotted_where_it_ends(plan.plan, getattr(arguments, "plot", None)),
         Display(plan.plan, show_progress=not arguments.no_progress, quiet=arguments.quiet) as display,
         nullcontext() if how.get("processes", True) else stdout_as_stderr(),
-        _ended_by_signals() as runs,
+        interrupted_by_signals() as runs,
     ):
         how["on_event"] = partial(_show, reporter, display)
-        runs.append(Run.start(plan, **how))
-        outcome = runs[0].wait().outcome
+        run = Run.start(plan, **how)
+        runs.append(run)
+        outcome = run.wait().outcome
     assert outcome is not None  # it has run
     _finish(plan.plan, outcome, arguments)
 
@@ -152,9 +157,9 @@ def _planned(mesh: Mesh, options: PlanOptions, arguments: argparse.Namespace) ->
 
 
 @contextmanager
-def _ended_by_signals() -> Iterator[list[Run]]:
+def interrupted_by_signals() -> Iterator[list[Run | Sweep]]:
     """Inside, Ctrl-C and SIGTERM end the run in the list that this yields, instead of this process."""
-    runs: list[Run] = []
+    runs: list[Run | Sweep] = []
 
     def interrupt(_number: int, _frame: FrameType | None) -> None:
         if not runs:

@@ -22,7 +22,7 @@ from ...run.wiring import is_socket, leaves_host
 from ...system.plan import Plan
 from ...text import short_path
 from ...wire.views import LogLine, MeshStatus
-from .progress import ProgressLine
+from .progress import RunProgressLine
 from .terminal import error_console
 
 __all__ = ["Display", "say", "stdout_as_stderr", "summary", "teller", "warn"]
@@ -53,7 +53,7 @@ class Display:
         self._plan = plan
         self._console = error_console()
         self._quiet = quiet
-        self._progress = ProgressLine(plan, self._console, show=show_progress and not quiet)
+        self._progress = RunProgressLine(plan, self._console, show=show_progress and not quiet)
         self._waits_for_nodes = waits_for_nodes
         self._times: Counter[tuple[str, str]] = Counter()
         self._held: deque[LogLine] = deque()

@@ -1,11 +1,13 @@
-"""The progress line of a run: its point, its speed and the time left, in the width of the terminal.
+"""The progress line of a run or a sweep: how far it is, its speed and the time left, in the width of the terminal.
 
 Owns which parts are left out on a narrow terminal. It never wraps: a wrapped line cannot be erased.
 """
 
 from __future__ import annotations
 
-from typing import Final
+from abc import ABC, abstractmethod
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Final
 
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.live import Live
@@ -19,7 +21,10 @@ from ...system.plan import Plan
 from ...wire.views import MeshStatus
 from .terminal import may_draw
 
-__all__ = ["ProgressLine", "progress_parts"]
+if TYPE_CHECKING:
+    from ...sweeps.sweeping import SweepProgress
+
+__all__ = ["RunProgressLine", "SweepProgressLine", "progress_parts"]
 
 _LEAST_BAR: Final = 8
 _MOST_NAME: Final = 20
@@ -28,20 +33,17 @@ _ECHO: Final = 3
 """Columns for the `^C` that a terminal echoes, which would wrap the line."""
 
 
-class ProgressLine:
+class ProgressLine(ABC):
     """One line at the bottom of a terminal, while it is started.
 
     Args:
-        plan: the plan of the run.
+        name: of what is going on.
         console: where it is drawn, if that is a terminal.
         show: False never draws it.
     """
 
-    def __init__(self, plan: Plan, console: Console, *, show: bool) -> None:
-        self._name = plan.system.config.mesh
-        self._grid = plan.grid
-        self._status: MeshStatus | None = None
-        self._started: float | None = None
+    def __init__(self, name: str, console: Console, *, show: bool) -> None:
+        self._name = name
         drawn = show and may_draw(console.file) and console.is_terminal and not console.is_dumb_terminal
         self._live = Live(self, console=console, transient=True, refresh_per_second=10) if drawn else None
 
@@ -55,15 +57,20 @@ class ProgressLine:
         if self._live is not None:
             self._live.stop()
 
-    def status(self, status: MeshStatus) -> None:
-        """Show this status of the mesh."""
-        self._status = status
+    @abstractmethod
+    def _parts(self, width: int) -> list[str]:
+        """What fits into ``width`` columns beside the bar."""
+
+    @property
+    @abstractmethod
+    def _completed(self) -> tuple[int, int | None]:
+        """How much is done, and how much there is; None if that is not known."""
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         """The line; Rich calls this ten times a second."""
         width = max(options.max_width - _ECHO, 1)
         name = shortened(self._name, min(_MOST_NAME, width // 4))
-        parts = progress_parts(self._grid, self._status, width - len(name) - len(_GAP) - _LEAST_BAR - len(_GAP))
+        parts = self._parts(width - len(name) - len(_GAP) - _LEAST_BAR - len(_GAP))
         padding = (0, len(_GAP), 0, 0)
         line = Table(
             width=width,
@@ -77,11 +84,70 @@ class ProgressLine:
         line.add_column(no_wrap=True)
         line.add_column(ratio=1, no_wrap=True)
         line.add_column(no_wrap=True)
-        point = self._status.point if self._status is not None else 0
-        total = self._grid.last_point if self._grid.stop_time is not None else None
-        bar = ProgressBar(total=total, completed=point, pulse=total is None)
+        completed, total = self._completed
+        bar = ProgressBar(total=total, completed=completed, pulse=total is None)
         line.add_row(Text(name, style="bold"), bar, Text(_GAP.join(parts)))
         yield line
+
+
+class RunProgressLine(ProgressLine):
+    """The progress line of a run.
+
+    Args:
+        plan: the plan of the run.
+        console: where it is drawn, if that is a terminal.
+        show: False never draws it.
+    """
+
+    def __init__(self, plan: Plan, console: Console, *, show: bool) -> None:
+        super().__init__(plan.system.config.mesh, console, show=show)
+        self._grid = plan.grid
+        self._status: MeshStatus | None = None
+
+    def status(self, status: MeshStatus) -> None:
+        """Show this status of the mesh."""
+        self._status = status
+
+    def _parts(self, width: int) -> list[str]:
+        return progress_parts(self._grid, self._status, width)
+
+    @property
+    def _completed(self) -> tuple[int, int | None]:
+        point = self._status.point if self._status is not None else 0
+        return point, self._grid.last_point if self._grid.stop_time is not None else None
+
+
+class SweepProgressLine(ProgressLine):
+    """The progress line of a sweep.
+
+    Args:
+        name: name of the mesh.
+        console: where it is drawn, if that is a terminal.
+        show: False never draws it.
+    """
+
+    def __init__(self, name: str, console: Console, *, show: bool) -> None:
+        super().__init__(name, console, show=show)
+        self._progress: SweepProgress | None = None
+
+    def update(self, progress: SweepProgress) -> None:
+        """Show how far the sweep is."""
+        self._progress = progress
+
+    def _parts(self, width: int) -> list[str]:
+        progress = self._progress
+        if progress is None:
+            return ["starting"]
+        parts = [f"{progress.done} of {progress.total} runs"]
+        if progress.failed:
+            parts.append(f"{progress.failed} failed")
+        if progress.left is not None:
+            parts.append(f"{_duration(progress.left)} left")
+        return _fitting(parts, width)
+
+    @property
+    def _completed(self) -> tuple[int, int | None]:
+        return (self._progress.done, self._progress.total) if self._progress is not None else (0, None)
 
 
 def progress_parts(grid: TimeGrid, status: MeshStatus | None, width: int) -> list[str]:
@@ -105,6 +171,11 @@ def progress_parts(grid: TimeGrid, status: MeshStatus | None, width: int) -> lis
     elif grid.stop_time is not None and rate > 0.0:
         parts.append(f"{_duration((grid.last_point - status.point) / rate)} left")
     parts += [f"{rate:,.0f} points/s", f"factor {status.real_time_factor:.3g}"]
+    return _fitting(parts, width)
+
+
+def _fitting(parts: Iterable[str], width: int) -> list[str]:
+    """The first parts that fit into ``width`` columns."""
     shown: list[str] = []
     for part in parts:
         if len(_GAP.join([*shown, part])) > width:
