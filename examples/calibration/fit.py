@@ -1,0 +1,121 @@
+"""Finds the damping and the length of a pendulum from a bag of measured angles, by least squares.
+
+From the root of the repository, after `measure.py`:
+
+    python examples/calibration/fit.py results/measured.mcap --plot results/calibration.png
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from rosbags.highlevel import AnyReader
+from scipy.optimize import least_squares
+
+import fmu_mesh
+
+NAMES = ("pendulum.d", "pendulum.l")
+START = (0.1, 1.0)
+"""Where the search begins: 1/s, m."""
+
+Array = NDArray[np.float64]
+
+
+class Fit(NamedTuple):
+    """What was found.
+
+    Attributes:
+        values: the estimates, in the order of `NAMES`.
+        errors: their standard errors.
+        noise: standard deviation of the residuals in rad.
+        runs: how often the mesh was run.
+        times: the time of each row of the model in s.
+        angles: the angle of the model with the estimates in rad.
+    """
+
+    values: Array
+    errors: Array
+    noise: float
+    runs: int
+    times: Array
+    angles: Array
+
+
+def main() -> None:
+    """Read the bag, fit the model, and draw both."""
+    parser = argparse.ArgumentParser(description="Fit the pendulum to a bag.")
+    parser.add_argument("bag", type=Path)
+    parser.add_argument("--plot", type=Path)
+    options = parser.parse_args()
+    times, angles = read(options.bag, "/joint_states", "pendulum")
+    found = fitted(times, angles)
+    for name, value, error in zip(NAMES, found.values, found.errors, strict=True):
+        print(f"{name} = {value:.4f} +- {error:.4f}")
+    print(f"noise {found.noise:.4f} rad, {found.runs} runs")
+    if options.plot is not None:
+        draw(options.plot, times, angles, found)
+
+
+def read(bag: Path, topic: str, joint: str) -> tuple[Array, Array]:
+    """The times of the stamps in s, beginning at 0, and the positions of a joint in rad."""
+    stamps, positions = [], []
+    with AnyReader([bag]) as reader:
+        connections = [connection for connection in reader.connections if connection.topic == topic]
+        for connection, _, data in reader.messages(connections):
+            message: Any = reader.deserialize(data, connection.msgtype)
+            stamps.append(message.header.stamp.sec * 10**9 + message.header.stamp.nanosec)
+            positions.append(message.position[message.name.index(joint)])
+    return (np.array(stamps) - stamps[0]) / 1e9, np.array(positions)
+
+
+def fitted(times: Array, angles: Array) -> Fit:
+    """The damping and the length with the least squares of the residuals."""
+    mesh = fmu_mesh.load(Path(__file__).with_name("pendulum.yaml"))
+    runs = 0
+    with mesh.repeated() as model:  # the FMU is loaded once
+
+        def simulated(values: Array) -> fmu_mesh.Result:
+            nonlocal runs
+            runs += 1
+            return model.run(start_values=dict(zip(NAMES, values.tolist(), strict=True)))
+
+        def residuals(values: Array) -> Array:
+            result = simulated(values)
+            return np.interp(times, result.times, result["pendulum.a"]) - angles
+
+        # The relative step of the derivatives is far above the error of the solver in the FMU.
+        found = least_squares(residuals, START, bounds=([0.0, 0.1], [np.inf, np.inf]), x_scale=START, diff_step=1e-4)
+        best = simulated(found.x)
+    noise = np.sqrt(2.0 * found.cost / (len(times) - len(START)))
+    errors = noise * np.sqrt(np.diag(np.linalg.inv(found.jac.T @ found.jac)))
+    return Fit(found.x, errors, float(noise), runs, best.times, best["pendulum.a"])
+
+
+def draw(path: Path, times: Array, angles: Array, found: Fit) -> None:
+    """Draw measured and fitted angles, and below them what remains."""
+    from matplotlib.figure import Figure  # noqa: PLC0415  only this needs it
+
+    figure = Figure(figsize=(8.4, 5.0), dpi=120, layout="constrained")
+    above, below = figure.subplots(2, 1, sharex=True, height_ratios=[3, 1])
+    above.plot(times, angles, ".", color="0.6", markersize=4, label="measured")
+    damping, length = found.values
+    above.plot(found.times, found.angles, color="C0", label=f"fitted: d = {damping:.4f} 1/s, l = {length:.4f} m")
+    above.set_ylabel("angle in rad")
+    above.legend()
+    below.plot(times, angles - np.interp(times, found.times, found.angles), ".", color="0.4", markersize=3)
+    below.axhspan(-2.0 * found.noise, 2.0 * found.noise, color="C0", alpha=0.15, label="2 standard deviations")
+    below.set_ylabel("residual in rad")
+    below.set_xlabel("time in s")
+    below.legend(loc="upper right", fontsize=8)
+    for axes in (above, below):
+        axes.grid(alpha=0.35)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path)
+
+
+if __name__ == "__main__":
+    main()
