@@ -315,6 +315,19 @@ NOT_RUN = [
         "`ros2` is not on PyPI; tests/ros/test_rmw_zenoh.py calls these services",
     ),
     (
+        "docs/sweeps.md",
+        "fmu-mesh sweep configs/pendulum_delay.yaml --vary pendulum.d=0.05:0.8:16 --dask tcp://192.168.1.2:8786",
+        "it needs a Dask cluster; tests/sweeps/test_dask.py starts one",
+    ),
+    (
+        "docs/sweeps.md",
+        (
+            "fmu-mesh sweep configs/pendulum_delay.yaml --vary pendulum.d=0.05:0.8:256 --slurm --tasks 8 "
+            "--slurm-option=--partition=short"
+        ),
+        "it needs a Slurm cluster; tests/sweeps/test_slurm.py runs it on one of two hosts",
+    ),
+    (
         "examples/cart_pole/README.md",
         "python examples/cart_pole/train.py --output policy.onnx",
         "it takes 10 s; tests/physics/test_cart_pole.py runs it with less training",
