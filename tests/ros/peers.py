@@ -12,6 +12,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator, Mapping, Sequence
+from functools import cache
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Any, Self
@@ -20,10 +21,13 @@ import pytest
 
 from tests.helpers import DEADLINE_S, wait_until
 
-__all__ = ["Peer", "bridge", "domain", "free_port", "need", "ros_environment"]
+__all__ = ["Peer", "bridge", "domain", "free_port", "need", "ros_settings"]
 
 FOLDER = Path(__file__).parent
 BRIDGE = "fmu-mesh-ros2dds"
+_DOMAINS = 101  # with a higher number, the ports of DDS reach those that the kernel gives to others
+
+_held: list[socket.socket] = []
 
 
 def need(*modules: str) -> None:
@@ -52,14 +56,24 @@ def free_port() -> int:
         return port
 
 
+@cache
 def domain() -> int:
-    """A ROS domain that other tests on this machine are unlikely to use at the same time."""
-    return 1 + os.getpid() % 100
+    """A ROS domain that no other process of tests in this network namespace has, as long as this process lives."""
+    for number in range(1, _DOMAINS):
+        holder = socket.socket(socket.AF_UNIX)
+        try:
+            holder.bind(f"\0fmu_mesh_tests_ros_domain_{number}")  # no file, and gone with the process
+        except OSError:
+            holder.close()
+            continue
+        _held.append(holder)
+        return number
+    raise AssertionError(f"all {_DOMAINS - 1} ROS domains are in use by other tests")
 
 
-def ros_environment() -> dict[str, str]:
-    """The environment of a ROS node that stays on this host."""
-    return os.environ | {
+def ros_settings() -> dict[str, str]:
+    """The variables that keep ROS nodes on this host, and apart from other tests."""
+    return {
         "ROS_DOMAIN_ID": str(domain()),
         "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
         "RMW_IMPLEMENTATION": "rmw_fastrtps_cpp",
@@ -79,7 +93,7 @@ class Peer:
     ) -> None:
         command = [sys.executable, str(FOLDER / script)] if isinstance(script, str) else [str(script)]
         texts = [own if isinstance(own, str) else json.dumps(own) for own in arguments]
-        variables = dict(environment if environment is not None else ros_environment())
+        variables = dict(environment if environment is not None else os.environ | ros_settings())
         # Without a buffer, Python loses the rest of a long line if the process is stopped while it writes it.
         variables.pop("PYTHONUNBUFFERED", None)
         self._popen = subprocess.Popen(
@@ -169,7 +183,7 @@ def bridge(folder: Path, port: int, connect: Sequence[str] = ()) -> Iterator[Non
         "<MaxAutoParticipantIndex>60</MaxAutoParticipantIndex><Peers><Peer address='127.0.0.1'/></Peers>"
         "</Discovery></Domain></CycloneDDS>"
     )
-    environment = ros_environment() | {"CYCLONEDDS_URI": cyclone, "ROS_DISTRO": "kilted"}
+    environment = os.environ | ros_settings() | {"CYCLONEDDS_URI": cyclone, "ROS_DISTRO": "kilted"}
     with Peer(bridge_binary(), str(config), environment=environment) as process:
         assert process.line(0) == "ready\n"
         yield

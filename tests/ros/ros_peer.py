@@ -18,6 +18,7 @@ from typing import Any, Self, TypeVar
 import pytest
 
 from tests.helpers import DEADLINE_S
+from tests.ros.peers import ros_settings
 
 __all__ = ["Ros", "environment", "ros_or_skip"]
 
@@ -27,13 +28,8 @@ Found = TypeVar("Found")
 
 
 def environment(log_folder: Path) -> dict[str, str]:
-    """What keeps ROS on this machine, and apart from other tests: a domain by process."""
-    return {
-        "ROS_DOMAIN_ID": str(1 + os.getpid() % 100),
-        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
-        "ROS_LOG_DIR": str(log_folder),
-        "RMW_IMPLEMENTATION": "rmw_fastrtps_cpp",
-    }
+    """What keeps ROS on this machine, apart from other tests, and its log in a folder."""
+    return {**ros_settings(), "ROS_LOG_DIR": str(log_folder)}
 
 
 def ros_or_skip() -> None:
