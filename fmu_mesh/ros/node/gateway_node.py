@@ -20,7 +20,6 @@ from ...instances.configuration import load
 from ...wire.client.mesh_client import MeshClient
 from ...wire.client.reaching import Meshes
 from ...wire.client.readings import Target
-from ...wire.session import tokens
 from ..bags.playing import grid_of
 from ..gateway.gateway import Gateway
 from ..gateway.mapping import descriptions_of, resolve
@@ -158,7 +157,8 @@ class GatewayNode:
         client, plan = self._client, self._plan
         if client is None or plan is None:
             raise ConfigurationError("the gateway has no mesh yet.", hint="Configure it first.")
-        if not tokens(client.session, client.keys.master) or (info := client.info()).run != self._run:
+        info = client.info_if_running()
+        if info is None or info.run != self._run:
             raise MeshLost(
                 f"the run of mesh '{client.keys.mesh}' for which this node was configured has ended",
                 hint="Clean the node up, and configure it again when the mesh runs.",

@@ -73,6 +73,17 @@ class MeshClient:
         """The description of the mesh."""
         return self._view(self.keys.mesh_key("info"), MeshInfo, f"mesh '{self.keys.mesh}'")
 
+    def info_if_running(self) -> MeshInfo | None:
+        """The description of the mesh if it runs now; None otherwise. This does not wait for a mesh, as `info` does.
+
+        A query for the token of the master would not do: beside a subscriber for that token, such as `until_end`
+        has, its answer is empty now and then although the mesh runs.
+        """
+        try:
+            return next((_decoded(sample, MeshInfo) for sample in self._get(self.keys.mesh_key("info"))), None)
+        except MessageRefused as error:
+            raise _not_understood(f"mesh '{self.keys.mesh}'", error) from error
+
     def status(self) -> MeshStatus:
         """The state and the point of the mesh."""
         return self._view(self.keys.mesh_key("status"), MeshStatus, f"mesh '{self.keys.mesh}'")
