@@ -79,12 +79,13 @@ class InProcessRun:
         try:
             remove_stale_folders()
             self._folder = folder = run_folder(self._run.mesh, run_name())
+            (fmus := folder / "fmus").mkdir()
             self._mesh = mesh = LocalMesh(
                 self._run.plan,
                 self._log,
                 self._progress,
                 on_hang=self._end,
-                parent=folder / "fmus",
+                parent=fmus,
                 showing=self._run.options.showing,
                 loaded=self._run.loaded,
             )

@@ -16,12 +16,13 @@ import stat
 import tempfile
 from collections.abc import Iterator
 from contextlib import suppress
+from errno import ENOENT
 from pathlib import Path
 from typing import TextIO
 
 import msgspec
 
-from ..errors import ConfigurationError
+from ..errors import ConfigurationError, MeshLost
 
 __all__ = [
     "MeshNote",
@@ -45,6 +46,8 @@ _SOCKET_PATH_LIMIT = 100
 _PF_EXITING = 0x4
 _KILLED = 1 << (signal.SIGKILL - 1)
 """Bits of a process in /proc."""
+_ENTRIES = 100
+"""How often a process tries to enter a folder that others, who leave it, remove meanwhile."""
 _NAME_LIMIT = 40
 """Largest length of a mesh's name in the name of its folder; a longer name is cut, and a hash is added."""
 
@@ -94,9 +97,7 @@ def run_folder(mesh: str, run: str) -> Path:
     name = mesh
     if len(mesh) > _NAME_LIMIT:  # FMUs have long names, and the path of a socket must be short
         name = f"{mesh[: _NAME_LIMIT - 9]}-{hashlib.sha256(mesh.encode()).hexdigest()[:8]}"
-    folder = _private(runtime_folder() / f"{name}.{run}")
-    (folder / "fmus").mkdir(exist_ok=True)
-    return folder
+    return _private(runtime_folder() / f"{name}.{run}")
 
 
 def run_name() -> str:
@@ -118,14 +119,15 @@ def _private(folder: Path) -> Path:
     """
     hint = "Set FMU_MESH_RUNTIME_DIR to a folder of your own."
     try:
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        found = folder.lstat()
+        found = _made(folder)
     except OSError as error:
         raise ConfigurationError(
             f"the runtime folder '{folder}' cannot be made: {error.strerror or error}", hint=hint
         ) from error
     if stat.S_ISLNK(found.st_mode):
         raise ConfigurationError(f"the runtime folder '{folder}' is a symbolic link", hint=hint)
+    if not stat.S_ISDIR(found.st_mode):
+        raise ConfigurationError(f"the runtime folder '{folder}' is no folder", hint=hint)
     if found.st_uid != os.getuid():
         raise ConfigurationError(f"the runtime folder '{folder}' belongs to another user", hint=hint)
     if (mode := stat.S_IMODE(found.st_mode)) & 0o077:
@@ -134,6 +136,19 @@ def _private(folder: Path) -> Path:
             hint=f"Close it with `chmod 700 {folder}`, or set FMU_MESH_RUNTIME_DIR to another folder.",
         )
     return folder
+
+
+def _made(folder: Path) -> os.stat_result:
+    """Create a folder if nothing is there; return the state of what is there.
+
+    Until this process has a file in it, the last other process that leaves a run may remove its folder at any moment.
+    """
+    for _ in range(_ENTRIES):
+        with suppress(FileExistsError):
+            folder.mkdir(mode=0o700, parents=True)
+        with suppress(FileNotFoundError):
+            return folder.lstat()
+    raise FileNotFoundError(ENOENT, "it is removed again and again")
 
 
 def remove_run_folder(folder: Path) -> None:
@@ -148,9 +163,8 @@ def fmu_folder(folder: Path) -> Path:
 
 def enter_run_folder(folder: Path, node: str) -> None:
     """Note that this process is the node ``node`` of a run, so that others can remove its files if it is killed."""
-    _private(folder)  # the last process that left the folder may just have removed it
     draft = folder / f"{os.getpid()}.new"
-    file = draft.open("w", encoding="utf-8")
+    file = _first_file(draft)
     _held[folder] = file
     file.write(_socket_name(node))
     file.flush()
@@ -158,13 +172,31 @@ def enter_run_folder(folder: Path, node: str) -> None:
     draft.rename(folder / f"{os.getpid()}.pid")
 
 
+def _first_file(path: Path) -> TextIO:
+    """Open a new file in the folder of a run, which nobody else removes from then on."""
+    for _ in range(_ENTRIES):
+        _private(path.parent)
+        with suppress(FileNotFoundError):
+            return path.open("w", encoding="utf-8")
+    raise MeshLost(
+        f"the runtime folder '{path.parent}' is removed again and again", hint="Does something else do that?"
+    )
+
+
 def tidy_run_folder(folder: Path) -> None:
     """Remove the files of killed processes from the folder of a run."""
-    for note in folder.glob("*.pid"):
+    try:
+        notes = [*folder.glob("*.pid")]
+    except FileNotFoundError:  # another process, the last one that left the run, has just removed the folder
+        return
+    for note in notes:
         try:
             with note.open(encoding="utf-8") as file:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                is_current = os.path.samestat(os.fstat(file.fileno()), note.stat())
         except OSError:  # its process still holds the lock, or another process was faster
+            continue
+        if not is_current:  # its process has left the run, and has entered it again
             continue
         _remove_traces(folder, note.stem)
 
@@ -248,9 +280,13 @@ def remove_stale_folders() -> None:
 
 
 def _remove_if_empty(folder: Path) -> None:
-    for empty in (folder / "fmus", folder):
-        with suppress(OSError):  # another process still uses it
-            empty.rmdir()
+    fmus = folder / "fmus"
+    with suppress(OSError):  # another process still uses it, or has removed it
+        if any(entry != fmus for entry in folder.iterdir()):
+            return
+        if fmus.exists():
+            fmus.rmdir()
+        folder.rmdir()
 
 
 def _read_note(file: Path) -> MeshNote | None:

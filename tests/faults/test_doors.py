@@ -208,7 +208,7 @@ def file_instead(folder: Path) -> None:
         (open_to_others, "is open to other users (mode 0755). Close it with `chmod 700 {folder}`"),
         (somebody_elses, "belongs to another user. Set FMU_MESH_RUNTIME_DIR"),
         (planted_link, "is a symbolic link. Set FMU_MESH_RUNTIME_DIR"),
-        (file_instead, "cannot be made: File exists. Set FMU_MESH_RUNTIME_DIR"),
+        (file_instead, "is no folder. Set FMU_MESH_RUNTIME_DIR"),
     ],
 )
 def test_a_runtime_folder_that_others_get_into_is_refused(
