@@ -109,7 +109,7 @@ class RepeatedMesh:
             remove_stale_folders()
             folder = run_folder(mesh, run_name())
             models = fmu_folder(folder)
-            models.mkdir()
+            models.mkdir(parents=True)
             self._loaded.append((self._make(models), folder))
         return self._loaded[0][0]
 
