@@ -110,7 +110,8 @@ def write_config(
     }
     members = {own_name: dict(member) for own_name, member in (own if instances is None else instances).items()}
     for member in members.values():
-        member["fmu"] = kept.get(member["fmu"], member["fmu"])
+        if "fmu" in member:
+            member["fmu"] = kept.get(member["fmu"], member["fmu"])
     content = {
         "mesh": name,
         "record": {"file": f"{name}.csv"},

@@ -76,6 +76,7 @@ class NodeServer:
         self._status_publishers: dict[str, zenoh.Publisher] = {}
         self._log_publishers: dict[str, zenoh.Publisher] = {}
         self._early_lines: list[LogLine] = []
+        self._visible = threading.Event()
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="server", daemon=True)
         self._thread.start()
@@ -87,7 +88,12 @@ class NodeServer:
     # --- called by the main thread
 
     def serve(self, runners: Mapping[str, Runner]) -> None:
-        """From now on values can be read and set, and streams can be subscribed."""
+        """From now on values can be read and set, and streams can be subscribed.
+
+        What the master gets from this node after this comes to it after the declarations of the node: once a mesh has
+        begun, a query for any of its instances finds it.
+        """
+        self._visible.wait(self._plan.timeouts.start)
         self._activity.serve(runners)
         for runner in runners.values():
             self._streams.append(
@@ -169,6 +175,14 @@ class NodeServer:
     # --- queries
 
     def _declare(self) -> None:
+        try:
+            self._declare_instances()
+        finally:
+            self._visible.set()
+        for line in self._early_lines:
+            self._publish_log(line)
+
+    def _declare_instances(self) -> None:
         for name in (instance.name for instance in self._plan.instances):
             root = self._keys.instance(name)
             self._entities.append(self._session.liveliness().declare_token(root))
@@ -181,8 +195,6 @@ class NodeServer:
                 publishers[name] = self._session.declare_publisher(
                     f"{root}/{what}", encoding=json_encoding, congestion_control=congestion_control
                 )
-        for line in self._early_lines:
-            self._publish_log(line)
 
     def _query_arrived(self, name: str, query: zenoh.Query) -> None:
         def answer() -> None:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import signal
 import socket
 from collections.abc import Sequence
 from pathlib import Path
 
-import psutil
 import pytest
 
 from tests.helpers import DEADLINE_S, FMUS, Launched, Place, rows_of, wait_until, write_config
@@ -175,21 +175,40 @@ def test_of_several_meshes_one_has_to_be_named(place: Place) -> None:
 # --- the address
 
 
+GATE = """
+from pathlib import Path
+import fmu_mesh
+
+folder = Path(__file__).parent
+try:
+    (folder / "described").touch(exist_ok=False)
+except FileExistsError:
+    (folder / "gate").open().close()  # the node loads it: wait until somebody opens the other end
+
+class Gate(fmu_mesh.Component):
+    y = fmu_mesh.Output()
+
+    def step(self, time, step_size):
+        self.y = time
+"""
+
+
 def test_the_address_is_shown_when_all_instances_answer(place: Place) -> None:
-    config = write_config(place.folder, stop_time=FAR_S, simulation=PACED)
+    os.mkfifo(place.folder / "gate")
+    (place.folder / "gate.py").write_text(GATE, encoding="utf-8")
+    instances = {"pendulum": {"fmu": "DampedPendulum"}, "gate": {"python": "gate.py:Gate"}}
+    config = write_config(place.folder, instances=instances, connections=[], stop_time=FAR_S, simulation=PACED)
     launched = place.start("launch", config)
-    node = launched.child("pendulum")
-    node.suspend()
-    wait_until(lambda: node.status() == psutil.STATUS_STOPPED, "a stopped node")
     assert place.run("wait", "--state", "starting").wait() == 0
     assert "mesh 'pair' at" not in launched.errors
-    node.resume()
+    (place.folder / "gate").open("w", encoding="utf-8").close()  # waits until the node waits
 
     launched.wait_for_error_line("mesh 'pair' at")
 
     with place.session() as session:
-        replies = session.get("fmu_mesh/pair/pendulum/out/a", timeout=DEADLINE_S)
-        assert [str(reply.ok.key_expr) for reply in replies if reply.ok is not None] == ["fmu_mesh/pair/pendulum/out/a"]
+        for name in ("pendulum/out/a", "gate/out/y"):
+            replies = session.get(f"fmu_mesh/pair/{name}", timeout=DEADLINE_S)
+            assert [str(reply.ok.key_expr) for reply in replies if reply.ok is not None] == [f"fmu_mesh/pair/{name}"]
 
 
 def test_a_mesh_that_never_answers_shows_no_address(place: Place, faulty: Path) -> None:
