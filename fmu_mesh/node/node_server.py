@@ -82,18 +82,18 @@ class NodeServer:
         self._thread.start()
 
     def open(self) -> None:
-        """From any thread, after the node has joined the mesh: it is visible from now on, even while FMUs load."""
+        """From any thread, after the master has admitted the node: it is visible afterwards, even while FMUs load.
+
+        What the node sends after this comes to the master later than what is declared here. So a query for any instance
+        of a mesh that has begun finds it.
+        """
         self._jobs.put(self._declare)
+        self._visible.wait(self._plan.timeouts.start)
 
     # --- called by the main thread
 
     def serve(self, runners: Mapping[str, Runner]) -> None:
-        """From now on values can be read and set, and streams can be subscribed.
-
-        What the master gets from this node after this comes to it after the declarations of the node: once a mesh has
-        begun, a query for any of its instances finds it.
-        """
-        self._visible.wait(self._plan.timeouts.start)
+        """From now on values can be read and set, and streams can be subscribed."""
         self._activity.serve(runners)
         for runner in runners.values():
             self._streams.append(
