@@ -29,7 +29,7 @@ from msgspec.structs import replace
 from ..errors import ConfigurationError
 from ..files import is_file, replaced
 from ..run.options import Options
-from .variant_run import Cell, Row, path_of
+from .variant_run import Cell, Row, curves_of, path_of
 from .variants import Parameters
 
 __all__ = ["RowFile", "SweepFolder", "Wanted", "cells_of", "identity_of", "is_sweep"]
@@ -104,7 +104,7 @@ class SweepFolder:
 
     def curves_of(self, identity: str) -> Path:
         """The file with the curves of a run."""
-        return self.curves / f"{identity}.csv"
+        return curves_of(self.curves, identity)
 
     def owner(self) -> int:
         """The user who has made the sweep."""

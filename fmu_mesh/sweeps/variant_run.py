@@ -32,7 +32,7 @@ from ..run.options import Options
 from .reductions import read_reduction, reduced_value
 from .variants import Parameters
 
-__all__ = ["Row", "SweepTask", "encoded_task", "options_of_variant", "path_of", "run_variant"]
+__all__ = ["Row", "SweepTask", "curves_of", "encoded_task", "options_of_variant", "path_of", "run_variant"]
 
 Cell = float | int | bool | str | None
 """One value of the table."""
@@ -189,7 +189,7 @@ class _Loaded:
             raise ConfigurationError(f"this worker has fmu_mesh {__version__}, and the sweep {task.version}")
         options = options_of_variant(task.options, self._mesh.instances, parameters)
         if task.curves is not None:
-            options["output"] = task.curves / f"{identity}.csv"
+            options["output"] = curves_of(task.curves, identity)
         else:
             options["record"] = "memory"
         if task.processes:
@@ -246,6 +246,11 @@ def _work(mesh: Mesh, jobs: SimpleQueue[_Job | None], hung: _Hung, *, reset: boo
             except BaseException as error:  # noqa: BLE001  whoever waits gets it
                 if not hung.stuck:
                     job.ended.set_exception(error)
+
+
+def curves_of(folder: Path, identity: str) -> Path:
+    """The file with the curves of a run, in the folder of the curves."""
+    return folder / f"{identity}.csv"
 
 
 def path_of(type_: type, value: object) -> object:
