@@ -78,8 +78,9 @@ class Node:
         assert self._popen.stderr is not None
         self._reader = threading.Thread(target=self._read, args=(self._popen.stderr,), daemon=True)
         self._reader.start()
-        self._ros = ros
-        peer = ros.peer()
+        self._ros, self._peer = ros, ros.peer()
+        self._known = False
+        peer = self._peer
         self._change = ChangeState, peer.create_client(ChangeState, "/own/change_state")
         self._state = GetState, peer.create_client(GetState, "/own/get_state")
         self._list = ListParameters, peer.create_client(ListParameters, "/own/list_parameters")
@@ -92,10 +93,13 @@ class Node:
             assert self.succeeds(transition), f"{transition}: {self.errors}"
 
     def succeeds(self, transition: int) -> bool:
+        if not self._known:
+            self._ros.known_to("/own", self._peer)
+            self._known = True
         kind, client = self._change
         request = kind.Request()
         request.transition.id = transition
-        return bool(self._ros.called(client, request).success)
+        return bool(self._ros.called(client, request, once=True).success)
 
     def state(self) -> str:
         kind, client = self._state
@@ -181,6 +185,38 @@ def test_ctrl_c_ends_it_in_every_state_with_exit_code_0_and_no_traceback(
 
     assert "Traceback" not in node.errors
     assert "rror" not in node.errors
+
+
+SHUT_DOWN_IN_A_CALLBACK = """
+import sys
+import rclpy
+from fmu_mesh.ros.node import entry
+
+def create_node():
+    node = made()
+    def use_it():
+        rclpy.shutdown()
+        node.get_publishers_info_by_topic("/clock")
+    node.create_timer(0.01, use_it)
+    return node
+
+made, entry.create_node = entry.create_node, create_node
+sys.exit(entry.main())
+"""
+
+
+def test_ros_that_is_shut_down_while_a_callback_uses_it_is_a_plain_end(ros: Ros) -> None:
+    """After Ctrl-C a thread of rclpy shuts ROS down; here a callback does, so the order is always this."""
+    done = subprocess.run(
+        [sys.executable, "-c", SHUT_DOWN_IN_A_CALLBACK],
+        env={**os.environ, **ros.environment},
+        capture_output=True,
+        text=True,
+        timeout=DEADLINE_S,
+        check=False,
+    )
+
+    assert (done.returncode, done.stderr) == (0, "")
 
 
 @pytest.mark.usefixtures("ros")

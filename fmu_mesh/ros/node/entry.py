@@ -166,6 +166,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
             rclpy.spin(node, executor)
     except (KeyboardInterrupt, executors.ExternalShutdownException):
         pass
+    except Exception:
+        # rclpy has a thread for Ctrl-C, which shuts ROS down while the executor, or a callback, is about to use it.
+        if node.context.ok():
+            raise
     finally:
         # A second Ctrl-C ends the process at once, without a traceback.
         signal.signal(signal.SIGINT, lambda *_: os._exit(Interrupted.exit_code))
