@@ -231,9 +231,10 @@ class Launch:
         from lifecycle_msgs.srv import ChangeState as Service  # noqa: PLC0415 only where ROS is installed
 
         for node in filter(change.lifecycle_node_matcher, self._nodes):
+            client = self._peer.create_client(Service, f"{node.path}/change_state")
             self._ros.matched(self._subscriptions[node])
             self._ros.known_to(node.path, self._peer)
             request = Service.Request()
             request.transition.id = change.transition_id
-            answer = self._ros.called(self._peer.create_client(Service, f"{node.path}/change_state"), request)
+            answer = self._ros.called(client, request, once=True)
             assert answer.success, f"{node.path} refused transition {change.transition_id}"

@@ -23,6 +23,7 @@ from tests.ros.peers import ros_settings
 __all__ = ["Ros", "environment", "ros_or_skip"]
 
 _SPIN_S = 0.02
+_REPEAT_S = 5.0
 
 Found = TypeVar("Found")
 
@@ -120,7 +121,7 @@ class Ros:
 
         `matched` cannot tell: it sees that this side has heard of the other one, and a subscription that the publisher
         has not heard of is sent nothing. DDS announces what a process reads in the order of its making, so a node that
-        answers a client has heard of all that was made before.
+        answers a client has heard of all that was made before, such as other clients.
         """
         from rcl_interfaces.srv import GetParameters  # noqa: PLC0415 only where ROS is installed
 
@@ -128,12 +129,23 @@ class Ros:
         self.called(client, GetParameters.Request())
         peer.destroy_client(client)
 
-    def called(self, client: Any, request: Any) -> Any:  # noqa: ANN401 types of rclpy
-        """The answer of a service."""
+    def called(self, client: Any, request: Any, *, once: bool = False) -> Any:  # noqa: ANN401 types of rclpy
+        """The answer of a service.
+
+        A service is ready when this side has heard of it. It may not have heard of this side by then, and what it
+        answers is lost; so a request is repeated, unless it may be made only ``once``: then call `known_to` before.
+        """
         self.until(client.service_is_ready, f"the service {client.srv_name}")
-        future = client.call_async(request)
-        self.until(future.done, f"an answer of {client.srv_name}")
-        return future.result()
+        end, asked = time.monotonic() + DEADLINE_S, []
+        while True:
+            asked.append(client.call_async(request))
+            asked_s = DEADLINE_S if once else _REPEAT_S
+            until = min(time.monotonic() + asked_s, end)
+            while time.monotonic() < until:
+                if (answered := next((future for future in asked if future.done()), None)) is not None:
+                    return answered.result()
+                self._executor.spin_once(timeout_sec=_SPIN_S)
+            assert time.monotonic() < end, f"not within {DEADLINE_S:g} s: an answer of {client.srv_name}"
 
     def collect(
         self,

@@ -233,7 +233,7 @@ def test_the_lifecycle_is_driven_by_the_services_of_a_managed_node(ros: Ros) -> 
     for transition in ("configure", "activate", "deactivate", "cleanup", "configure", "cleanup", "shutdown"):
         request = ChangeState.Request()
         request.transition.label = transition
-        assert ros.called(change, request).success, transition
+        assert ros.called(change, request, once=True).success, transition
         states.append(ros.called(get, GetState.Request()).current_state.label)
 
     assert states == ["inactive", "active", "inactive", "unconfigured", "inactive", "unconfigured", "finalized"]
