@@ -8,7 +8,6 @@ import threading
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import contextmanager
-from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -37,10 +36,6 @@ def config(tmp_path: Path) -> Path:
 def table(result: fmu_mesh.SweepResult) -> list[list[str]]:
     """The cells of the table but the last three, which tell how a variant was run."""
     return [line.rsplit(",", 3)[:1] for line in result.table.read_text().splitlines()]
-
-
-def has_more_than(running: fmu_mesh.Sweep, done: int) -> bool:
-    return running.progress.done > done
 
 
 def contents(result: fmu_mesh.SweepResult) -> list[bytes]:
@@ -155,17 +150,36 @@ def test_a_failed_run_is_a_row_with_its_exit_code_and_message(faulty: Path, tmp_
     assert len(result.curves(0).times) == 5  # what it has recorded is kept
 
 
-def test_a_killed_worker_loses_nothing(config: Path, tmp_path: Path) -> None:
-    vary = {"pendulum.d": fmu_mesh.Range(0.05, 0.8, 20), "delay.d": [0.1, 0.2]}
-    with fmu_mesh.sweep(config, vary, folder=tmp_path / "quiet") as running:
+def test_a_killed_worker_loses_nothing(tmp_path: Path) -> None:
+    """Three variants kill their worker in the middle of their first run, so none is lost in both of its attempts."""
+    killed_in = {3, 10, 25}
+    (tmp_path / "killer.py").write_text(
+        "import os, pathlib, signal\n"
+        "import fmu_mesh\n"
+        "class Killer(fmu_mesh.Component):\n"
+        "    number = fmu_mesh.Parameter(0.0)\n"
+        "    y = fmu_mesh.Output(start=0.0)\n"
+        "    def step(self, time, step_size):\n"
+        "        first = pathlib.Path(__file__).with_name(f'{self.number:g}')\n"
+        "        if time > 0.5 and first.exists():\n"
+        "            first.unlink()\n"
+        "            os.kill(os.getpid(), signal.SIGKILL)\n"
+        "        self.y = time\n"
+    )
+    pendulum, delay = {"fmu": "DampedPendulum"}, {"fmu": "TransportDelay"}
+    instances = {"pendulum": pendulum, "delay": delay, "killer": {"python": "killer.py:Killer"}}
+    config = write_config(tmp_path, instances=instances)
+    variants = [{"pendulum.d": 0.05 + 0.02 * number, "killer.number": float(number)} for number in range(40)]
+    with fmu_mesh.sweep(config, variants, folder=tmp_path / "quiet") as running:
         undisturbed = running.wait(DEADLINE_S)
+    assert not undisturbed.failed
+    for number in killed_in:
+        (tmp_path / f"{number}").touch()
 
-    with WorkerPool(2) as pool, fmu_mesh.sweep(config, vary, executor=pool, folder=tmp_path / "killed") as running:
-        for done in (3, 10, 25):
-            wait_until(partial(has_more_than, running, done), f"{done} rows")
-            os.kill(pool.pids[done % 2], signal.SIGKILL)
+    with fmu_mesh.sweep(config, variants, workers=2, folder=tmp_path / "killed") as running:
         result = running.wait(DEADLINE_S)
 
+    assert not any((tmp_path / f"{number}").exists() for number in killed_in)
     assert len({row.worker for row in result}) > 2
     assert table(result) == table(undisturbed)
     assert contents(result) == contents(undisturbed)
