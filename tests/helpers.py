@@ -34,6 +34,7 @@ __all__ = [
     "Launched",
     "Place",
     "assert_readable",
+    "braked",
     "on_a_busy_machine",
     "row_count",
     "rows_of",
@@ -123,6 +124,30 @@ def write_config(
     path = folder / f"{name}.yaml"
     path.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
     return path
+
+
+_BRAKE = """
+import time
+import fmu_mesh
+
+class Brake(fmu_mesh.Component):
+    y = fmu_mesh.Output(start=0.0)
+
+    def step(self, now, step_size):
+        time.sleep(2e-5)
+        self.y = now
+"""
+
+
+def braked(folder: Path) -> Mapping[str, Mapping[str, Any]]:
+    """A pendulum, a delay, and an instance that sleeps in each step, for `write_config`.
+
+    They run as fast as possible, and still write only some ten thousand rows per second. So whatever the machine does
+    until a test ends the run, its result is small enough to be read.
+    """
+    (folder / "brake.py").write_text(_BRAKE, encoding="utf-8")
+    delay = {"fmu": "TransportDelay", "start_values": {"d": 0.1}}
+    return {"pendulum": {"fmu": "DampedPendulum"}, "delay": delay, "brake": {"python": "brake.py:Brake"}}
 
 
 def row_count(file: Path) -> int:

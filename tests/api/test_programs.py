@@ -60,7 +60,7 @@ def test_a_mesh_is_stepped_by_hand(clone: Place) -> None:
 
 
 def test_a_mesh_that_somebody_else_started_is_attached_to(clone: Place) -> None:
-    launched = clone.start("launch", clone.folder / "configs" / "pendulum_delay.yaml", "--real-time-factor", "20")
+    launched = clone.start("launch", clone.folder / "configs" / "pendulum_delay.yaml", "--real-time-factor", "4")
     assert clone.run("wait", "pendulum_delay").wait() == 0
 
     done = clone.start_command([sys.executable, str(PROGRAMS / "attach.py")])

@@ -208,7 +208,7 @@ def test_no_color_leaves_no_escape_sequence_on_a_terminal(
 
 
 def test_no_color_makes_top_print_plain_tables(place: Place) -> None:
-    config = write_config(place.folder, stop_time=2.0, simulation=PACED)
+    config = write_config(place.folder, stop_time=6.0, simulation=PACED)
     place.start("launch", config, "-q")
     place.run("wait")
 

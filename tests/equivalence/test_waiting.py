@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.helpers import DEADLINE_S, FMUS, Launched, Place, rows_of, wait_until, write_config
+from tests.helpers import DEADLINE_S, FMUS, Launched, Place, braked, rows_of, wait_until, write_config
 
 FAR_S = 1e6
 PACED = {"real_time_factor": 1.0, "step_size": 0.01}
@@ -267,7 +267,7 @@ def test_a_mesh_that_comes_to_its_end_before_it_rests_says_so(place: Place) -> N
 @pytest.mark.parametrize("paused", [[], ["--paused"]], ids=["running", "paused"])
 def test_stop_is_the_normal_end_of_a_run_without_a_stop_time(place: Place, paused: list[str]) -> None:
     simulation = {"stop_time": None, "step_size": 0.01}
-    config = write_config(place.folder, simulation=simulation)
+    config = write_config(place.folder, instances=braked(place.folder), simulation=simulation)
     launched = place.start("launch", config, "--no-progress", *paused)
     assert place.run("wait", "--state", "paused" if paused else "running").wait() == 0
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from tests.helpers import DEADLINE_S, Place, on_a_busy_machine, row_count, rows_of, wait_until, write_config
+from tests.helpers import DEADLINE_S, Place, braked, on_a_busy_machine, row_count, rows_of, wait_until, write_config
 
 FAR_S = 1_000_000.0
 SIGNALS = [signal.SIGINT, signal.SIGTERM]
@@ -38,7 +38,7 @@ def is_pending(pid: int, number: signal.Signals) -> bool:
 
 
 def test_ctrl_c_ends_the_run_within_two_seconds_even_if_the_master_does_not_answer(place: Place) -> None:
-    config = write_config(place.folder, stop_time=FAR_S)
+    config = write_config(place.folder, instances=braked(place.folder), stop_time=FAR_S)
     launched = place.start("launch", config)
     wait_until(lambda: row_count(config.with_suffix(".csv")) > 1000, "1000 rows")
     launched.child("master").suspend()
@@ -56,7 +56,7 @@ def test_ctrl_c_ends_the_run_within_two_seconds_even_if_the_master_does_not_answ
 def test_a_signal_ends_the_run_within_two_seconds_with_a_readable_partial_result(
     place: Place, number: signal.Signals, options: tuple[str, ...]
 ) -> None:
-    config = write_config(place.folder, stop_time=FAR_S)
+    config = write_config(place.folder, instances=braked(place.folder), stop_time=FAR_S)
     result = config.with_suffix(".csv")
     launched = place.start("launch", config, *options)
     wait_until(lambda: row_count(result) > 1000, "1000 rows")
@@ -73,7 +73,7 @@ def test_a_signal_ends_the_run_within_two_seconds_with_a_readable_partial_result
 
 @pytest.mark.parametrize("options", [(), ("--local",)], ids=["distributed", "local"])
 def test_a_run_that_is_interrupted_is_plotted_up_to_there(place: Place, options: tuple[str, ...]) -> None:
-    config = write_config(place.folder, stop_time=FAR_S)
+    config = write_config(place.folder, instances=braked(place.folder), stop_time=FAR_S)
     plot = place.folder / "run.png"
     launched = place.start("launch", config, *options, "--plot", plot)
     wait_until(lambda: row_count(config.with_suffix(".csv")) > 1000, "1000 rows")
@@ -96,7 +96,7 @@ def test_ctrl_c_while_the_command_is_being_loaded_is_told_like_any_other(module:
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="looks into /proc")
 def test_a_second_ctrl_c_waits_for_nobody(place: Place) -> None:
-    config = write_config(place.folder, stop_time=FAR_S)
+    config = write_config(place.folder, instances=braked(place.folder), stop_time=FAR_S)
     result = config.with_suffix(".csv")
     launched = place.start("launch", config)
     wait_until(lambda: row_count(result) > 1000, "1000 rows")

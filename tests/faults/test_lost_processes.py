@@ -20,6 +20,7 @@ from tests.helpers import (
     FMUS,
     Launched,
     Place,
+    braked,
     on_a_busy_machine,
     row_count,
     rows_of,
@@ -36,7 +37,7 @@ FAR_S = 1_000_000.0
 
 def started(place: Place, simulation: dict[str, float], rows: int) -> tuple[Launched, Path]:
     """A pendulum and a delay that run, and their result file with ``rows`` rows or more."""
-    config = write_config(place.folder, stop_time=FAR_S, simulation=simulation)
+    config = write_config(place.folder, instances=braked(place.folder), stop_time=FAR_S, simulation=simulation)
     launched = place.start("launch", config)
     result = config.with_suffix(".csv")
     wait_until(lambda: row_count(result) > rows, f"{rows} rows")
@@ -45,10 +46,10 @@ def started(place: Place, simulation: dict[str, float], rows: int) -> tuple[Laun
 
 def assert_is_what_one_process_calculates(place: Place, result: Path) -> None:
     """The rows that were kept are those of a run in one process that stops at the last of them, byte for byte."""
-    rows = len(rows_of(result))
-    config = write_config(place.folder, name="local", stop_time=(rows - 1) * 0.001)
-    assert main(["launch", str(config), "--local", "--no-progress"]) == 0
-    assert result.read_bytes() == config.with_suffix(".csv").read_bytes()
+    config, local, last = result.with_suffix(".yaml"), place.folder / "local.csv", len(rows_of(result)) - 1
+    options = ["--output", str(local), "--stop-time", str(last * 0.001), "--real-time-factor", "0"]
+    assert main(["launch", str(config), "--local", "--no-progress", *options]) == 0
+    assert result.read_bytes() == local.read_bytes()
 
 
 def point_in(message: str) -> int:

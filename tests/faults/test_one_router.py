@@ -11,7 +11,7 @@ import pytest
 
 from tests.helpers import Launched, Place, row_count, rows_of, wait_until, write_config
 
-POINTS = 4000
+POINTS = 10_000
 
 
 @pytest.fixture
