@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import re
 import signal
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -58,10 +59,15 @@ def test_top_fits_its_terminal_and_has_one_head_line(place: Place, columns: int)
     start_pair(place)
 
     with Terminal(place, "top", "--interval", "0.05", columns=columns) as top:
-        first = top.wait_for("pendulum")
-        later = wait_until(
-            lambda: shown if (shown := top.shown)[:1] != first[:1] and len(shown) == 5 else None, "a look"
-        )
+
+        def look(*, other_than: Sequence[str] = ()) -> Sequence[str] | None:
+            """A whole page on which the delay waits for its input; now and then it waits for the grant."""
+            shown = top.shown
+            is_whole = len(shown) == 5 and "waiting for 'p" in shown[3]
+            return shown if is_whole and shown[:1] != other_than[:1] else None
+
+        first = wait_until(look, "a look")
+        later = wait_until(partial(look, other_than=first), "another look")
 
     for shown in (first, later):
         assert [line.partition(":")[0] for line in shown if line.startswith("pair")] == ["pair"]
