@@ -31,6 +31,7 @@ from fmu_mesh.wire.runtime import MeshNote
 __all__ = [
     "DEADLINE_S",
     "FMUS",
+    "PAIR",
     "Launched",
     "Place",
     "assert_readable",
@@ -43,6 +44,12 @@ __all__ = [
 ]
 
 FMUS = Path(__file__).resolve().parents[1] / "fmus"
+
+PAIR: Mapping[str, Mapping[str, Any]] = {
+    "pendulum": {"fmu": "DampedPendulum"},
+    "delay": {"fmu": "TransportDelay", "start_values": {"d": 0.1}},
+}
+"""The instances that `write_config` writes by default."""
 
 DEADLINE_S = 100.0
 """Longer than anything takes on a busy machine, shorter than the timeout of a test."""
@@ -105,11 +112,7 @@ def write_config(
         sections: more of the file; what is in ``simulation`` comes on top of the default.
     """
     kept = {path.stem: str(path) for path in FMUS.glob("*.fmu")}
-    own: Mapping[str, Mapping[str, Any]] = {
-        "pendulum": {"fmu": "DampedPendulum"},
-        "delay": {"fmu": "TransportDelay", "start_values": {"d": 0.1}},
-    }
-    members = {own_name: dict(member) for own_name, member in (own if instances is None else instances).items()}
+    members = {own_name: dict(member) for own_name, member in (PAIR if instances is None else instances).items()}
     for member in members.values():
         if "fmu" in member:
             member["fmu"] = kept.get(member["fmu"], member["fmu"])
@@ -146,8 +149,7 @@ def braked(folder: Path) -> Mapping[str, Mapping[str, Any]]:
     until a test ends the run, its result is small enough to be read.
     """
     (folder / "brake.py").write_text(_BRAKE, encoding="utf-8")
-    delay = {"fmu": "TransportDelay", "start_values": {"d": 0.1}}
-    return {"pendulum": {"fmu": "DampedPendulum"}, "delay": delay, "brake": {"python": "brake.py:Brake"}}
+    return {**PAIR, "brake": {"python": "brake.py:Brake"}}
 
 
 def row_count(file: Path) -> int:

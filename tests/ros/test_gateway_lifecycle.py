@@ -62,6 +62,7 @@ class Node:
 
     Attributes:
         errors: what it has written so far.
+        peer: has the clients of its services.
     """
 
     def __init__(self, ros: Ros, **parameters: object) -> None:
@@ -78,9 +79,8 @@ class Node:
         assert self._popen.stderr is not None
         self._reader = threading.Thread(target=self._read, args=(self._popen.stderr,), daemon=True)
         self._reader.start()
-        self._ros, self._peer = ros, ros.peer()
-        self._known = False
-        peer = self._peer
+        self._ros = ros
+        self.peer = peer = ros.peer()
         self._change = ChangeState, peer.create_client(ChangeState, "/own/change_state")
         self._state = GetState, peer.create_client(GetState, "/own/get_state")
         self._list = ListParameters, peer.create_client(ListParameters, "/own/list_parameters")
@@ -93,9 +93,6 @@ class Node:
             assert self.succeeds(transition), f"{transition}: {self.errors}"
 
     def succeeds(self, transition: int) -> bool:
-        if not self._known:
-            self._ros.known_to("/own", self._peer)
-            self._known = True
         kind, client = self._change
         request = kind.Request()
         request.transition.id = transition
@@ -158,6 +155,7 @@ class Node:
 def gateway(ros: Ros, **parameters: object) -> Iterator[Node]:
     node = Node(ros, **parameters)
     try:
+        ros.known_to("/own", node.peer)
         yield node
     finally:
         node.close()

@@ -18,7 +18,7 @@ import pytest
 import fmu_mesh
 from fmu_mesh.sweeps.sweep_folder import SweepFolder
 from fmu_mesh.sweeps.worker_pool import WorkerLost, WorkerPool
-from tests.helpers import DEADLINE_S, wait_until, write_config
+from tests.helpers import DEADLINE_S, PAIR, wait_until, write_config
 
 VARY: Mapping[str, Any] = {
     "pendulum.d": [0.05, 0.3, 0.8],
@@ -166,9 +166,7 @@ def test_a_killed_worker_loses_nothing(tmp_path: Path) -> None:
         "            os.kill(os.getpid(), signal.SIGKILL)\n"
         "        self.y = time\n"
     )
-    pendulum, delay = {"fmu": "DampedPendulum"}, {"fmu": "TransportDelay"}
-    instances = {"pendulum": pendulum, "delay": delay, "killer": {"python": "killer.py:Killer"}}
-    config = write_config(tmp_path, instances=instances)
+    config = write_config(tmp_path, instances={**PAIR, "killer": {"python": "killer.py:Killer"}})
     variants = [{"pendulum.d": 0.05 + 0.02 * number, "killer.number": float(number)} for number in range(40)]
     with fmu_mesh.sweep(config, variants, folder=tmp_path / "quiet") as running:
         undisturbed = running.wait(DEADLINE_S)
