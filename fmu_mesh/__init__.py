@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from .api.mesh_builder import Mesh, load
     from .api.mesh_check import Check
     from .api.open_system import System, SystemState
+    from .api.recovering import recover
     from .api.result import Result
     from .api.run_handle import Run
     from .api.samples import Sample
@@ -83,6 +84,7 @@ __all__ = [
     "inspect",
     "load",
     "meshes",
+    "recover",
     "sweep",
 ]
 
@@ -96,6 +98,7 @@ _PLACES = {
     "Output": "instances.python.declarations",
     "Parameter": "instances.python.declarations",
     "Result": "api.result",
+    "recover": "api.recovering",
     "Run": "api.run_handle",
     "Range": "sweeps.variants",
     "Sample": "api.samples",

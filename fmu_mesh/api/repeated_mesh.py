@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import weakref
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from types import TracebackType
@@ -142,6 +142,10 @@ class _CollectedRows:
         self.rows += len(times)
         if self._file is not None:
             self._file.write(times, columns)
+
+    def note(self, entry: Mapping[str, Any]) -> None:
+        if self._file is not None:
+            self._file.note(entry)
 
     def flush(self) -> None:
         if self._file is not None:

@@ -19,7 +19,7 @@ from ..text import listed
 from ..variables.model_description import Variable
 from ..variables.value_types import VariableType, is_float
 from .drawing import FLAGS, VALUE, Curve, figure_of
-from .result_reading import Columns, chosen_names, read_csv
+from .result_reading import Columns, chosen_names, read_result
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -72,7 +72,9 @@ class Result(Mapping[str, NDArray[Any]]):
 
     @classmethod
     def read(cls, path: str | Path) -> Self:
-        """Read a CSV of an earlier run, such as `launch` writes.
+        """Read the result file of an earlier run, such as `launch` writes: CSV, Parquet or MCAP.
+
+        Of a Parquet file whose run goes on or was killed, the rows are read that are complete in its stream.
 
         Example:
             >>> import fmu_mesh
@@ -81,10 +83,11 @@ class Result(Mapping[str, NDArray[Any]]):
             True
 
         Raises:
-            ConfigurationError: there is no such file, or it is no result file; says in which line.
+            ConfigurationError: there is no such file, it is no result file, or the package for its format is not
+                installed.
         """
         path = Path(path)
-        return cls(path.stem, file=path, columns=read_csv(path))
+        return cls(path.stem, file=path, columns=read_result(path))
 
     @property
     def times(self) -> NDArray[np.float64]:
@@ -98,8 +101,20 @@ class Result(Mapping[str, NDArray[Any]]):
 
     @property
     def units(self) -> dict[str, str | None]:
-        """The unit of each variable; None without one, or if it is not known, as for a file that was read."""
+        """The unit of each variable; None without one, or if a file that was read does not say it."""
         return {name: self._unit(name) for name in self}
+
+    @property
+    def metadata(self) -> dict[str, Any]:
+        """What the result file says about its run; empty if it says nothing.
+
+        Example:
+            >>> import fmu_mesh
+            >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
+            >>> mesh.run(stop_time=0.1, record="memory").metadata
+            {}
+        """
+        return dict(self._columns.metadata)
 
     @property
     def summary(self) -> str:
@@ -163,10 +178,10 @@ class Result(Mapping[str, NDArray[Any]]):
             return self._given
         if self.file is None or (self.outcome is not None and not self.outcome.rows):
             return Columns(np.zeros(0), {name: np.zeros(0) for name in self._variables})
-        return read_csv(self.file, types_of(self._system))
+        return read_result(self.file, types_of(self._system))
 
     def _unit(self, name: str) -> str | None:
-        return self._variables[name][1].unit if name in self._variables else None
+        return self._variables[name][1].unit if name in self._variables else self._columns.units.get(name)
 
     def _curve(self, instance: str, variable: Variable) -> Curve:
         """On which axes a variable is drawn: one for each unit."""

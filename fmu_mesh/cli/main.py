@@ -48,6 +48,7 @@ COMMANDS: Final[Mapping[str, tuple[str, str]]] = {
     "stop": ("steering", "end the run of a mesh"),
     "play": ("play", "play a recorded bag into the inputs of a mesh"),
     "plot": ("plotting", "plot a result file"),
+    "recover": ("recover", "finish the result file of a run that was killed"),
     "node": ("running", "start one node manually"),
     "master": ("running", "start the master and the recorder manually"),
     "gateway": ("running", "start the gateway to ROS manually"),

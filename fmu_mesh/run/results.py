@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import os
 import struct
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -74,9 +74,10 @@ def rows_left(result_file: str, folder: Path) -> int:
         kept = Kept(*_NOTE.unpack((folder / _NAME).read_bytes()))
     except (FileNotFoundError, struct.error):
         kept = None
+    growing = _format(path).growing_file(path)
     # Opening the file makes sure that no other run is writing it, and removes a draft that the process has left.
-    with suppress(ConfigurationError, OSError), open_alone(path):
-        if kept is not None and path.is_file() and path.stat().st_size >= kept.size:  # or it is another file by now
+    with suppress(ConfigurationError, OSError), open_alone(growing):
+        if kept is not None and growing.is_file() and growing.stat().st_size >= kept.size:  # or it is another file
             return _format(path).keep_whole_rows(path, kept)
     return 0
 
@@ -132,6 +133,9 @@ class _NotedFile:
             self._note(Kept())
         self._file.write(times, columns)
         self._note_kept()
+
+    def note(self, entry: Mapping[str, Any]) -> None:
+        self._file.note(entry)
 
     def flush(self) -> None:
         self._file.flush()

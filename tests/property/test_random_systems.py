@@ -458,6 +458,9 @@ class Kept:
         self.columns.append([np.array(column) for column in (times, *columns)])
         self.rows += len(times)
 
+    def note(self, entry: Mapping[str, Any]) -> None:  # noqa: ARG002  it keeps rows only
+        return
+
     def flush(self) -> None:
         return
 

@@ -6,7 +6,7 @@ Owns which topics a recording has, and how rows become messages. `fmu_mesh.ros.m
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from io import BufferedWriter
 from pathlib import Path
 from types import TracebackType
@@ -98,6 +98,11 @@ class McapFile:
         return cls(path, recording.columns, found)
 
     @staticmethod
+    def growing_file(path: Path) -> Path:
+        """The bag itself: its messages can be read while it grows."""
+        return path
+
+    @staticmethod
     def keep_whole_rows(path: Path, kept: Kept) -> int:
         """Cut a bag off after the rows that are known to be whole; returns their number.
 
@@ -127,6 +132,9 @@ class McapFile:
                 if topic.due(point):
                     self._add(topic.channel, stamp, topic.message(row, time), point)
             self.rows += 1
+
+    def note(self, entry: Mapping[str, Any]) -> None:
+        """Add an entry to the metadata."""
 
     def flush(self) -> None:
         """Give all rows to the operating system, so that they survive the end of this process."""
