@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from .api.mesh_check import Check
     from .api.open_system import System, SystemState
     from .api.recovering import recover
+    from .api.rerunning import rerun
     from .api.result import Result
     from .api.run_handle import Run
     from .api.samples import Sample
@@ -85,6 +86,7 @@ __all__ = [
     "load",
     "meshes",
     "recover",
+    "rerun",
     "sweep",
 ]
 
@@ -99,6 +101,7 @@ _PLACES = {
     "Parameter": "instances.python.declarations",
     "Result": "api.result",
     "recover": "api.recovering",
+    "rerun": "api.rerunning",
     "Run": "api.run_handle",
     "Range": "sweeps.variants",
     "Sample": "api.samples",

@@ -123,7 +123,9 @@ class _CollectedRows:
 
     def __init__(self, plan: RunPlan) -> None:
         self._plan = plan
-        self._file = open_result(plan.loaded, plan.plan.system) if memory_of(plan) is None else None
+        self._file = None
+        if memory_of(plan) is None:
+            self._file = open_result(plan.loaded, plan.plan.system, digest=plan.plan.digest, contents=plan.contents)
         self._times: list[NDArray[np.float64]] = []
         self._blocks: list[list[NDArray[Any]]] = []
         self.rows = 0

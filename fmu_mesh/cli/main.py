@@ -46,6 +46,7 @@ COMMANDS: Final[Mapping[str, tuple[str, str]]] = {
     "resume": ("steering", "resume a paused mesh"),
     "step": ("steering", "run a mesh for some points and pause it again"),
     "stop": ("steering", "end the run of a mesh"),
+    "rerun": ("rerunning", "run again what a result file has recorded"),
     "play": ("play", "play a recorded bag into the inputs of a mesh"),
     "plot": ("plotting", "plot a result file"),
     "recover": ("recover", "finish the result file of a run that was killed"),

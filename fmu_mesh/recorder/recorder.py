@@ -15,6 +15,7 @@ from typing import Any, Self
 
 import numpy as np
 import zenoh
+from msgspec import to_builtins
 from numpy.typing import NDArray
 
 from ..errors import FmuMeshError, MeshLost, MessageRefused, ProtocolBroken
@@ -26,7 +27,20 @@ from ..variables.value_types import is_text
 from ..wire.frames import FrameReceiver, SourceRows, rows_of
 from ..wire.inbox import Inbox, Message
 from ..wire.membership import Membership
-from ..wire.messages import ABORT, FINISH, FRAME, GRANT, HEADER, INITIAL, LAST, PROGRESS, NodeReport
+from ..wire.messages import (
+    ABORT,
+    FINISH,
+    FRAME,
+    GRANT,
+    HEADER,
+    INITIAL,
+    LAST,
+    PROGRESS,
+    SET,
+    NodeReport,
+    SetValue,
+    decode_json,
+)
 
 __all__ = ["RecordedSource", "Recorder"]
 
@@ -193,6 +207,9 @@ class Recorder:
 
     def _take_from_node(self, message: Message) -> None:
         sender, kind, number, count, point, data = message
+        if kind == SET:
+            self._file.note(to_builtins(decode_json(data[HEADER.size :], SetValue)))
+            return
         source = self._sources.get(number)
         if source is None or source.link.source_node != sender:
             raise MessageRefused(f"there is no link {number} from it to the recorder")
@@ -260,7 +277,7 @@ class Recorder:
                 if left <= 0 or not self._rows_are_missing():
                     return
                 message = self._inbox.wait(left)
-            if message is not None and message[1] in (FRAME, LAST):
+            if message is not None and message[1] in (FRAME, LAST, SET):
                 self._take(message)
 
     def _rows_are_missing(self) -> bool:

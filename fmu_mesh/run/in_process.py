@@ -88,6 +88,7 @@ class InProcessRun:
                 parent=fmus,
                 showing=self._run.options.showing,
                 loaded=self._run.loaded,
+                contents=self._run.contents,
             )
             if self._interrupted:
                 mesh.interrupt("interrupted")

@@ -11,10 +11,11 @@ import shutil
 import tempfile
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import closing, suppress
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 
 from ..config.loading import LoadedConfig
 from ..errors import FmuError, FmuMeshError, Interrupted, TerminationRequested
@@ -25,6 +26,7 @@ from ..master.pacing import Pacer
 from ..recorder.row_buffer import RowBuffer
 from ..system.layout import Layout
 from ..system.plan import Plan
+from ..system.recording import ResultFile
 from .local_system import LocalSystem, check_one_process, opening_of
 from .outcome import Outcome
 from .results import open_result, what_is_kept
@@ -55,6 +57,7 @@ class LocalMesh:
         parent: an existing folder to extract FMUs into; by default the folder for temporary files.
         showing: whether and how a physics engine shows its world.
         loaded: the configuration; None: that of the plan, with paths relative to the working directory.
+        contents: the SHA-256 of the model of each instance, for the metadata of the result.
 
     Attributes:
         rows: rows in the result file, once the run is over.
@@ -70,6 +73,7 @@ class LocalMesh:
         parent: Path | None = None,
         showing: Showing = Showing(),  # noqa: B008  a frozen Struct
         loaded: LoadedConfig | None = None,
+        contents: Mapping[str, str] = MappingProxyType({}),
     ) -> None:
         self._seconds = 0.0
         self._begun = False
@@ -85,6 +89,7 @@ class LocalMesh:
         self._parent = parent
         self._showing = showing
         self._loaded = loaded if loaded is not None else LoadedConfig(plan.system.config, Path())
+        self._contents = contents
         self._stop: str | None = None
         self._stopped = threading.Event()
         self._folder: Path | None = None
@@ -140,7 +145,7 @@ class LocalMesh:
         watch = CallWatch(self._take_hang)
         with tempfile.TemporaryDirectory(prefix="fmu_mesh-", dir=self._parent) as folder, closing(watch):
             self._folder = Path(folder)
-            file = open_result(self._loaded, plan.system) if plan.system.result_file else None
+            file = self._opened_result() if plan.system.result_file else None
             self._buffer = rows = RowBuffer(file, plan.grid, types)
             try:
                 system.start(partial(self._guarded, folder=self._folder, watch=watch))
@@ -154,6 +159,10 @@ class LocalMesh:
             finally:
                 self._save()
                 system.close()
+
+    def _opened_result(self) -> ResultFile:
+        plan = self._plan
+        return open_result(self._loaded, plan.system, digest=plan.digest, contents=self._contents)
 
     def _guarded(self, name: str, folder: Path, watch: CallWatch) -> Guarded:
         return Guarded(name, lambda: self._open(name, folder), watch, self._plan.system.config.timeouts)

@@ -16,6 +16,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from msgspec import to_builtins
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from ..config.loading import LoadedConfig
@@ -23,6 +25,7 @@ from ..errors import ConfigurationError
 from ..files import Kept, open_alone
 from ..recorder.arrays_file import ENDING
 from ..system.recording import Recording, ResultFile, ResultFormat, result_format
+from ..system.run_metadata import metadata_of
 from ..system.system import ResolvedSystem
 
 __all__ = ["check_results", "open_result", "rows_left", "what_is_kept"]
@@ -43,20 +46,30 @@ def check_results(loaded: LoadedConfig, system: ResolvedSystem) -> None:
         findings.raise_any()
 
 
-def open_result(loaded: LoadedConfig, system: ResolvedSystem, folder: Path | None = None) -> ResultFile:
+def open_result(
+    loaded: LoadedConfig,
+    system: ResolvedSystem,
+    folder: Path | None = None,
+    *,
+    digest: str = "",
+    contents: Mapping[str, str] = {},
+) -> ResultFile:
     """Open the result file of a run.
 
     Args:
         loaded: the configuration.
         system: the system of this configuration; it has a result file.
         folder: the folder of the run, if somebody calls `rows_left` when this process was killed.
+        digest: the digest of the mesh, for the metadata.
+        contents: the SHA-256 of the model of each instance, for the metadata.
 
     Raises:
         ConfigurationError: the file cannot be written, or another run is writing it.
     """
     assert system.result_file is not None
     path = Path(system.result_file)
-    file = _format(path).open(path, _recording(loaded, system))
+    metadata = metadata_of(loaded, system, system.recorded, digest=digest, contents=contents)
+    file = _format(path).open(path, replace(_recording(loaded, system), metadata=to_builtins(metadata)))
     return _NotedFile(file, folder) if folder is not None else file
 
 

@@ -174,7 +174,13 @@ def run_master(run: RunPlan, emit: Callable[[Event], None]) -> Outcome:
         recorder = failure = None
         try:
             if RECORDER in plan.nodes:
-                result = open_result(run.loaded, plan.system, process.folder if process.is_child else None)
+                result = open_result(
+                    run.loaded,
+                    plan.system,
+                    process.folder if process.is_child else None,
+                    digest=plan.digest,
+                    contents=run.contents,
+                )
                 with Recorder(
                     plan.nodes[RECORDER],
                     session,
