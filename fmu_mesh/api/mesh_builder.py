@@ -23,7 +23,7 @@ from ..run.preparing import KnownModels, planned
 from ..run.run_plan import RunPlan
 from ..text import listed, shown
 from .mesh_check import Check
-from .plan_options import PlanOptions, RunOptions, StartOptions, options_of, plain
+from .plan_options import PlanOptions, RunOptions, StartOptions, options_of, plain, with_record
 from .run_handle import Run
 
 if TYPE_CHECKING:
@@ -235,15 +235,25 @@ class Mesh:
         connections = self._data.setdefault("connections", [])
         connections.append(plain({"from": source, "to": target, **keys}))
 
-    def record(self, *variables: str, file: str | Path | None = None) -> None:
+    def record(self, *variables: str, file: str | Path | None = None, also: bool = False, **keys: Any) -> None:  # noqa: ANN401  as the file has it
         """Choose what is recorded, and into which file.
 
+        Example:
+            >>> import fmu_mesh
+            >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
+            >>> mesh.record("pendulum.a", "in:delay.*", file="results/all.csv")
+            >>> mesh.record("pendulum.a", file="results/slow.csv", every=100, also=True)
+            >>> [result.names for result in mesh.run(stop_time=1.0).all]
+            [['pendulum.a', 'delay.x'], ['pendulum.a']]
+
         Args:
-            variables: outputs as `instance.variable`; all outputs if none is named.
+            variables: variables as `instance.variable`, or patterns; all outputs if none is named.
             file: the result file; None leaves the one of the configuration.
+            also: whether this is one more result file, or the first one is changed.
+            keys: any other key of the section in a configuration file; the key `from` is ``start``.
         """
-        section = self._section("record")
-        section.update(plain({"variables": list(variables) or None} | ({"file": file} if file is not None else {})))
+        keys = {"file": file, **keys}
+        self._data["record"] = with_record(self._data.get("record", {}), variables, keys, also=also)
 
     def configure(self, **sections: Any) -> None:  # noqa: ANN401  as the file has it
         """Set keys of other sections of the configuration, or of the top level.

@@ -18,7 +18,7 @@ from ..text import shown
 from ..wire.runtime import run_name, runtime_folder
 from ..wire.views import MeshStatus
 
-__all__ = ["PlanOptions", "RunOptions", "StartOptions", "memory_of", "options_of", "plain", "texts_of"]
+__all__ = ["PlanOptions", "RunOptions", "StartOptions", "memory_of", "options_of", "plain", "texts_of", "with_record"]
 
 _MEMORY = "memory."
 
@@ -126,6 +126,24 @@ def texts_of(values: Mapping[str, object] | Sequence[str], what: str) -> tuple[s
         except (TypeError, msgspec.MsgspecError) as error:
             raise CallRefused(f"the {what} of '{name}' is {shown(value)}: {error}", variable=name) from error
     return tuple(texts)
+
+
+def with_record(section: Any, variables: Sequence[str], keys: Mapping[str, Any], *, also: bool) -> Any:  # noqa: ANN401  as a file has it
+    """The section `record` with another first file, or with one more.
+
+    Args:
+        section: what it was: a mapping or a list of mappings.
+        variables: what the file gets; all outputs if there are none.
+        keys: other keys of its section; None leaves what the section says.
+        also: whether it is one more file.
+    """
+    given = {"from" if key == "start" else key: plain(value) for key, value in keys.items() if value is not None}
+    given["variables"] = list(variables) or None
+    sections = section if isinstance(section, list) else [section]
+    if also:
+        return [*sections, given]
+    changed = {**(sections[0] if sections and isinstance(sections[0], dict) else {}), **given}
+    return [changed, *sections[1:]] if isinstance(section, list) else changed
 
 
 def plain(value: Any) -> Any:  # noqa: ANN401  whatever a program gives

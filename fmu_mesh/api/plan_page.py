@@ -8,6 +8,7 @@ from ..rings.library import library_missed, why_no_library
 from ..system.grouping import automatic_nodes
 from ..system.initialization_plan import Loop
 from ..system.plan import Plan
+from ..system.records import RecordPlan
 from ..system.system import Connection, SystemInstance
 from ..text import listed, short_number, short_path, shown
 from ..variables.model_description import Variable
@@ -181,15 +182,26 @@ def _assumed(plan: Plan, loop: Loop) -> list[str]:
 
 
 def _recorded(plan: Plan) -> list[str]:
-    if plan.system.result_file is None or not plan.system.recorded:
-        return ["  nothing"]
-    instances = plan.system.instances
-    rows = []
-    for name, variable in plan.system.recorded:
-        described = instances[name].description.variable_of(variable)
-        type_ = described.type_name.partition("[")[0] if described is not None else ""
-        rows.append([f"{name}.{variable}", type_, _unit(described).strip()])
-    return [*table(rows, indent=2), f"  into {short_path(plan.system.result_file)}"]
+    """The columns of each result file, and its points if it does not have all of them."""
+    instances, lines = plan.system.instances, []
+    for record in plan.system.records:
+        rows = []
+        for name, variable in record.variables:
+            described = instances[name].description.variable_of(variable)
+            type_ = described.type_name.partition("[")[0] if described is not None else ""
+            rows.append([f"{name}.{variable}", type_, _unit(described).strip()])
+        lines += [*table(rows, indent=2), f"  into {short_path(record.file)}{_points_of(record, plan)}"]
+    return lines or ["  nothing"]
+
+
+def _points_of(record: RecordPlan, plan: Plan) -> str:
+    """Which points a result file has, as the end of a line; empty for all of them."""
+    step, parts = plan.grid.step_size, []
+    if record.every > 1:
+        parts.append(f"every {record.every} points ({short_number(record.every * step)} s)")
+    if record.first:
+        parts.append(f"from point {record.first} ({short_number(plan.grid.time(record.first))} s)")
+    return f", {' '.join(parts)}" if parts else ""
 
 
 def _warnings(plan: Plan) -> list[str]:

@@ -36,6 +36,15 @@ class PlannedConnection(msgspec.Struct, frozen=True):
     closes_cycle: bool
 
 
+class PlannedRecord(msgspec.Struct, frozen=True):
+    """One result file: its columns but the time, the point of its first row, and the points from row to row."""
+
+    file: str
+    variables: list[str]
+    first: int
+    every: int
+
+
 class PlanView(msgspec.Struct, frozen=True):
     """What would run.
 
@@ -47,8 +56,9 @@ class PlanView(msgspec.Struct, frozen=True):
         cycles: the instances of each cycle.
         free_inputs: `instance.variable` of the inputs that are not connected.
         levels: level in the initialization of each connected output.
-        recorded: `instance.variable` of the columns of the result file.
-        result_file: the result file; None if nothing is recorded.
+        recorded: `instance.variable` of the columns of the first result file.
+        result_file: the first result file; None if nothing is recorded.
+        records: all result files.
         warnings: findings that do not prevent a run.
         library: why the library of C is not used; None if it is.
     """
@@ -65,6 +75,7 @@ class PlanView(msgspec.Struct, frozen=True):
     levels: dict[str, int]
     recorded: list[str]
     result_file: str | None
+    records: list[PlannedRecord]
     warnings: tuple[Finding, ...]
     library: str | None
 
@@ -102,6 +113,10 @@ def plan_view(plan: Plan) -> PlanView:
         for variable in own.description.variables
         if variable.causality == "input" and (name, variable.name) not in connected
     )
+    records = [
+        PlannedRecord(own.file, [f"{name}.{variable}" for name, variable in own.variables], own.first, own.every)
+        for own in system.records
+    ]
     return PlanView(
         mesh=system.config.mesh,
         simulation=system.config.simulation,
@@ -113,8 +128,9 @@ def plan_view(plan: Plan) -> PlanView:
         cycles=[[*cycle] for cycle in plan.cycles],
         free_inputs=[*free],
         levels={f"{name}.{variable}": level for (name, variable), level in plan.initialization.levels.items()},
-        recorded=[f"{name}.{variable}" for name, variable in system.recorded],
+        recorded=records[0].variables if records else [],
         result_file=system.result_file,
+        records=records,
         warnings=system.warnings,
         library=why_no_library(),
     )

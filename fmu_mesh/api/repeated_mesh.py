@@ -164,7 +164,8 @@ class _CollectedRows:
         parts = zip(*self._blocks, strict=True) if self._blocks else [[np.zeros(0, DTYPES[t])] for t in types.values()]
         columns = {name: np.concatenate(part) for name, part in zip(types, parts, strict=True)}
         times = np.concatenate(self._times) if self._times else np.zeros(0)
-        outcome = replace(outcome, file=str(file) if file is not None else None)
+        files = ((str(file), outcome.rows),) if file is not None else ()
+        outcome = replace(outcome, file=str(file) if file is not None else None, files=files)
         return Result(self._plan.mesh, file=file, outcome=outcome, system=system, columns=Columns(times, columns))
 
 

@@ -9,6 +9,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from ..errors import ConfigurationError, UnknownName
@@ -48,12 +49,13 @@ class Result(Mapping[str, NDArray[Any]]):
     Attributes:
         title: name of the mesh, or of the file.
         file: the result file; None if the rows are only in memory, or if nothing was recorded.
+        all: this result and those of the other files of the run, in the order of the configuration.
         outcome: how the run ended; None for a file that was read.
         names: the recorded variables, in order.
         units: the unit of each, as FMI writes it; None without one.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913  what a result is made of
         self,
         title: str,
         *,
@@ -61,6 +63,7 @@ class Result(Mapping[str, NDArray[Any]]):
         outcome: Outcome | None = None,
         system: ResolvedSystem | None = None,
         columns: Columns | None = None,
+        record: int = 0,
     ) -> None:
         self.title = title
         self.file = file
@@ -68,7 +71,8 @@ class Result(Mapping[str, NDArray[Any]]):
         self._system = system
         self._step_size = system.grid.step_size if system is not None else 0.0
         self._given = columns
-        self._variables = _recorded(self._system)
+        self._record = record
+        self._variables = _recorded(self._system, record)
 
     @classmethod
     def read(cls, path: str | Path) -> Self:
@@ -115,6 +119,23 @@ class Result(Mapping[str, NDArray[Any]]):
             {}
         """
         return dict(self._columns.metadata)
+
+    @property
+    def all(self) -> tuple[Result, ...]:
+        """The results of all files that the run wrote, in the order of the configuration; this one is among them.
+
+        Example:
+            >>> import fmu_mesh
+            >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
+            >>> mesh.configure(record=[{"file": "fast.csv"}, {"file": "slow.csv", "every": 100}])
+            >>> fast, slow = mesh.run(stop_time=1.0).all
+            >>> len(fast.times), len(slow.times), slow.file.name
+            (501, 6, 'slow.csv')
+        """
+        files = self.outcome.files if self.outcome is not None and self._given is None else ()
+        if len(files) < 2:
+            return (self,)
+        return tuple(self if number == self._record else self._of_file(number) for number in range(len(files)))
 
     @property
     def summary(self) -> str:
@@ -178,7 +199,13 @@ class Result(Mapping[str, NDArray[Any]]):
             return self._given
         if self.file is None or (self.outcome is not None and not self.outcome.rows):
             return Columns(np.zeros(0), {name: np.zeros(0) for name in self._variables})
-        return read_result(self.file, types_of(self._system))
+        return read_result(self.file, types_of(self._system, self._record))
+
+    def _of_file(self, number: int) -> Result:
+        assert self.outcome is not None  # it has files
+        file, rows = self.outcome.files[number]
+        outcome = replace(self.outcome, file=file, rows=rows)
+        return Result(self.title, file=Path(file), outcome=outcome, system=self._system, record=number)
 
     def _unit(self, name: str) -> str | None:
         return self._variables[name][1].unit if name in self._variables else self._columns.units.get(name)
@@ -218,16 +245,21 @@ def summary_of(outcome: Outcome, step_size: float) -> str:
     return f"{point} points in {seconds:.3f} s: {rate:.0f} points/s, real-time factor {factor:.3g}"
 
 
-def types_of(system: ResolvedSystem | None) -> dict[str, VariableType] | None:
-    """The types of the recorded variables by name; None without a system."""
-    return {name: variable.type for name, (_, variable) in _recorded(system).items()} if system is not None else None
+def types_of(system: ResolvedSystem | None, record: int = 0) -> dict[str, VariableType] | None:
+    """The types of the variables in one of the result files by name; None without a system."""
+    if system is None:
+        return None
+    return {name: variable.type for name, (_, variable) in _recorded(system, record).items()}
 
 
-def _recorded(system: ResolvedSystem | None) -> dict[str, tuple[str, Variable]]:
-    """Instance and variable of each recorded column, by its name."""
+def _recorded(system: ResolvedSystem | None, record: int) -> dict[str, tuple[str, Variable]]:
+    """Instance and variable of each column of a result file, by its name."""
     columns: dict[str, tuple[str, Variable]] = {}
-    for instance, name in system.recorded if system is not None else ():
-        variable = system.instances[instance].description.variable_of(name) if system is not None else None
+    if system is None:
+        return columns
+    own = system.records[record].variables if record < len(system.records) else ()
+    for instance, name in own:
+        variable = system.instances[instance].description.variable_of(name)
         assert variable is not None  # the system is valid
         columns[f"{instance}.{name}"] = instance, variable
     return columns

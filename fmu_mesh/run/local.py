@@ -26,10 +26,9 @@ from ..master.pacing import Pacer
 from ..recorder.row_buffer import RowBuffer
 from ..system.layout import Layout
 from ..system.plan import Plan
-from ..system.recording import ResultFile
 from .local_system import LocalSystem, check_one_process, opening_of
 from .outcome import Outcome
-from .results import open_result, what_is_kept
+from .results import open_results, what_is_kept
 
 __all__ = ["LocalMesh"]
 
@@ -60,7 +59,7 @@ class LocalMesh:
         contents: the SHA-256 of the model of each instance, for the metadata of the result.
 
     Attributes:
-        rows: rows in the result file, once the run is over.
+        files: each result file and the number of its rows, once the run is over.
     """
 
     def __init__(  # noqa: PLR0913, PLR0917  what a caller may want to hear of
@@ -79,7 +78,7 @@ class LocalMesh:
         self._begun = False
         self._ended_by: TerminationRequested | None = None
         self._buffer: RowBuffer | None = None
-        self.rows = 0
+        self.files: tuple[tuple[str, int], ...] = ()
         self._plan = plan
         self._system = LocalSystem(plan)
         self._log = log
@@ -130,13 +129,14 @@ class LocalMesh:
             point=self.point,
             time=self._plan.grid.time(self.point),
             seconds=self._seconds,
-            rows=self.rows,
+            rows=self.files[0][1] if self.files else 0,
             file=self._plan.system.result_file,
             ended_by=ended_by,
+            files=self.files,
         )
 
     def _kept(self) -> str | None:
-        return what_is_kept(self._plan.system.result_file, self.rows)
+        return what_is_kept(self.files)
 
     def _run(self) -> None:
         plan, system = self._plan, self._system
@@ -145,8 +145,8 @@ class LocalMesh:
         watch = CallWatch(self._take_hang)
         with tempfile.TemporaryDirectory(prefix="fmu_mesh-", dir=self._parent) as folder, closing(watch):
             self._folder = Path(folder)
-            file = self._opened_result() if plan.system.result_file else None
-            self._buffer = rows = RowBuffer(file, plan.grid, types)
+            files = open_results(self._loaded, plan.system, digest=plan.digest, contents=self._contents)
+            self._buffer = rows = RowBuffer(files, plan.grid, plan.system.records, types)
             try:
                 system.start(partial(self._guarded, folder=self._folder, watch=watch))
                 started = time.perf_counter()
@@ -159,10 +159,6 @@ class LocalMesh:
             finally:
                 self._save()
                 system.close()
-
-    def _opened_result(self) -> ResultFile:
-        plan = self._plan
-        return open_result(self._loaded, plan.system, digest=plan.digest, contents=self._contents)
 
     def _guarded(self, name: str, folder: Path, watch: CallWatch) -> Guarded:
         return Guarded(name, lambda: self._open(name, folder), watch, self._plan.system.config.timeouts)
@@ -232,4 +228,4 @@ class LocalMesh:
         try:
             rows.close()
         finally:
-            self.rows = rows.count
+            self.files = rows.counted

@@ -237,7 +237,8 @@ class _Run:
         plan, writer = self._plan, self.writer
         ended_by = event.report() if event is not None else None
         time_s = plan.grid.time(self.point)
-        return Outcome("done", self.point, time_s, seconds, writer.rows, writer.file, ended_by=ended_by)
+        rows, file, files = writer.rows, writer.file, writer.counted
+        return Outcome("done", self.point, time_s, seconds, rows, file, ended_by=ended_by, files=files)
 
     def interrupt(self, reason: str) -> None:
         """From any thread: see `RepeatedRuns.interrupt`."""
@@ -353,11 +354,11 @@ class _Run:
 
 
 def _in_one_node(plan: Plan) -> Plan:
-    """The plan of the same system with all instances in one node; a run in one process needs no window."""
+    """The plan of the same system with all instances in one node and one result file, without a window."""
     system = plan.system
     config = replace(system.config, simulation=replace(system.config.simulation, window="auto"))
     instances = {name: replace(own, node=_NODE) for name, own in system.instances.items()}
-    return make_plan(replace(system, config=config, instances=instances))
+    return make_plan(replace(system, config=config, instances=instances, records=system.records[:1]))
 
 
 def _nothing_comes(_left_s: float) -> None:

@@ -48,19 +48,25 @@ _OTHER_FORMATS = frozenset(
 
 
 class Recording(msgspec.Struct, frozen=True):
-    """What a run records.
+    """What a run records into one file.
 
     Attributes:
         loaded: the configuration; `loaded.resolve` gives the absolute path of a path in it.
         descriptions: the model descriptions by instance name, with the units of all variables.
         recorded: (instance, variable) of every column, in order; of an array every element is a column of its own,
             as `y[1,2]`.
+        place: the path of its section in the configuration, `record` or `record[1]`, for findings.
+        first: point of the first row.
+        every: number of points from row to row.
         metadata: about the run, as JSON can hold it; `Result.metadata` reads it from the file. May be empty.
     """
 
     loaded: LoadedConfig
     descriptions: Mapping[str, ModelDescription]
     recorded: tuple[tuple[str, str], ...]
+    place: str = "record"
+    first: int = 0
+    every: int = 1
     metadata: Mapping[str, Any] = msgspec.field(default_factory=dict)
 
     @property
@@ -99,8 +105,9 @@ class ResultFormat(Protocol):
     1. `check`, before anything is started, in another process than the rest.
     2. `open`, when the run starts. Another run must not be able to open the same file, and what is at ``path`` must
        not change before the first row. `fmu_mesh.files.open_alone` opens a file in this way.
-    3. `write`, with rows in the order of their points, from point 0 on and without a gap; `flush` in between, about
-       five times a second; `note` at any time, also before the first row. They are called from one thread at a time.
+    3. `write`, with rows in the order of their points, from `Recording.first` on at every `Recording.every`-th point;
+       `flush` in between, about five times a second; `note` at any time, also before the first row. They are called
+       from one thread at a time.
     4. `close`, once, also after an error. It may be called from another thread than `write`.
     5. `keep_whole_rows`, only if the process was killed before `close`, in another process.
 
@@ -113,7 +120,8 @@ class ResultFormat(Protocol):
 
         Args:
             recording: what is to be recorded.
-            findings: where findings go, each with its path in the configuration, such as `record.variables`.
+            findings: where findings go, each with its path in the configuration: that of the section and a key, such
+                as `record.variables` or `record[1].variables`.
 
         Raises:
             ConfigurationError: a package that the format needs is missing.

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import platform
 import socket
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
@@ -21,6 +21,7 @@ from ..config.loading import LoadedConfig
 from ..variables.model_description import Variable
 from ..variables.value_conversion import to_plain
 from ..variables.value_types import PlainValue
+from .records import RecordPlan
 from .system import ResolvedSystem
 
 __all__ = ["ModelOrigin", "RecordedVariable", "RunMetadata", "configuration_of", "metadata_of"]
@@ -70,6 +71,8 @@ class RunMetadata(msgspec.Struct, frozen=True):
         configuration: the values of a configuration file: that of the run, with everything that options replaced.
         file: the configuration file of the run, absolute; relative paths in `configuration` refer to its folder.
         section: which of the sections of `record` the file belongs to, counted from 0.
+        first: point of the first row.
+        every: number of points from row to row.
         models: the models by instance.
         start_values: the start values that were set, by instance and variable.
         start_time: time of point 0 in s.
@@ -87,6 +90,8 @@ class RunMetadata(msgspec.Struct, frozen=True):
     configuration: dict[str, Any]
     file: str
     section: int
+    first: int
+    every: int
     models: dict[str, ModelOrigin]
     start_values: dict[str, dict[str, PlainValue]]
     start_time: float
@@ -100,7 +105,7 @@ class RunMetadata(msgspec.Struct, frozen=True):
 def metadata_of(
     loaded: LoadedConfig,
     system: ResolvedSystem,
-    recorded: Iterable[tuple[str, str]],
+    record: RecordPlan,
     *,
     digest: str = "",
     contents: Mapping[str, str] = {},
@@ -110,7 +115,7 @@ def metadata_of(
     Args:
         loaded: the configuration, options applied.
         system: the system of this configuration.
-        recorded: (instance, variable) of every column of the file.
+        record: the plan of the file, one of the system.
         digest: the digest of the mesh.
         contents: the SHA-256 of the model of each instance.
     """
@@ -125,7 +130,9 @@ def metadata_of(
         digest=digest,
         configuration=configuration_of(loaded),
         file=str(loaded.file.absolute()),
-        section=0,
+        section=system.records.index(record),
+        first=record.first,
+        every=record.every,
         models=models,
         start_values={
             name: {variable: to_plain(value) for variable, value in own.start_values.items()}
@@ -134,7 +141,7 @@ def metadata_of(
         start_time=grid.start_time,
         step_size=grid.step_size,
         stop_time=grid.stop_time,
-        variables={f"{instance}.{name}": _recorded(system, instance, name) for instance, name in recorded},
+        variables={f"{instance}.{name}": _recorded(system, instance, name) for instance, name in record.variables},
         started=datetime.now(UTC).isoformat(timespec="seconds"),
         host=socket.gethostname(),
     )

@@ -136,7 +136,7 @@ def test_rows_of_a_killed_process_count_only_in_the_file_that_it_has_written(
     if noted is not None:
         (tmp_path / "recorded").write_bytes(struct.pack("<qq", *noted))
 
-    assert rows_left(str(result), tmp_path) == rows
+    assert rows_left([str(result)], tmp_path) == ((str(result), rows),)
 
     assert result.read_bytes() == b"abc"
 
@@ -144,7 +144,7 @@ def test_rows_of_a_killed_process_count_only_in_the_file_that_it_has_written(
 def test_a_device_keeps_no_rows(tmp_path: Path) -> None:
     (tmp_path / "recorded").write_bytes(struct.pack("<qq", 2, 3))
 
-    assert rows_left(os.devnull, tmp_path) == 0
+    assert rows_left([os.devnull], tmp_path) == ((os.devnull, 0),)
 
 
 @pytest.mark.parametrize("format_", [CsvFile, McapFile])
