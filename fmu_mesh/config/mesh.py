@@ -27,6 +27,7 @@ from fmu_mesh.config.base import (
 )
 from fmu_mesh.config.instance_sections import InstanceSection
 from fmu_mesh.config.ros_section import RosConfig, RosProfile, RosTopicConfig
+from fmu_mesh.config.scenario_section import ScenarioConfig
 
 __all__ = [
     "ENDPOINT_PATTERN",
@@ -295,6 +296,13 @@ class Config(Base, frozen=True, kw_only=True):
     connections: Annotated[list[ConnectionConfig], Meta(description="From which output to which input values go.")] = []
     initialization: InitializationConfig = InitializationConfig()
     record: RecordConfig = RecordConfig()
+    scenario: Annotated[
+        ScenarioConfig | str | None,
+        Meta(
+            description="Values of inputs and tunable parameters over time; or a file with these keys, relative to "
+            "this file."
+        ),
+    ] = None
     zenoh: ZenohConfig = ZenohConfig()
     timeouts: TimeoutsConfig = TimeoutsConfig()
     limits: LimitsConfig = LimitsConfig()
