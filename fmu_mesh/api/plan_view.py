@@ -8,6 +8,9 @@ from ..config.mesh import SimulationConfig
 from ..errors import Finding
 from ..rings.library import why_no_library
 from ..system.plan import Plan
+from ..system.schedule import Schedule
+from ..system.series_files import course_of
+from ..system.system import SystemInstance
 from ..variables.value_conversion import to_plain
 from ..variables.value_types import PlainValue
 
@@ -36,6 +39,17 @@ class PlannedConnection(msgspec.Struct, frozen=True):
     closes_cycle: bool
 
 
+class PlannedSchedule(msgspec.Struct, frozen=True):
+    """What a scenario sets: number of values, and the times in s of the first and the last one."""
+
+    variable: str
+    values: int
+    first: float
+    last: float
+    interpolation: str
+    file: str | None
+
+
 class PlanView(msgspec.Struct, frozen=True):
     """What would run.
 
@@ -49,6 +63,7 @@ class PlanView(msgspec.Struct, frozen=True):
         levels: level in the initialization of each connected output.
         recorded: `instance.variable` of the columns of the result file.
         result_file: the result file; None if nothing is recorded.
+        scenario: what the scenario sets, by `instance.variable`.
         warnings: findings that do not prevent a run.
         library: why the library of C is not used; None if it is.
     """
@@ -65,6 +80,7 @@ class PlanView(msgspec.Struct, frozen=True):
     levels: dict[str, int]
     recorded: list[str]
     result_file: str | None
+    scenario: list[PlannedSchedule]
     warnings: tuple[Finding, ...]
     library: str | None
 
@@ -115,6 +131,22 @@ def plan_view(plan: Plan) -> PlanView:
         levels={f"{name}.{variable}": level for (name, variable), level in plan.initialization.levels.items()},
         recorded=[f"{name}.{variable}" for name, variable in system.recorded],
         result_file=system.result_file,
+        scenario=[_scheduled(plan, own, schedule) for own in system.instances.values() for schedule in own.scenario],
         warnings=system.warnings,
         library=why_no_library(),
+    )
+
+
+def _scheduled(plan: Plan, instance: SystemInstance, schedule: Schedule) -> PlannedSchedule:
+    variable = instance.description.variable(schedule.variable)
+    assert variable is not None  # the plan is valid
+    course = course_of(schedule, variable, plan.grid, instance.step_points)
+    first, last = (plan.grid.time(step * instance.step_points) for step in (course.first_step, course.last_step))
+    return PlannedSchedule(
+        f"{instance.name}.{schedule.variable}",
+        course.changes,
+        first,
+        last,
+        "linear" if schedule.linear else "hold",
+        schedule.file.path if schedule.file is not None else None,
     )

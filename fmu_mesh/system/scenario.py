@@ -15,6 +15,7 @@ from msgspec.structs import replace
 
 from ..config.findings import Findings
 from ..config.scenario_section import ScenarioEvent, ScenarioSource, ScenarioValues
+from ..errors import Finding
 from ..simtime import TimeGrid
 from ..text import shown
 from ..variables.model_description import Value, Variable
@@ -83,11 +84,13 @@ class ResolvedScenario(msgspec.Struct, frozen=True):
         schedules: by instance.
         start_values: by instance and variable: what it prescribes for the start.
         files: the SHA-256 of each file that it reads, by absolute path.
+        warnings: what has no effect.
     """
 
     schedules: dict[str, tuple[Schedule, ...]] = {}
     start_values: dict[str, dict[str, Value]] = {}
     files: dict[str, str] = {}
+    warnings: tuple[Finding, ...] = ()
 
 
 class _Entry(NamedTuple):
@@ -145,6 +148,7 @@ class _Resolving:
         self._grid = grid
         self._findings = findings
         self._files: dict[str, str] = {}
+        self._late = scenario.source.findings()
 
     def resolved(self) -> ResolvedScenario:
         """All schedules without a finding."""
@@ -165,11 +169,13 @@ class _Resolving:
             if (course := self._course(entry)) is None:
                 continue
             schedules.setdefault(entry.instance, []).append(entry.schedule)
+            self._check_end(entry, course)
             start = course.value(0) if entry.schedule.initial else None
             if start is not None:
                 start_values.setdefault(entry.instance, {})[entry.variable.name] = start
                 self._check_start(entry)
-        return ResolvedScenario({name: tuple(own) for name, own in schedules.items()}, start_values, self._files)
+        by_instance = {name: tuple(own) for name, own in schedules.items()}
+        return ResolvedScenario(by_instance, start_values, self._files, tuple(self._late))
 
     # --- the parts of the file
 
@@ -382,6 +388,14 @@ class _Resolving:
         except SeriesRefused as refused:
             self._findings.add(f"{entry.path}.{refused.key}", str(refused), refused.expected)
             return None
+
+    def _check_end(self, entry: _Entry, course: Course) -> None:
+        """Warn of what comes after the last step: most likely the stop time, or the unit of a time, is wrong."""
+        begin = course.first_step * self._instances[entry.instance].step_points
+        if begin >= self._grid.last_point > 0:
+            found = f"the first value of '{entry.instance}.{entry.variable.name}' comes after the last step"
+            stop = self._grid.stop_time
+            self._late.add(entry.path, found, f"a time before {stop:g} s" if stop is not None else "an earlier time")
 
     def _check_start(self, entry: _Entry) -> None:
         """A value for the start is a start value: there must be no other one, and it must be allowed."""

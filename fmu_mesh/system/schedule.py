@@ -162,6 +162,11 @@ class Course:
         return self._steps[-1]
 
     @property
+    def end(self) -> Value:
+        """The last value."""
+        return self._values[-1]
+
+    @property
     def changes(self) -> int:
         """Number of times at which the value, or its slope, changes."""
         return len(self._steps)

@@ -11,6 +11,7 @@ import hashlib
 import importlib
 import math
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -176,13 +177,13 @@ def _plain(text: str, variable: Variable) -> object:
         return _TRUTH.get(text.lower(), text)
     if not is_float(variable.type) and variable.type not in INTEGERS:
         return text
-    for read in (int, float) if variable.type in INTEGERS else (float,):
-        try:
-            number = read(text)
-        except ValueError:
-            continue
-        return int(number) if variable.type in INTEGERS and number.is_integer() else number
-    return text
+    with suppress(ValueError):
+        return int(text)
+    try:
+        number = float(text)
+    except ValueError:
+        return text
+    return int(number) if variable.type in INTEGERS and number.is_integer() else number
 
 
 @lru_cache(maxsize=256)

@@ -141,6 +141,7 @@ def build(
     warnings = loaded.findings()
     forbidden_start_values(config, descriptions, warnings, strict=False)
     unit_warnings(connections, descriptions, warnings)
+    warnings.merge(prescribed.warnings)
     _needed_tools(config, descriptions, warnings)
     _ending_warning(loaded, result_file, warnings)
     return ResolvedSystem(
