@@ -266,7 +266,7 @@ class _Resolving:
             for key in (*_OF_TABLES, *_OF_BAGS):
                 if getattr(given, key) is not None:
                     self._findings.add(f"{path}.{key}", f"'{key}' without a file", "file: with the values")
-            if given.times is None or given.values is None:
+            if len(self._findings) == before and (given.times is None or given.values is None):
                 missing = "times" if given.times is None else "values"
                 self._findings.add(f"{path}.{missing}", "missing", "times: and values:, or file: with both")
         else:

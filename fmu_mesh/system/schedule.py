@@ -124,7 +124,7 @@ class Course:
         if place < 0:
             return None
         value = self._values[place]
-        if not self._linear or place + 1 == len(self._values):
+        if not self._linear or place + 1 == len(self._values) or _same(value, self._values[place + 1]):
             return value
         time = self._grid.time(step * self._points)
         start, end = self._times[place], self._times[place + 1]
