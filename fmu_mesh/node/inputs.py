@@ -11,6 +11,7 @@ from types import MappingProxyType
 from typing import Literal, cast
 
 from ..errors import FmuError
+from ..instances.call_guard import Guarded
 from ..instances.contract import Instance, KeepsState, StepsNatively
 from ..instances.input_trajectory import Trajectory
 from ..instances.instance_wrapper import AroundInstance
@@ -54,6 +55,7 @@ class TimedInputs(AroundInstance[Instance]):
     ) -> None:
         super().__init__(instance)
         self.python_at = 0
+        self._set_in_step = instance.set_in_step if isinstance(instance, Guarded) else instance.set_values
         self._courses = courses
         self._linear = interpolation == "linear"
         self._trajectories: dict[str, Trajectory] = {}
@@ -147,7 +149,7 @@ class TimedInputs(AroundInstance[Instance]):
             if self._used.get(name) != value:
                 changes[name] = value
         if changes:
-            self._instance.set_values(changes)
+            self._set_in_step(changes)
             self._used.update((name, value) for name, value in changes.items() if name in self._trajectories)
 
     def _next_change(self, step: int) -> int:

@@ -306,7 +306,7 @@ class _Member:
         if self._courses:
             changes = {name: course.change(step) for name, course in self._courses.items()}
             if prescribed := {name: value for name, value in changes.items() if value is not None}:
-                self.instance.set_values(prescribed)
+                self.instance.set_in_step(prescribed)
         for read, points, lead, change, write in self._feeds:
             value = read((start + lead) // points)  # `CouplingRule.row_for`, without a call
             write(0, value if change is None else change(value))
