@@ -48,7 +48,10 @@ def bag_values(
                 topics = topics_for(loaded, descriptions, bag, choices)
                 samples = timed(bag.samples(topics, "log" if stamps == "log" else "header"), start)
         except ConfigurationError as error:
-            findings.add(f"{places[0]}.file", error.message.removeprefix("--topic: "), error.hint or "a bag")
+            of_topic = error.message.startswith("--topic: ")
+            place = f"{places[0]}.{'topic' if of_topic else 'file'}"
+            expected = error.hint or ("another field" if of_topic else "a bag that can be read")
+            findings.add(place, error.message.removeprefix("--topic: ").rstrip("."), expected.rstrip("."))
             continue
         pairs: dict[str, list[tuple[float, Value]]] = {}
         for time, sample in samples:
