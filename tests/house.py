@@ -256,6 +256,7 @@ ALLOWED: dict[str, dict[str, str]] = {
         "instances/fmi/callbacks.py: callbacks.freeMemory": _C_STRUCT,
         "instances/fmi/callbacks.py: callbacks.logger": _C_STRUCT,
         "instances/fmi/callbacks.py: callbacks.stepFinished": _C_STRUCT,
+        "node/engine.py: member.python_at": _C_STRUCT,
         "node/engine.py: member.stage": _C_STRUCT,
         "node/engine.py: node.eager": _C_STRUCT,
         "node/engine.py: node.wait_ns": _C_STRUCT,
@@ -289,6 +290,7 @@ ALLOWED: dict[str, dict[str, str]] = {
     "importers_of_kinds": {
         "fmu_mesh: fmu_mesh.instances.python": "what a component derives from is public",
         "fmu_mesh.api.mesh_builder: fmu_mesh.instances.python": "a program gives a class, not the place of a class",
+        "fmu_mesh.run.preparing: fmu_mesh.instances.python": "a scenario has units by the names that components use",
         "fmu_mesh.adapter.adapter: fmu_mesh.instances.fmi": "FMIAdapter is one FMU, by what it promises",
         "fmu_mesh.api.inspection: fmu_mesh.instances.fmi": "`inspect` shows what is in an .fmu file",
     },

@@ -9,6 +9,7 @@ from typing import Any, Literal, TypedDict
 import msgspec
 import numpy as np
 
+from ..config.loading import PlainConfig
 from ..errors import CallRefused
 from ..recorder.arrays_file import ENDING
 from ..run.events import Event
@@ -18,7 +19,17 @@ from ..text import shown
 from ..wire.runtime import run_name, runtime_folder
 from ..wire.views import MeshStatus
 
-__all__ = ["PlanOptions", "RunOptions", "StartOptions", "memory_of", "options_of", "plain", "texts_of", "with_record"]
+__all__ = [
+    "PlanOptions",
+    "RunOptions",
+    "StartOptions",
+    "memory_of",
+    "options_of",
+    "plain",
+    "texts_of",
+    "with_record",
+    "with_scenario",
+]
 
 _MEMORY = "memory."
 
@@ -30,6 +41,7 @@ class PlanOptions(TypedDict, total=False):
         record: "memory" keeps the results as arrays, without a file.
         output: the result file; its ending chooses the format.
         start_values: start values by `instance.variable`; or texts as `--set` has them.
+        scenario: values of inputs and tunable parameters over time: a file, or a mapping with the keys of such a file.
         config_values: values of any keys by their path, such as `{"simulation.window": 16}`; or texts as `--set-config`
             has them.
         algorithm: "jacobi" or "gauss_seidel".
@@ -53,6 +65,7 @@ class PlanOptions(TypedDict, total=False):
     record: Literal["memory"] | None
     output: str | Path | None
     start_values: Mapping[str, Any] | Sequence[str]
+    scenario: str | Path | Mapping[str, Any] | None
     config_values: Mapping[str, Any] | Sequence[str]
     algorithm: str | None
     step_size: float | None
@@ -106,13 +119,24 @@ def options_of(given: PlanOptions) -> Options:
             raise CallRefused('`output` and `record="memory"` exclude each other')
         fields["output"] = _memory_file()
     fields["profile"] = Path() if fields.get("profile") is True else fields.get("profile") or None
-    for name in ("output", "video"):
+    if isinstance(fields.get("scenario"), Mapping):
+        fields.pop("scenario")  # `with_scenario` takes it
+    for name in ("output", "video", "scenario"):
         fields[name] = Path(fields[name]) if fields.get(name) is not None else None
     for name, what in (("start_values", "start value"), ("config_values", "value")):
         fields[name] = texts_of(fields.get(name, ()), what)
     for name in ("listen", "connect"):
         fields[name] = tuple(fields.get(name, ()))
     return Options(**fields)
+
+
+def with_scenario(values: PlainConfig, given: PlanOptions) -> PlainConfig:
+    """The values of a configuration with the scenario that a program gives as a mapping; unchanged without one."""
+    scenario = given.get("scenario")
+    if not isinstance(scenario, Mapping) or not isinstance(values.data, dict):
+        return values
+    lines = {path: line for path, line in values.lines.items() if path.partition(".")[0] != "scenario"}
+    return values._replace(data={**values.data, "scenario": plain(scenario)}, lines=lines)
 
 
 def texts_of(values: Mapping[str, object] | Sequence[str], what: str) -> tuple[str, ...]:

@@ -184,7 +184,7 @@ class Run:
             at: simulation time in s from which on the value holds; None: from the next point on.
 
         Returns:
-            The point, and its time in s, from which on the value holds.
+            The point, and its time in s, from which on the value holds; `late` says that the time asked for was past.
 
         Raises:
             CallRefused: the variable cannot be set, or takes no such value; says why.

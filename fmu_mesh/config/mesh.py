@@ -27,6 +27,7 @@ from fmu_mesh.config.base import (
 )
 from fmu_mesh.config.instance_sections import InstanceSection
 from fmu_mesh.config.ros_section import RosConfig, RosProfile, RosTopicConfig
+from fmu_mesh.config.scenario_section import ScenarioConfig
 
 __all__ = [
     "ENDPOINT_PATTERN",
@@ -311,6 +312,13 @@ class Config(Base, frozen=True, kw_only=True):
         RecordConfig | list[RecordConfig],
         Meta(description="What is recorded: one result file, or a list of several; an empty list: nothing."),
     ] = RecordConfig()
+    scenario: Annotated[
+        ScenarioConfig | str | None,
+        Meta(
+            description="Values of inputs and tunable parameters over time; or a file with these keys, relative to "
+            "this file."
+        ),
+    ] = None
     zenoh: ZenohConfig = ZenohConfig()
     timeouts: TimeoutsConfig = TimeoutsConfig()
     limits: LimitsConfig = LimitsConfig()

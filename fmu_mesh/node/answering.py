@@ -214,7 +214,10 @@ class Answers:
             self._finish(pending, partial(query.reply_err, reason))
 
         def confirm(point: int) -> None:
-            answer = msgspec.json.encode(SetAnswer(key, point, self._plan.grid.time(point)))
+            grid, points = self._plan.grid, self._plan.instance(name).step_points
+            time = new[2].time
+            late = time is not None and point > grid.step_at(time, points) * points
+            answer = msgspec.json.encode(SetAnswer(key, point, grid.time(point), late))
             self._finish(pending, partial(query.reply, key, answer, encoding=json_encoding))
 
         if runner is None:

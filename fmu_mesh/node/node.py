@@ -57,7 +57,7 @@ from .activity import Activity
 from .connecting import connect
 from .engine import Engine, make_engine
 from .initialization import Initialization
-from .inputs import TimedInputs
+from .inputs import with_times
 from .links import OutLink
 from .node_server import NodeServer
 from .stepping import Runner
@@ -184,8 +184,7 @@ class Node:
         instances = {}
         for item in plan.instances:
             instance = self._open_instance(item.name)
-            if item.section.interpolation is not None:
-                instance = TimedInputs(instance, item.section.interpolation)
+            instance = with_times(instance, item, plan.grid)
             instances[item.name] = instance
         self._activity.enter("waiting for the mesh")
         self._membership.keys(plan.timeouts.start)

@@ -75,6 +75,9 @@ class Options(msgspec.Struct, frozen=True):
     output: Annotated[
         Path | None, Flag("--output", "FILE", "record.file", "result file; its ending chooses the format")
     ] = None
+    scenario: Annotated[
+        Path | None, Flag("--scenario", "FILE", text="values of inputs and parameters over time, from this file")
+    ] = None
     listen: Annotated[tuple[Endpoint, ...], Flag("--listen", "ENDPOINT", "zenoh.listen")] = ()
     connect: Annotated[tuple[Endpoint, ...], Flag("--connect", "ENDPOINT", "zenoh.connect")] = ()
     paused: Annotated[
@@ -200,6 +203,9 @@ def with_options(loaded: LoadedConfig, options: Options, findings: Findings | No
         findings: collects what is wrong with the values of options; None where they were checked before.
     """
     config, overrides = loaded.config, dict(loaded.overrides)
+    if options.scenario is not None:
+        overrides["scenario"] = f"--scenario {options.scenario}"
+        config = replace(config, scenario=str(options.scenario.absolute()))
     for setting in option_fields().values():
         value, flag = getattr(options, setting.name), setting.flag
         if flag.key is None or value in (None, ()):

@@ -29,6 +29,7 @@ from ..master.pacing import Pacer
 from ..node.connecting import connect
 from ..node.engine import Engine, make_engine
 from ..node.initialization import Initialization
+from ..node.inputs import with_times
 from ..node.stepping import Position, Runner
 from ..rings import native
 from ..rings.host_memory import HostMemory
@@ -254,7 +255,8 @@ class _Run:
             stack.callback(instance.close)
             place = places[item.name]
             ring, counter = memory.ring(place), memory.counter(place.counter)
-            self._runners[item.name] = Runner(item, instance, node.grid, ring, counter)
+            timed = with_times(instance, item, node.grid)
+            self._runners[item.name] = Runner(item, timed, node.grid, ring, counter)
         connect(node, self._runners, memory, memory, ())
 
     def _instance(self, name: str) -> Instance:

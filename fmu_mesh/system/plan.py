@@ -24,6 +24,7 @@ from .layout import Layout, row_bytes, rows_for
 from .linear_inputs import LinearInput, linear_inputs
 from .memory_map import MASTER, RECORDER, MemoryMap, RingPlace, map_memory
 from .records import RecordPlan, union_of
+from .schedule import Schedule
 from .system import Connection, ResolvedSystem, SystemInstance
 from .window import batch_of, recorder_window, window_of
 
@@ -53,6 +54,7 @@ class InstancePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         section: its section of the configuration, without the common keys: their meaning is in the other fields. It is
             decoded with the hook `fmu_mesh.instances.registry.decode_section`, because only that knows the kinds.
         linear_inputs: the inputs whose connections are extrapolated.
+        scenario: what a scenario prescribes for its variables.
     """
 
     name: str
@@ -65,6 +67,7 @@ class InstancePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     initialization: dict[str, int]
     section: InstanceSection
     linear_inputs: tuple[LinearInput, ...] = ()
+    scenario: tuple[Schedule, ...] = ()
 
 
 class Link(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -237,7 +240,13 @@ def _digest(system: ResolvedSystem, nodes: dict[str, NodePlan], contents: Mappin
             limits=LimitsConfig(),
             records=tuple(replace(record, file="") for record in node.records),
             instances=tuple(
-                replace(instance, fmu="", section=instance.section.agreed()) for instance in node.instances
+                replace(
+                    instance,
+                    fmu="",
+                    section=instance.section.agreed(),
+                    scenario=tuple(schedule.agreed() for schedule in instance.scenario),
+                )
+                for instance in node.instances
             ),
         )
         for node in nodes.values()
@@ -384,6 +393,7 @@ def _instance_plan(plan: Plan, instance: SystemInstance, outputs: Layout) -> Ins
         initialization={variable: level for (owner, variable), level in levels.items() if owner == instance.name},
         section=placed(plan.system.config.instances[instance.name]),
         linear_inputs=linear_inputs(plan.connections, instance.name),
+        scenario=instance.scenario,
     )
 
 

@@ -29,6 +29,8 @@ from fmu_mesh.system.couplings import coupled_connections
 from fmu_mesh.system.grouping import automatic_nodes
 from fmu_mesh.system.linear_inputs import check_extrapolation
 from fmu_mesh.system.records import RecordPlan, ending_warnings, resolve_records, union_of
+from fmu_mesh.system.scenario import ResolvedScenario, Scenario, ScenarioInput, resolve_scenario
+from fmu_mesh.system.schedule import Schedule
 from fmu_mesh.system.start_values import forbidden_start_values, resolve_start_values, sized
 from fmu_mesh.text import nearest_file, shown
 from fmu_mesh.variables.model_description import ModelDescription, Value
@@ -45,9 +47,10 @@ class SystemInstance(msgspec.Struct, frozen=True):
         name: instance name.
         fmu: absolute path of the model; empty for a kind without files.
         description: its model description.
-        start_values: start values by variable name, converted to the variable's type.
+        start_values: start values by variable name, converted to the variable's type; with those of the scenario.
         step_points: its step size as a multiple of the base step size; 1 or more.
         node: name of its node (process): its group, that of its cycle (`group: auto`), or its own name.
+        scenario: what a scenario prescribes for its variables.
     """
 
     name: str
@@ -56,6 +59,7 @@ class SystemInstance(msgspec.Struct, frozen=True):
     start_values: dict[str, Value]
     step_points: int
     node: str
+    scenario: tuple[Schedule, ...] = ()
 
 
 class ResolvedSystem(msgspec.Struct, frozen=True):
@@ -65,6 +69,7 @@ class ResolvedSystem(msgspec.Struct, frozen=True):
         instances: in the order of the file.
         records: the result files; empty if nothing is recorded.
         warnings: findings that do not prevent a run, such as connections between different units.
+        scenario_files: the SHA-256 of each file with values of the scenario, by absolute path.
     """
 
     config: Config
@@ -73,6 +78,7 @@ class ResolvedSystem(msgspec.Struct, frozen=True):
     connections: tuple[Connection, ...]
     records: tuple[RecordPlan, ...] = ()
     warnings: tuple[Finding, ...] = ()
+    scenario_files: dict[str, str] = {}
 
     @property
     def recorded(self) -> tuple[tuple[str, str], ...]:
@@ -89,7 +95,10 @@ class ResolvedSystem(msgspec.Struct, frozen=True):
 
 
 def build(
-    loaded: LoadedConfig, descriptions: Mapping[str, ModelDescription], findings: Iterable[Finding] = ()
+    loaded: LoadedConfig,
+    descriptions: Mapping[str, ModelDescription],
+    findings: Iterable[Finding] = (),
+    scenario: Scenario | None = None,
 ) -> ResolvedSystem:
     """Resolve every name of a configuration.
 
@@ -98,6 +107,7 @@ def build(
         descriptions: the model descriptions by instance name. One may be missing because its model could not be read;
             then ``findings`` must say why, and checks that need it are left out.
         findings: earlier findings; the error has them, too.
+        scenario: the scenario, if there is one.
 
     Raises:
         ConfigurationError: there are findings; it has all of them.
@@ -122,6 +132,7 @@ def build(
     check_extrapolation(connections, config.instances, descriptions, collected)
     connections += coupled_connections(config, variables, connections, collected)
     records = resolve_records(loaded, variables, grid, collected)
+    prescribed = _prescribed(scenario, variables, instances, connections, grid, collected)
     _check_zenoh(loaded, collected)
     if grid is None or len(instances) < len(config.instances):
         collected.raise_any()
@@ -132,12 +143,39 @@ def build(
         edges = [(c.source_instance, c.target_instance) for c in connections]
         nodes = automatic_nodes(config, edges, descriptions)
         instances = {name: replace(own, node=nodes.get(name, own.node)) for name, own in instances.items()}
+    instances = {name: _with_scenario(own, prescribed) for name, own in instances.items()}
     warnings = loaded.findings()
     forbidden_start_values(config, descriptions, warnings, strict=False)
     unit_warnings(connections, descriptions, warnings)
+    warnings.merge(prescribed.warnings)
     _needed_tools(config, descriptions, warnings)
     ending_warnings(loaded, records, warnings)
-    return ResolvedSystem(config, grid, instances, connections, records, tuple(warnings))
+    return ResolvedSystem(config, grid, instances, connections, records, tuple(warnings), prescribed.files)
+
+
+def _prescribed(  # noqa: PLR0913, PLR0917  what a scenario refers to
+    scenario: Scenario | None,
+    variables: Variables,
+    instances: Mapping[str, SystemInstance],
+    connections: Iterable[Connection],
+    grid: TimeGrid | None,
+    findings: Findings,
+) -> ResolvedScenario:
+    """What the scenario prescribes; nothing without a time grid, for which there is a finding."""
+    if scenario is None or grid is None:
+        return ResolvedScenario()
+    inputs = {name: ScenarioInput(own.start_values, own.step_points) for name, own in instances.items()}
+    if scenario.source.prefix:
+        return resolve_scenario(scenario, variables, inputs, connections, grid, findings)
+    own = scenario.source.findings()
+    prescribed = resolve_scenario(scenario, variables, inputs, connections, grid, own)
+    findings.merge(own)
+    return prescribed
+
+
+def _with_scenario(instance: SystemInstance, prescribed: ResolvedScenario) -> SystemInstance:
+    start_values = instance.start_values | prescribed.start_values.get(instance.name, {})
+    return replace(instance, start_values=start_values, scenario=prescribed.schedules.get(instance.name, ()))
 
 
 def _grid(config: Config, findings: Findings) -> TimeGrid | None:
