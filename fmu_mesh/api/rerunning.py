@@ -19,7 +19,7 @@ from .. import __version__
 from ..config.loading import PlainConfig
 from ..errors import ConfigurationError, Finding, FmuMeshError
 from ..run.run_plan import RunPlan
-from ..system.run_metadata import RunMetadata
+from ..system.run_metadata import RunMetadata, scenario_files
 from ..text import listed
 from ..wire.messages import SetValue
 from .mesh_builder import Mesh
@@ -179,7 +179,7 @@ def _check_owner(path: Path) -> None:
 
 
 def _check_models(path: Path, metadata: RunMetadata, plan: RunPlan) -> None:
-    """Check that the models are those of the first run.
+    """Check that the models and the files of the scenario are those of the first run.
 
     Raises:
         ConfigurationError: some are not; has a finding for each.
@@ -191,7 +191,12 @@ def _check_models(path: Path, metadata: RunMetadata, plan: RunPlan) -> None:
             there = plan.plan.system.instances[name].fmu
             found = f"'{there}' has the SHA-256 {now[:12]}…"
             findings.append(Finding(str(path), f"models.{name}", found, f"{own.sha256[:12]}…, as in the first run"))
+    files = scenario_files(plan.loaded, plan.plan.system)
+    for file, sha256 in metadata.files.items():
+        if (now := files.get(file, "")) != sha256:
+            found = f"it has the SHA-256 {now[:12]}…"
+            findings.append(Finding(str(path), f"files.{file}", found, f"{sha256[:12]}…, as in the first run"))
     if findings:
         changed = listed([f"'{finding.path.partition('.')[2]}'" for finding in findings])
-        text = str(findings[0]) if len(findings) == 1 else f"{path}: the models of {changed} have changed"
+        text = str(findings[0]) if len(findings) == 1 else f"{path}: {changed} have changed"
         raise ConfigurationError(text, findings=tuple(findings))

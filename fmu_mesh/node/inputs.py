@@ -60,13 +60,12 @@ class TimedInputs(AroundInstance[Instance]):
         self._linear = interpolation == "linear"
         self._trajectories: dict[str, Trajectory] = {}
         self._used: dict[str, Value] = {}
-        self._early: list[tuple[str, Value, float | None]] = []
         self._grid: TimeGrid | None = None
         self._points = 1
         self._step = 0
 
     def bind(self, inputs: Ring, outputs: Sequence[Ring], grid: TimeGrid, points: int, step: int = 0) -> None:
-        """Bind the inner instance. From now on there is a time; values that came before get the present one."""
+        """Bind the inner instance. From now on there is a time."""
         self._instance.bind(inputs, outputs, grid, points, step)
         self.start(grid, points, step)
 
@@ -74,9 +73,6 @@ class TimedInputs(AroundInstance[Instance]):
         """Start the time at own step ``step``; each own step has ``points`` points of ``grid``."""
         self._grid, self._points, self._step = grid, points, step
         self.python_at = step
-        early, self._early = self._early, []
-        for name, value, time in early:
-            self.add(name, value, time)
 
     def do_step(self, step: int) -> None:
         """Set all values that change at the start of the step, then step the inner instance."""
@@ -110,12 +106,9 @@ class TimedInputs(AroundInstance[Instance]):
         Raises:
             ValueRefused: too many values wait for their time, or this one is too late.
         """
-        if self._grid is None:
-            self._early.append((name, value, time))
-            return 0
         now = self._time(self._step)
         when = now if time is None else time
-        step = self._grid.step_at(when, self._points)
+        step = self._grid_here.step_at(when, self._points)
         if step >= ENDLESS:
             raise ValueRefused(f"the time {when:g} s is later than any run ends")
         if name not in self._trajectories:

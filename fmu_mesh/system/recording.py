@@ -262,12 +262,13 @@ def with_notes(metadata: Mapping[str, Any], entries: Iterable[Mapping[str, Any]]
         {'mesh': 'pair', 'set': [{'variable': 'u', 'value': 3.0}], 'end': {'point': 5}}
     """
     noted: dict[str, Any] = {**metadata}
+    values = [*noted.get("set", ())]
     for entry in entries:
         if "variable" in entry:
-            noted["set"] = [*noted.get("set", ()), entry]
+            values.append(entry)
         else:
             noted |= entry
-    return noted
+    return {**noted, "set": values} if values else noted
 
 
 def _ending(path: str | Path) -> str:

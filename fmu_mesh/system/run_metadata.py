@@ -22,9 +22,10 @@ from ..variables.model_description import Variable
 from ..variables.value_conversion import to_plain
 from ..variables.value_types import PlainValue
 from .records import RecordPlan
+from .series_files import content_of
 from .system import ResolvedSystem
 
-__all__ = ["ModelOrigin", "RecordedVariable", "RunMetadata", "configuration_of", "metadata_of"]
+__all__ = ["ModelOrigin", "RecordedVariable", "RunMetadata", "configuration_of", "metadata_of", "scenario_files"]
 
 _FORMAT = 1
 _PACKAGES = {"fmpy": "fmpy", "zenoh": "eclipse-zenoh", "numpy": "numpy"}
@@ -74,6 +75,7 @@ class RunMetadata(msgspec.Struct, frozen=True):
         first: point of the first row.
         every: number of points from row to row.
         models: the models by instance.
+        files: the SHA-256 of each file of the scenario, by absolute path.
         start_values: the start values that were set, by instance and variable.
         start_time: time of point 0 in s.
         step_size: base communication step size in s.
@@ -93,6 +95,7 @@ class RunMetadata(msgspec.Struct, frozen=True):
     first: int
     every: int
     models: dict[str, ModelOrigin]
+    files: dict[str, str]
     start_values: dict[str, dict[str, PlainValue]]
     start_time: float
     step_size: float
@@ -134,6 +137,7 @@ def metadata_of(
         first=record.first,
         every=record.every,
         models=models,
+        files=scenario_files(loaded, system),
         start_values={
             name: {variable: to_plain(value) for variable, value in own.start_values.items()}
             for name, own in system.instances.items()
@@ -145,6 +149,15 @@ def metadata_of(
         started=datetime.now(UTC).isoformat(timespec="seconds"),
         host=socket.gethostname(),
     )
+
+
+def scenario_files(loaded: LoadedConfig, system: ResolvedSystem) -> dict[str, str]:
+    """The SHA-256 of the file of the scenario, and of the files with its values, by absolute path."""
+    files = dict(system.scenario_files)
+    if isinstance(loaded.config.scenario, str):
+        path = loaded.resolve(loaded.config.scenario)
+        files[str(path)] = content_of(path)
+    return files
 
 
 def configuration_of(loaded: LoadedConfig) -> dict[str, Any]:

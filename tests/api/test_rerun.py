@@ -217,3 +217,27 @@ def test_the_command_runs_a_result_again(place: Place, folder: Path) -> None:
     assert json.loads(done.output)["rows"] == 1001
     assert Path("again.csv").read_bytes() == Path("first.csv").read_bytes()
     assert "is the result itself" in place.run("rerun", "first.csv", "--output", "first.csv").errors
+
+
+def test_a_run_with_a_scenario_is_run_again_unless_a_file_of_it_has_changed(folder: Path) -> None:
+    Path("drive.csv").write_text("time,u\n0.0,1.0\n0.5,2.0\n", encoding="utf-8")
+    Path("drive.yaml").write_text("values: {gain.u: {file: drive.csv, column: u}}\n", encoding="utf-8")
+    config = write_config(folder, instances={"gain": {"fmu": "Gain"}}, connections=())
+    mesh = fmu_mesh.load(config)
+    mesh.scenario(file="drive.yaml")
+    with mesh.start(paused=True) as run:
+        run.step(300)
+        run.set("gain.u", 7.0)
+        run.set("gain.k", 3.0)
+        run.resume()
+        run.wait(DEADLINE_S)
+
+    fmu_mesh.rerun("pair.csv")
+
+    assert Path("pair.rerun.csv").read_bytes() == Path("pair.csv").read_bytes()
+    for changed in ("drive.csv", "drive.yaml"):
+        before = Path(changed).read_bytes()
+        Path(changed).write_bytes(before.replace(b"drive.csv", b"./drive.csv").replace(b"2.0", b"2.5"))
+        with pytest.raises(fmu_mesh.ConfigurationError, match=f"files.*{changed}.*as in the first run"):
+            fmu_mesh.rerun("pair.csv", output="again.csv")
+        Path(changed).write_bytes(before)

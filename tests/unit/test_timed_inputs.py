@@ -104,17 +104,6 @@ def test_a_value_whose_time_is_past_holds_unless_a_later_one_is_in_use(hold: Ste
     assert hold.go(1) == [8.0]
 
 
-def test_values_that_come_before_the_first_point_wait_for_it(tmp_path: Path) -> None:
-    steps = Steps(tmp_path, "hold")
-    steps.inputs.add("u", 4.0, 1.2)
-    steps.inputs.add("u", 3.0, None)
-
-    steps.bind()
-
-    assert steps.go(4) == [3.0, 3.0, 4.0, 4.0]
-    steps.inputs.close()
-
-
 def runner_of(instance: Instance) -> tuple[Runner, Position]:
     """A runner in the middle of a run, whose steps are a tenth of a second, and where it is."""
     outputs = Layout.of([("y", "Float64")])

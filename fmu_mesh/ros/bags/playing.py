@@ -7,8 +7,6 @@ the result depends on the bag alone, and not on the speed of any process.
 from __future__ import annotations
 
 import math
-import threading
-import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Literal, TypedDict, Unpack
@@ -16,20 +14,19 @@ from typing import Literal, TypedDict, Unpack
 import msgspec
 
 from ...config.loading import LoadedConfig
-from ...errors import ConfigurationError, DeadlineExceeded, MeshLost
+from ...errors import ConfigurationError, MeshLost
 from ...instances.configuration import load
 from ...simtime import ENDLESS, TimeGrid
 from ...system.scenario import BAG_STAMP_S
 from ...variables.model_description import Value
 from ...wire.client.mesh_client import MeshClient
+from ...wire.client.pausing import go_on, paused_at, wait_until_at
 from ...wire.client.readings import Target
 from ...wire.views import Command, MeshInfo
 from .bag import Bag, BagSample, chosen_topics, timed
 
 __all__ = ["Moment", "PlayOptions", "Played", "grid_of", "play", "play_bag", "schedule"]
 
-_LOOK_S = 0.001
-_LONGEST_LOOK_S = 0.05
 _TIMEOUT_S = 60.0
 
 
@@ -177,15 +174,15 @@ def play(
         MeshLost: the mesh has ended, or another program controls it too.
         DeadlineExceeded: the mesh does not reach the next moment.
     """
-    hold = _commanded(client, Command("pause"))
+    hold = paused_at(client, Command("pause"))
     together = math.lcm(*step_points.values())  # where every instance has a point of its own
-    hold = _go_on(client, hold, -(-hold // together) * together)
+    hold = go_on(client, hold, -(-hold // together) * together)
     targets: dict[tuple[str, str], Target] = {}
     first, count = hold, 0
     for moment in _from(hold, moments):
-        hold = _go_on(client, hold, moment.point)
+        hold = go_on(client, hold, moment.point)
         for instance in {instance for instance, _ in moment.values}:
-            _wait_until_at(client, instance, hold, timeout_s)
+            wait_until_at(client, instance, hold, timeout_s)
         for (instance, variable), value in moment.values.items():
             key = (instance, variable)
             if key not in targets:
@@ -196,21 +193,6 @@ def play(
             count += 1
     client.command(Command("resume"))
     return count, first
-
-
-def _commanded(client: MeshClient, command: Command) -> int:
-    """Give a command that pauses the mesh; returns the point at which it will be paused."""
-    hold = client.command(command).hold
-    if hold is None:
-        raise ConfigurationError("the mesh does not say where it pauses.", hint="Is it another version of fmu_mesh?")
-    return hold
-
-
-def _go_on(client: MeshClient, hold: int, point: int) -> int:
-    """Let the mesh run from the point at which it is or will be paused to a later one; returns that point."""
-    if point > hold and _commanded(client, Command("step", point - hold)) != point:
-        raise MeshLost(f"the mesh runs to another point than {point}: another program controls it too.")
-    return point
 
 
 def _from(point: int, moments: Sequence[Moment]) -> Iterator[Moment]:
@@ -226,19 +208,3 @@ def _from(point: int, moments: Sequence[Moment]) -> Iterator[Moment]:
         yield moment
     if past:
         yield Moment(point, past)
-
-
-def _wait_until_at(client: MeshClient, instance: str, point: int, timeout_s: float) -> None:
-    """Wait until an instance is paused at ``point``."""
-    never = threading.Event()
-    look, reached, moved = _LOOK_S, -1, time.monotonic()
-    while (status := client.instance_status(instance)).point != point:
-        now = time.monotonic()
-        if status.point != reached:
-            look, reached, moved = _LOOK_S, status.point, now
-        if now - moved > timeout_s:
-            raise DeadlineExceeded(
-                f"it does not reach point {point}: {status.activity}.", instance=instance, point=reached
-            )
-        never.wait(look)
-        look = min(2 * look, _LONGEST_LOOK_S)
