@@ -84,11 +84,17 @@ def rows_left(result_file: str, folder: Path) -> int:
 
 def what_is_kept(result_file: str | None, rows: int) -> str | None:
     """The sentence for a run that ended early and left rows; None if there are no rows, as on a device."""
-    if not rows or result_file is None or not Path(result_file).is_file():
+    if not rows or result_file is None:
         return None
-    if result_file.endswith(ENDING):
+    path = Path(result_file)
+    if result_file.endswith(ENDING) and path.is_file():
         return f"What was recorded up to then ({rows} rows) is in the `result` of this error."
-    return f"What was recorded up to then ({rows} rows) is in '{result_file}'."
+    growing = _format(path).growing_file(path)
+    if growing != path and growing.is_file():
+        return (
+            f"What was recorded up to then ({rows} rows) is in '{growing}': `fmu-mesh recover {path}` makes the file."
+        )
+    return f"What was recorded up to then ({rows} rows) is in '{result_file}'." if path.is_file() else None
 
 
 def _format(path: str | Path) -> ResultFormat:
