@@ -211,9 +211,9 @@ class ParquetFile:
         """Write the rows that are waiting as one batch."""
         pa = _pyarrow()
         fields = zip(self._block, self._schema, strict=True)
-        arrays = [pa.array(array[: self._waiting].copy(), field.type, from_pandas=False) for array, field in fields]
+        arrays = [_arrow_array(array[: self._waiting], field.type) for array, field in fields]
         self._waiting = 0
-        batch = pa.record_batch(arrays, schema=self._schema)
+        batch = pa.RecordBatch.from_arrays(arrays, schema=self._schema)
         notes, self._notes = self._notes, []
         self._noted += notes
         if self._stream is None:
@@ -428,6 +428,21 @@ def _about(variable: Variable) -> dict[str, str]:
     if variable.items:
         about["items"] = msgspec.json.encode(dict(variable.items)).decode()
     return about
+
+
+def _arrow_array(values: NDArray[Any], type_: Any) -> Any:  # noqa: ANN401  pyarrow has no types
+    """A copy of the values as pyarrow has it. `pyarrow.array` would import pandas, which takes half a second."""
+    pa = _pyarrow()
+    if values.dtype == object:
+        texts = [value.encode() if isinstance(value, str) else value for value in values.tolist()]
+        ends = np.zeros(1 + len(texts), np.int32)
+        np.cumsum([len(text) for text in texts], out=ends[1:])
+        buffers = [ends, b"".join(texts)]
+    elif values.dtype == np.bool_:
+        buffers = [np.packbits(values, bitorder="little")]
+    else:
+        buffers = [values.copy()]
+    return pa.Array.from_buffers(type_, len(values), [None, *map(pa.py_buffer, buffers)], null_count=0)
 
 
 def _array(column: Any) -> NDArray[Any]:  # noqa: ANN401  pyarrow has no types
