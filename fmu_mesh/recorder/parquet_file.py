@@ -101,6 +101,7 @@ class ParquetFile:
         self._sink = _Sink()
         self._stream: Any = None
         self._groups: _GroupWriter | None = None
+        self._stream_only = False  # the draft could not be written
 
     @classmethod
     def check(cls, recording: Recording, findings: Findings) -> None:  # noqa: ARG003  it can hold values of all types
@@ -201,11 +202,16 @@ class ParquetFile:
             self._file.close()
 
     def _finish(self) -> None:
+        """Write the end of the draft; if there is none because it could not be written, make it of the stream again."""
+        stream = self.growing_file(self.path)
         if self._groups is not None:
             with self._groups as groups:
                 groups.finish(self._noted)
-        if self._stream is not None:
-            self.growing_file(self.path).unlink()
+            stream.unlink()
+        elif self.kept.rows:
+            self.keep_whole_rows(self.path, self.kept)
+        elif self._stream is not None:
+            stream.unlink()
 
     def _send(self) -> None:
         """Write the rows that are waiting as one batch."""
@@ -229,9 +235,17 @@ class ParquetFile:
                 os.truncate(self.growing_file(self.path), self.kept.size)
             raise
         self.kept = Kept(self.rows, self._file.size)
-        if self._groups is None:
-            self._groups = _GroupWriter(self.path, self._schema)
-        self._groups.add(batch)
+        if self._stream_only:
+            return
+        try:
+            if self._groups is None:
+                self._groups = _GroupWriter(self.path, self._schema)
+            self._groups.add(batch)
+        except OSError:
+            groups, self._groups, self._stream_only = self._groups, None, True
+            if groups is not None:
+                groups.abandon()
+            raise
 
     @staticmethod
     def _rows_of_texts(columns: Sequence[NDArray[Any]]) -> int:
@@ -315,9 +329,10 @@ class _GroupWriter:
         self._levels: list[list[Any]] = [[]]
         self._rows = self._size = self._written = 0
         self._replacing = replaced(path)
+        self._file = self._replacing.__enter__().open("wb")
         floats = [field.name for field in schema if str(field.type) in ("double", "float")]
         self._writer = _parquet().ParquetWriter(
-            self._replacing.__enter__(),
+            self._file,
             schema,
             compression="zstd",
             compression_level=1,
@@ -331,8 +346,7 @@ class _GroupWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if self._writer is not None:
-            self._abandon()
+        self.abandon()
 
     def add(self, batch: Any) -> None:  # noqa: ANN401  pyarrow has no types
         """Add the rows of a batch.
@@ -360,9 +374,22 @@ class _GroupWriter:
             metadata = with_notes(_decoded(self._schema), notes)
             self._writer.add_key_value_metadata({_KEY: msgspec.json.encode(metadata)})
             self._writer.close()
+            self._file.close()
             self._writer = None
             self._replacing.__exit__(None, None, None)
         return self._written
+
+    def abandon(self) -> None:
+        """Remove the draft, unless it has become the file."""
+        writer, self._writer = self._writer, None
+        if writer is None:
+            return
+        with suppress(OSError):
+            writer.close()
+        with suppress(OSError):
+            self._file.close()
+        with suppress(_Abandoned):
+            self._replacing.__exit__(_Abandoned, _Abandoned(), None)
 
     def _keep(self, batch: Any) -> None:  # noqa: ANN401  pyarrow has no types
         """Keep a batch for the row group; many small ones become a large one, which takes less memory."""
@@ -380,13 +407,6 @@ class _GroupWriter:
         self._written += self._rows
         self._levels, self._rows, self._size = [[]], 0, 0
         self._writer.write_table(table, row_group_size=_GROUP_ROWS)
-
-    def _abandon(self) -> None:
-        writer, self._writer = self._writer, None
-        with suppress(OSError):
-            writer.close()
-        with suppress(_Abandoned):
-            self._replacing.__exit__(_Abandoned, _Abandoned(), None)
 
 
 class _Abandoned(Exception):
