@@ -76,11 +76,12 @@ def is_folder(path: Path) -> bool:
     return os.path.isdir(path)  # noqa: PTH112 see `exists`
 
 
-def open_alone(path: Path) -> OwnFile:
+def open_alone(path: Path, result: Path | None = None) -> OwnFile:
     """Open a result file for a single writer: two runs of one configuration would mix their rows.
 
     Args:
         path: the file. Its folder is created; its content stays until the first write.
+        result: the result file that errors name, if the run makes it of this one.
 
     Raises:
         ConfigurationError: another run writes it, or it cannot be written.
@@ -90,9 +91,9 @@ def open_alone(path: Path) -> OwnFile:
         return OwnFile(path)
     except BlockingIOError as error:
         hint = "Wait for its end, or choose another file with --output."
-        raise ConfigurationError(f"another run is writing the result file '{path}'", hint=hint) from error
+        raise ConfigurationError(f"another run is writing the result file '{result or path}'", hint=hint) from error
     except OSError as error:
-        raise ConfigurationError(f"the result file '{path}' cannot be written: {error.strerror}") from error
+        raise ConfigurationError(f"the result file '{result or path}' cannot be written: {error.strerror}") from error
 
 
 def unwritable(path: Path, error: OSError) -> ConfigurationError:

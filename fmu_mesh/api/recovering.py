@@ -44,7 +44,7 @@ def recover(path: str | Path) -> int:
             if not is_file(path):
                 raise _missing(path)
             return format_.keep_whole_rows(path, Kept())
-        with open_alone(growing):
+        with open_alone(growing, path):
             return format_.keep_whole_rows(path, Kept())
     except OSError as error:
         raise ConfigurationError(f"the result file '{path}' cannot be recovered: {error.strerror or error}.") from error

@@ -23,7 +23,7 @@ import orjson
 from numpy.typing import NDArray
 
 from ..errors import ConfigurationError
-from ..files import Kept
+from ..files import Kept, exists, is_file
 from ..rings.library import load_library
 from ..system.recording import Recording
 from ..variables.value_types import VariableType, is_text
@@ -62,7 +62,7 @@ class CsvFile(BlockFile):
         self, path: Path, columns: Sequence[tuple[str, VariableType]], metadata: Mapping[str, Any] | None = None
     ) -> None:
         super().__init__(path, 1 + len(columns))
-        is_device = path.exists() and not path.is_file()
+        is_device = exists(path) and not is_file(path)
         self._notes = NotesFile(path, metadata) if metadata and not is_device else None
         header = io.StringIO()
         csv.writer(header, lineterminator="\n").writerow(["time", *(name for name, _ in columns)])

@@ -1,12 +1,13 @@
 """Results as Parquet: one column for the time, and one for each variable, with its own type and its unit.
 
 A Parquet file cannot be read without its end. While a run goes on, its rows are in an Arrow IPC stream beside it,
-`<file>.arrows`, in batches that the operating system has after every `flush`. `close` makes the Parquet file of the
-stream, and so does `keep_whole_rows` after the writer was killed: it has all batches that are complete in the stream.
-`docs/adr/0062-a-parquet-file-is-made-of-a-stream.md` says why.
+`<file>.arrows`, in batches that the operating system has after every `flush`. The same rows are compressed into a draft
+of the Parquet file, group by group; `close` writes its end, renames it and removes the stream. After the writer was
+killed, `keep_whole_rows` makes the file of all batches that are complete in the stream.
+`docs/adr/0062-a-parquet-file-grows-as-a-stream.md` says why.
 
-Metadata are JSON under `fmu_mesh` in the schema. What is noted during the run is in the metadata of a batch, and in the
-Parquet file together with the rest.
+Metadata are JSON under `fmu_mesh`, in the schema of the stream and at the end of the Parquet file. What is noted during
+the run is in the metadata of a batch, and at the end of the Parquet file together with the rest.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
+from types import TracebackType
 from typing import Any, Final, Self
 
 import msgspec
@@ -24,7 +26,7 @@ from numpy.typing import NDArray
 
 from ..config.findings import Findings
 from ..errors import ConfigurationError
-from ..files import Kept, is_file, open_alone, replaced
+from ..files import Kept, exists, is_file, open_alone, replaced
 from ..system.recording import Columns, Recording, with_notes
 from ..variables.model_description import Variable
 from ..variables.value_types import DTYPES, VariableType, is_text
@@ -43,6 +45,8 @@ _BLOCK_BYTES: Final = 1 << 22
 _GROUP_ROWS: Final = 131072
 _GROUP_BYTES: Final = 1 << 26
 """A row group of the Parquet file has at most so many rows, and about so many bytes before they are compressed."""
+
+_MERGED: Final = 32
 
 _ARROW_TYPES: Final[dict[VariableType, str]] = {
     "Float64": "float64",
@@ -80,6 +84,7 @@ class ParquetFile:
     """
 
     def __init__(self, path: Path, columns: Sequence[tuple[str, VariableType]], schema: Any) -> None:  # noqa: ANN401  pyarrow has no types
+        _parquet()  # importing it with the first rows would delay the run
         self.path = path
         self.rows = 0
         self.kept = Kept()
@@ -90,10 +95,13 @@ class ParquetFile:
         self._texts = [place for place, type_ in enumerate(types) if is_text(type_)]
         self._waiting = 0
         self._notes: list[Mapping[str, Any]] = []
+        self._noted: list[Mapping[str, Any]] = []
         self._schema = schema
-        self._file = open_alone(self.growing_file(path))
+        self._file = open_alone(self.growing_file(path), path)
         self._sink = _Sink()
         self._stream: Any = None
+        self._groups: _GroupWriter | None = None
+        self._stream_only = False  # the draft could not be written
 
     @classmethod
     def check(cls, recording: Recording, findings: Findings) -> None:  # noqa: ARG003  it can hold values of all types
@@ -103,7 +111,7 @@ class ParquetFile:
     @classmethod
     def open(cls, path: Path, recording: Recording) -> Self:
         """Open a result file for what a run records."""
-        if path.exists() and not path.is_file():
+        if exists(path) and not is_file(path):
             hint = "Record into a .csv file."
             raise ConfigurationError(f"'{path}' is not a file, and a Parquet file cannot replace it.", hint=hint)
         return cls(path, recording.columns, _schema_of(recording))
@@ -119,7 +127,12 @@ class ParquetFile:
         stream = ParquetFile.growing_file(path)
         if not stream.exists():
             return _rows_of(path) if is_file(path) else 0
-        rows = _converted(stream, path)
+        rows = 0
+        if stream.stat().st_size:
+            with _Stream(stream) as batches, _GroupWriter(path, batches.schema) as groups:
+                for batch in batches:
+                    groups.add(batch)
+                rows = groups.finish(batches.notes)
         stream.unlink()
         return rows
 
@@ -135,8 +148,9 @@ class ParquetFile:
                     metadata = with_notes(_decoded(table.schema), batches.notes)
             else:
                 with path.open("rb") as file:
-                    table = _parquet().ParquetFile(file).read()
-                    metadata = _decoded(table.schema)
+                    content = _parquet().ParquetFile(file)
+                    table = content.read()
+                    metadata = _decoded(content.metadata)
         except (pa.ArrowException, msgspec.DecodeError) as error:
             raise _no_result(path, str(error)) from error
         if not table.column_names or table.column_names[0] != _TIME or not pa.types.is_float64(table.schema[0].type):
@@ -183,19 +197,31 @@ class ParquetFile:
                 self.flush()
             finally:
                 self.rows = self.kept.rows
-                if self.kept.size:
-                    self.keep_whole_rows(self.path, self.kept)
+                self._finish()
         finally:
             self._file.close()
+
+    def _finish(self) -> None:
+        """Write the end of the draft; if there is none because it could not be written, make it of the stream again."""
+        stream = self.growing_file(self.path)
+        if self._groups is not None:
+            with self._groups as groups:
+                groups.finish(self._noted)
+            stream.unlink()
+        elif self.kept.rows:
+            self.keep_whole_rows(self.path, self.kept)
+        elif self._stream is not None:
+            stream.unlink()
 
     def _send(self) -> None:
         """Write the rows that are waiting as one batch."""
         pa = _pyarrow()
         fields = zip(self._block, self._schema, strict=True)
-        arrays = [pa.array(array[: self._waiting], field.type, from_pandas=False) for array, field in fields]
+        arrays = [_arrow_array(array[: self._waiting], field.type) for array, field in fields]
         self._waiting = 0
-        batch = pa.record_batch(arrays, schema=self._schema)
+        batch = pa.RecordBatch.from_arrays(arrays, schema=self._schema)
         notes, self._notes = self._notes, []
+        self._noted += notes
         if self._stream is None:
             self._stream = pa.ipc.new_stream(self._sink, self._schema)
         self._stream.write_batch(batch, {_KEY: msgspec.json.encode(notes)} if notes else None)
@@ -209,6 +235,17 @@ class ParquetFile:
                 os.truncate(self.growing_file(self.path), self.kept.size)
             raise
         self.kept = Kept(self.rows, self._file.size)
+        if self._stream_only:
+            return
+        try:
+            if self._groups is None:
+                self._groups = _GroupWriter(self.path, self._schema)
+            self._groups.add(batch)
+        except OSError:
+            groups, self._groups, self._stream_only = self._groups, None, True
+            if groups is not None:
+                groups.abandon()
+            raise
 
     @staticmethod
     def _rows_of_texts(columns: Sequence[NDArray[Any]]) -> int:
@@ -222,17 +259,16 @@ class _Stream:
 
     Args:
         path: the stream.
-        mapped: whether its bytes are only mapped into memory: columns that nobody uses are not read.
 
     Attributes:
         schema: of the stream.
         notes: the entries of the batches that were read.
     """
 
-    def __init__(self, path: Path, *, mapped: bool = False) -> None:
+    def __init__(self, path: Path) -> None:
         self.notes: list[Mapping[str, Any]] = []
         self._pa = _pyarrow()
-        self._file = self._pa.memory_map(str(path)) if mapped else path.open("rb")
+        self._file = path.open("rb")
         try:
             self._reader = self._pa.ipc.open_stream(self._file)
         except (self._pa.ArrowException, OSError) as error:
@@ -278,46 +314,103 @@ class _Sink(io.RawIOBase):
         return taken
 
 
-def _converted(stream: Path, path: Path) -> int:
-    """Write the Parquet file of a stream; return the number of its rows. Without a row nothing is written."""
-    if not stream.stat().st_size:
-        return 0
-    with _Stream(stream, mapped=True) as batches:
-        rows = sum(int(batch.num_rows) for batch in batches)
-        metadata = with_notes(_decoded(batches.schema), batches.notes)
-        schema = batches.schema.with_metadata({_KEY: msgspec.json.encode(metadata)})
-    if not rows:
-        return 0
-    floats = [field.name for field in schema if str(field.type) in ("double", "float")]
-    others = [field.name for field in schema if field.name not in floats]
-    ways = {"compression": "zstd", "compression_level": 1, "use_dictionary": others, "use_byte_stream_split": floats}
-    with (
-        _Stream(stream) as batches,
-        replaced(path) as draft,
-        _parquet().ParquetWriter(draft, schema, **ways) as writer,
-    ):
-        for group in _grouped(batches):
-            writer.write_table(group, row_group_size=_GROUP_ROWS)
-    return rows
+class _GroupWriter:
+    """Writes a draft of the Parquet file, which gets its name at the end; a context manager, which removes the draft.
+
+    A batch is kept until its row group is complete. So it must own its memory.
+
+    Args:
+        path: the file.
+        schema: its columns and metadata.
+    """
+
+    def __init__(self, path: Path, schema: Any) -> None:  # noqa: ANN401  pyarrow has no types
+        self._schema = schema
+        self._levels: list[list[Any]] = [[]]
+        self._rows = self._size = self._written = 0
+        self._replacing = replaced(path)
+        self._file = self._replacing.__enter__().open("wb")
+        floats = [field.name for field in schema if str(field.type) in ("double", "float")]
+        self._writer = _parquet().ParquetWriter(
+            self._file,
+            schema,
+            compression="zstd",
+            compression_level=1,
+            use_dictionary=[field.name for field in schema if field.name not in floats],
+            use_byte_stream_split=floats,
+        )
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.abandon()
+
+    def add(self, batch: Any) -> None:  # noqa: ANN401  pyarrow has no types
+        """Add the rows of a batch.
+
+        Raises:
+            OSError: the draft cannot be written; it is removed.
+        """
+        while batch.num_rows:
+            part = batch.slice(0, _GROUP_ROWS - self._rows)
+            batch = batch.slice(part.num_rows)
+            self._keep(part)
+            self._rows, self._size = self._rows + part.num_rows, self._size + part.nbytes
+            if self._rows == _GROUP_ROWS or self._size >= _GROUP_BYTES:
+                self._write()
+
+    def finish(self, notes: Sequence[Mapping[str, Any]]) -> int:
+        """Write the end, and give the file its name; return the number of its rows. Without a row, there is no file.
+
+        Raises:
+            OSError: the draft cannot be written; it is removed.
+        """
+        if self._rows:
+            self._write()
+        if self._written:
+            metadata = with_notes(_decoded(self._schema), notes)
+            self._writer.add_key_value_metadata({_KEY: msgspec.json.encode(metadata)})
+            self._writer.close()
+            self._file.close()
+            self._writer = None
+            self._replacing.__exit__(None, None, None)
+        return self._written
+
+    def abandon(self) -> None:
+        """Remove the draft, unless it has become the file."""
+        writer, self._writer = self._writer, None
+        if writer is None:
+            return
+        with suppress(OSError):
+            writer.close()
+        with suppress(OSError):
+            self._file.close()
+        with suppress(_Abandoned):
+            self._replacing.__exit__(_Abandoned, _Abandoned(), None)
+
+    def _keep(self, batch: Any) -> None:  # noqa: ANN401  pyarrow has no types
+        """Keep a batch for the row group; many small ones become a large one, which takes less memory."""
+        for level in self._levels:
+            level.append(batch)
+            if len(level) < _MERGED:
+                return
+            [batch] = _pyarrow().Table.from_batches(level).combine_chunks().to_batches()
+            level.clear()
+        self._levels.append([batch])
+
+    def _write(self) -> None:
+        """Write what is waiting as one row group."""
+        table = _pyarrow().Table.from_batches([batch for level in reversed(self._levels) for batch in level])
+        self._written += self._rows
+        self._levels, self._rows, self._size = [[]], 0, 0
+        self._writer.write_table(table, row_group_size=_GROUP_ROWS)
 
 
-def _grouped(batches: _Stream) -> Iterator[Any]:
-    """The rows of a stream in tables that become one row group each."""
-    pa = _pyarrow()
-    waiting: list[Any] = []
-    rows = size = 0
-    for batch in batches:
-        rest = batch
-        while rest.num_rows:
-            part = rest.slice(0, _GROUP_ROWS - rows)
-            rest = rest.slice(part.num_rows)
-            waiting.append(part)
-            rows, size = rows + part.num_rows, size + part.nbytes
-            if rows == _GROUP_ROWS or size >= _GROUP_BYTES:
-                yield pa.Table.from_batches(waiting)
-                waiting, rows, size = [], 0, 0
-    if waiting:
-        yield pa.Table.from_batches(waiting)
+class _Abandoned(Exception):
+    """A draft is of no use."""
 
 
 def _rows_of(path: Path) -> int:
@@ -357,6 +450,21 @@ def _about(variable: Variable) -> dict[str, str]:
     return about
 
 
+def _arrow_array(values: NDArray[Any], type_: Any) -> Any:  # noqa: ANN401  pyarrow has no types
+    """A copy of the values as pyarrow has it. `pyarrow.array` would import pandas, which takes half a second."""
+    pa = _pyarrow()
+    if values.dtype == object:
+        texts = [value.encode() if isinstance(value, str) else value for value in values.tolist()]
+        ends = np.zeros(1 + len(texts), np.int32)
+        np.cumsum([len(text) for text in texts], out=ends[1:])
+        buffers = [ends, b"".join(texts)]
+    elif values.dtype == np.bool_:
+        buffers = [np.packbits(values, bitorder="little")]
+    else:
+        buffers = [values.copy()]
+    return pa.Array.from_buffers(type_, len(values), [None, *map(pa.py_buffer, buffers)], null_count=0)
+
+
 def _array(column: Any) -> NDArray[Any]:  # noqa: ANN401  pyarrow has no types
     """A column as numpy has it, of its own memory; `object` for texts and bytes."""
     pa = _pyarrow()
@@ -365,8 +473,8 @@ def _array(column: Any) -> NDArray[Any]:  # noqa: ANN401  pyarrow has no types
     return np.array(column.to_numpy())
 
 
-def _decoded(schema: Any) -> dict[str, Any]:  # noqa: ANN401  pyarrow has no types
-    return msgspec.json.decode((schema.metadata or {}).get(_KEY, b"{}"), type=dict[str, Any])
+def _decoded(container: Any) -> dict[str, Any]:  # noqa: ANN401  a schema of pyarrow, or the end of a file
+    return msgspec.json.decode((container.metadata or {}).get(_KEY, b"{}"), type=dict[str, Any])
 
 
 def _no_result(path: Path, why: str) -> ConfigurationError:

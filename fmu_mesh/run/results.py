@@ -110,15 +110,24 @@ def what_is_kept(files: Sequence[tuple[str, int]]) -> str | None:
     Args:
         files: each result file, and the number of its rows.
     """
-    kept = [(file, rows) for file, rows in files if rows and Path(file).is_file()]
+    kept = [(where, rows) for file, rows in files if rows and (where := _where(file)) is not None]
     if not kept:
         return None
-    if kept[0][0].endswith(ENDING):
+    if kept[0][0].endswith(f"{ENDING}'"):
         return f"What was recorded up to then ({kept[0][1]} rows) is in the `result` of this error."
     if len(kept) == 1:
-        return f"What was recorded up to then ({kept[0][1]} rows) is in '{kept[0][0]}'."
-    *others, last = [f"'{file}' ({rows} rows)" for file, rows in kept]
+        return f"What was recorded up to then ({kept[0][1]} rows) is in {kept[0][0]}."
+    *others, last = [f"{where} ({rows} rows)" for where, rows in kept]
     return f"What was recorded up to then is in {', '.join(others)} and {last}."
+
+
+def _where(file: str) -> str | None:
+    """Where the rows of a result file are, in words; None if there is no such file."""
+    path = Path(file)
+    growing = _format(path).growing_file(path)
+    if growing != path and growing.is_file():
+        return f"'{growing}', from which `fmu-mesh recover {path}` makes the result"
+    return f"'{file}'" if path.is_file() else None
 
 
 def _note_of(number: int) -> str:

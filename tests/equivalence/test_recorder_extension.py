@@ -113,6 +113,16 @@ def test_what_the_format_cannot_hold_is_a_finding_of_check(extended: Place) -> N
     assert "'all.binary_out', which is Binary; expected types that JSON has, or a .csv file" in checked.errors
 
 
+def test_a_format_that_can_only_be_written_is_not_plotted(extended: Place) -> None:
+    config = write_config(extended.folder)
+
+    launched = extended.run("launch", config, "--output", "pair.jsonl", "--plot", "pair.png")
+
+    assert launched.wait() == 2
+    assert "its format can only be written" in launched.message
+    assert "Record into a .csv or .parquet file" in launched.message
+
+
 def test_without_the_package_a_run_warns_that_the_file_becomes_a_csv(place: Place) -> None:
     launched = place.run("launch", write_config(place.folder, record={"file": "pair.jsonl"}))
 

@@ -206,12 +206,12 @@ def test_a_missing_package_is_told_by_check(
     assert "a recording into .mcap needs the package mcap" in capsys.readouterr().err
 
 
-def test_a_plot_of_an_mcap_is_refused_with_the_way_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_is_no_recording_of_a_mesh_is_not_plotted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "x.mcap").touch()
 
     assert main(["plot", str(tmp_path / "x.mcap")]) == 2
 
-    assert "Record into a .csv file" in capsys.readouterr().err
+    assert "x.mcap' is no result file: it does not begin as an MCAP does" in capsys.readouterr().err
 
 
 # ---- playing ----

@@ -262,7 +262,6 @@ def test_a_wrong_option_is_told_as_it_was_written(
         (["launch", "mesh.yaml", "--output", "folder"], "mesh.yaml: --output folder: the folder '"),
         (["check", "nothing.yaml"], "fmu-mesh: nothing.yaml: no such file\n"),
         (["launch", "mesh.yaml", "--plot", "plot.xyz"], "a plot cannot be written as 'plot.xyz'"),
-        (["launch", "mesh.yaml", "--plot", "plot.png", "--output", "x.mcap"], "results are read from CSV"),
         (["launch", "mesh.yaml", "--real-time-factor", "-1"], "--real-time-factor -1"),
         (["plot", "mesh.csv"], "the result file 'mesh.csv' cannot be read"),
         (["play", "mesh.yam"], "the bag 'mesh.yam' does not exist. Did you mean 'mesh.yaml'?"),

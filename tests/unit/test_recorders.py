@@ -126,12 +126,11 @@ def test_an_installation_that_is_older_than_its_source_says_how_to_install_again
     assert "pip install --editable ." in str(raised.value)
 
 
-@pytest.mark.parametrize("suffix", [".csv", ".mcap"])
 @pytest.mark.parametrize(("noted", "rows"), [((2, 3), 2), ((2, 1000), 0), (None, 0)])
 def test_rows_of_a_killed_process_count_only_in_the_file_that_it_has_written(
-    tmp_path: Path, suffix: str, noted: tuple[int, int] | None, rows: int
+    tmp_path: Path, noted: tuple[int, int] | None, rows: int
 ) -> None:
-    result = tmp_path / f"a{suffix}"
+    result = tmp_path / "a.csv"
     result.write_bytes(b"abc")
     if noted is not None:
         (tmp_path / "recorded").write_bytes(struct.pack("<qq", *noted))
@@ -147,15 +146,12 @@ def test_a_device_keeps_no_rows(tmp_path: Path) -> None:
     assert rows_left([os.devnull], tmp_path) == ((os.devnull, 0),)
 
 
-@pytest.mark.parametrize("format_", [CsvFile, McapFile])
-def test_what_follows_the_rows_that_are_known_is_no_more_than_what_is_told(
-    format_: ResultFormat, tmp_path: Path
-) -> None:
+def test_what_follows_the_rows_that_are_known_is_no_more_than_what_is_told(tmp_path: Path) -> None:
     """The writer was killed after it wrote more than it had noted, perhaps within a row."""
     path = tmp_path / "killed"
     whole = b"time,a.x\n0.0,1.0\n0.5,2.0\n"
     path.write_bytes(whole + b"1.0,")
 
-    assert format_.keep_whole_rows(path, Kept(2, len(whole))) == 2
+    assert CsvFile.keep_whole_rows(path, Kept(2, len(whole))) == 2
 
     assert path.read_bytes() == whole

@@ -5,13 +5,13 @@ Owns which topics a recording has, and how rows become messages. `fmu_mesh.ros.m
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from io import BufferedWriter
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+import msgspec
 import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
@@ -20,7 +20,7 @@ from ...config.findings import Findings
 from ...config.mesh import RosConfig
 from ...errors import ConfigurationError
 from ...files import Kept, open_alone
-from ...system.recording import Recording
+from ...system.recording import Columns, Recording
 from ...variables.value_types import nested
 from ..gateway.mapping import message_types
 from ..gateway.resolver import Resolver
@@ -29,10 +29,12 @@ from ..messages.cdr import Codec
 from ..messages.definitions import CLOCK, MessageTypes
 from ..messages.stamp import nanoseconds, to_stamp
 from ..messages.topics import RosPlan, Topic
+from .mcap_layout import NOTE, RECORDING, ROWS, RecordedColumn, RecordedMcap, TopicColumns, has_passed
 
 __all__ = ["McapFile"]
 
 _BUFFER_BYTES = 1 << 16
+_CLOCK_TOPIC = "/clock"
 _QOS = (
     "- history: keep_last\n  depth: 10\n  reliability: reliable\n  durability: volatile\n"
     "  deadline:\n    sec: 9223372036\n    nsec: 854775807\n"
@@ -51,10 +53,8 @@ class McapFile:
 
     Args:
         path: the file. Its folder is made; the first row replaces an older file.
-        columns: (`instance.variable`, type) of every column that `write` is given.
+        recording: what is recorded.
         plan: the topics, and how often the clock ticks.
-        first: point of the first row.
-        every: number of points from row to row.
 
     Attributes:
         path: the file.
@@ -65,15 +65,13 @@ class McapFile:
         ConfigurationError: the file cannot be written, or the package `mcap` is not installed.
     """
 
-    def __init__(
-        self, path: Path, columns: Sequence[tuple[str, str]], plan: RosPlan, *, first: int = 0, every: int = 1
-    ) -> None:
+    def __init__(self, path: Path, recording: Recording, plan: RosPlan) -> None:
         writer = _writer_class()
-        self._first, self._every = first, every
+        self._first, self._every = recording.first, recording.every
         self.path = path
         self.rows = 0
         self.kept = Kept()
-        index = {name: number for number, (name, _) in enumerate(columns)}
+        index = {name: number for number, (name, _) in enumerate(recording.columns)}
         self._own = open_alone(path)
         self._file = BufferedWriter(self._own, _BUFFER_BYTES)
         self._mcap = writer(self._file)
@@ -85,7 +83,12 @@ class McapFile:
         self._clock_points = plan.clock_points
         if self._clock_points is not None:
             self._clock = Codec(types, CLOCK)
-            self._clock_channel = self._channel("/clock", CLOCK)
+            self._clock_channel = self._channel(_CLOCK_TOPIC, CLOCK)
+        self._about = {
+            "metadata": msgspec.json.encode(recording.metadata).decode(),
+            "recording": msgspec.json.encode(_recorded(recording, plan)).decode(),
+        }
+        self._waiting: list[Mapping[str, Any]] = []
 
     @classmethod
     def check(cls, recording: Recording, findings: Findings) -> None:
@@ -100,7 +103,7 @@ class McapFile:
         found = _topics(recording, findings)
         findings.raise_any()
         assert found is not None  # or there is a finding
-        return cls(path, recording.columns, found, first=recording.first, every=recording.every)
+        return cls(path, recording, found)
 
     @staticmethod
     def growing_file(path: Path) -> Path:
@@ -109,12 +112,19 @@ class McapFile:
 
     @staticmethod
     def keep_whole_rows(path: Path, kept: Kept) -> int:
-        """Cut a bag off after the rows that are known to be whole; returns their number.
+        """Cut a bag off after its last whole row, and write its index; returns the number of its rows."""
+        _writer_class()
+        from .mcap_records import finish_mcap  # noqa: PLC0415 an optional dependency
 
-        What follows may be more messages, of which nobody knows to how many rows they belong.
-        """
-        os.truncate(path, kept.size)
-        return kept.rows
+        return finish_mcap(path, kept)
+
+    @staticmethod
+    def read(path: Path) -> Columns:
+        """Read a result file. What a field has rounded, such as a Float64 in a float32, comes back rounded."""
+        _writer_class()
+        from .mcap_reading import read_mcap  # noqa: PLC0415 an optional dependency
+
+        return read_mcap(path)
 
     def __enter__(self) -> Self:
         return self
@@ -128,11 +138,14 @@ class McapFile:
         """Append one row per time; ``columns`` are arrays of the same length."""
         if not self.rows:
             self._mcap.start(profile="ros2", library="fmu_mesh")
+            self._mcap.add_metadata(RECORDING, self._about)
+            for entry in self._waiting:
+                self._add_note(entry)
         rows = zip(*(column.tolist() for column in columns), strict=True) if columns else iter([()] * len(times))
         for time, row in zip(times.tolist(), rows, strict=True):
             point, stamp = self._first + self.rows * self._every, nanoseconds(time)
             before = point - self._every if self.rows else -1
-            if self._clock_points is not None and _has_passed(self._clock_points, before, point):
+            if self._clock_points is not None and has_passed(self._clock_points, before, point):
                 self._add(self._clock_channel, stamp, self._clock.encode({"clock": to_stamp(time)}), point)
             for topic in self._topics:
                 if topic.due(before, point):
@@ -141,6 +154,10 @@ class McapFile:
 
     def note(self, entry: Mapping[str, Any]) -> None:
         """Add an entry to the metadata."""
+        if self.rows:
+            self._add_note(entry)
+        else:
+            self._waiting.append(entry)
 
     def flush(self) -> None:
         """Give all rows to the operating system, so that they survive the end of this process."""
@@ -154,10 +171,15 @@ class McapFile:
         written, self.rows = self.rows, self.kept.rows
         try:
             if written:
+                self._mcap.flush()  # the number of rows follows the last message
+                self._mcap.add_metadata(ROWS, {"rows": str(written)})
                 self._mcap.finish()
         finally:
             self._file.close()
         self.rows, self.kept = written, Kept(written, self._own.size)
+
+    def _add_note(self, entry: Mapping[str, Any]) -> None:
+        self._mcap.add_metadata(NOTE, {"entry": msgspec.json.encode(entry).decode()})
 
     def _add(self, channel: int, stamp: int, data: bytes, point: int) -> None:
         self._mcap.add_message(channel, log_time=stamp, publish_time=stamp, data=data, sequence=point & 0xFFFFFFFF)
@@ -183,7 +205,7 @@ class _RecordedTopic:
 
     def due(self, before: int, point: int) -> bool:
         """Whether one of the variables has a new value at ``point`` that it did not have at the point ``before``."""
-        return any(_has_passed(step, before, point) for step in self._steps)
+        return any(has_passed(step, before, point) for step in self._steps)
 
     def message(self, row: Sequence[Any], time: float) -> bytes:
         """The message of a row."""
@@ -194,9 +216,35 @@ class _RecordedTopic:
         return self._assembler.make(values, time)
 
 
-def _has_passed(step: int, before: int, point: int) -> bool:
-    """Whether one of the points after ``before``, up to ``point``, is a multiple of ``step``."""
-    return point // step > before // step
+def _recorded(recording: Recording, plan: RosPlan) -> RecordedMcap:
+    """Where the columns are in the file, for those who read it."""
+    topics = [
+        TopicColumns(
+            topic.name,
+            tuple(sorted({port.step_points for port in topic.ports})),
+            tuple(
+                (port.path, tuple(f"{port.instance}.{name}" for name in port.variable.elements)) for port in topic.ports
+            ),
+        )
+        for topic in plan.topics
+    ]
+    if plan.clock_points is not None:
+        topics.append(TopicColumns(_CLOCK_TOPIC, (plan.clock_points,)))
+    columns = []
+    for (instance, name), (column, type_) in zip(recording.recorded, recording.columns, strict=True):
+        variable = recording.descriptions[instance].variable_of(name)
+        assert variable is not None  # the system is valid
+        columns.append(RecordedColumn(column, type_, variable.unit))
+    simulation = recording.loaded.config.simulation
+    return RecordedMcap(
+        simulation.start_time,
+        simulation.step_size,
+        plan.types.distribution,
+        tuple(columns),
+        tuple(topics),
+        recording.first,
+        recording.every,
+    )
 
 
 def _topics(recording: Recording, findings: Findings) -> RosPlan | None:

@@ -1,0 +1,75 @@
+"""Where the columns of a run are in its MCAP: what its metadata records say.
+
+`fmu_mesh` has the metadata of the run as JSON under `metadata`, and a `RecordedMcap` under `recording`; each
+`fmu_mesh.note` has what was noted later, under `entry`; `fmu_mesh.rows` at the end has the number of rows.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import msgspec
+
+from ...variables.value_types import VariableType
+from ..messages.definitions import Distribution
+
+__all__ = ["NOTE", "RECORDING", "ROWS", "RecordedColumn", "RecordedMcap", "TopicColumns", "has_passed"]
+
+RECORDING: Final = "fmu_mesh"
+NOTE: Final = "fmu_mesh.note"
+ROWS: Final = "fmu_mesh.rows"
+
+
+class RecordedColumn(msgspec.Struct, frozen=True):
+    """One column of a recording: `instance.variable`, its type, and its unit."""
+
+    name: str
+    type: VariableType
+    unit: str | None = None
+
+
+class TopicColumns(msgspec.Struct, frozen=True):
+    """The columns of one topic.
+
+    Attributes:
+        name: of the topic.
+        steps: it has a message in every row with the first point after a multiple of one of these.
+        fields: the columns that each field has, by its path; of an array those of all elements.
+    """
+
+    name: str
+    steps: tuple[int, ...]
+    fields: tuple[tuple[str, tuple[str, ...]], ...] = ()
+
+
+class RecordedMcap(msgspec.Struct, frozen=True):
+    """Where the columns of a run are in its MCAP.
+
+    Attributes:
+        start_time: time of point 0 in s.
+        step_size: from one point to the next, in s.
+        distribution: of ROS; it defines the message types.
+        columns: all of them, in order.
+        topics: all of them; also those without columns, such as `/clock`.
+        first: point of the first row.
+        every: number of points from row to row.
+    """
+
+    start_time: float
+    step_size: float
+    distribution: Distribution
+    columns: tuple[RecordedColumn, ...]
+    topics: tuple[TopicColumns, ...]
+    first: int = 0
+    every: int = 1
+
+    def is_due(self, topic: TopicColumns, row: int) -> bool:
+        """Whether a topic has a message in a row."""
+        point = self.first + row * self.every
+        before = point - self.every if row else -1
+        return any(has_passed(step, before, point) for step in topic.steps)
+
+
+def has_passed(step: int, before: int, point: int) -> bool:
+    """Whether one of the points after ``before``, up to ``point``, is a multiple of ``step``."""
+    return point // step > before // step

@@ -1,0 +1,159 @@
+"""Reads the columns of a run back from the messages of its MCAP."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from mcap.records import Channel, McapRecord, Message, Schema
+from numpy.typing import NDArray
+
+from ...errors import ConfigurationError
+from ...simtime import ENDLESS, TimeGrid
+from ...system.recording import Columns
+from ...variables.value_types import DTYPES, VariableType, is_text
+from ..messages.cdr import CdrError, Codec
+from ..messages.definitions import Basic, MessageTypes, path_parts
+from .mcap_layout import RecordedMcap, TopicColumns
+from .mcap_records import McapContent
+
+__all__ = ["read_mcap"]
+
+_CDR_HEADER: Final = 4
+_NUMBERS: Final = (
+    "bool",
+    "float32",
+    "float64",
+    *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)),
+)
+
+
+def read_mcap(path: Path) -> Columns:
+    """Read the columns of a run; of a file without its end the rows that are complete.
+
+    Raises:
+        ConfigurationError: it is not the MCAP of a run.
+        OSError: it cannot be read.
+    """
+    with path.open("rb") as file:
+        content = McapContent(file, path)
+        recording = content.recording
+        rows = content.rows if content.rows is not None else content.whole_rows()[0]
+        reader = _ColumnReader(recording)
+        try:
+            for chunk in content.chunks:
+                for record in content.records_of(chunk):
+                    reader.take(record)
+            return reader.columns(rows)._replace(metadata=content.metadata)
+        except (CdrError, KeyError, ValueError, TypeError, IndexError) as error:
+            raise ConfigurationError(f"'{path}' is no result file: {error}.") from error
+
+
+class _ColumnReader:
+    """Collects the values of the columns from the records of all chunks.
+
+    Args:
+        recording: which column is where.
+    """
+
+    def __init__(self, recording: RecordedMcap) -> None:
+        self._recording = recording
+        self._types = MessageTypes(recording.distribution)
+        self._schemas: dict[int, str] = {}
+        self._topics = {topic.name: topic for topic in recording.topics}
+        self._channels: dict[int, _ChannelReader] = {}
+
+    def take(self, record: McapRecord) -> None:
+        """Take the next record."""
+        match record:
+            case Message():
+                if record.channel_id in self._channels:
+                    self._channels[record.channel_id].add(record)
+            case Schema():
+                self._types.define(record.name, record.data.decode())
+                self._schemas[record.id] = record.name
+            case Channel() if record.topic in self._topics:
+                topic = self._topics[record.topic]
+                self._channels[record.id] = _ChannelReader(topic, self._types, self._schemas[record.schema_id])
+
+    def columns(self, rows: int) -> Columns:
+        """The columns of the first rows."""
+        first, every = self._recording.first, self._recording.every
+        grid = TimeGrid(self._recording.start_time, self._recording.step_size, ENDLESS)
+        times = grid.times(first, first + rows * every)[::every]
+        found: dict[str, NDArray[Any]] = {}
+        types = {column.name: column.type for column in self._recording.columns}
+        for channel in self._channels.values():
+            found |= channel.columns(times, types, first, every)
+        columns = self._recording.columns
+        values = {column.name: found[column.name] for column in columns}
+        return Columns(times, values, {column.name: column.unit for column in columns if column.unit is not None})
+
+
+class _ChannelReader:
+    """Collects the values of one topic."""
+
+    def __init__(self, topic: TopicColumns, types: MessageTypes, message: str) -> None:
+        self._fields = [(path_parts(path), columns) for path, columns in topic.fields]
+        self._codec = Codec(types, message)
+        self._plain = _plain_dtype(types, message) if [path for path, _ in topic.fields] == ["data"] else None
+        self._points: list[int] = []
+        self._stamps: list[int] = []
+        self._data: list[bytes] = []
+
+    def add(self, message: Message) -> None:
+        """Take the next message."""
+        self._points.append(message.sequence)
+        self._stamps.append(message.log_time)
+        self._data.append(message.data)
+
+    def columns(
+        self, times: NDArray[np.float64], types: dict[str, VariableType], first: int, every: int
+    ) -> dict[str, NDArray[Any]]:
+        """Its columns, in which a value holds until the next message; corrects ``times`` where its stamps differ."""
+        own = (np.array(self._points, np.int64) - first) // every
+        known = own < len(times)
+        stamps = np.array(self._stamps, np.float64)[known] / 1e9
+        wrong = np.abs(times[own[known]] - stamps) > 1e-9 + np.spacing(stamps)
+        times[own[known][wrong]] = stamps[wrong]
+        held = np.searchsorted(own, np.arange(len(times)), side="right") - 1
+        found: dict[str, NDArray[Any]] = {}
+        if self._plain is not None:
+            [(_, (name,))] = self._fields
+            values = np.frombuffer(b"".join(self._data), self._plain)["data"]
+            return {name: values.astype(DTYPES[types[name]])[held]}
+        messages = [self._codec.decode(data) for data in self._data]
+        for path, names in self._fields:
+            found |= _field_columns([_value(message, path) for message in messages], names, types, held)
+        return found
+
+
+def _field_columns(
+    values: list[Any], names: Sequence[str], types: dict[str, VariableType], held: NDArray[np.int64]
+) -> dict[str, NDArray[Any]]:
+    """The columns of one field: of an array one for each element."""
+    type_ = types[names[0]]
+    if is_text(type_):
+        texts = np.empty(len(values), object)
+        texts[:] = [value if isinstance(value, str) else np.asarray(value, np.uint8).tobytes() for value in values]
+        return {names[0]: texts[held]}
+    table = np.array(values).reshape(len(values), len(names)).astype(DTYPES[type_])
+    return {name: table[held, place] for place, name in enumerate(names)}
+
+
+def _value(message: Any, path: Sequence[str | int]) -> Any:  # noqa: ANN401  any field
+    for part in path:
+        message = message[part]
+    return message
+
+
+def _plain_dtype(types: MessageTypes, message: str) -> np.dtype[Any] | None:
+    """How numpy reads messages that have a single number, such as std_msgs/msg/Float64; None for others."""
+    match types.fields(message):
+        case (("data", Basic(kind)),) if kind in _NUMBERS:
+            number = np.dtype(kind)
+            size = _CDR_HEADER + number.itemsize
+            return np.dtype({"names": ["data"], "formats": [number], "offsets": [_CDR_HEADER], "itemsize": size})
+    return None

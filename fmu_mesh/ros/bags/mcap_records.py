@@ -1,0 +1,334 @@
+"""What is in the MCAP of a run, also without its end; finishes it after its writer was killed.
+
+A run writes messages in chunks, in the order of their rows; the sequence number of a message is the number of its row.
+`mcap_layout` says which metadata records there are.
+
+Only this module knows the records of MCAP; writing a file that is not interrupted is up to `mcap.writer`.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import struct
+import zlib
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import BinaryIO, Final
+
+import msgspec
+from mcap.data_stream import ReadDataStream, RecordBuilder
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import (
+    Channel,
+    Chunk,
+    ChunkIndex,
+    DataEnd,
+    Footer,
+    McapRecord,
+    Message,
+    MessageIndex,
+    Metadata,
+    MetadataIndex,
+    Schema,
+    Statistics,
+    SummaryOffset,
+)
+from mcap.stream_reader import breakup_chunk
+
+from ...errors import ConfigurationError
+from ...files import Kept
+from ...system.recording import with_notes
+from .mcap_layout import NOTE, RECORDING, ROWS, RecordedMcap
+
+__all__ = ["McapContent", "finish_mcap"]
+
+_MAGIC: Final = b"\x89MCAP0\r\n"
+_HEAD: Final = struct.Struct("<BQ")
+
+
+def finish_mcap(path: Path, kept: Kept) -> int:
+    """Cut a file off after its last whole row, and write its end; return the number of its rows.
+
+    Args:
+        path: the file; nobody is writing it any more. If it has its end, it stays as it is.
+        kept: rows that are known to be there.
+
+    Raises:
+        ConfigurationError: it is not the MCAP of a run.
+        OSError: it cannot be written.
+    """
+    with path.open("r+b") as file:
+        if not os.fstat(file.fileno()).st_size:
+            return 0
+        content = McapContent(file, path)
+        if content.rows is not None:
+            return content.rows
+        rows, changed = content.whole_rows()
+        if not rows:
+            file.truncate(0)
+            return 0
+        rows = max(rows, kept.rows)
+        _write_end(file, content, rows, changed)
+    return rows
+
+
+class _PlacedChunk:
+    """A chunk, and the message indexes that follow it.
+
+    Attributes:
+        offset: of the chunk in the file.
+        length: of its record.
+        chunk: without its data.
+        compressed_size: of its data.
+        indexes: the offset of the message index of each channel.
+        index_length: of all of these records.
+        counts: the number of messages of each channel.
+    """
+
+    def __init__(self, offset: int, length: int, chunk: Chunk) -> None:
+        self.offset = offset
+        self.length = length
+        self.compressed_size = len(chunk.data)
+        self.chunk = replace(chunk, data=b"")
+        self.indexes: dict[int, int] = {}
+        self.index_length = 0
+        self.counts: dict[int, int] = {}
+
+    def add(self, index: MessageIndex, offset: int, length: int) -> None:
+        """Add the next message index."""
+        self.indexes[index.channel_id] = offset
+        self.index_length += length
+        self.counts[index.channel_id] = len(index.records)
+
+
+class McapContent:
+    """The complete records of an MCAP that a run has written, or is writing.
+
+    Args:
+        file: open for reading.
+        path: for errors.
+
+    Attributes:
+        file: the file.
+        chunks: the complete ones.
+        notes: (offset, length, metadata record) of each.
+        rows: the number of rows; None if the file has no end.
+        recording: which column is where.
+        metadata: of the run, with what was noted.
+
+    Raises:
+        ConfigurationError: it is not the MCAP of a run.
+    """
+
+    def __init__(self, file: BinaryIO, path: Path) -> None:
+        self.file = file
+        self.chunks: list[_PlacedChunk] = []
+        self.notes: list[tuple[int, int, Metadata]] = []
+        self._is_finished = False
+        self._size = os.fstat(file.fileno()).st_size
+        file.seek(0)
+        if file.read(len(_MAGIC)) != _MAGIC:
+            raise ConfigurationError(f"'{path}' is no result file: it does not begin as an MCAP does.")
+        try:
+            for offset, opcode, length in self._heads():
+                self._look(offset, opcode, length)
+            records = [(note.name, note.metadata) for _, _, note in self.notes]
+            about = next((record for name, record in records if name == RECORDING), None)
+            if about is None:
+                hint = "Was it recorded by this version? `fmu-mesh play` reads all bags."
+                text = f"'{path}' is no result file: it does not say which variables are in its topics."
+                raise ConfigurationError(text, hint=hint)
+            self.recording = msgspec.json.decode(about["recording"], type=RecordedMcap)
+            entries = [msgspec.json.decode(record["entry"]) for name, record in records if name == NOTE]
+            self.metadata = with_notes(msgspec.json.decode(about["metadata"]), entries)
+            rows = [int(record["rows"]) for name, record in records if name == ROWS]
+            self.rows = rows[-1] if rows and self._is_finished else None
+        except (McapError, struct.error, KeyError, ValueError) as error:
+            raise ConfigurationError(f"'{path}' is no result file: {error}.") from error
+
+    def records_of(self, placed: _PlacedChunk) -> list[McapRecord]:
+        """The schemas, channels and messages of a chunk."""
+        self.file.seek(placed.offset + _HEAD.size)
+        chunk = Chunk.read(_stream(self.file.read(placed.length - _HEAD.size)))
+        return breakup_chunk(chunk, validate_crc=True)
+
+    def whole_rows(self) -> tuple[int, int]:
+        """The number of whole rows, and the index of the first chunk that has messages of another one."""
+        names: dict[int, str] = {}
+        if self.chunks:
+            first = self.records_of(self.chunks[0])
+            names = {record.id: record.topic for record in first if isinstance(record, Channel)}
+        last: int | None = None
+        there: set[str] = set()
+        changed = index = len(self.chunks)
+        while index:
+            index -= 1
+            messages = [record for record in self.records_of(self.chunks[index]) if isinstance(record, Message)]
+            last = messages[-1].sequence if last is None else last
+            own = [message for message in messages if message.sequence == last]
+            there |= {names[message.channel_id] for message in own}
+            changed = index if own else changed
+            if len(own) < len(messages):
+                break
+        if last is None:
+            return 0, 0
+        row = (last - self.recording.first) // self.recording.every
+        if there == {topic.name for topic in self.recording.topics if self.recording.is_due(topic, row)}:
+            return row + 1, len(self.chunks)
+        return row, changed
+
+    def _heads(self) -> Iterator[tuple[int, int, int]]:
+        """Offset, opcode and length of every complete record of the data."""
+        offset = len(_MAGIC)
+        while offset + _HEAD.size <= self._size:
+            self.file.seek(offset)
+            opcode, length = _HEAD.unpack(self.file.read(_HEAD.size))
+            if opcode == Opcode.DATA_END:
+                self.file.seek(-len(_MAGIC), os.SEEK_END)
+                self._is_finished = self.file.read() == _MAGIC
+                return
+            if offset + _HEAD.size + length > self._size:
+                return
+            yield offset, opcode, _HEAD.size + length
+            offset += _HEAD.size + length
+
+    def _look(self, offset: int, opcode: int, length: int) -> None:
+        if opcode == Opcode.CHUNK:
+            self.chunks.append(_PlacedChunk(offset, length, Chunk.read(self._record(length))))
+        elif opcode == Opcode.MESSAGE_INDEX:
+            self.chunks[-1].add(MessageIndex.read(self._record(length)), offset, length)
+        elif opcode == Opcode.METADATA:
+            self.notes.append((offset, length, Metadata.read(self._record(length))))
+
+    def _record(self, length: int) -> ReadDataStream:
+        """The content of the record whose head was read last."""
+        return _stream(self.file.read(length - _HEAD.size))
+
+
+def _write_end(file: BinaryIO, content: McapContent, rows: int, changed: int) -> None:
+    """Write the end of a file after its whole rows.
+
+    Args:
+        file: the file.
+        content: what is in it.
+        rows: the number of whole rows.
+        changed: index of the first chunk with messages of a row that is not whole.
+    """
+    # The last chunk is always written again: its message indexes may be missing.
+    first = min(changed, len(content.chunks) - 1)
+    records = [r for r in content.records_of(content.chunks[first]) if not isinstance(r, Message) or r.sequence < rows]
+    registered = [record for record in content.records_of(content.chunks[0]) if not isinstance(record, Message)]
+    kept, start = content.chunks[:first], content.chunks[first].offset
+    notes = [(offset, length, note) for offset, length, note in content.notes if offset < start]
+    later = [note for offset, _, note in content.notes if offset > start and note.name != ROWS]
+    file.seek(start)
+    file.truncate()
+    out = RecordBuilder()
+    if any(isinstance(record, Message) for record in records):
+        kept.append(_write_chunk(file, records))
+    for note in (*later, Metadata(ROWS, {"rows": str(rows)})):
+        offset = file.tell()
+        note.write(out)
+        notes.append((offset, out.count, note))
+        file.write(_taken(out))
+    DataEnd(0).write(out)
+    file.write(_taken(out))
+    _write_summary(file, registered, kept, notes)
+
+
+def _write_chunk(file: BinaryIO, records: Sequence[McapRecord]) -> _PlacedChunk:
+    """Write a chunk, and its message indexes."""
+    out = RecordBuilder()
+    indexes: dict[int, MessageIndex] = {}
+    for record in records:
+        if isinstance(record, Message):
+            index = indexes.setdefault(record.channel_id, MessageIndex(record.channel_id, []))
+            index.records.append((record.log_time, out.count))
+        record.write(out)
+    data = _taken(out)
+    stamps = [stamp for index in indexes.values() for stamp, _ in index.records]
+    chunk = Chunk("", data, max(stamps), min(stamps), zlib.crc32(data), len(data))
+    offset = file.tell()
+    chunk.write(out)
+    placed = _PlacedChunk(offset, out.count, chunk)
+    file.write(_taken(out))
+    for index in indexes.values():
+        offset = file.tell()
+        index.write(out)
+        placed.add(index, offset, out.count)
+        file.write(_taken(out))
+    return placed
+
+
+def _write_summary(
+    file: BinaryIO,
+    registered: Sequence[McapRecord],
+    chunks: Sequence[_PlacedChunk],
+    notes: Sequence[tuple[int, int, Metadata]],
+) -> None:
+    """Write what `mcap.writer` writes at the end: the summary, its offsets and the footer."""
+    schemas = [record for record in registered if isinstance(record, Schema)]
+    channels = [record for record in registered if isinstance(record, Channel)]
+    counts: Counter[int] = Counter()
+    for placed in chunks:
+        counts.update(placed.counts)
+    statistics = Statistics(
+        attachment_count=0,
+        channel_count=len(channels),
+        channel_message_counts=dict(counts),
+        chunk_count=len(chunks),
+        message_count=counts.total(),
+        message_end_time=max(placed.chunk.message_end_time for placed in chunks),
+        message_start_time=min(placed.chunk.message_start_time for placed in chunks),
+        metadata_count=len(notes),
+        schema_count=len(schemas),
+    )
+    groups: list[tuple[Opcode, Sequence[McapRecord]]] = [
+        (Opcode.SCHEMA, schemas),
+        (Opcode.CHANNEL, channels),
+        (Opcode.STATISTICS, [statistics]),
+        (Opcode.CHUNK_INDEX, [_chunk_index(placed) for placed in chunks]),
+        (Opcode.METADATA_INDEX, [MetadataIndex(offset, length, note.name) for offset, length, note in notes]),
+    ]
+    start, out, offsets = file.tell(), RecordBuilder(), []
+    for opcode, records in groups:
+        first = out.count
+        for record in records:
+            record.write(out)
+        offsets.append(SummaryOffset(opcode, start + first, out.count - first))
+    offsets_start = start + out.count
+    for offset in offsets:
+        offset.write(out)
+    summary = _taken(out)
+    crc = zlib.crc32(struct.pack("<BQQQ", Opcode.FOOTER, 20, start, offsets_start), zlib.crc32(summary))
+    Footer(start, offsets_start, crc).write(out)
+    file.write(summary + _taken(out) + _MAGIC)
+
+
+def _chunk_index(placed: _PlacedChunk) -> ChunkIndex:
+    chunk = placed.chunk
+    return ChunkIndex(
+        chunk_length=placed.length,
+        chunk_start_offset=placed.offset,
+        compression=chunk.compression,
+        compressed_size=placed.compressed_size,
+        message_end_time=chunk.message_end_time,
+        message_index_length=placed.index_length,
+        message_index_offsets=placed.indexes,
+        message_start_time=chunk.message_start_time,
+        uncompressed_size=chunk.uncompressed_size,
+    )
+
+
+def _stream(content: bytes) -> ReadDataStream:
+    return ReadDataStream(io.BytesIO(content))
+
+
+def _taken(out: RecordBuilder) -> bytes:
+    """What was written; afterwards nothing is."""
+    data: bytes = out.end()  # type: ignore[no-untyped-call]  # mcap leaves its type open
+    return data
