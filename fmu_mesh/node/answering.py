@@ -179,7 +179,9 @@ class Answers:
         ]
 
     def _from_rows(self, runner: Runner, wanted: list[tuple[str, Variable]]) -> tuple[list[tuple[str, Value]], int]:
-        """The values in the rows of the newest own step, and that step; values that only the FMU has are not included.
+        """The outputs in the rows of the newest own step, and that step; what only the FMU has is not included.
+
+        An input or a parameter that was set since then has its new value in the FMU only, also if it is recorded.
 
         The main thread steps meanwhile, and may overwrite this row of the ring with values of a later step. Then the
         values are read again; after a few attempts the main thread reads them.
@@ -188,7 +190,9 @@ class Answers:
         names = {*ring.layout.names}
         for _ in range(_LOOKS):
             step = runner.step
-            values = [(key, ring.value(step, v.name)) for key, v in wanted if v.name in names]
+            values = [
+                (key, ring.value(step, v.name)) for key, v in wanted if v.name in names and v.causality == "output"
+            ]
             if runner.step + 1 - step < ring.rows:
                 return values, step
         return [], runner.step

@@ -91,11 +91,18 @@ class Runner:
         self._position = Position()
 
     def bind(self) -> None:
-        """Bind the instance to its rows, and read the current outputs. Call after Initialization Mode."""
+        """Bind the instance to its rows, and read the current outputs. Call after Initialization Mode.
+
+        Between two steps, the row of the last one stays as it is: what was set since then belongs to the next row.
+        """
         connected = [target for source in self.sources for _, target, _, _ in source.transfer.columns]
         fill_unconnected(self.inputs, connected, self.instance.get_values)
         outputs = (self.outputs,) if self.watched is None else (self.outputs, self.watched)
+        slot = self.step & self.outputs.mask
+        row = [part[slot].copy() for part in self.outputs.parts] if self.outputs.has_row(self.step) else []
         self.instance.bind(self.inputs, outputs, self.grid, self.plan.step_points, self.step)
+        for part, kept in zip(self.outputs.parts, row, strict=False):
+            part[slot] = kept
         self._position.refit()
 
     def begin(self) -> None:

@@ -116,7 +116,8 @@ def ending_warnings(loaded: LoadedConfig, records: Sequence[RecordPlan], warning
         file = _path(loaded, section)
         if file is not None and str(file) in files and has_unknown_ending(file):
             found = f"'{section.file}', an ending of no installed format, so the file becomes a CSV"
-            warnings.add(f"{place}.file", found, f"a name ending in {' or '.join(result_endings())}")
+            endings = " or ".join(result_endings())
+            warnings.add(f"{place}.file", found, f"a name ending in {endings}; from version 0.3 on this is an error")
 
 
 def record_paths(loaded: LoadedConfig) -> dict[str, Path]:
@@ -288,17 +289,21 @@ def _matched(pattern: _Pattern, variables: Variables) -> list[tuple[str, Variabl
 def _nothing_matches(reference: str, pattern: _Pattern, place: str, variables: Variables, findings: Findings) -> None:
     """Say what a pattern that matches nothing may have been meant to be."""
     word, text = _parts(reference)
-    found = f"{shown(reference)}, which matches no {_WORDS[word]}"
-    others = [own for own in _PREFIXES if _matched(pattern._replace(causalities=_PREFIXES[own]), variables)]
-    if others:
-        expected = f"a pattern for {_WORDS[others[0]]}s, as its matches are"
-        findings.add(place, found, expected, f"{others[0]}:{text}")
-        return
     every = [(f"{instance}.{v.name}", v) for instance, own in variables.items() for v in (own or {}).values()]
-    texts = [name for name, v in every if is_text(v.type) and pattern.expression.fullmatch(name)]
     names = [name for name, v in every if v.causality in pattern.causalities and not is_text(v.type)]
-    near = nearest(re.sub(r"[*?]", "", text.removeprefix(_EXPRESSION)), names)
+    texts = [
+        name
+        for name, v in every
+        if v.causality in pattern.causalities and is_text(v.type) and pattern.expression.fullmatch(name)
+    ]
+    others = [own for own in _PREFIXES if _matched(pattern._replace(causalities=_PREFIXES[own]), variables)]
+    found = f"{shown(reference)}, which matches no {_WORDS[word]}"
     if texts:
         findings.add(place, found, "each String and Binary by its whole name", texts[0])
+    elif not names:
+        findings.add(place, found, f"another pattern: this mesh has no {_WORDS[word]}s with numbers")
+    elif others:
+        findings.add(place, found, f"a pattern for {_WORDS[others[0]]}s, as it matches some", f"{others[0]}:{text}")
     else:
+        near = nearest(re.sub(r"[*?]", "", text.removeprefix(_EXPRESSION)), names)
         findings.add(place, found, f"a pattern for one of {listed(names)}", near)

@@ -134,6 +134,8 @@ class MeshInfo(msgspec.Struct, frozen=True):
 
     Attributes:
         run: the id of the run, which all its internal keys contain.
+        result_file: the first result file; None if nothing is recorded.
+        result_files: all of them.
         shared_memory: the processes that exchange values, grants and progress through the memory of the master's host;
             all others do it through Zenoh. Empty until all nodes are ready.
     """
@@ -155,6 +157,7 @@ class MeshInfo(msgspec.Struct, frozen=True):
     pid: int
     host: str
     shared_memory: tuple[str, ...] = ()
+    result_files: tuple[str, ...] = ()
 
 
 class MeshStatus(msgspec.Struct, frozen=True):

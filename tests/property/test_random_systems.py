@@ -68,6 +68,10 @@ class Drawn(msgspec.Struct, frozen=True):
         steps: base points per own step.
         groups: number of the node of each instance.
         feedthrough: whether the initial Real output depends on the inputs.
+        recorded: whether `y` of every instance is recorded.
+        inputs: whether all inputs are recorded, too.
+        first: point of the first recorded row.
+        every: points from row to row.
     """
 
     algorithm: str
@@ -79,6 +83,9 @@ class Drawn(msgspec.Struct, frozen=True):
     pipes: tuple[Pipe, ...]
     recorded: bool
     seed: int
+    inputs: bool = False
+    first: int = 0
+    every: int = 1
 
 
 @st.composite
@@ -117,6 +124,9 @@ def systems(draw: st.DrawFn) -> Drawn:
         pipes=tuple(pipes),
         recorded=draw(st.booleans()),
         seed=draw(st.integers(0, 2**32)),
+        inputs=draw(st.booleans()),
+        first=draw(st.sampled_from([0, 0, 1, 5])),
+        every=draw(st.sampled_from([1, 1, 2, 7])),
     )
 
 
@@ -262,6 +272,9 @@ def planned(drawn: Drawn) -> Plan:
     ]
     inputs = {p: variable(f"u{p}", kind(pipe), "input", ()) for p, pipe in enumerate(drawn.pipes)}
     names = [name_of(i) for i in range(count)]
+    recorded = tuple((name, "y") for name in names)
+    if drawn.inputs:
+        recorded += tuple((name_of(pipe.target), f"u{p}") for p, pipe in enumerate(drawn.pipes))
     config = msgspec.convert(
         {
             "mesh": "random",
@@ -286,8 +299,8 @@ def planned(drawn: Drawn) -> Plan:
                     kind="co_simulation",
                     guid="{1}",
                     variables=(
-                        *(inputs[p] for p, pipe in enumerate(drawn.pipes) if pipe.target == i),
                         *outputs[i].values(),
+                        *(inputs[p] for p, pipe in enumerate(drawn.pipes) if pipe.target == i),
                     ),
                 ),
                 start_values={},
@@ -309,7 +322,7 @@ def planned(drawn: Drawn) -> Plan:
             )
             for p, pipe in enumerate(drawn.pipes)
         ),
-        records=(RecordPlan("none.csv", tuple((name, "y") for name in names)),) if drawn.recorded else (),
+        records=(RecordPlan("none.csv", recorded, drawn.first, drawn.every),) if drawn.recorded else (),
     )
     return make_plan(system, window=drawn.window)
 
@@ -331,6 +344,7 @@ class Mixer:
         self._initial: dict[str, Any] = {
             v.name: 0.0 for v in self.description.variables if v.causality == "input" and v.type == "Float64"
         }
+        self._inputs: dict[str, Any] = {v.name: 0 for v in self.description.variables if v.causality == "input"}
         self._rings: tuple[Ring, Ring] | None = None
 
     def enter_initialization(
@@ -343,10 +357,11 @@ class Mixer:
 
     def set_values(self, values: Mapping[str, Value]) -> None:
         self._initial.update({name: value for name, value in values.items() if name in self._initial})
+        self._inputs.update(values)
 
     def get_values(self, names: Sequence[str]) -> list[Value]:
         row = self._initial_row()
-        return [row[0] if name == "y" else row[1] for name in names]
+        return [self._inputs[name] if name in self._inputs else row[name != "y"] for name in names]
 
     def bind(self, inputs: Ring, outputs: Sequence[Ring], _grid: TimeGrid, _points: int, step: int = 0) -> None:
         self._rings = inputs, outputs[0]
@@ -359,6 +374,7 @@ class Mixer:
         slot = step & inputs.mask
         reals, integers = inputs.part("Float64")[slot].tolist(), inputs.part("Int32")[slot].tolist()
         self.rows.append(stepped(self.rows[-1], step, reals, integers))
+        self._inputs.update({name: inputs.value(step, name) for name in inputs.layout.names})
         self._write(step + 1)
 
     def close(self) -> None:
@@ -371,9 +387,8 @@ class Mixer:
     def _write(self, step: int) -> None:
         assert self._rings is not None
         outputs = self._rings[1]
-        slot = step & outputs.mask
-        outputs.part("Float64")[slot] = self.rows[-1][0]
-        outputs.part("Int32")[slot] = self.rows[-1][1]
+        for name in outputs.layout.names:
+            outputs.put(step, name, self._inputs[name] if name in self._inputs else self.rows[-1][name != "y"])
 
 
 def expected_of(drawn: Drawn, plan: Plan) -> list[list[Row]]:
@@ -509,11 +524,13 @@ def test_any_system_gives_the_reference_result_in_each_of_many_runs(library: boo
                 continue
             outcome = runs.run(run_plan, kept)
 
-            assert (outcome.point, outcome.rows) == (drawn.last_point, drawn.last_point + 1 if drawn.recorded else 0)
+            rows = len(range(drawn.first, drawn.last_point + 1, drawn.every)) if drawn.recorded else 0
+            assert (outcome.point, outcome.rows) == (drawn.last_point, rows)
             assert bits([opened[name_of(number)].rows for number in range(len(drawn.steps))]) == bits(expected)
             if drawn.recorded:
                 columns = [np.concatenate(parts) for parts in zip(*kept.columns, strict=True)]
-                assert_recorded(drawn, expected, columns)
+                delays = [connection.delay or 0 for connection in plan.connections]
+                assert_recorded(drawn, delays, expected, columns)
         runs.close()
 
 
@@ -564,6 +581,10 @@ def test_many_runs_end_where_a_run_point_by_point_ends(
             return error.instance, error.point, error.time
         return outcome.state, outcome.point, outcome.time, outcome.ended_by
 
+    def written() -> bytes | None:
+        """What is in the file, if a row was written."""
+        return file.read_bytes() if file.is_file() else None
+
     with pytest.MonkeyPatch.context() as patch, tempfile.TemporaryDirectory() as folder:
         if not library:
             patch.setattr(native, "library", None)
@@ -572,22 +593,39 @@ def test_many_runs_end_where_a_run_point_by_point_ends(
         file = Path(folder, "rows.csv")
         plan = with_file(plan, file)
         loaded = LoadedConfig(plan.system.config, Path())
-        expected = ended(LocalMesh(plan, open_instance=instance, loaded=loaded).run), file.read_bytes()
+        expected = ended(LocalMesh(plan, open_instance=instance, loaded=loaded).run), written()
         runs = RepeatedRuns(Path(folder), open_instance=instance)
         run_plan = RunPlan(loaded, Options(), plan, {})
         for _ in range(2):
             result = open_result(loaded, plan.system)
-            assert (ended(lambda result=result: runs.run(run_plan, result)), file.read_bytes()) == expected  # type: ignore[misc]  # the result of this loop
+            assert (ended(lambda result=result: runs.run(run_plan, result)), written()) == expected  # type: ignore[misc]  # the result of this loop
         runs.close()
     event("ended early" if len(expected[0]) == 3 or expected[0][3] is not None else "to the end")
 
 
-def assert_recorded(drawn: Drawn, expected: list[list[Row]], columns: list[NDArray[Any]]) -> None:
-    """The times, and then `y` of every instance at every point: it holds between its own points."""
-    points = range(drawn.last_point + 1)
+def assert_recorded(
+    drawn: Drawn, delays: Sequence[int], expected: list[list[Row]], columns: list[NDArray[Any]]
+) -> None:
+    """The times, then `y` of every instance, which holds between its own points, then the inputs.
+
+    An input has the value that the last own step used; what it has at the start, others look at.
+    """
+    points = range(drawn.first, drawn.last_point + 1, drawn.every)
+    if not points:
+        assert columns == []
+        return
     assert columns[0].tolist() == [point * STEP_SIZE for point in points]
-    for found, rows, own in zip(columns[1:], expected, drawn.steps, strict=True):
+    outputs, inputs = columns[1 : 1 + len(drawn.steps)], columns[1 + len(drawn.steps) :]
+    for found, rows, own in zip(outputs, expected, drawn.steps, strict=True):
         assert [y.hex() for y in found.tolist()] == [rows[point // own][0].hex() for point in points]
+    for p, found in enumerate(inputs):
+        pipe = drawn.pipes[p]
+        own, source = drawn.steps[pipe.target], drawn.steps[pipe.source]
+        for value, point in zip(found.tolist(), points, strict=True):
+            if step := point // own:
+                used = (step - 1) * own if delays[p] else step * own
+                assert value == scaled(pipe, expected[pipe.source][used // source])
+    assert len(inputs) == (len(drawn.pipes) if drawn.inputs else 0)
 
 
 @pytest.mark.parametrize("window", [1, 7, 256])

@@ -541,7 +541,7 @@ def test_all_findings_are_shown_together_with_earlier_ones_and_those_without_a_d
             pendulum="fmu: p.fmu, start_values: {q: 1}, step_size: 0.1",
             delay="fmu: d.fmu, start_values: {q: 1}, step_size: -1",
             connections="pendulum.q -> delay.q, pendulum.a -> delays.x",
-            rest="record: {variables: [pendulum.l, delay.q, x.y]}",
+            rest="record: {variables: [pendulum.q, delay.q, x.y]}",
         ),
         FILE,
     )

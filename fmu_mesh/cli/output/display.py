@@ -210,8 +210,6 @@ def stdout_as_stderr() -> Iterator[None]:
 
 def summary(plan: Plan, outcome: Outcome) -> list[str]:
     """The closing lines of a run; the last one is `20000 points in 1.234 s: 16207 points/s, real-time factor 32.4`."""
-    lines = []
-    if outcome.file is not None:
-        lines.append(f"result: {short_path(outcome.file)} ({outcome.rows} rows)")
+    lines = [f"result: {short_path(file)} ({rows} rows)" for file, rows in outcome.files]
     lines.append(summary_of(outcome, plan.grid.step_size))
     return lines

@@ -95,7 +95,7 @@ def mesh_info(info: MeshInfo) -> list[str]:
             ("real-time factor", f"{info.real_time_factor:g}" if info.real_time_factor else "as fast as possible"),
             ("instances", ", ".join(info.instances)),
             ("nodes", ", ".join(info.nodes)),
-            ("result file", info.result_file or "none"),
+            ("result files" if len(info.result_files) > 1 else "result file", ", ".join(info.result_files) or "none"),
             ("endpoints", ", ".join(info.endpoints)),
             ("shared memory", ", ".join(_PARTS.get(name, name) for name in info.shared_memory) or "not used"),
             ("master", f"process {info.pid} on {info.host}, fmu_mesh {info.version}"),

@@ -22,6 +22,13 @@ from .json_output import Failure, failure_of, print_json
 __all__ = ["RunReport", "RunReporter"]
 
 
+class ReportedFile(msgspec.Struct, frozen=True):
+    """A result file and its number of rows."""
+
+    file: str
+    rows: int
+
+
 class RunReport(msgspec.Struct, frozen=True):
     """The output of `launch --json` and `run --json`.
 
@@ -32,11 +39,12 @@ class RunReport(msgspec.Struct, frozen=True):
         point: the last point that all instances reached.
         time: the simulation time of that point in s.
         seconds: wall-clock time from the first grant to the last point in s.
-        rows: number of rows in the result file.
-        file: the result file; None if nothing was recorded.
+        rows: number of rows in the first result file.
+        file: the first result file; None if nothing was recorded.
         restarts: how often the run was started again.
         error: why it failed.
         ended_by: what ended the simulation before its last point although nothing failed.
+        files: all result files, each with its number of rows.
     """
 
     mesh: str | None
@@ -50,6 +58,7 @@ class RunReport(msgspec.Struct, frozen=True):
     restarts: int = 0
     error: Failure | None = None
     ended_by: ErrorReport | None = None
+    files: tuple[ReportedFile, ...] = ()
 
 
 class RunReporter:
@@ -109,4 +118,5 @@ class RunReporter:
             restarts=self._restarts,
             error=failure,
             ended_by=outcome.ended_by,
+            files=tuple(ReportedFile(*own) for own in outcome.files),
         )

@@ -6,6 +6,7 @@ Owns which topics a recording has, and how rows become messages. `fmu_mesh.ros.m
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from collections.abc import Set as AbstractSet
 from io import BufferedWriter
 from pathlib import Path
 from types import TracebackType
@@ -21,6 +22,7 @@ from ...config.mesh import RosConfig
 from ...errors import ConfigurationError
 from ...files import Kept, open_alone
 from ...system.recording import Columns, Recording
+from ...variables.model_description import ModelDescription
 from ...variables.value_types import nested
 from ..gateway.mapping import message_types
 from ..gateway.resolver import Resolver
@@ -274,7 +276,7 @@ def _topics(recording: Recording, findings: Findings) -> RosPlan | None:
     covered = {variable for topic in configured for variable in _variables(topic)}
     rest = replace(section, topics=[f"{i}.{v}" for i, v in recorded if (i, v) not in covered])
     own = Findings(str(loaded.file))
-    others = Resolver(config, rest, descriptions, types, own).plan().topics
+    others = Resolver(config, rest, _published(descriptions, wanted), types, own).plan().topics
     section_file = loaded.config.records[recording.place].file
     for finding in own:
         findings.add(f"{recording.place}.file", f"in '{section_file}': {finding.found}", finding.expected)
@@ -283,6 +285,22 @@ def _topics(recording: Recording, findings: Findings) -> RosPlan | None:
             f"{recording.place}.file", "an MCAP of times before 0, which it cannot hold", "a CSV file, or another start"
         )
     return replace(plan, topics=(*configured, *others))
+
+
+def _published(
+    descriptions: Mapping[str, ModelDescription], recorded: AbstractSet[tuple[str, str]]
+) -> dict[str, ModelDescription]:
+    """The model descriptions with all recorded variables as outputs: a bag publishes inputs and parameters, too."""
+    return {
+        instance: replace(
+            description,
+            variables=tuple(
+                replace(variable, causality="output") if (instance, variable.name) in recorded else variable
+                for variable in description.variables
+            ),
+        )
+        for instance, description in descriptions.items()
+    }
 
 
 def _whole(recording: Recording, findings: Findings) -> list[tuple[str, str]]:
