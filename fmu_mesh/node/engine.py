@@ -123,6 +123,7 @@ class BurstEngine(Engine):
         assert native.library is not None
         self._library = native.library
         self._kept: dict[tuple[int, int], list[object]] = {}
+        self._tracks: dict[tuple[int, int], list[object]] = {}
         self._members = [(native.MemberTable * len(unit))() for unit in units]
         self._units = table(native.UnitTable, [self._unit(number) for number in range(len(units))])
         self._peers = table(native.Peer, [native.Peer(counter.address, window) for counter, window in self._windows])
@@ -245,10 +246,22 @@ class BurstEngine(Engine):
             step=before.step,
             stage=before.stage,
             outcome=before.outcome,
-            python_at=_python_at(runner),
         )
         self._kept[unit, index] = [made, bases, own]  # what the table points to
         self._members[unit][index] = made
+        self._follow(unit, index)
+
+    def _follow(self, unit: int, index: int) -> None:
+        """Note in the table of a runner which step Python takes next, and what its inputs are in the steps before."""
+        runner, member = self._at(unit, index)
+        timed = runner.instance if isinstance(runner.instance, TimedInputs) else None
+        member.python_at = timed.python_at if timed is not None else NEVER
+        tracks = timed.tracks if timed is not None else []
+        addresses = [native.Track(values.ctypes.data, to) for to, values in tracks]
+        made = table(native.Track, addresses)
+        self._tracks[unit, index] = [made, tracks]  # what the table points to
+        member.tracks, member.n_tracks = made, len(addresses)
+        member.tracks_from = timed.tracks_from if timed is not None else 0
 
     def _at(self, unit: int, member: int) -> tuple[Runner, native.MemberTable]:
         return self.units[unit][member], self._members[unit][member]
@@ -261,7 +274,7 @@ class BurstEngine(Engine):
                 for source in runner.sources:
                     source.transfer.step_text(step)
                 runner.instance.do_step(step)
-                member.python_at = _python_at(runner)
+                self._follow(unit, self._node.member)
             else:
                 if divmod(member.outcome, 1 << STAGE_BITS) == (Stage.SETTING, OUT_OF_RANGE):
                     for source in runner.sources:
@@ -316,11 +329,6 @@ class _InTable(Position):
     def refit(self) -> None:
         """See `Position`."""
         self._fill()
-
-
-def _python_at(runner: Runner) -> int:
-    """The own step that Python has to take although those before it need no Python; `NEVER` if there is none."""
-    return runner.instance.python_at if isinstance(runner.instance, TimedInputs) else NEVER
 
 
 def _gate(source: Source) -> native.Gate:

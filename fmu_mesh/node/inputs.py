@@ -6,9 +6,12 @@ variables may be set.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Literal, cast
+
+import numpy as np
+from numpy.typing import NDArray
 
 from ..errors import FmuError
 from ..instances.call_guard import Guarded
@@ -29,6 +32,11 @@ from .stepping import Runner
 __all__ = ["TimedInputs", "set_input", "with_times"]
 
 _WAITING = 1 << 16
+_SOON = 64
+"""An input that changes within this many steps is calculated ahead."""
+
+_AHEAD = 4096
+"""Number of steps that inputs are calculated ahead."""
 
 
 class TimedInputs(AroundInstance[Instance]):
@@ -45,6 +53,8 @@ class TimedInputs(AroundInstance[Instance]):
 
     Attributes:
         python_at: the next own step that `do_step` has to take, because a value may change in it.
+        tracks: inputs that change in each step before it: where each lies in the row of inputs, and its values.
+        tracks_from: the own step of the first of these values.
     """
 
     def __init__(
@@ -55,6 +65,10 @@ class TimedInputs(AroundInstance[Instance]):
     ) -> None:
         super().__init__(instance)
         self.python_at = 0
+        self.tracks: list[tuple[int, NDArray[np.float64]]] = []
+        self.tracks_from = 0
+        self._in_row: dict[str, tuple[Callable[[int, Value], None], int]] = {}
+        self._tracked: list[str] = []
         self._set_in_step = instance.set_in_step if isinstance(instance, Guarded) else instance.set_values
         self._courses = courses
         self._linear = interpolation == "linear"
@@ -66,6 +80,11 @@ class TimedInputs(AroundInstance[Instance]):
 
     def bind(self, inputs: Ring, outputs: Sequence[Ring], grid: TimeGrid, points: int, step: int = 0) -> None:
         """Bind the inner instance. From now on there is a time."""
+        self._in_row.clear()
+        for name in self._courses.keys() & {*inputs.layout.names}:
+            place = inputs.layout.place(name)
+            self._in_row[name] = inputs.writer(name), inputs.address + inputs.place_in_row(place.part, place.first)
+            inputs.put(0, name, self._instance.get_values([name])[0])
         self._instance.bind(inputs, outputs, grid, points, step)
         self.start(grid, points, step)
 
@@ -73,12 +92,16 @@ class TimedInputs(AroundInstance[Instance]):
         """Start the time at own step ``step``; each own step has ``points`` points of ``grid``."""
         self._grid, self._points, self._step = grid, points, step
         self.python_at = step
+        self.tracks, self._tracked = [], []
 
     def do_step(self, step: int) -> None:
         """Set all values that change at the start of the step, then step the inner instance."""
         if step >= self.python_at:
             self._set_changes(step)
-            self.python_at = self._next_change(step + 1)
+            self._look_ahead(step + 1)
+        else:
+            for name, (_, values) in zip(self._tracked, self.tracks, strict=True):
+                self._in_row[name][0](0, float(values[step - self.tracks_from]))
         self._instance.do_step(step)
         self._step = step + 1
 
@@ -137,17 +160,43 @@ class TimedInputs(AroundInstance[Instance]):
         for name, value in changes.items():
             if name in self._trajectories:
                 self._trajectories[name].add(time, value)
+                if self._trajectories[name].after(time + self._grid_here.rounding(time)) is None:
+                    del self._trajectories[name]
+                    self._used.pop(name, None)
         for name, own in self._trajectories.items():
             value = own.value(time, self._grid_here.rounding(time))
             if self._used.get(name) != value:
                 changes[name] = value
-        if changes:
-            self._set_in_step(changes)
-            self._used.update((name, value) for name, value in changes.items() if name in self._trajectories)
+        for name in changes.keys() & self._in_row.keys():
+            self._in_row[name][0](0, changes[name])
+        if others := {name: value for name, value in changes.items() if name not in self._in_row}:
+            self._set_in_step(others)
+        self._used.update((name, value) for name, value in changes.items() if name in self._trajectories)
 
-    def _next_change(self, step: int) -> int:
-        """The first own step from ``step`` on in which a value may change; the step before it is taken."""
-        steps = [own.next_change(step) for own in self._courses.values()]
+    def _look_ahead(self, step: int) -> None:
+        """Find the step that Python takes next, and the values of inputs that change in each step before it."""
+        changes = {name: own.next_change(step) for name, own in self._courses.items()}
+        soon = [
+            name
+            for name, change in changes.items()
+            if change < step + _SOON
+            and name in self._in_row
+            and name not in self._trajectories
+            and self._courses[name].first_step <= step
+        ]
+        others = [change for name, change in changes.items() if name not in soon]
+        end = min([*others, self._next_sent(step), step + _AHEAD])
+        self.tracks, self._tracked, self.tracks_from = [], [], step
+        if not soon or end - step < _SOON:
+            self.python_at = min([*changes.values(), self._next_sent(step)])
+            return
+        self._tracked = soon
+        self.tracks = [(self._in_row[name][1], self._courses[name].values(step, end - step)) for name in soon]
+        self.python_at = end
+
+    def _next_sent(self, step: int) -> int:
+        """The first own step from ``step`` on in which a value that was sent may change."""
+        steps = []
         time = self._time(step - 1)
         for own in self._trajectories.values():
             later = own.after(time + self._grid_here.rounding(time))

@@ -80,7 +80,7 @@ class Runner:
         self.plan = plan
         self.name = plan.name
         self.instance = instance
-        self.inputs = Ring(plan.inputs, 1)
+        self.inputs = Ring(plan.input_row, 1)
         self.outputs = outputs
         self.counter = counter
         self.sources: list[Source] = []

@@ -108,6 +108,11 @@ typedef struct { /* what a model says in a step besides its status, and how far 
   int64_t step;       /* own steps done */
 } Said;
 
+typedef struct { /* an input with a value for each own step that the burst takes before python_at */
+  const double *values;
+  double *to; /* in the row of inputs */
+} Track;
+
 enum { BY_PYTHON, FMI1, FMI2, FMI3 };                                    /* Member.kind */
 enum { WAITING, SETTING, STEPPING, GETTING, IN_PYTHON, STEPPED };        /* Member.stage */
 enum { FIXED, OUTPUT, WATCHED, FIRST_GATE, MAX_GATES = 4096 };           /* bases */
@@ -130,6 +135,9 @@ typedef struct {
   int64_t every;  /* ticks of the unit per own step */
   int64_t last_step;
   int64_t python_at; /* the first own step that Python takes, whatever its kind */
+  Track *tracks;
+  int64_t n_tracks;
+  int64_t tracks_from; /* the own step of their first values */
   Output outputs[2]; /* the own ring; and outputs that somebody watches */
   Counter *counter;  /* rows of the own ring */
   char **bases;      /* room for the rows of the gates */
@@ -476,6 +484,8 @@ static inline int64_t call_step(Member *member, int64_t step) {
   const double end = time_of(member, step + 1);
   int status;
   member->stage = SETTING;
+  for (int64_t i = 0; i < member->n_tracks; i++)
+    *member->tracks[i].to = member->tracks[i].values[step - member->tracks_from];
   if ((status = move_all(member->loads, member->n_loads, bases)) != 0)
     return (int64_t)SETTING << STAGE_BITS | status;
   if (!(said->quiet_until > end)) return (int64_t)IN_PYTHON << STAGE_BITS;
@@ -829,7 +839,8 @@ PUBLIC void node_attended(Node *node) { atomic_store(&node->attention, 0); }
 /* Sizes of the structures, which Python compares with its own. */
 PUBLIC int64_t structure_sizes(int64_t *sizes) {
   const int64_t own[] = {sizeof(Place), sizeof(Gate), sizeof(Move), sizeof(Call), sizeof(Output),
-                         sizeof(Member), sizeof(Unit), sizeof(Peer), sizeof(Node), sizeof(Wish), sizeof(Said)};
+                         sizeof(Member), sizeof(Unit), sizeof(Peer), sizeof(Node), sizeof(Wish), sizeof(Said),
+                         sizeof(Track)};
   memcpy(sizes, own, sizeof own);
   return sizeof own / sizeof own[0];
 }

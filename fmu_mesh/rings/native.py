@@ -34,6 +34,7 @@ __all__ = [
     "Said",
     "Stage",
     "StepKind",
+    "Track",
     "UnitTable",
     "Wish",
     "library",
@@ -209,6 +210,12 @@ class Said(Structure):
         return bool(self.event_needed or self.terminate or self.early)
 
 
+class Track(Structure):
+    """An input with a value for each own step that the burst takes before `MemberTable.python_at`."""
+
+    _fields_ = (("values", c_void_p), ("to", c_void_p))
+
+
 class MemberTable(Structure):
     """One instance: how it gets its inputs, steps, and gives its outputs."""
 
@@ -234,6 +241,9 @@ class MemberTable(Structure):
         ("every", c_int64),
         ("last_step", c_int64),
         ("python_at", c_int64),
+        ("tracks", POINTER(Track)),
+        ("n_tracks", c_int64),
+        ("tracks_from", c_int64),
         ("outputs", OutputTable * 2),
         ("counter", c_void_p),
         ("bases", POINTER(c_void_p)),
@@ -333,7 +343,20 @@ def table(kind: Any, items: Sequence[Any]) -> Any:  # noqa: ANN401 ctypes has no
     return (kind * max(len(items), 1))(*items)
 
 
-_STRUCTURES: Final = (Participant, Gate, Move, Call, OutputTable, MemberTable, UnitTable, Peer, NodeTable, Wish, Said)
+_STRUCTURES: Final = (
+    Participant,
+    Gate,
+    Move,
+    Call,
+    OutputTable,
+    MemberTable,
+    UnitTable,
+    Peer,
+    NodeTable,
+    Wish,
+    Said,
+    Track,
+)
 
 
 class _Library:

@@ -216,6 +216,7 @@ class _SavedMember(NamedTuple):
     step: int
     set_at: int
     outputs: Rows
+    inputs: Rows
 
 
 class SavedSystem(NamedTuple):
@@ -237,7 +238,7 @@ class _Member:
         self.connections = [c for c in plan.connections if c.target_instance == name]
         self.instance = instance
         self._do_step = instance.do_step
-        self._inputs = Ring(self.plan.inputs, 1)
+        self._inputs = Ring(self.plan.input_row, 1)
         # A slower instance reads values that are as old as its own step.
         oldest = max(instance.step_points for instance in plan.system.instances.values())
         self._outputs = Ring(self.plan.outputs, 1 << (2 * oldest).bit_length())
@@ -279,8 +280,8 @@ class _Member:
     def bind(self, grid: TimeGrid, members: Mapping[str, _Member]) -> None:
         """Prepare `step_from`: what it needs at every point is looked up here, once."""
         self._courses = courses_of(self.plan.scenario, self.instance.description, grid, self._points)
-        arrays = [column.name for column in self.plan.inputs.columns if column.shape]
-        for name, value in zip(arrays, self.instance.get_values(arrays) if arrays else [], strict=True):
+        names = [column.name for column in self._inputs.layout.columns if column.shape or column.name in self._courses]
+        for name, value in zip(names, self.instance.get_values(names) if names else [], strict=True):
             self._inputs.put(0, name, value)  # elements that are not connected keep it
         self.instance.bind(self._inputs, (self._outputs,), grid, self.plan.step_points)
         for c in self.connections:
@@ -306,7 +307,7 @@ class _Member:
         if self._courses:
             changes = {name: course.change(step) for name, course in self._courses.items()}
             if prescribed := {name: value for name, value in changes.items() if value is not None}:
-                self.instance.set_in_step(prescribed)
+                self._give(prescribed)
         for read, points, lead, change, write in self._feeds:
             value = read((start + lead) // points)  # `CouplingRule.row_for`, without a call
             write(0, value if change is None else change(value))
@@ -333,17 +334,31 @@ class _Member:
         """See `LocalSystem.set`."""
         self._set_at = self.step
         self.instance.set_values({name: value})
+        if name in self._courses:
+            self._give({name: value})
+
+    def _give(self, values: Mapping[str, Value]) -> None:
+        """Give the next step values of the scenario, or of somebody instead of it: in the row of inputs, if it can."""
+        in_row = {*self._inputs.layout.names}
+        for name, value in values.items():
+            if name in in_row:
+                self._inputs.put(0, name, value)
+        if others := {name: value for name, value in values.items() if name not in in_row}:
+            self.instance.set_in_step(others)
 
     def save(self) -> _SavedMember:
         """See `LocalSystem.save`."""
         rows = tuple(part.copy() for part in self._outputs.parts)
-        return _SavedMember(self.instance.get_state(), self.step, self._set_at, rows)
+        inputs = tuple(part.copy() for part in self._inputs.parts)
+        return _SavedMember(self.instance.get_state(), self.step, self._set_at, rows, inputs)
 
     def restore(self, saved: _SavedMember) -> None:
-        """See `LocalSystem.restore`. The input row needs none: each step writes what is connected anew."""
+        """See `LocalSystem.restore`."""
         self.instance.set_state(saved.state)
         self.step, self._set_at = saved.step, saved.set_at
         for part, kept in zip(self._outputs.parts, saved.outputs, strict=True):
+            part[...] = kept
+        for part, kept in zip(self._inputs.parts, saved.inputs, strict=True):
             part[...] = kept
 
 

@@ -55,6 +55,7 @@ class InstancePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             decoded with the hook `fmu_mesh.instances.registry.decode_section`, because only that knows the kinds.
         linear_inputs: the inputs whose connections are extrapolated.
         scenario: what a scenario prescribes for its variables.
+        row: the inputs that are set in every step: ``inputs``, and the Float64 inputs of the scenario.
     """
 
     name: str
@@ -68,6 +69,12 @@ class InstancePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     section: InstanceSection
     linear_inputs: tuple[LinearInput, ...] = ()
     scenario: tuple[Schedule, ...] = ()
+    row: Layout | None = None
+
+    @property
+    def input_row(self) -> Layout:
+        """The inputs that are set in every step."""
+        return self.row if self.row is not None else self.inputs
 
 
 class Link(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -394,7 +401,17 @@ def _instance_plan(plan: Plan, instance: SystemInstance, outputs: Layout) -> Ins
         section=placed(plan.system.config.instances[instance.name]),
         linear_inputs=linear_inputs(plan.connections, instance.name),
         scenario=instance.scenario,
+        row=_row(instance, connected),
     )
+
+
+def _row(instance: SystemInstance, connected: set[str]) -> Layout | None:
+    """The inputs that are set in every step; None if these are the connected ones."""
+    driven = {schedule.variable for schedule in instance.scenario}
+    variables = instance.description.variables
+    driven = {v.name for v in variables if v.name in driven and v.causality == "input" and not v.shape}
+    driven = {v.name for v in variables if v.name in driven and v.type == "Float64"}
+    return Layout.of(v for v in variables if v.name in connected | driven) if driven else None
 
 
 def _links(plan: Plan) -> tuple[Link, ...]:

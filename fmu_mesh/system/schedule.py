@@ -11,6 +11,8 @@ from bisect import bisect_left, bisect_right
 from collections.abc import Sequence
 
 import msgspec
+import numpy as np
+from numpy.typing import NDArray
 
 from ..simtime import ENDLESS, TimeGrid
 from ..variables.model_description import Value
@@ -107,6 +109,7 @@ class Course:
         self._values: list[Value] = []
         self._steps: list[int] = []
         """The first own step that begins at each time or later."""
+        self._arrays: tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]] | None = None
         for time, value in zip(times, values, strict=True):
             step = grid.step_at(time, points, tolerance)
             last = self._times[-1] if self._times else None
@@ -132,6 +135,28 @@ class Course:
         if start >= time - self._grid.rounding(time):
             return value
         return between(value, self._values[place + 1], min((time - start) / (end - start), 1.0))
+
+    def values(self, first: int, count: int) -> NDArray[np.float64]:
+        """The prescribed values for ``count`` own steps from ``first`` on, bit for bit those of `value`; of a Float64.
+
+        ``first`` is not before `first_step`.
+        """
+        if self._arrays is None:
+            self._arrays = np.array(self._steps), np.array(self._times), np.array(self._values, np.float64)
+        own_steps, own_times, own_values = self._arrays
+        steps = np.arange(first, first + count)
+        place = np.searchsorted(own_steps, steps, side="right") - 1
+        values: NDArray[np.float64] = own_values[place]
+        if not self._linear:
+            return values
+        following = np.minimum(place + 1, len(own_values) - 1)
+        right, start, end = own_values[following], own_times[place], own_times[following]
+        times = self._grid.start_time + (steps * self._points).astype(np.float64) * self._grid.step_size
+        rounding = 8 * np.spacing(np.maximum(abs(self._grid.start_time), np.abs(times)))
+        equal = (values.view(np.int64) == right.view(np.int64)) | (np.isnan(values) & np.isnan(right))
+        with np.errstate(all="ignore"):  # where two times are equal, the line is not used
+            line = values + (right - values) * np.minimum((times - start) / (end - start), 1.0)
+        return np.where(equal | (following == place) | (start >= times - rounding), values, line)
 
     def change(self, step: int) -> Value | None:
         """The value to set before an own step; None if the prescribed value is that of the step before it."""

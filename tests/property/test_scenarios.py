@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from fractions import Fraction
-from typing import Any
+from typing import Any, cast
 
 import msgspec
 import numpy as np
@@ -15,6 +15,7 @@ from hypothesis import HealthCheck, event, given, settings
 from hypothesis import strategies as st
 
 import fmu_mesh
+from fmu_mesh.node import inputs
 from fmu_mesh.rings import native
 from fmu_mesh.simtime import ENDLESS, TimeGrid
 from fmu_mesh.system.schedule import Course
@@ -158,6 +159,15 @@ def without_library() -> Iterator[None]:
         yield
 
 
+@contextmanager
+def little_ahead() -> Iterator[None]:
+    """Inputs are calculated only a few steps ahead, so that it happens often in a short run."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(inputs, "_SOON", 2)
+        patch.setattr(inputs, "_AHEAD", 5)
+        yield
+
+
 @given(drawn_scenarios())
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 def test_every_way_of_running_gives_the_floats_of_a_loop_over_fmpy(drawn: Drawn) -> None:
@@ -169,10 +179,16 @@ def test_every_way_of_running_gives_the_floats_of_a_loop_over_fmpy(drawn: Drawn)
         in_c = [rows_of(runs.run()) for _ in range(2)]
     with without_library(), mesh.repeated() as runs:
         in_python = rows_of(runs.run())
+    with little_ahead():
+        with mesh.repeated() as runs:
+            ahead = [rows_of(runs.run())]
+        with without_library(), mesh.repeated() as runs:
+            ahead.append(rows_of(runs.run()))
 
     assert local == bits(expected_of(drawn))
     assert in_c == [local, local]
     assert in_python == local
+    assert ahead == [local, local]
 
 
 @given(drawn_scenarios(), st.integers(1, 4))
@@ -224,6 +240,9 @@ def test_next_change_misses_no_change_and_change_tells_when_the_value_differs(
         due = next((other for other in changing if other >= step), ENDLESS)
         assert step <= course.next_change(step) <= due
     assert course.value(math.ceil(max(first, Fraction(0)) / points)) is not None
+    start = course.first_step
+    ahead = course.values(start, 40).tolist()
+    assert all(same(value, cast("float", course.value(start + n))) for n, value in enumerate(ahead))
     held: Any = course.value(0) if initial else None
     for step in range(40):
         value = course.change(step)

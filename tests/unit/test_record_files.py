@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import errno
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +43,9 @@ class ListFile:
             if len(self.lines) >= self._room:
                 raise OSError(errno.ENOSPC, "No space left on device")
             self.lines.append(row)
+
+    def note(self, entry: Mapping[str, Any]) -> None:
+        self.calls.append(f"note {entry}")
 
     def flush(self) -> None:
         self.calls.append("flush")
