@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from ..errors import ConfigurationError, UnknownName
+from ..errors import CallRefused, ConfigurationError, UnknownName
+from ..instances.python.unit_names import base_unit_of
 from ..run.outcome import Outcome
 from ..run.run_plan import RunPlan
 from ..system.system import ResolvedSystem
-from ..text import listed
+from ..text import listed, short_path
 from ..variables.model_description import Variable
+from ..variables.units import BaseUnit
 from ..variables.value_types import VariableType, is_float
+from .comparison import Comparison, Side, compared
 from .drawing import FLAGS, VALUE, Curve, figure_of
 from .result_reading import Columns, chosen_names, read_csv
 
@@ -134,6 +138,46 @@ class Result(Mapping[str, NDArray[Any]]):
         curves = {name: self._curve(*self._variables[name]) for name in chosen if name in self._variables}
         return figure_of(columns, title if title is not None else self.title, curves)
 
+    def compare(
+        self, other: Result, *, rtol: float = 0.0, atol: float = 0.0, variables: Sequence[str] = ()
+    ) -> Comparison:
+        """Compare with another result, by default bit for bit; NaN equals NaN, and -0.0 equals 0.0.
+
+        Two numbers are equal if `|a - b| <= atol + rtol * max(|a|, |b|)`. If the results have different times, the rows
+        at times that both have are compared. If not all times of one are in the other, the other result is interpolated
+        at the times of this one. Values in other units are converted, if both units are known.
+
+        Example:
+            >>> import fmu_mesh
+            >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
+            >>> one = mesh.run(record="memory", stop_time=1.0)
+            >>> print(one.compare(mesh.run(record="memory", stop_time=1.0, processes=False)))
+            this result and the other one are equal: 2 variables, 501 rows
+            >>> assert one.compare(one, variables=["pendulum.*"])
+
+        Args:
+            other: the other result.
+            rtol: relative tolerance.
+            atol: absolute tolerance, in the unit of each variable.
+            variables: names, or patterns such as `motor.*`; default: all of both.
+
+        Returns:
+            The comparison, which is true if the results are equal.
+
+        Raises:
+            ConfigurationError: neither of them has such a variable.
+            CallRefused: a tolerance is no number of 0 or more.
+        """
+        for name, tolerance in (("rtol", rtol), ("atol", atol)):
+            if not tolerance >= 0.0:
+                raise CallRefused(f"{name} is {tolerance!r}, and a tolerance is a number of 0 or more")
+        here, there = self._side, other._side
+        if here.title == there.title:
+            here, there = here._replace(title="this result"), there._replace(title="the other one")
+        names = chosen_names(f"{here.title}' or '{there.title}", [*dict.fromkeys([*self, *other])], variables)
+        comparison = compared(here, there, names, rtol=rtol, atol=atol)
+        return replace(comparison, drawn=lambda chosen: self.plot(*chosen, others=(other,), difference=True))
+
     def __getitem__(self, name: str) -> NDArray[Any]:
         """The values of one variable, one per row; elements of arrays are variables of their own, such as `a.y[1,2]`.
 
@@ -164,6 +208,33 @@ class Result(Mapping[str, NDArray[Any]]):
         if self.file is None or (self.outcome is not None and not self.outcome.rows):
             return Columns(np.zeros(0), {name: np.zeros(0) for name in self._variables})
         return read_csv(self.file, types_of(self._system))
+
+    @property
+    def _side(self) -> Side:
+        """This result, as it is compared with another one."""
+        return Side(
+            str(short_path(self.file)) if self.file is not None else self.title,
+            self.times,
+            [*self],
+            self._columns.values.__getitem__,
+            self._unit,
+            self._base_unit,
+            self._point,
+        )
+
+    def _base_unit(self, name: str) -> BaseUnit | None:
+        """The unit of a variable in SI base units: as its model defines it, or by its usual name."""
+        if name in self._variables and (defined := self._variables[name][1].base_unit) is not None:
+            return defined
+        unit = self._unit(name)
+        return base_unit_of(unit) if unit is not None else None
+
+    def _point(self, row: int) -> int:
+        """The communication point of a row; its number, counted from 0, where a file does not say more."""
+        if self._system is None:
+            return row
+        grid = self._system.grid
+        return round((float(self.times[row]) - grid.start_time) / grid.step_size)
 
     def _unit(self, name: str) -> str | None:
         return self._variables[name][1].unit if name in self._variables else None
