@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from .adapter import FMIAdapter
     from .api.attaching import attach, meshes
+    from .api.comparison import Comparison
     from .api.inspection import Inspection, inspect
     from .api.mesh_builder import Mesh, load
     from .api.mesh_check import Check
@@ -48,6 +49,7 @@ if TYPE_CHECKING:
 __all__ = [
     "CallRefused",
     "Check",
+    "Comparison",
     "Component",
     "ConfigurationError",
     "DeadlineExceeded",
@@ -91,6 +93,7 @@ __all__ = [
 _PLACES = {
     "FMIAdapter": "adapter",
     "Check": "api.mesh_check",
+    "Comparison": "api.comparison",
     "Mesh": "api.mesh_builder",
     "load": "api.mesh_builder",
     "Component": "instances.python.component",

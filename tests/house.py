@@ -293,6 +293,7 @@ ALLOWED: dict[str, dict[str, str]] = {
     "importers_of_kinds": {
         "fmu_mesh: fmu_mesh.instances.python": "what a component derives from is public",
         "fmu_mesh.api.mesh_builder: fmu_mesh.instances.python": "a program gives a class, not the place of a class",
+        "fmu_mesh.api.result: fmu_mesh.instances.python": "a file has units by the names that components use",
         "fmu_mesh.adapter.adapter: fmu_mesh.instances.fmi": "FMIAdapter is one FMU, by what it promises",
         "fmu_mesh.api.inspection: fmu_mesh.instances.fmi": "`inspect` shows what is in an .fmu file",
     },

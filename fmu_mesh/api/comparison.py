@@ -19,7 +19,15 @@ from .tables import shortened, table
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["Comparison", "FirstDifference", "Side", "VariableDifference", "compared"]
+__all__ = [
+    "Comparison",
+    "FirstDifference",
+    "Side",
+    "VariableDifference",
+    "compared",
+    "differences_of",
+    "values_in_unit_of",
+]
 
 Rows = Literal["same", "common", "interpolated"]
 
@@ -278,6 +286,21 @@ def compared(here: Side, there: Side, names: Sequence[str], *, rtol: float = 0.0
     )
 
 
+def differences_of(
+    here: Side, there: Side, names: Sequence[str]
+) -> dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]:
+    """By variable that both have, the compared times in s, and the values here minus those there."""
+    pair = _Pair(here, there, _matched(here.times, there.times), 0.0, 0.0)
+    rows = pair.matching.here
+    found = {}
+    for name in names:
+        if name in here.columns and name in there.columns and _conversion(pair.here, pair.there, name)[1] is not None:
+            own, other = here.values(name)[rows], _values_there(pair, name)
+            if object not in (own.dtype, other.dtype):
+                found[name] = here.times[rows], own.astype(np.float64) - other.astype(np.float64)
+    return found
+
+
 # --- rows
 
 
@@ -331,7 +354,7 @@ def _nearest(times: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray
 def _difference(pair: _Pair, name: str) -> tuple[VariableDifference | None, int | None]:
     """How a variable differs, None if not at all; and the first of the compared rows beyond the tolerance."""
     here, matching = pair.here, pair.matching
-    unit, (note, change) = here.unit(name), _conversion(pair, name)
+    unit, (note, change) = here.unit(name), _conversion(pair.here, pair.there, name)
     times = here.times[matching.here]
     own, other = here.values(name)[matching.here], _values_there(pair, name)
     if change is None or (own.dtype == object) != (other.dtype == object):
@@ -365,10 +388,7 @@ def _difference(pair: _Pair, name: str) -> tuple[VariableDifference | None, int 
 def _values_there(pair: _Pair, name: str) -> NDArray[Any]:
     """The values of the other result at the compared times, in the unit of this one."""
     there, matching = pair.there, pair.matching
-    values = there.values(name)
-    change = _conversion(pair, name)[1]
-    if change is not None and not change.identity and values.dtype != object:
-        values = change.factor * values + change.offset
+    values = values_in_unit_of(pair.here, there, name)
     if matching.there is not None:
         return values[matching.there]
     times = pair.here.times[matching.here]
@@ -380,9 +400,18 @@ def _values_there(pair: _Pair, name: str) -> NDArray[Any]:
     return np.where(is_same, held, np.interp(times, there.times, values))
 
 
-def _conversion(pair: _Pair, name: str) -> tuple[str, Linear | None]:
+def values_in_unit_of(here: Side, there: Side, name: str) -> NDArray[Any]:
+    """The values of a variable there, in the unit that it has here; as they are if that is not known."""
+    values = there.values(name)
+    change = _conversion(here, there, name)[1] if name in here.columns else None
+    if change is None or change.identity or values.dtype == object:
+        return values
+    converted: NDArray[Any] = change.factor * values + change.offset
+    return converted
+
+
+def _conversion(here: Side, there: Side, name: str) -> tuple[str, Linear | None]:
     """A note, and the conversion of the values there; None for units that cannot be converted."""
-    here, there = pair.here, pair.there
     unit, other = here.unit(name), there.unit(name)
     if unit is None or other is None or unit == other:
         return "", Linear()
@@ -402,7 +431,7 @@ def _first(pair: _Pair, row: int, name: str) -> FirstDifference:
     one = pair._replace(matching=matching._replace(here=matching.here[row : row + 1], there=other_place))
     own, other = here.values(name)[place], _values_there(one, name)[0]
     is_number = not any(isinstance(value, str | bytes) for value in (own, other))
-    has_difference = is_number and _conversion(pair, name)[1] is not None
+    has_difference = is_number and _conversion(pair.here, pair.there, name)[1] is not None
     return FirstDifference(
         float(here.times[place]),
         here.point(place),
