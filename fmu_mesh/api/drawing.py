@@ -43,16 +43,16 @@ __all__ = [
 MAX_POINTS = 4000
 """Points per line: more than twice the width of the picture in pixels would not be visible."""
 PALETTE = (
-    "#0072b2",
-    "#d55e00",
+    "#0057a0",
+    "#e8890c",
+    "#7a1f6b",
+    "#29a3a3",
     "#222222",
-    "#cc79a7",
-    "#007a5a",
-    "#e69f00",
+    "#d1495b",
     "#56b4e9",
-    "#7a3e9d",
-    "#8c8c8c",
-    "#6b3f1d",
+    "#6b4a1f",
+    "#9a9a9a",
+    "#3d6b35",
 )
 """Colours that are told apart by the colour-blind; neighbours differ in their brightness as well."""
 COLOURS = len(PALETTE)

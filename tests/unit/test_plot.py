@@ -22,12 +22,13 @@ from numpy.typing import NDArray
 from fmu_mesh.api.drawing import reduced
 from fmu_mesh.api.result import Result
 from fmu_mesh.api.result_drawing import Curves, Picture, figure_of
-from fmu_mesh.api.result_reading import read_csv
+from fmu_mesh.api.result_reading import Columns, read_csv
 from fmu_mesh.cli.main import main
 from fmu_mesh.cli.plotting import plot_results, plotted_where_it_ends
 from fmu_mesh.errors import ConfigurationError, StepFailed
 from fmu_mesh.run.preparing import prepare
 from fmu_mesh.system.plan import Plan
+from fmu_mesh.variables.model_description import Variability
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 
@@ -259,6 +260,20 @@ def test_a_unit_that_says_that_there_is_none_is_no_label(tmp_path: Path, unit: s
     assert "<!-- y -->" in drawn
     assert " in -" not in drawn
     assert " in 1" not in drawn
+
+
+@pytest.mark.parametrize(("variability", "style"), [("continuous", "default"), ("discrete", "steps-post")])
+def test_a_float_that_only_changes_at_events_is_drawn_in_steps(variability: Variability, style: str) -> None:
+    system = prepare(CONFIGS / "pendulum_delay.yaml").system
+    own = system.instances["delay"]
+    variables = tuple(replace(variable, variability=variability) for variable in own.description.variables)
+    own = replace(own, description=replace(own.description, variables=variables))
+    system = replace(system, instances={**system.instances, "delay": own})
+    columns = Columns(np.arange(2.0), {"pendulum.a": np.ones(2), "delay.y": np.ones(2)})
+
+    (axes,) = Result("drawn", system=system, columns=columns).plot("delay.y").axes
+
+    assert [line.get_drawstyle() for line in axes.lines] == [style]
 
 
 def drawn_of(columns: Mapping[str, Sequence[float]]) -> Figure:
