@@ -12,6 +12,7 @@ from typing import Literal, NamedTuple
 import msgspec
 
 from .graph_layout import Arrangement, Dot, Wire, arranged
+from .result_drawing import in_unit
 from .tables import shortened
 
 __all__ = [
@@ -427,7 +428,7 @@ def _tip(edge: GraphEdge, variable: GraphVariable) -> str:
 
 
 def _port_text(name: str, unit: str) -> str:
-    return shortened(name, 18) + (f" in {shortened(unit, 10)}" if unit and unit != "1" else "")
+    return in_unit(shortened(name, 24), shortened(unit, 12))
 
 
 def _row_y(row: int, *, is_live: bool) -> float:

@@ -47,9 +47,15 @@ _AXES_INCHES = (8.4, 2.8)
 """Width, and least height, of axes with their labels in inches."""
 _FEW_AXES = 40
 """More axes than this are lower."""
+_NOTE_POINTS = 9.0
+"""Size of the font of an annotation."""
+_FRAME = 4.0
+"""How far the frame of an annotation, and what is free around it, is from its text in points."""
+_BESIDE = tuple((across * x, up * y) for x, y in ((16.0, 9.0), (8.0, 20.0)) for across in (1, -1) for up in (1, -1))
+"""Where an annotation may stand, in points from its place; or several times as far."""
 _PHASE_POINTS = 20_000
 """Points of a line over another variable, of which no section can be left out."""
-_LABEL_CHARACTERS = 28
+_LABEL_NAMES, _LABEL_CHARACTERS = 2, 28
 _SUPERSCRIPTS = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
 _UNIT_NAMES = {"degC": "°C", "degF": "°F", "deg": "°", "Ohm": "Ω"}
 _DIMENSIONLESS = ("", "1", "-")
@@ -182,11 +188,12 @@ class _Drawer:
         several = len(self._results) if len(self._results) > 1 else 0
         heights = [max(least, 0.4 + 0.18 * legend_rows(len(panel.names) + several)) for panel in panels]
         heights = [0.7 * h if panel.is_difference else h for h, panel in zip(heights, panels, strict=True)]
+        heights[0] += (1.0 if len(panels) == 1 else 0.0) + (1.6 if self._picture.x is not None else 0.0)
         all_axes = self._figure.subplots(len(panels), 1, sharex=True, squeeze=False, height_ratios=heights)[:, 0]
         all_axes[0].set_title(short(self._picture.title), fontweight="bold", parse_math=False)
         legend_width = 0.0
-        for axes, panel in zip(all_axes, panels, strict=True):
-            lines = self._draw_panel(axes, panel)
+        for axes, panel, own_height in zip(all_axes, panels, heights, strict=True):
+            lines = self._draw_panel(axes, panel, own_height)
             axes.label_outer()
             if lines:
                 legend = add_legend(axes, *self._legend(panel, lines))
@@ -196,8 +203,7 @@ class _Drawer:
             short(in_unit(x, self._curve(x).unit)) if x is not None else "time in s", parse_math=False
         )
         width = _AXES_INCHES[0] if x is None else 0.75 * _AXES_INCHES[0]
-        height = 1.2 + sum(heights) + (1.0 if len(panels) == 1 else 0.0) + (1.6 if x is not None else 0.0)
-        self._figure.set_size_inches(width + legend_width, height)
+        self._figure.set_size_inches(width + legend_width, 1.2 + sum(heights))
 
     # --- panels
 
@@ -213,12 +219,15 @@ class _Drawer:
         return panels
 
     def _label(self, key: str, names: Sequence[str]) -> str:
-        """What the vertical axis is: the variable, if there is one name, and its unit."""
+        """What the vertical axis is: the variables, if one or two names say it, and their unit."""
         if key == FLAGS:
             return FLAGS
-        own = ", ".join(dict.fromkeys(name.partition(".")[2] or name for name in names))
-        what = own if own and len(own) <= _LABEL_CHARACTERS and own.count(",") < 2 else "value"
-        return in_unit(what, "" if key == NUMBERS else key)
+        of_instances = [name.partition(".")[2] or name for name in names]
+        last = [name if "(" in name else name.rpartition(".")[2] for name in of_instances]
+        for found in (dict.fromkeys(of_instances), dict.fromkeys(last)):
+            if 0 < len(found) <= _LABEL_NAMES and len(text := ", ".join(found)) <= _LABEL_CHARACTERS:
+                return in_unit(text, "" if key == NUMBERS else key)
+        return in_unit("value", "" if key == NUMBERS else key)
 
     def _curve(self, name: str) -> Curve:
         """How a variable is drawn; without more knowledge, as its type says."""
@@ -229,8 +238,8 @@ class _Drawer:
 
     # --- lines
 
-    def _draw_panel(self, axes: Axes, panel: _Panel) -> list[Line2D]:
-        """Draw the lines of one axes; returns one for each variable."""
+    def _draw_panel(self, axes: Axes, panel: _Panel, height: float) -> list[Line2D]:
+        """Draw the lines of one axes, ``height`` inches high; returns one for each variable."""
         first: dict[str, Line2D] = {}
         below = self._lines_below(panel) if len(self._results) == 1 else []
         for order, result in enumerate(self._results):
@@ -262,7 +271,7 @@ class _Drawer:
         if not any(len(result.times) for result in self._results):
             axes.text(0.5, 0.5, "no points were recorded", ha="center", va="center", transform=axes.transAxes)
         elif not panel.is_difference:
-            self._annotate(axes, panel)
+            self._annotate(axes, panel, height)
         return [first[name] for name in panel.names if name in first]
 
     def _data(
@@ -309,30 +318,86 @@ class _Drawer:
             for number, row in enumerate(table)
         ]
 
-    def _annotate(self, axes: Axes, panel: _Panel) -> None:
-        """Write texts at places of the first result."""
-        result = self._results[0]
+    def _annotate(self, axes: Axes, panel: _Panel, height: float) -> None:
+        """Write texts at places of the first result, where they cover few lines."""
+        result, x = self._results[0], self._picture.x
+        room = _Room(axes, (_AXES_INCHES[0] if x is None else 0.75 * _AXES_INCHES[0]) - 0.8, height - 0.3)
         for (time, name), text in self._picture.annotations.items():
             if name not in panel.names or name not in result.values or not len(result.times):
                 continue
             row = int(np.abs(result.times - time).argmin())
-            x = self._picture.x
             place = (
                 float(result.times[row] if x is None else result.values[x][row]),
                 float(result.values[name].astype(np.float64)[row]),
             )
-            low, high = axes.get_ylim()
-            is_high = place[1] > 0.5 * (low + high)
+            offset = room.offset(place, text)
             axes.plot(*place, marker="o", markersize=4.5, color="black", linestyle="none", zorder=4)
             axes.annotate(
                 text,
                 place,
-                xytext=(14.0, 9.0 if is_high else -9.0),
+                xytext=offset,
                 textcoords="offset points",
-                va="bottom" if is_high else "top",
-                fontsize=9,
+                ha="left" if offset[0] > 0.0 else "right",
+                va="bottom" if offset[1] > 0.0 else "top",
+                fontsize=_NOTE_POINTS,
                 parse_math=False,
                 bbox={"boxstyle": "round,pad=0.2", "facecolor": "white", "edgecolor": "0.6", "linewidth": 0.6},
                 arrowprops={"arrowstyle": "-", "color": "0.3", "linewidth": 0.8},
                 zorder=5,
             )
+
+
+class _Room:
+    """Where a text beside a point covers few lines; all lengths are in points, from the lower left corner of the axes.
+
+    Args:
+        axes: the axes, with all lines.
+        width: about their width in inches; ``height`` likewise.
+    """
+
+    def __init__(self, axes: Axes, width: float, height: float) -> None:
+        self._limits = axes.get_xlim(), axes.get_ylim()
+        self._size = 72.0 * width, 72.0 * height
+        self._taken: list[tuple[float, float, float, float]] = []
+        self._lines = [
+            self._placed(np.asarray(line.get_xdata(), np.float64), np.asarray(line.get_ydata(), np.float64))
+            for line in axes.lines
+        ]
+        axes.set(xlim=self._limits[0], ylim=self._limits[1])
+
+    def _placed(self, x: Any, y: Any) -> Any:  # noqa: ANN401  numbers or arrays
+        (left, right), (low, high) = self._limits
+        return np.stack([(x - left) / (right - left) * self._size[0], (y - low) / (high - low) * self._size[1]])
+
+    def offset(self, place: tuple[float, float], text: str) -> tuple[float, float]:
+        """From the point to the nearest corner of its text, in points."""
+        x, y = self._placed(*place)
+        width, height = 0.62 * _NOTE_POINTS * len(text) + 6.0, 1.6 * _NOTE_POINTS
+        rectangles = {}
+        for distance in (1.0, 2.0, 3.5, 5.0):
+            for across, up in _BESIDE:
+                dx, dy = distance * across, distance * up
+                left, low = x + dx - (width if dx < 0.0 else 0.0), y + dy - (height if dy < 0.0 else 0.0)
+                rectangles[dx, dy] = left, low, left + width, low + height
+        best = min(rectangles, key=lambda offset: self._cost(rectangles[offset]))
+        self._taken.append(rectangles[best])
+        return best
+
+    def _cost(self, rectangle: tuple[float, float, float, float]) -> int:
+        """How much a text covers there; the first and so nearest place of several with the same cost is taken."""
+        left, low, right, high = (
+            rectangle[0] - _FRAME,
+            rectangle[1] - _FRAME,
+            rectangle[2] + _FRAME,
+            rectangle[3] + _FRAME,
+        )
+        is_outside = left < 0.0 or low < 0.0 or right > self._size[0] or high > self._size[1]
+        cost = 10_000 * is_outside
+        cost += 1_000 * sum(
+            left < other[2] and other[0] < right and low < other[3] and other[1] < high for other in self._taken
+        )
+        for xs, ys in self._lines:
+            across = (np.minimum(xs[1:], xs[:-1]) < right) & (np.maximum(xs[1:], xs[:-1]) > left)
+            up = (np.minimum(ys[1:], ys[:-1]) < high) & (np.maximum(ys[1:], ys[:-1]) > low)
+            cost += int((across & up).any())
+        return cost

@@ -62,6 +62,8 @@ def test_an_axis_has_a_name_and_a_unit(unit: str, label: str) -> None:
         (["p.a", "q.a", "r.a"], "a in rad"),
         (["p.a", "q.b"], "a, b in rad"),
         (["p.a", "p.b", "p.c"], "value in rad"),
+        (["w.left.position", "w.right.position", "v.up.position"], "position in rad"),
+        (["p.der(a.b)", "p.der(c.b)", "p.d"], "value in rad"),
         (["p." + "x" * 30], "value in rad"),
     ],
 )
