@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from .api.mesh_builder import Mesh, load
     from .api.mesh_check import Check
     from .api.open_system import System, SystemState
+    from .api.recovering import recover
+    from .api.rerunning import rerun
     from .api.result import Result
     from .api.run_handle import Run
     from .api.samples import Sample
@@ -87,6 +89,8 @@ __all__ = [
     "inspect",
     "load",
     "meshes",
+    "recover",
+    "rerun",
     "sweep",
 ]
 
@@ -101,6 +105,8 @@ _PLACES = {
     "Output": "instances.python.declarations",
     "Parameter": "instances.python.declarations",
     "Result": "api.result",
+    "recover": "api.recovering",
+    "rerun": "api.rerunning",
     "Run": "api.run_handle",
     "Range": "sweeps.variants",
     "Sample": "api.samples",

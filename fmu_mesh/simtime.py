@@ -43,6 +43,33 @@ class TimeGrid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         times: NDArray[np.float64] = self.start_time + np.arange(first, end, dtype=np.float64) * self.step_size
         return times
 
+    def step_at(self, time: float, points: int = 1, tolerance: float = 0.0) -> int:
+        """The first own step that begins at ``time`` (s) or later: 0 for the past, `ENDLESS` beyond all runs.
+
+        Example:
+            >>> grid = TimeGrid(start_time=1.0, step_size=0.1, last_point=60)
+            >>> grid.step_at(1.3), grid.step_at(1.31), grid.step_at(1.3, points=2)  # 1.0 + 3 * 0.1 is not 1.3
+            (3, 4, 2)
+
+        Args:
+            time: in s.
+            points: points per own step.
+            tolerance: times that differ by this much (s) are equal. Those that differ by rounding always are.
+        """
+        exact = (time - self.start_time) / (points * self.step_size)
+        if not exact > 0.0:
+            return 0
+        if exact >= ENDLESS:
+            return ENDLESS
+        near = round(exact)
+        if abs(self.time(near * points) - time) <= max(tolerance, self.rounding(time)):
+            return near
+        return math.ceil(exact)
+
+    def rounding(self, time: float) -> float:
+        """Largest difference in s of two equal times: the rounding of one multiplication and one addition."""
+        return 8 * math.ulp(max(abs(self.start_time), abs(time)))
+
     @property
     def stop_time(self) -> float | None:
         """The time of the last point in s; None for a run without a stop time."""

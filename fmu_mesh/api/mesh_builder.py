@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Self, Unpack, cast
@@ -23,7 +23,7 @@ from ..run.preparing import KnownModels, planned
 from ..run.run_plan import RunPlan
 from ..text import listed, shown
 from .mesh_check import Check
-from .plan_options import PlanOptions, RunOptions, StartOptions, options_of, plain
+from .plan_options import PlanOptions, RunOptions, StartOptions, options_of, plain, with_record, with_scenario
 from .run_handle import Run
 
 if TYPE_CHECKING:
@@ -236,15 +236,55 @@ class Mesh:
         connections = self._data.setdefault("connections", [])
         connections.append(plain({"from": source, "to": target, **keys}))
 
-    def record(self, *variables: str, file: str | Path | None = None) -> None:
+    def record(self, *variables: str, file: str | Path | None = None, also: bool = False, **keys: Any) -> None:  # noqa: ANN401  as the file has it
         """Choose what is recorded, and into which file.
 
+        Example:
+            >>> import fmu_mesh
+            >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
+            >>> mesh.record("pendulum.a", "in:delay.*", file="results/all.csv")
+            >>> mesh.record("pendulum.a", file="results/slow.csv", every=100, also=True)
+            >>> [result.names for result in mesh.run(stop_time=1.0).all]
+            [['pendulum.a', 'delay.x'], ['pendulum.a']]
+
         Args:
-            variables: outputs as `instance.variable`; all outputs if none is named.
+            variables: variables as `instance.variable`, or patterns; all outputs if none is named.
             file: the result file; None leaves the one of the configuration.
+            also: whether this is one more result file, or the first one is changed.
+            keys: any other key of the section in a configuration file; the key `from` is ``start``.
         """
-        section = self._section("record")
-        section.update(plain({"variables": list(variables) or None} | ({"file": file} if file is not None else {})))
+        keys = {"file": file, **keys}
+        self._data["record"] = with_record(self._data.get("record", {}), variables, keys, also=also)
+
+    def scenario(
+        self,
+        values: Mapping[str, Any] | None = None,
+        events: Sequence[Mapping[str, Any]] = (),
+        *,
+        file: str | Path | None = None,
+    ) -> None:
+        """Say what inputs and tunable parameters get while the mesh runs; adds to what was said before.
+
+        Example:
+            >>> import fmu_mesh
+            >>> mesh = fmu_mesh.Mesh("gain", step_size=0.5, stop_time=2.0)
+            >>> mesh.add("gain", fmu="fmus/Gain.fmu")
+            >>> mesh.scenario({"gain.u": {"times": [0, 1], "values": [1, 3], "interpolation": "linear"}})
+            >>> mesh.scenario(events=[{"at": 1.5, "set": {"gain.k": 10.0}}])
+            >>> mesh.run(record="memory", processes=False)["gain.y"].tolist()
+            [1.0, 1.0, 2.0, 3.0, 30.0]
+
+        Args:
+            values: by `instance.variable`: a constant, or a mapping with times and values, or with a file.
+            events: mappings with a time in s (``at``) and the values from then on (``set``), by `instance.variable`.
+            file: a file with `values` and `events`, in the place of everything that was said before.
+        """
+        if file is not None:
+            self._data["scenario"] = plain(Path(file))
+            return
+        section = self._section("scenario")
+        section["values"] = {**section.get("values", {}), **plain(dict(values or {}))}
+        section["events"] = [*section.get("events", ()), *plain(list(events))]
 
     def configure(self, **sections: Any) -> None:  # noqa: ANN401  as the file has it
         """Set keys of other sections of the configuration, or of the top level.
@@ -326,7 +366,8 @@ class Mesh:
             hint = 'Write `if __name__ == "__main__":` before what the program does.'
             raise ConfigurationError(f"mesh '{self.name}' would run while '{place}' is imported", hint=hint)
         chosen = options_of(options)
-        data = with_config_values(self._plain._replace(file=self._shown_file), chosen.config_values)
+        values = with_scenario(self._plain._replace(file=self._shown_file), options)
+        data = with_config_values(values, chosen.config_values)
         loaded, findings = examine_data(data, chosen.start_values)
         return planned(loaded, findings, chosen, options.get("on_notice", log.info), self._known)
 

@@ -9,6 +9,7 @@ from typing import Any, Literal, TypedDict
 import msgspec
 import numpy as np
 
+from ..config.loading import PlainConfig
 from ..errors import CallRefused
 from ..recorder.arrays_file import ENDING
 from ..run.events import Event
@@ -18,7 +19,17 @@ from ..text import shown
 from ..wire.runtime import run_name, runtime_folder
 from ..wire.views import MeshStatus
 
-__all__ = ["PlanOptions", "RunOptions", "StartOptions", "memory_of", "options_of", "plain", "texts_of"]
+__all__ = [
+    "PlanOptions",
+    "RunOptions",
+    "StartOptions",
+    "memory_of",
+    "options_of",
+    "plain",
+    "texts_of",
+    "with_record",
+    "with_scenario",
+]
 
 _MEMORY = "memory."
 
@@ -30,6 +41,7 @@ class PlanOptions(TypedDict, total=False):
         record: "memory" keeps the results as arrays, without a file.
         output: the result file; its ending chooses the format.
         start_values: start values by `instance.variable`; or texts as `--set` has them.
+        scenario: values of inputs and tunable parameters over time: a file, or a mapping with the keys of such a file.
         config_values: values of any keys by their path, such as `{"simulation.window": 16}`; or texts as `--set-config`
             has them.
         algorithm: "jacobi" or "gauss_seidel".
@@ -53,6 +65,7 @@ class PlanOptions(TypedDict, total=False):
     record: Literal["memory"] | None
     output: str | Path | None
     start_values: Mapping[str, Any] | Sequence[str]
+    scenario: str | Path | Mapping[str, Any] | None
     config_values: Mapping[str, Any] | Sequence[str]
     algorithm: str | None
     step_size: float | None
@@ -106,13 +119,24 @@ def options_of(given: PlanOptions) -> Options:
             raise CallRefused('`output` and `record="memory"` exclude each other')
         fields["output"] = _memory_file()
     fields["profile"] = Path() if fields.get("profile") is True else fields.get("profile") or None
-    for name in ("output", "video"):
+    if isinstance(fields.get("scenario"), Mapping):
+        fields.pop("scenario")  # `with_scenario` takes it
+    for name in ("output", "video", "scenario"):
         fields[name] = Path(fields[name]) if fields.get(name) is not None else None
     for name, what in (("start_values", "start value"), ("config_values", "value")):
         fields[name] = texts_of(fields.get(name, ()), what)
     for name in ("listen", "connect"):
         fields[name] = tuple(fields.get(name, ()))
     return Options(**fields)
+
+
+def with_scenario(values: PlainConfig, given: PlanOptions) -> PlainConfig:
+    """The values of a configuration with the scenario that a program gives as a mapping; unchanged without one."""
+    scenario = given.get("scenario")
+    if not isinstance(scenario, Mapping) or not isinstance(values.data, dict):
+        return values
+    lines = {path: line for path, line in values.lines.items() if path.partition(".")[0] != "scenario"}
+    return values._replace(data={**values.data, "scenario": plain(scenario)}, lines=lines)
 
 
 def texts_of(values: Mapping[str, object] | Sequence[str], what: str) -> tuple[str, ...]:
@@ -126,6 +150,24 @@ def texts_of(values: Mapping[str, object] | Sequence[str], what: str) -> tuple[s
         except (TypeError, msgspec.MsgspecError) as error:
             raise CallRefused(f"the {what} of '{name}' is {shown(value)}: {error}", variable=name) from error
     return tuple(texts)
+
+
+def with_record(section: Any, variables: Sequence[str], keys: Mapping[str, Any], *, also: bool) -> Any:  # noqa: ANN401  as a file has it
+    """The section `record` with another first file, or with one more.
+
+    Args:
+        section: what it was: a mapping or a list of mappings.
+        variables: what the file gets; all outputs if there are none.
+        keys: other keys of its section; None leaves what the section says.
+        also: whether it is one more file.
+    """
+    given = {"from" if key == "start" else key: plain(value) for key, value in keys.items() if value is not None}
+    given["variables"] = list(variables) or None
+    sections = section if isinstance(section, list) else [section]
+    if also:
+        return [*sections, given]
+    changed = {**(sections[0] if sections and isinstance(sections[0], dict) else {}), **given}
+    return [changed, *sections[1:]] if isinstance(section, list) else changed
 
 
 def plain(value: Any) -> Any:  # noqa: ANN401  whatever a program gives

@@ -8,9 +8,12 @@ from ..rings.library import library_missed, why_no_library
 from ..system.grouping import automatic_nodes
 from ..system.initialization_plan import Loop
 from ..system.plan import Plan
+from ..system.records import RecordPlan
+from ..system.series_files import course_of
 from ..system.system import Connection, SystemInstance
 from ..text import listed, short_number, short_path, shown
 from ..variables.model_description import Variable
+from ..variables.value_conversion import to_plain
 from .tables import pairs, table
 
 __all__ = ["plan_page", "slower_than_it_could_be"]
@@ -26,6 +29,7 @@ def plan_page(plan: Plan) -> list[str]:
         ("Connections", _connections(plan)),
         ("Execution order within one point", _order(plan)),
         ("Groups", _groups(plan)),
+        ("Scenario", _scenario(plan)),
         ("Inputs that are not connected", _free_inputs(plan)),
         ("Initialization", _initialization(plan)),
         ("Recorded", _recorded(plan)),
@@ -104,6 +108,7 @@ def _connections(plan: Plan) -> list[str]:
 def _free_inputs(plan: Plan) -> list[str]:
     """Inputs that keep their start values unless they are set: a forgotten connection is visible here."""
     connected = {(c.target_instance, c.target.name) for c in plan.connections}
+    connected |= {(name, own.variable) for name, item in plan.system.instances.items() for own in item.scenario}
     lines = []
     for name, instance in plan.system.instances.items():
         free = [v for v in instance.description.variables if v.causality == "input" and (name, v.name) not in connected]
@@ -112,6 +117,32 @@ def _free_inputs(plan: Plan) -> list[str]:
         if shown_:
             lines.append([name, listed(shown_)])
     return table(lines, indent=2)
+
+
+def _scenario(plan: Plan) -> list[str]:
+    """What the scenario sets, and when."""
+    rows = []
+    for name, instance in plan.system.instances.items():
+        for own in instance.scenario:
+            variable = instance.description.variable(own.variable)
+            assert variable is not None  # the plan is valid
+            course = course_of(own, variable, plan.grid, instance.step_points)
+            first, last = (
+                short_number(plan.grid.time(step * instance.step_points))
+                for step in (course.first_step, course.last_step)
+            )
+            shape = "linear" if own.linear else "hold"
+            if course.changes == 1:
+                value = f"{shown(to_plain(course.end))}{_unit(variable)}"
+                what, shape = (
+                    f"= {value}" if own.initial and not course.first_step else f"= {value} from {first} s on",
+                    "",
+                )
+            else:
+                what = f"{course.changes} values from {first} s to {last} s"
+            source = f"column '{own.file.column}' of {short_path(own.file.path)}" if own.file is not None else ""
+            rows.append([f"{name}.{own.variable}", what, shape, source])
+    return table(rows, indent=2)
 
 
 def _arithmetic(c: Connection) -> str:
@@ -181,15 +212,26 @@ def _assumed(plan: Plan, loop: Loop) -> list[str]:
 
 
 def _recorded(plan: Plan) -> list[str]:
-    if plan.system.result_file is None or not plan.system.recorded:
-        return ["  nothing"]
-    instances = plan.system.instances
-    rows = []
-    for name, variable in plan.system.recorded:
-        described = instances[name].description.variable_of(variable)
-        type_ = described.type_name.partition("[")[0] if described is not None else ""
-        rows.append([f"{name}.{variable}", type_, _unit(described).strip()])
-    return [*table(rows, indent=2), f"  into {short_path(plan.system.result_file)}"]
+    """The columns of each result file, and its points if it does not have all of them."""
+    instances, lines = plan.system.instances, []
+    for record in plan.system.records:
+        rows = []
+        for name, variable in record.variables:
+            described = instances[name].description.variable_of(variable)
+            type_ = described.type_name.partition("[")[0] if described is not None else ""
+            rows.append([f"{name}.{variable}", type_, _unit(described).strip()])
+        lines += [*table(rows, indent=2), f"  into {short_path(record.file)}{_points_of(record, plan)}"]
+    return lines or ["  nothing"]
+
+
+def _points_of(record: RecordPlan, plan: Plan) -> str:
+    """Which points a result file has, as the end of a line; empty for all of them."""
+    step, parts = plan.grid.step_size, []
+    if record.every > 1:
+        parts.append(f"every {record.every} points ({short_number(record.every * step)} s)")
+    if record.first:
+        parts.append(f"from point {record.first} ({short_number(plan.grid.time(record.first))} s)")
+    return f", {' '.join(parts)}" if parts else ""
 
 
 def _warnings(plan: Plan) -> list[str]:

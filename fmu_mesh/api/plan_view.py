@@ -8,6 +8,9 @@ from ..config.mesh import SimulationConfig
 from ..errors import Finding
 from ..rings.library import why_no_library
 from ..system.plan import Plan
+from ..system.schedule import Schedule
+from ..system.series_files import course_of
+from ..system.system import SystemInstance
 from ..variables.value_conversion import to_plain
 from ..variables.value_types import PlainValue
 
@@ -36,6 +39,26 @@ class PlannedConnection(msgspec.Struct, frozen=True):
     closes_cycle: bool
 
 
+class PlannedRecord(msgspec.Struct, frozen=True):
+    """One result file: its columns but the time, the point of its first row, and the points from row to row."""
+
+    file: str
+    variables: list[str]
+    first: int
+    every: int
+
+
+class PlannedSchedule(msgspec.Struct, frozen=True):
+    """What a scenario sets: number of values, and the times in s of the first and the last one."""
+
+    variable: str
+    values: int
+    first: float
+    last: float
+    interpolation: str
+    file: str | None
+
+
 class PlanView(msgspec.Struct, frozen=True):
     """What would run.
 
@@ -47,8 +70,10 @@ class PlanView(msgspec.Struct, frozen=True):
         cycles: the instances of each cycle.
         free_inputs: `instance.variable` of the inputs that are not connected.
         levels: level in the initialization of each connected output.
-        recorded: `instance.variable` of the columns of the result file.
-        result_file: the result file; None if nothing is recorded.
+        recorded: `instance.variable` of the columns of the first result file.
+        result_file: the first result file; None if nothing is recorded.
+        records: all result files.
+        scenario: what the scenario sets, by `instance.variable`.
         warnings: findings that do not prevent a run.
         library: why the library of C is not used; None if it is.
     """
@@ -65,6 +90,8 @@ class PlanView(msgspec.Struct, frozen=True):
     levels: dict[str, int]
     recorded: list[str]
     result_file: str | None
+    records: list[PlannedRecord]
+    scenario: list[PlannedSchedule]
     warnings: tuple[Finding, ...]
     library: str | None
 
@@ -102,6 +129,10 @@ def plan_view(plan: Plan) -> PlanView:
         for variable in own.description.variables
         if variable.causality == "input" and (name, variable.name) not in connected
     )
+    records = [
+        PlannedRecord(own.file, [f"{name}.{variable}" for name, variable in own.variables], own.first, own.every)
+        for own in system.records
+    ]
     return PlanView(
         mesh=system.config.mesh,
         simulation=system.config.simulation,
@@ -113,8 +144,25 @@ def plan_view(plan: Plan) -> PlanView:
         cycles=[[*cycle] for cycle in plan.cycles],
         free_inputs=[*free],
         levels={f"{name}.{variable}": level for (name, variable), level in plan.initialization.levels.items()},
-        recorded=[f"{name}.{variable}" for name, variable in system.recorded],
+        recorded=records[0].variables if records else [],
         result_file=system.result_file,
+        records=records,
+        scenario=[_scheduled(plan, own, schedule) for own in system.instances.values() for schedule in own.scenario],
         warnings=system.warnings,
         library=why_no_library(),
+    )
+
+
+def _scheduled(plan: Plan, instance: SystemInstance, schedule: Schedule) -> PlannedSchedule:
+    variable = instance.description.variable(schedule.variable)
+    assert variable is not None  # the plan is valid
+    course = course_of(schedule, variable, plan.grid, instance.step_points)
+    first, last = (plan.grid.time(step * instance.step_points) for step in (course.first_step, course.last_step))
+    return PlannedSchedule(
+        f"{instance.name}.{schedule.variable}",
+        course.changes,
+        first,
+        last,
+        "linear" if schedule.linear else "hold",
+        schedule.file.path if schedule.file is not None else None,
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import weakref
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from types import TracebackType
@@ -123,7 +123,9 @@ class _CollectedRows:
 
     def __init__(self, plan: RunPlan) -> None:
         self._plan = plan
-        self._file = open_result(plan.loaded, plan.plan.system) if memory_of(plan) is None else None
+        self._file = None
+        if memory_of(plan) is None:
+            self._file = open_result(plan.loaded, plan.plan.system, digest=plan.plan.digest, contents=plan.contents)
         self._times: list[NDArray[np.float64]] = []
         self._blocks: list[list[NDArray[Any]]] = []
         self.rows = 0
@@ -143,6 +145,10 @@ class _CollectedRows:
         if self._file is not None:
             self._file.write(times, columns)
 
+    def note(self, entry: Mapping[str, Any]) -> None:
+        if self._file is not None:
+            self._file.note(entry)
+
     def flush(self) -> None:
         if self._file is not None:
             self._file.flush()
@@ -158,7 +164,8 @@ class _CollectedRows:
         parts = zip(*self._blocks, strict=True) if self._blocks else [[np.zeros(0, DTYPES[t])] for t in types.values()]
         columns = {name: np.concatenate(part) for name, part in zip(types, parts, strict=True)}
         times = np.concatenate(self._times) if self._times else np.zeros(0)
-        outcome = replace(outcome, file=str(file) if file is not None else None)
+        files = ((str(file), outcome.rows),) if file is not None else ()
+        outcome = replace(outcome, file=str(file) if file is not None else None, files=files)
         return Result(self._plan.mesh, file=file, outcome=outcome, system=system, columns=Columns(times, columns))
 
 

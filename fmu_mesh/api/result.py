@@ -23,7 +23,7 @@ from ..variables.units import BaseUnit
 from ..variables.value_types import VariableType, is_float
 from .comparison import Comparison, Side, compared, differences_of, values_in_unit_of
 from .result_drawing import FLAGS, NUMBERS, Curve, Curves, Picture, figure_of
-from .result_reading import Columns, chosen_names, read_csv
+from .result_reading import Columns, chosen_names, read_result
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -52,12 +52,13 @@ class Result(Mapping[str, NDArray[Any]]):
     Attributes:
         title: name of the mesh, or of the file.
         file: the result file; None if the rows are only in memory, or if nothing was recorded.
+        all: this result and those of the other files of the run, in the order of the configuration.
         outcome: how the run ended; None for a file that was read.
         names: the recorded variables, in order.
         units: the unit of each, as FMI writes it; None without one.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913  what a result is made of
         self,
         title: str,
         *,
@@ -65,6 +66,7 @@ class Result(Mapping[str, NDArray[Any]]):
         outcome: Outcome | None = None,
         system: ResolvedSystem | None = None,
         columns: Columns | None = None,
+        record: int = 0,
     ) -> None:
         self.title = title
         self.file = file
@@ -72,11 +74,14 @@ class Result(Mapping[str, NDArray[Any]]):
         self._system = system
         self._step_size = system.grid.step_size if system is not None else 0.0
         self._given = columns
-        self._variables = _recorded(self._system)
+        self._record = record
+        self._variables = _recorded(self._system, record)
 
     @classmethod
     def read(cls, path: str | Path) -> Self:
-        """Read a CSV of an earlier run, such as `launch` writes.
+        """Read the result file of an earlier run, such as `launch` writes: CSV, Parquet or MCAP.
+
+        Of a Parquet file whose run goes on or was killed, the rows are read that are complete in its stream.
 
         Example:
             >>> import fmu_mesh
@@ -85,10 +90,11 @@ class Result(Mapping[str, NDArray[Any]]):
             True
 
         Raises:
-            ConfigurationError: there is no such file, or it is no result file; says in which line.
+            ConfigurationError: there is no such file, it is no result file, or the package for its format is not
+                installed.
         """
         path = Path(path)
-        return cls(path.stem, file=path, columns=read_csv(path))
+        return cls(path.stem, file=path, columns=read_result(path))
 
     @property
     def times(self) -> NDArray[np.float64]:
@@ -102,8 +108,37 @@ class Result(Mapping[str, NDArray[Any]]):
 
     @property
     def units(self) -> dict[str, str | None]:
-        """The unit of each variable; None without one, or if it is not known, as for a file that was read."""
+        """The unit of each variable; None without one, or if a file that was read does not say it."""
         return {name: self._unit(name) for name in self}
+
+    @property
+    def metadata(self) -> dict[str, Any]:
+        """What the result file says about its run; empty if it says nothing.
+
+        Example:
+            >>> import fmu_mesh
+            >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
+            >>> mesh.run(stop_time=0.1, record="memory").metadata
+            {}
+        """
+        return dict(self._columns.metadata)
+
+    @property
+    def all(self) -> tuple[Result, ...]:
+        """The results of all files that the run wrote, in the order of the configuration; this one is among them.
+
+        Example:
+            >>> import fmu_mesh
+            >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
+            >>> mesh.configure(record=[{"file": "fast.csv"}, {"file": "slow.csv", "every": 100}])
+            >>> fast, slow = mesh.run(stop_time=1.0).all
+            >>> len(fast.times), len(slow.times), slow.file.name
+            (501, 6, 'slow.csv')
+        """
+        files = self.outcome.files if self.outcome is not None and self._given is None else ()
+        if len(files) < 2:
+            return (self,)
+        return tuple(self if number == self._record else self._of_file(number) for number in range(len(files)))
 
     @property
     def summary(self) -> str:
@@ -170,7 +205,8 @@ class Result(Mapping[str, NDArray[Any]]):
         for label, result in zip(_titles(results), results, strict=True):
             drawn.append(self._drawn(result, label, chosen, x, difference=difference))
             curves = self._curves_of(result, drawn[-1].values) | curves
-        title = title if title is not None else " and ".join(dict.fromkeys(result.title for result in results))
+        meshes = dict.fromkeys(str(result.metadata.get("mesh", result.title)) for result in results)
+        title = title if title is not None else " and ".join(meshes)
         return figure_of(drawn, Picture(title, curves, x, difference, annotate))
 
     def compare(
@@ -242,7 +278,13 @@ class Result(Mapping[str, NDArray[Any]]):
             return self._given
         if self.file is None or (self.outcome is not None and not self.outcome.rows):
             return Columns(np.zeros(0), {name: np.zeros(0) for name in self._variables})
-        return read_csv(self.file, types_of(self._system))
+        return read_result(self.file, types_of(self._system, self._record))
+
+    def _of_file(self, number: int) -> Result:
+        assert self.outcome is not None  # it has files
+        file, rows = self.outcome.files[number]
+        outcome = replace(self.outcome, file=file, rows=rows)
+        return Result(self.title, file=Path(file), outcome=outcome, system=self._system, record=number)
 
     def _drawn(self, other: Result, label: str, names: Sequence[str], x: str | None, *, difference: bool) -> Curves:
         """What is drawn of a result, in the units of this one."""
@@ -281,21 +323,23 @@ class Result(Mapping[str, NDArray[Any]]):
     def _point(self, row: int) -> int:
         """The communication point of a row; its number, counted from 0, where a file does not say more."""
         if self._system is None:
-            return row
+            said = self._columns.metadata
+            return int(said.get("first", 0)) + row * int(said.get("every", 1))
         grid = self._system.grid
         return round((float(self.times[row]) - grid.start_time) / grid.step_size)
 
     def _unit(self, name: str) -> str | None:
-        return self._variables[name][1].unit if name in self._variables else None
+        return self._variables[name][1].unit if name in self._variables else self._columns.units.get(name)
 
     def _curve(self, name: str) -> Curve:
         """How a variable is drawn: one axes for each unit, and steps for what holds between two points."""
         if name not in self._variables:
-            values = self[name]
-            axis = FLAGS if values.dtype == bool else ""
-            return Curve(self._unit(name) or "", axis=axis, held=values.dtype.kind != "f")
+            values, said = self[name], self._columns.metadata.get("variables", {}).get(name, {})
+            held = values.dtype.kind != "f" or said.get("variability") in _HELD
+            axis = FLAGS if values.dtype == bool else NUMBERS if said and values.dtype.kind in "iu" else ""
+            return Curve(self._unit(name) or "", axis=axis, held=held)
         instance, variable = self._variables[name]
-        held = not is_float(variable.type) or "arameter" in variable.causality or variable.variability in _HELD
+        held = not is_float(variable.type) or variable.variability in _HELD
         if variable.type == "Boolean":
             return Curve(axis=FLAGS, held=True)
         if not is_float(variable.type):
@@ -327,9 +371,11 @@ def summary_of(outcome: Outcome, step_size: float) -> str:
     return f"{point} points in {seconds:.3f} s: {rate:.0f} points/s, real-time factor {factor:.3g}"
 
 
-def types_of(system: ResolvedSystem | None) -> dict[str, VariableType] | None:
-    """The types of the recorded variables by name; None without a system."""
-    return {name: variable.type for name, (_, variable) in _recorded(system).items()} if system is not None else None
+def types_of(system: ResolvedSystem | None, record: int = 0) -> dict[str, VariableType] | None:
+    """The types of the variables in one of the result files by name; None without a system."""
+    if system is None:
+        return None
+    return {name: variable.type for name, (_, variable) in _recorded(system, record).items()}
 
 
 def _titles(results: Sequence[Result]) -> list[str]:
@@ -343,11 +389,14 @@ def _titles(results: Sequence[Result]) -> list[str]:
     return [f"{result.title} ({number})" for number, result in enumerate(results, 1)]
 
 
-def _recorded(system: ResolvedSystem | None) -> dict[str, tuple[str, Variable]]:
-    """Instance and variable of each recorded column, by its name."""
+def _recorded(system: ResolvedSystem | None, record: int) -> dict[str, tuple[str, Variable]]:
+    """Instance and variable of each column of a result file, by its name."""
     columns: dict[str, tuple[str, Variable]] = {}
-    for instance, name in system.recorded if system is not None else ():
-        variable = system.instances[instance].description.variable_of(name) if system is not None else None
+    if system is None:
+        return columns
+    own = system.records[record].variables if record < len(system.records) else ()
+    for instance, name in own:
+        variable = system.instances[instance].description.variable_of(name)
         assert variable is not None  # the system is valid
         columns[f"{instance}.{name}"] = instance, variable
     return columns

@@ -8,18 +8,19 @@ import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from io import BytesIO
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import ConfigurationError
 from ..recorder.csv_file import CsvFile
-from ..system.recording import result_format
+from ..recorder.notes_file import read_notes
+from ..system.recording import Columns, ReadableFormat, result_format
 from ..text import listed, nearest, nearest_file
 from ..variables.value_types import DTYPES, VariableType, is_float
 
-__all__ = ["Columns", "chosen_names", "read_csv", "require_csv"]
+__all__ = ["Columns", "chosen_names", "read_csv", "read_result", "require_readable"]
 
 _TIME = "time"
 _FLAGS: Final = {"true": True, "false": False}
@@ -27,27 +28,36 @@ _WILD: Final = {"*": ".*", "?": "."}
 _FIELD = re.compile(rb'"((?:[^"]|"")*)"|([^,]*)')
 
 
-class Columns(NamedTuple):
-    """The columns of a result.
-
-    Attributes:
-        times: the times in s, shape `(rows,)`.
-        values: an array of this shape for each variable, by name: of floats, whole numbers, truth values, or of dtype
-            `object` for texts and bytes.
-    """
-
-    times: NDArray[np.float64]
-    values: dict[str, NDArray[Any]]
-
-
-def require_csv(path: Path) -> None:
-    """Check that a result file is a CSV.
+def require_readable(path: Path) -> None:
+    """Check that results can be read from a file of this name.
 
     Raises:
-        ConfigurationError: it has another format.
+        ConfigurationError: they cannot.
     """
-    if result_format(path) not in (CsvFile, None):
-        raise ConfigurationError(f"'{path}' is no CSV, and results are read from CSV.", hint="Record into a .csv file.")
+    format_ = result_format(path)
+    if format_ not in (CsvFile, None) and not hasattr(format_, "read"):
+        hint = "Record into a .csv or .parquet file."
+        raise ConfigurationError(f"results cannot be read from '{path}': its format can only be written.", hint=hint)
+
+
+def read_result(path: Path, types: Mapping[str, VariableType] | None = None) -> Columns:
+    """Read a result file of any format.
+
+    Args:
+        path: the file.
+        types: the types of the columns, by name, if they are known.
+
+    Raises:
+        ConfigurationError: there is no such file, or it is no result file.
+    """
+    require_readable(path)
+    format_ = result_format(path)
+    if format_ in (CsvFile, None):
+        return read_csv(path, types)
+    try:
+        return cast("ReadableFormat", format_).read(path)
+    except OSError as error:
+        raise _unreadable(path, error) from error
 
 
 def read_csv(path: Path, types: Mapping[str, VariableType] | None = None) -> Columns:
@@ -61,13 +71,10 @@ def read_csv(path: Path, types: Mapping[str, VariableType] | None = None) -> Col
     Raises:
         ConfigurationError: there is no such file, or it is no result file; says in which line.
     """
-    require_csv(path)
     try:
         data = path.read_bytes()
     except OSError as error:
-        near = nearest_file(path) if isinstance(error, FileNotFoundError) else None
-        hint = f"Did you mean '{near}'?" if near is not None else None
-        raise ConfigurationError(f"the result file '{path}' cannot be read: {error.strerror}.", hint=hint) from error
+        raise _unreadable(path, error) from error
     heading, _, body = data.partition(b"\n")
     try:
         body.decode()
@@ -77,7 +84,17 @@ def read_csv(path: Path, types: Mapping[str, VariableType] | None = None) -> Col
     if not names or names[0] != _TIME:
         found = f"its first column is '{names[0][:40]}'" if names else "it is empty"
         raise ConfigurationError(f"'{path}' is no result file: {found}, not '{_TIME}'.")
-    return _columns(path, names, body, types or {})
+    metadata = read_notes(path)
+    about = {name: known for name, known in metadata.get("variables", {}).items() if name in names}
+    known = {name: of["type"] for name, of in about.items()} | dict(types or {})
+    units = {name: of["unit"] for name, of in about.items() if of.get("unit") is not None}
+    return _columns(path, names, body, known)._replace(units=units, metadata=metadata)
+
+
+def _unreadable(path: Path, error: OSError) -> ConfigurationError:
+    near = nearest_file(path) if isinstance(error, FileNotFoundError) else None
+    hint = f"Did you mean '{near}'?" if near is not None else None
+    return ConfigurationError(f"the result file '{path}' cannot be read: {error.strerror}.", hint=hint)
 
 
 def _columns(path: Path, names: Sequence[str], body: bytes, types: Mapping[str, VariableType]) -> Columns:

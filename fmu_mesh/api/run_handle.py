@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
 from concurrent.futures import TimeoutError as NotYet
 from contextlib import ExitStack, contextmanager, nullcontext
@@ -41,6 +41,7 @@ if TYPE_CHECKING:  # whoever attaches to a mesh needs nothing that plans or star
     from ..ros.bags.bag import Bag
     from ..ros.bags.playing import Played, PlayOptions
     from ..run.run_plan import RunPlan
+    from ..wire.messages import SetValue
     from .plan_options import StartOptions
     from .result import Result
     from .run_thread import RunThread
@@ -208,7 +209,7 @@ class Run:
             at: simulation time in s from which on the value holds; None: from the next point on.
 
         Returns:
-            The point, and its time in s, from which on the value holds.
+            The point, and its time in s, from which on the value holds; `late` says that the time asked for was past.
 
         Raises:
             CallRefused: the variable cannot be set, or takes no such value; says why.
@@ -275,6 +276,25 @@ class Run:
         loaded = self._own.plan.loaded if self._own is not None else None
         with nullcontext(bag) if isinstance(bag, Bag) else Bag(Path(bag)) as opened:
             return play_bag(self._running(), opened, loaded, **how)
+
+    def replay(self, values: Sequence[SetValue], last_point: int | None = None) -> None:
+        """Set values at exact points, as the metadata of a result have them (`rerun`).
+
+        The mesh is paused at each of these points until its value is set, and then goes on.
+
+        Args:
+            values: what to set; each at its own `point`, which is not past.
+            last_point: the point at which the mesh is stopped; None: it runs to its end.
+
+        Raises:
+            CallRefused: a variable cannot be set, or takes no such value.
+            MeshLost: the mesh has ended, or another program controls it too.
+        """
+        from .replaying import replay  # noqa: PLC0415  not for those who only look
+
+        replay(self._running(), values, last_point)
+        if last_point is not None:
+            self.stop()
 
     # --- steering
 

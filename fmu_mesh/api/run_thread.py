@@ -220,7 +220,7 @@ class RunThread:
         times, arrays = read_arrays(self._memory, list(types.values()))
         columns = Columns(times, dict(zip(types, arrays, strict=True)))
         return Result(
-            self.plan.mesh, outcome=replace(outcome, file=None), system=self.plan.plan.system, columns=columns
+            self.plan.mesh, outcome=replace(outcome, file=None, files=()), system=self.plan.plan.system, columns=columns
         )
 
 
@@ -259,8 +259,8 @@ def _check_memory(plan: RunPlan, limit: int) -> None:
         CallRefused: they do not.
     """
     types = types_of(plan.plan.system) or {}
-    last = plan.plan.grid.last_point
-    size = (last + 1) * bytes_of_a_row(list(types.values()))
+    last, records = plan.plan.grid.last_point, plan.plan.system.records
+    size = records[0].rows_before(last + 1) * bytes_of_a_row(list(types.values())) if records else 0
     if last < ENDLESS and size > limit:
         raise _too_large(plan.mesh, limit, size)
 

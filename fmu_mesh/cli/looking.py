@@ -21,7 +21,7 @@ from ..wire.client.mesh_client import MeshClient
 from ..wire.client.reaching import Meshes
 from ..wire.client.readings import Target
 from ..wire.views import InstanceInfo, InstanceStatus, MeshInfo, MeshStatus, RosView
-from .arguments import CommandParser, Parsers, add_json, add_quiet, add_reaching, count
+from .arguments import CommandParser, Parsers, add_json, add_quiet, add_reaching, count, number
 from .output.json_output import print_json
 from .output.pages import (
     cells,
@@ -134,11 +134,11 @@ def _status(arguments: argparse.Namespace, meshes: Meshes) -> int:
             return client.instance_status(instance), [], []
         return client.status(), [] if arguments.json else _statuses(client), client.ros()
 
-    for number, (_, (view, statuses, ros)) in enumerate(meshes.answers(clients, view_of)):
+    for index, (_, (view, statuses, ros)) in enumerate(meshes.answers(clients, view_of)):
         if arguments.json:
             print_json({**msgspec.structs.asdict(view), "ros": ros} if isinstance(view, MeshStatus) else view)
             continue
-        if number:
+        if index:
             print()
         match view:
             case MeshStatus():
@@ -194,14 +194,18 @@ def _add_set(parser: CommandParser) -> None:
     add_quiet(parser)
     parser.add_argument("key", metavar="KEY", help="`instance.variable`, `MESH/instance.variable`, or a key")
     parser.add_argument("value", metavar="VALUE", help="a number, true, false, text, or [a, list] for an array")
+    parser.add_argument("--at", type=number, metavar="T", help="simulation time in s from which on it holds")
 
 
 def _set(arguments: argparse.Namespace, meshes: Meshes) -> int:
     client = meshes.one(arguments.key)
     target = client.target(arguments.key)
-    answer = client.set(target, _value(target, arguments.value))
+    answer = client.set(target, _value(target, arguments.value), arguments.at)
     if arguments.json:
         print_json(answer)
+    elif answer.late:
+        past = f"t = {seconds(arguments.at)} was past"
+        print(f"{answer.key}: {past}; it holds from t = {seconds(answer.time)} (point {answer.point}) instead")
     else:
         print(f"{answer.key} holds from point {answer.point} on (t = {seconds(answer.time)})")
     return 0

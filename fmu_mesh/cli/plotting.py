@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from ..api.drawing import draw, require_matplotlib
 from ..api.result import Result
-from ..api.result_reading import require_csv
+from ..api.result_reading import require_readable
 from ..errors import ConfigurationError, FmuMeshError
 from ..sweeps.sweep_folder import is_sweep
 from ..sweeps.sweep_result import SweepResult
@@ -135,7 +135,7 @@ def check_plot(plot: Path, result: str | None) -> None:
         raise ConfigurationError(f"a plot cannot be written as '{plot}'.", hint="Name it .png, .svg or .pdf.")
     if result is None:
         raise ConfigurationError("nothing is recorded, so there is nothing to plot.", hint="Name a file with --output.")
-    require_csv(Path(result))
+    require_readable(Path(result))
 
 
 def plot_results(result: Path, plot: Path, plan: Plan) -> None:

@@ -32,6 +32,7 @@ def add_configuration(parser: argparse.ArgumentParser) -> None:
         "real_time_factor",
         "start_values",
         "config_values",
+        "scenario",
         "output",
         "listen",
         "connect",

@@ -35,7 +35,7 @@ from .run_options import add_configuration, add_options, given_options
 if TYPE_CHECKING:
     from ..sweeps.sweeping import Sweep
 
-__all__ = ["PARSERS", "add_output", "interrupted_by_signals", "run_mesh"]
+__all__ = ["PARSERS", "add_output", "interrupted_by_signals", "run_mesh", "show_event"]
 
 
 def _add_launch(parser: CommandParser) -> None:
@@ -133,7 +133,7 @@ def run_mesh(
         nullcontext() if how.get("processes", True) else stdout_as_stderr(),
         interrupted_by_signals() as runs,
     ):
-        how["on_event"] = partial(_show, reporter, display)
+        how["on_event"] = partial(show_event, reporter, display)
         run = Run.start(plan, **how)
         runs.append(run)
         outcome = run.wait().outcome
@@ -141,7 +141,8 @@ def run_mesh(
     _finish(plan.plan, outcome, arguments)
 
 
-def _show(reporter: RunReporter, display: Display, event: Event) -> None:
+def show_event(reporter: RunReporter, display: Display, event: Event) -> None:
+    """Show an event of a run, and keep it for the report."""
     reporter.event(event)
     display.event(event)
 

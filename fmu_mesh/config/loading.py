@@ -20,6 +20,7 @@ from fmu_mesh.config.findings import Findings, locate
 from fmu_mesh.config.instance_sections import KIND, InstanceSection, Kinds, keys_of
 from fmu_mesh.config.mesh import Config, config_type
 from fmu_mesh.config.partial import partial_configuration
+from fmu_mesh.config.scenario_section import ScenarioConfig, ScenarioSource, converted, scenario_type
 from fmu_mesh.config.structure import check
 from fmu_mesh.config.yaml_text import Plain, read
 from fmu_mesh.errors import Finding
@@ -34,6 +35,7 @@ __all__ = [
     "load",
     "parse",
     "read_file",
+    "read_scenario",
     "read_text",
 ]
 
@@ -167,6 +169,29 @@ def read_text(text: str, path: Path) -> PlainConfig:
     if data is None:
         findings.raise_any()
     return PlainConfig(data, path, lines, tuple(findings))
+
+
+def read_scenario(loaded: LoadedConfig) -> ScenarioSource | None:
+    """The scenario of a configuration: its section, or the file that the section names; None if there is none.
+
+    Raises:
+        ConfigurationError: the file cannot be read, or its structure is wrong; has all findings.
+    """
+    section = loaded.config.scenario
+    if section is None:
+        return None
+    if isinstance(section, ScenarioConfig):
+        return ScenarioSource(section, "scenario.", loaded.file, loaded.lines, loaded.overrides)
+    path = loaded.resolve(section)
+    if not section or not path.is_file():
+        findings = loaded.findings()
+        findings.add("scenario", f"no such file '{section}'", "a file with values and events", nearest_file(path))
+        findings.raise_any()
+    plain = read_file(path if Path(section).is_absolute() else loaded.file.parent / section)
+    findings = Findings(str(plain.file), plain.lines, None, plain.findings)
+    check(plain.data, scenario_type(), "", findings)
+    findings.raise_any()
+    return ScenarioSource(converted(plain.data), "", plain.file, plain.lines, {})
 
 
 def examine_data(plain: PlainConfig, overrides: Sequence[str], kinds: Kinds) -> tuple[LoadedConfig, Findings]:

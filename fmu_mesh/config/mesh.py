@@ -27,6 +27,7 @@ from fmu_mesh.config.base import (
 )
 from fmu_mesh.config.instance_sections import InstanceSection
 from fmu_mesh.config.ros_section import RosConfig, RosProfile, RosTopicConfig
+from fmu_mesh.config.scenario_section import ScenarioConfig
 
 __all__ = [
     "ENDPOINT_PATTERN",
@@ -189,7 +190,7 @@ class InitializationConfig(Base, frozen=True, kw_only=True):
 
 
 class RecordConfig(Base, frozen=True, kw_only=True):
-    """Where results go and which variables they hold."""
+    """One result file: where it is, which variables it holds, and at which points."""
 
     file: Annotated[
         str | None,
@@ -197,8 +198,21 @@ class RecordConfig(Base, frozen=True, kw_only=True):
     ] = "results/{mesh}.csv"
     variables: Annotated[
         list[str] | None,
-        Meta(description="`instance.variable` of outputs; default: all outputs but those of type String and Binary."),
+        Meta(
+            description="`instance.variable` of any causality, or patterns: `*` any characters, `?` one, `re:` a "
+            "regular expression. A pattern matches outputs; with `in:`, `local:` or `param:` before it, inputs, locals "
+            "or parameters. Default: all outputs but those of type String and Binary.",
+            examples=[["motor.*", "in:motor.*", "arm.angle"]],
+        ),
     ] = None
+    every: Annotated[
+        int,
+        Meta(ge=1, description="There is a row at every n-th communication point of the base step size."),
+    ] = 1
+    start: Annotated[
+        float | None,
+        Meta(description="Time in s from which on there are rows; null: from the first communication point on."),
+    ] = msgspec.field(name="from", default=None)
 
 
 class ZenohConfig(Base, frozen=True, kw_only=True):
@@ -294,7 +308,17 @@ class Config(Base, frozen=True, kw_only=True):
     ] = None
     connections: Annotated[list[ConnectionConfig], Meta(description="From which output to which input values go.")] = []
     initialization: InitializationConfig = InitializationConfig()
-    record: RecordConfig = RecordConfig()
+    record: Annotated[
+        RecordConfig | list[RecordConfig],
+        Meta(description="What is recorded: one result file, or a list of several; an empty list: nothing."),
+    ] = RecordConfig()
+    scenario: Annotated[
+        ScenarioConfig | str | None,
+        Meta(
+            description="Values of inputs and tunable parameters over time; or a file with these keys, relative to "
+            "this file."
+        ),
+    ] = None
     zenoh: ZenohConfig = ZenohConfig()
     timeouts: TimeoutsConfig = TimeoutsConfig()
     limits: LimitsConfig = LimitsConfig()
@@ -307,6 +331,13 @@ class Config(Base, frozen=True, kw_only=True):
     ] = False
     ros: Annotated[RosConfig | None, Meta(description="Topics for ROS 2; null: none.")] = None
     version: Annotated[Literal[1], Meta(description="Version of this file format.")] = 1
+
+    @property
+    def records(self) -> dict[str, RecordConfig]:
+        """The sections of all result files, by their paths in the file: `record`, or `record[0]`, `record[1]`, ..."""
+        if isinstance(self.record, RecordConfig):
+            return {"record": self.record}
+        return {f"record[{index}]": section for index, section in enumerate(self.record)}
 
     def is_strict(self, section: InstanceSection) -> bool:
         """Whether a violation of FMI is an error, and not a warning, for an instance of this mesh."""

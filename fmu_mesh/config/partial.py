@@ -22,6 +22,9 @@ __all__ = ["partial_configuration"]
 _CONTAINERS = re.compile(
     r"|simulation|connections|initialization|record|zenoh|timeouts|limits|instances(\.[^.]+(\.start_values)?)?"
 )
+_KEPT_LISTS = ("connections", "record")
+"""Lists whose other items keep their index if one is wrong."""
+
 _TIMES = ("start_time", "stop_time", "step_size")
 
 
@@ -50,6 +53,7 @@ def partial_configuration(
                 "simulation": _simulation(rest.get("simulation"), wrong),
                 "instances": _with_models(rest.get("instances"), sections),
                 "connections": _with_ends(rest.get("connections", [])),
+                "record": _with_records(rest.get("record", {})),
             },
             config_type(tuple(sections.values())),
         )
@@ -68,7 +72,7 @@ def _without(value: Plain, wrong: AbstractSet[str], path: str) -> Plain:
         }
     if isinstance(value, list):
         places_of_items = [f"{path}[{index}]" for index in range(len(value))]
-        if path != "connections" and any(_is_wrong(place, wrong) for place in places_of_items):
+        if path not in _KEPT_LISTS and any(_is_wrong(place, wrong) for place in places_of_items):
             return []
         pairs = zip(value, places_of_items, strict=True)
         return [None if place in wrong else _without(item, wrong, place) for item, place in pairs]
@@ -109,3 +113,10 @@ def _with_ends(section: Plain) -> list[Plain]:
         connection if isinstance(connection, dict) and {"from", "to"} <= connection.keys() else {"from": "", "to": ""}
         for connection in connections
     ]
+
+
+def _with_records(section: Plain) -> Plain:
+    """The section `record`; what is no section in a list of them records nothing."""
+    if not isinstance(section, list):
+        return section
+    return [own if isinstance(own, dict) else {"file": None} for own in section]

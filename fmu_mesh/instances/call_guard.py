@@ -15,7 +15,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, Final, TypeVar, cast
 
@@ -27,6 +27,7 @@ from ..rings.native import NativeStep, Stage
 from ..rings.ring import Ring
 from ..simtime import TimeGrid
 from ..text import short_path
+from ..variables.model_description import Value
 from .contract import Instance, StepsNatively
 from .instance_wrapper import AroundInstance
 
@@ -357,6 +358,10 @@ class Guarded(AroundInstance[Instance]):
     def finish(self, step: int, outcome: int) -> None:
         """See `StepsNatively`; only called if there is `native`."""
         cast("StepsNatively", self._instance).finish(step, outcome)
+
+    def set_in_step(self, values: Mapping[str, Value]) -> None:
+        """As `set_values`, as a part of a step: whoever watches the steps watches this, too, and it takes less time."""
+        self._instance.set_values(values)
 
     def close(self) -> None:
         """Terminate if allowed, free the instance and remove its files; one deadline for all of it."""

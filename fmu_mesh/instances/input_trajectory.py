@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
 
+from ..system.schedule import between
 from ..variables.model_description import Value
 
 __all__ = ["Trajectory"]
@@ -53,16 +54,14 @@ class Trajectory:
         if not self._linear or place + 1 == len(self._times) or start >= time - resolution:
             return value
         end, right = self._times[place + 1], self._values[place + 1]
-        return _between(value, right, (time - start) / (end - start))
+        return between(value, right, (time - start) / (end - start))
 
+    def after(self, time: float) -> float | None:
+        """The first time (s) after ``time``; None if no value has a later one."""
+        place = bisect_right(self._times, time)
+        return self._times[place] if place < len(self._times) else None
 
-def _between(left: Value, right: Value, weight: float) -> Value:
-    """The value between two values; of an array, element by element.
-
-    With a weight below 1, the result stays between the two values, which may be the limits of the variable.
-    """
-    if isinstance(left, list) and isinstance(right, list):
-        return [_between(one, other, weight) for one, other in zip(left, right, strict=True)]
-    assert isinstance(left, float)
-    assert isinstance(right, float)
-    return left + (right - left) * weight
+    @property
+    def linear(self) -> bool:
+        """Whether it is linear between two times."""
+        return self._linear

@@ -21,7 +21,17 @@ from ..variables.model_description import Value, Variable
 from ..variables.value_conversion import to_plain
 from ..wire.inbox import Inbox
 from ..wire.keys import Keys, escape, unescape
-from ..wire.values import ValueRefused, attachment, decode_time, decode_value, encode_value, json_encoding
+from ..wire.messages import SetValue
+from ..wire.values import (
+    NO_ORIGIN,
+    Origin,
+    ValueRefused,
+    attachment,
+    decode_origin,
+    decode_value,
+    encode_value,
+    json_encoding,
+)
 from ..wire.views import ConnectionView, InstanceInfo, LogLine, SetAnswer, VariableView
 from .activity import Activity
 from .inputs import set_input
@@ -47,8 +57,8 @@ _CAPABILITIES = (
 )
 
 Job = Callable[[], None]
-Setting = tuple[str, Value, float | None]
-"""A variable, its value, and the time in s from which on it holds; None: from the next step on."""
+Setting = tuple[str, Value, Origin]
+"""A variable, its value, and when it holds and who sent it."""
 
 
 class Answers:
@@ -58,15 +68,17 @@ class Answers:
         inbox: the inbox of the node, to let the main thread do something.
         post: lets the server thread do something; may be called from any thread.
         log: publishes a log message; on the server's thread.
+        tell: tells the recorder, if there is one, which value was set; on the main thread.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913, PLR0917  one node and whom it tells
         self,
         plan: NodePlan,
         inbox: Inbox,
         activity: Activity,
         post: Callable[[Job], None],
         log: Callable[[LogLine], None],
+        tell: Callable[[SetValue], None],
     ) -> None:
         self._plan = plan
         self._keys = Keys(plan.key_prefix, plan.mesh)
@@ -74,8 +86,16 @@ class Answers:
         self._activity = activity
         self._post = post
         self._log = log
+        self._tell = tell
+        self._before: list[Job] | None = []
         self._pending: list[_Pending] = []
         self._early: list[_Pending] = []
+
+    def begin(self) -> None:
+        """On the main thread, at point 0: set the values that came before; the initialization is as without them."""
+        before, self._before = self._before or [], None
+        for take in before:
+            take()
 
     def answer(self, name: str, query: zenoh.Query) -> None:
         """Answer for every key of the instance that the query's key expression matches."""
@@ -136,7 +156,7 @@ class Answers:
             except ValueRefused as refused:
                 refuse(str(refused))
             else:
-                self._set(runner, new, refuse, lambda _point: None)
+                self._set(runner, str(sample.key_expr), new, refuse, lambda _point: None)
 
         self._post(take)
 
@@ -194,7 +214,10 @@ class Answers:
             self._finish(pending, partial(query.reply_err, reason))
 
         def confirm(point: int) -> None:
-            answer = msgspec.json.encode(SetAnswer(key, point, self._plan.grid.time(point)))
+            grid, points = self._plan.grid, self._plan.instance(name).step_points
+            time = new[2].time
+            late = time is not None and point > grid.step_at(time, points) * points
+            answer = msgspec.json.encode(SetAnswer(key, point, grid.time(point), late))
             self._finish(pending, partial(query.reply, key, answer, encoding=json_encoding))
 
         if runner is None:
@@ -206,17 +229,30 @@ class Answers:
             pending.refuse(str(refused))
             return
         self._pending.append(pending)
-        self._set(runner, new, refuse, confirm)
+        self._set(runner, key, new, refuse, confirm)
 
-    def _set(self, runner: Runner, new: Setting, refuse: Callable[[str], None], confirm: Callable[[int], None]) -> None:
+    def _set(
+        self,
+        runner: Runner,
+        key: str,
+        new: Setting,
+        refuse: Callable[[str], None],
+        confirm: Callable[[int], None],
+    ) -> None:
         """Let the main thread set a variable between two steps; confirm the point from which on the value holds."""
+        name, value, origin = new
 
         def take() -> None:
+            if self._before is not None:
+                self._before.append(take)
+                return
+            at = runner.point
             try:
-                step = set_input(runner, *new)
+                step = set_input(runner, name, value, origin.time)
             except ValueRefused as refused:
                 self._post(partial(refuse, str(refused)))
             else:
+                self._tell(SetValue(runner.name, name, to_plain(value), at, origin.time, key, origin.who))
                 self._post(partial(confirm, step * runner.plan.step_points))
 
         self._inbox.post(take)
@@ -237,8 +273,8 @@ class Answers:
         except ValueRefused as refused:
             raise ValueRefused(f"'{runner.name}.{name}' {refused}") from refused
         try:
-            time = decode_time(attachment.to_bytes()) if attachment is not None else None
-            return name, decode_value(payload.to_bytes() if payload is not None else b"", variable), time
+            origin = decode_origin(attachment.to_bytes()) if attachment is not None else NO_ORIGIN
+            return name, decode_value(payload.to_bytes() if payload is not None else b"", variable), origin
         except ValueRefused as refused:
             raise ValueRefused(f"'{runner.name}.{name}': {refused}") from refused
 

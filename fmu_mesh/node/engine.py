@@ -20,8 +20,9 @@ from ..instances.call_guard import floating_point_changed, restore_floating_poin
 from ..instances.contract import StepsNatively
 from ..rings import native
 from ..rings.host_memory import HostMemory
-from ..rings.native import OUT_OF_RANGE, STAGE_BITS, BurstEnd, RowBase, Stage, StepKind, table
+from ..rings.native import NEVER, OUT_OF_RANGE, STAGE_BITS, BurstEnd, RowBase, Stage, StepKind, table
 from ..system.plan import NodePlan
+from .inputs import TimedInputs
 from .stepping import Position, Runner, Source
 
 __all__ = ["BurstEngine", "Engine", "PlainEngine", "make_engine"]
@@ -244,6 +245,7 @@ class BurstEngine(Engine):
             step=before.step,
             stage=before.stage,
             outcome=before.outcome,
+            python_at=_python_at(runner),
         )
         self._kept[unit, index] = [made, bases, own]  # what the table points to
         self._members[unit][index] = made
@@ -259,6 +261,7 @@ class BurstEngine(Engine):
                 for source in runner.sources:
                     source.transfer.step_text(step)
                 runner.instance.do_step(step)
+                member.python_at = _python_at(runner)
             else:
                 if divmod(member.outcome, 1 << STAGE_BITS) == (Stage.SETTING, OUT_OF_RANGE):
                     for source in runner.sources:
@@ -313,6 +316,11 @@ class _InTable(Position):
     def refit(self) -> None:
         """See `Position`."""
         self._fill()
+
+
+def _python_at(runner: Runner) -> int:
+    """The own step that Python has to take although those before it need no Python; `NEVER` if there is none."""
+    return runner.instance.python_at if isinstance(runner.instance, TimedInputs) else NEVER
 
 
 def _gate(source: Source) -> native.Gate:

@@ -48,14 +48,16 @@ from ..wire.messages import (
     INITIAL,
     PROGRESS,
     NodeReport,
+    SetValue,
     decode_abort,
+    encode_set,
 )
 from ..wire.session import RouterLink
 from .activity import Activity
 from .connecting import connect
 from .engine import Engine, make_engine
 from .initialization import Initialization
-from .inputs import TimedInputs
+from .inputs import with_times
 from .links import OutLink
 from .node_server import NodeServer
 from .stepping import Runner
@@ -117,6 +119,7 @@ class Node:
         self._progress_sent = -1
         self._progress_told_at = 0.0
         self._runners: dict[str, Runner] = {}
+        self._put_set: Callable[[bytes], None] | None = None
         self._receivers: dict[int, FrameReceiver | Link] = {}
         self._own_memory = HostMemory.private(plan.memory, plan.node)
         self._memory = self._own_memory
@@ -126,7 +129,9 @@ class Node:
         self._membership = Membership(plan, session, self._inbox, launch, router)
         self._profiler: Profiler | None = None
         self._activity = Activity(plan, self._inbox.refusals)
-        self.server = NodeServer(plan, session, self._inbox, self._activity, self._membership.report, on_hang)
+        self.server = NodeServer(
+            plan, session, self._inbox, self._activity, self._membership.report, on_hang, self._tell_set
+        )
 
     def run(self) -> None:
         """Load, initialize and step to the last point, then report to the master.
@@ -179,8 +184,7 @@ class Node:
         instances = {}
         for item in plan.instances:
             instance = self._open_instance(item.name)
-            if item.section.interpolation is not None:
-                instance = TimedInputs(instance, item.section.interpolation)
+            instance = with_times(instance, item, plan.grid)
             instances[item.name] = instance
         self._activity.enter("waiting for the mesh")
         self._membership.keys(plan.timeouts.start)
@@ -218,6 +222,8 @@ class Node:
             links.append(OutLink(link, layout, runner.outputs, put))
         self._receivers = connect(plan, self._runners, self._memory, self._own_memory, shares)
         self._put_progress = membership.sender(keys.progress(plan.node))
+        if RECORDER in dict(plan.windows):
+            self._put_set = membership.sender(keys.settings(plan.node))
 
     def _initialize(self) -> Engine:
         """Initialization Mode: set, get and exchange values level by level; then the outputs are those of point 0."""
@@ -421,6 +427,11 @@ class Node:
         report = NodeReport(self._plan.node, point, error.report() if error is not None else None, profile)
         # After the last samples: the master routes them to clients, and ends when it has all reports.
         self._membership.report(report, timeout_s, self._has_no_master, priority=PRIORITY)
+
+    def _tell_set(self, value: SetValue) -> None:
+        """Tell the recorder which value another program has set."""
+        if self._put_set is not None:
+            self._put_set(encode_set(value))
 
     def _has_no_master(self) -> bool:
         return self._token_went and self._membership.master_is_gone

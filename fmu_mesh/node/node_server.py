@@ -22,7 +22,7 @@ from ..errors import FmuError, FmuMeshError
 from ..system.plan import NodePlan
 from ..wire.inbox import Inbox
 from ..wire.keys import Keys
-from ..wire.messages import NodeReport
+from ..wire.messages import NodeReport, SetValue
 from ..wire.session import matches, undeclare_all
 from ..wire.values import json_encoding
 from ..wire.views import LogLine
@@ -50,6 +50,7 @@ class NodeServer:
         session: the session of this process; stays the caller's.
         report: tells the master how the node has ended; its argument is the time limit in s.
         on_hang: called on the server thread if a step does not return in time.
+        tell: tells the recorder, if there is one, which value was set; on the main thread.
     """
 
     def __init__(  # noqa: PLR0913, PLR0917  one node and whom it tells
@@ -60,6 +61,7 @@ class NodeServer:
         activity: Activity,
         report: Callable[[NodeReport, float], None],
         on_hang: Callable[[FmuError], None],
+        tell: Callable[[SetValue], None],
     ) -> None:
         self._on_hang = on_hang
         self._plan = plan
@@ -71,7 +73,7 @@ class NodeServer:
         self._streams: list[InstanceStreams] = []
         self._waiting_rows = 0
         self._jobs: queue.SimpleQueue[Job | None] = queue.SimpleQueue()
-        self._answers = Answers(plan, inbox, activity, self._jobs.put, self._publish_log)
+        self._answers = Answers(plan, inbox, activity, self._jobs.put, self._publish_log, tell)
         self._entities: list[zenoh.Queryable[None] | zenoh.Subscriber[None] | zenoh.LivelinessToken] = []
         self._status_publishers: dict[str, zenoh.Publisher] = {}
         self._log_publishers: dict[str, zenoh.Publisher] = {}
@@ -113,6 +115,7 @@ class NodeServer:
 
     def started(self) -> None:
         """All streams begin at the first point: find the subscriptions that were made before it."""
+        self._answers.begin()
         for streams in self._streams:
             streams.update()
         self.stepped()

@@ -136,6 +136,10 @@ class Runner:
         self.instance = wrapped
         self._position.refit()
 
+    def refit(self) -> None:
+        """The instance steps in another way from the next step on."""
+        self._position.refit()
+
     @property
     def step(self) -> int:
         """Number of own steps done; this is also the newest row of `outputs`."""

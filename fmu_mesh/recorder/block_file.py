@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -49,6 +49,11 @@ class BlockFile(ABC):
         """Do nothing: the file can hold values of all types."""
 
     @staticmethod
+    def growing_file(path: Path) -> Path:
+        """The file itself: its rows can be read while it grows."""
+        return path
+
+    @staticmethod
     @abstractmethod
     def keep_whole_rows(path: Path, kept: Kept) -> int:
         """Cut a file off after its last complete row; return the number of its rows. See `ResultFormat`."""
@@ -72,6 +77,9 @@ class BlockFile(ABC):
                 raise
             self.rows += len(block[0])
             self.kept = Kept(self.rows, self._file.size)
+
+    def note(self, entry: Mapping[str, Any]) -> None:  # noqa: B027  not every format has a place for it
+        """Do nothing: rows are all that the file has."""
 
     def flush(self) -> None:  # noqa: B027  nothing is left
         """Do nothing: `write` gives everything to the operating system."""

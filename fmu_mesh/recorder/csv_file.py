@@ -12,7 +12,7 @@ import csv
 import ctypes
 import io
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from ctypes import c_int64, c_void_p
 from functools import cache
 from pathlib import Path
@@ -22,15 +22,18 @@ import numpy as np
 import orjson
 from numpy.typing import NDArray
 
+from ..errors import ConfigurationError
 from ..files import Kept
 from ..rings.library import load_library
 from ..system.recording import Recording
 from ..variables.value_types import VariableType, is_text
 from .block_file import BlockFile
+from .notes_file import NotesFile
 
 __all__ = ["CsvFile", "NativeLines", "python_lines"]
 
 _READ_BYTES = 1 << 20
+_TIME: Final = b"time"
 
 _COLUMN_FIELDS: Final = 6
 _CELLS: Final = 512
@@ -49,13 +52,18 @@ class CsvFile(BlockFile):
     Args:
         path: the file; its folder is created, and the first row replaces an older file.
         columns: (name, type) of every column but `time`.
+        metadata: of the run; if there are some, they are in `<path>.json`.
 
     Raises:
         ConfigurationError: the file cannot be written, or another run writes into it.
     """
 
-    def __init__(self, path: Path, columns: Sequence[tuple[str, VariableType]]) -> None:
+    def __init__(
+        self, path: Path, columns: Sequence[tuple[str, VariableType]], metadata: Mapping[str, Any] | None = None
+    ) -> None:
         super().__init__(path, 1 + len(columns))
+        is_device = path.exists() and not path.is_file()
+        self._notes = NotesFile(path, metadata) if metadata and not is_device else None
         header = io.StringIO()
         csv.writer(header, lineterminator="\n").writerow(["time", *(name for name, _ in columns)])
         self._header = header.getvalue().encode()  # it is written with the first rows
@@ -67,7 +75,7 @@ class CsvFile(BlockFile):
     @classmethod
     def open(cls, path: Path, recording: Recording) -> Self:
         """Open a result file for what a run records."""
-        return cls(path, recording.columns)
+        return cls(path, recording.columns, recording.metadata)
 
     @staticmethod
     def keep_whole_rows(path: Path, kept: Kept) -> int:
@@ -76,9 +84,15 @@ class CsvFile(BlockFile):
         Args:
             path: the file, which no process writes any more.
             kept: rows that are known to be complete; only what follows them is read.
+
+        Raises:
+            ConfigurationError: nothing is known, and it does not begin as a result file does.
         """
         lines, end, quoted = 0, kept.size, False
         with path.open("r+b") as file:
+            start = file.read(1 + len(_TIME)).lstrip(b'"')
+            if not kept.size and not (start.startswith(_TIME) or _TIME.startswith(start)):
+                raise ConfigurationError(f"'{path}' is no result file: its first column is not '{_TIME.decode()}'.")
             offset = file.seek(kept.size)
             while piece := file.read(_READ_BYTES):
                 for number, part in enumerate(piece.split(b'"')):  # a String may contain line ends
@@ -92,6 +106,23 @@ class CsvFile(BlockFile):
             rows = kept.rows + lines - (0 if kept.size else 1)  # the first line is the heading
             file.truncate(end if rows > 0 else 0)
         return max(rows, 0)
+
+    def write(self, times: NDArray[np.float64], columns: Sequence[NDArray[Any]]) -> None:
+        """Append one row per time; ``columns`` are arrays of the same length, of their types' dtypes."""
+        if self._notes is not None and not self.rows:
+            self._notes.begin()
+        super().write(times, columns)
+
+    def note(self, entry: Mapping[str, Any]) -> None:
+        """Add an entry to the metadata."""
+        if self._notes is not None:
+            self._notes.note(entry)
+
+    def close(self) -> None:
+        """Close the file. Without a row, nothing has changed."""
+        if self._notes is not None:
+            self._notes.close()
+        super().close()
 
     def _block(self, columns: Sequence[NDArray[Any]]) -> bytes | memoryview:
         lines = self._lines(columns)

@@ -1,4 +1,4 @@
-"""The recorder: reads the rings of all recorded instances, and writes rows as soon as they are complete.
+"""The recorder: reads the rings of all recorded instances, and writes rows into all files as soon as they are complete.
 
 It has its own thread in the master's process, and its own inbox, liveliness token and progress. No node may be further
 ahead of the rows that are not written yet than the window of the recorder. So no row is dropped, and memory is bounded.
@@ -11,14 +11,13 @@ import threading
 import time
 from collections.abc import Callable, Collection, Sequence
 from types import TracebackType
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 import zenoh
-from numpy.typing import NDArray
+from msgspec import to_builtins
 
-from ..errors import FmuMeshError, MeshLost, MessageRefused, ProtocolBroken
-from ..files import unwritable
+from ..errors import ConfigurationError, FmuMeshError, MeshLost, MessageRefused, ProtocolBroken
 from ..rings.host_memory import HostMemory, Wish
 from ..system.plan import RECORDER, Link, NodePlan
 from ..system.recording import ResultFile
@@ -26,7 +25,21 @@ from ..variables.value_types import is_text
 from ..wire.frames import FrameReceiver, SourceRows, rows_of
 from ..wire.inbox import Inbox, Message
 from ..wire.membership import Membership
-from ..wire.messages import ABORT, FINISH, FRAME, GRANT, HEADER, INITIAL, LAST, PROGRESS, NodeReport
+from ..wire.messages import (
+    ABORT,
+    FINISH,
+    FRAME,
+    GRANT,
+    HEADER,
+    INITIAL,
+    LAST,
+    PROGRESS,
+    SET,
+    NodeReport,
+    SetValue,
+    decode_json,
+)
+from .record_files import ReadColumn, RecordFiles
 
 __all__ = ["RecordedSource", "Recorder"]
 
@@ -51,19 +64,19 @@ class Recorder:
     Args:
         plan: the recorder's part of the plan.
         session: the session of this process; the caller closes it.
-        file: the result file; closed by the recorder.
+        files: the result files, in the order of the plan; closed by the recorder.
         has_begun: whether all instances have reached point 0; nothing is written before.
         launch: the launcher that started this process; None if it was started manually.
         memory: the shared memory of this host; None if nothing is shared.
 
-    Use it as a context manager: the thread runs inside; afterwards the file has all complete rows.
+    Use it as a context manager: the thread runs inside; afterwards the files have all complete rows.
     """
 
     def __init__(  # noqa: PLR0913  one participant and its surroundings
         self,
         plan: NodePlan,
         session: zenoh.Session,
-        file: ResultFile,
+        files: Sequence[ResultFile],
         has_begun: Callable[[], bool] = lambda: True,
         *,
         launch: str | None = None,
@@ -73,9 +86,8 @@ class Recorder:
         self._own_memory = HostMemory.private(plan.memory, RECORDER)
         self._memory = memory if memory is not None else self._own_memory
         self._sources: dict[int, RecordedSource] = {}
-        self._columns: list[Callable[[int, int], NDArray[Any]]] = []
         self._rows = plan.rings[0].rows
-        self._file = file
+        self._files = RecordFiles(files)
         self._has_begun = has_begun
         self._written = 0
         self._told = 0
@@ -89,9 +101,9 @@ class Recorder:
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
 
     @property
-    def rows(self) -> int:
-        """Number of rows written so far; after the `with` block, the number of rows in the file."""
-        return self._file.rows
+    def files(self) -> tuple[tuple[str, int], ...]:
+        """Each file and its number of rows written so far; after the `with` block, the number of rows in the file."""
+        return self._files.counted
 
     def __enter__(self) -> Self:
         self._thread.start()
@@ -107,11 +119,11 @@ class Recorder:
             try:
                 self._write_rows()
             finally:
-                self._file.close()
-        except OSError as failure:
+                self._files.close()
+        except ConfigurationError:
             # The master has already reported a failure during the run; this failure came after the last point.
             if error is None:
-                raise unwritable(self._file.path, failure) from failure
+                raise
         finally:
             self._membership.close()
             self._inbox.close()
@@ -130,8 +142,6 @@ class Recorder:
                 self._take_last_rows(self._cause)
                 log.info("recording_ended_early", extra={"rows": self._written})
                 return
-        except OSError as error:
-            failure = unwritable(self._file.path, error)
         except Exception as error:  # noqa: BLE001 whatever it is, the master must know that nothing is recorded any more
             failure = error if isinstance(error, FmuMeshError) else FmuMeshError(f"recording failed: {error!r}")
         self._report(failure)
@@ -146,7 +156,9 @@ class Recorder:
         shares = welcome.shared if self._memory is not self._own_memory else ()
         self._sources = {link.index: self._source(link, shares) for link in self._plan.links_in}
         by_name = {source.link.source: source for source in self._sources.values()}
-        self._columns = [by_name[instance].column(variable) for instance, variable in self._plan.recorded]
+        self._files.begin(
+            self._plan.grid, self._plan.records, lambda instance, variable: by_name[instance].column(variable)
+        )
         self._put_progress = self._membership.sender(progress_key)
         return True
 
@@ -193,6 +205,9 @@ class Recorder:
 
     def _take_from_node(self, message: Message) -> None:
         sender, kind, number, count, point, data = message
+        if kind == SET:
+            self._files.note(to_builtins(decode_json(data[HEADER.size :], SetValue)))
+            return
         source = self._sources.get(number)
         if source is None or source.link.source_node != sender:
             raise MessageRefused(f"there is no link {number} from it to the recorder")
@@ -221,7 +236,7 @@ class Recorder:
         while (first := self._written) < rows:
             end = min(rows, first - first % self._rows + self._rows, first + _WRITE_ROWS)  # read without wrap-around
             self._check(first, end)
-            self._file.write(self._plan.grid.times(first, end), [column(first, end) for column in self._columns])
+            self._files.write(first, end)
             self._check(first, end)
             self._written = end
 
@@ -233,7 +248,7 @@ class Recorder:
     def _flush(self) -> None:
         if self._written and (now := time.monotonic()) - self._flushed > _FLUSH_S:
             self._flushed = now
-            self._file.flush()
+            self._files.flush()
 
     def _tell_progress(self) -> None:
         """Tell how many points are written; the first one before, because nothing is written until all are there."""
@@ -260,7 +275,7 @@ class Recorder:
                 if left <= 0 or not self._rows_are_missing():
                     return
                 message = self._inbox.wait(left)
-            if message is not None and message[1] in (FRAME, LAST):
+            if message is not None and message[1] in (FRAME, LAST, SET):
                 self._take(message)
 
     def _rows_are_missing(self) -> bool:
@@ -321,7 +336,7 @@ class RecordedSource:
                     hint="Does another process write to the memory of this run?",
                 )
 
-    def column(self, variable: str) -> Callable[[int, int], NDArray[Any]]:
+    def column(self, variable: str) -> ReadColumn:
         """A function that returns the values of a variable at the points first to end - 1, without wrap-around."""
         ring = self._rings[-1 if is_text(self.link.layout.column(variable).type) else 0]
         step_points, place, mask = self.link.step_points, ring.layout.place(variable), ring.mask

@@ -1,17 +1,20 @@
-"""Collects rows of single values and writes many at once into a result file: used by a run in one process."""
+"""Collects rows of single values and writes many at once into the result files: used by a run in one process."""
 
 from __future__ import annotations
 
 import threading
 import time
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ..files import unwritable
 from ..simtime import TimeGrid
 from ..system.recording import ResultFile
+from ..system.records import RecordPlan, union_of
 from ..variables.value_types import DTYPES, Value, VariableType
+from .record_files import ReadColumn, RecordFiles
 
 __all__ = ["RowBuffer"]
 
@@ -22,9 +25,10 @@ class RowBuffer:
     """The rows of a run, from point 0 on.
 
     Args:
-        file: the result file; None: nothing is recorded.
+        files: the result files; empty: nothing is recorded.
         grid: their times.
-        types: of their columns.
+        records: what each file gets.
+        types: of the values of a row, which are those of `union_of` the records.
 
     Attributes:
         flushed_at: last time at which other processes could read all rows; monotonic, in s.
@@ -32,65 +36,72 @@ class RowBuffer:
     Call `add` for every point and `write` from time to time; `close` at the end, also from another thread.
     """
 
-    def __init__(self, file: ResultFile | None, grid: TimeGrid, types: Sequence[VariableType]) -> None:
+    def __init__(
+        self,
+        files: Sequence[ResultFile],
+        grid: TimeGrid,
+        records: Sequence[RecordPlan],
+        types: Sequence[VariableType],
+    ) -> None:
         self.flushed_at = 0.0
-        self._file = file
-        self._grid = grid
+        self._files = RecordFiles(files)
         self._types = types
         self._first = 0
         self._waiting: list[list[Value]] = []
+        self._arrays: list[NDArray[Any]] = []
         self._writing = threading.Lock()
+        self._places = {column: place for place, column in enumerate(union_of(records))}
+        self._files.begin(grid, records, self._column_of)
 
     @property
-    def count(self) -> int:
-        """Number of rows given to the file; after `close`, the number of rows in the file."""
-        return self._file.rows if self._file is not None else 0
+    def counted(self) -> tuple[tuple[str, int], ...]:
+        """Each file and the number of rows given to it; after `close`, the number of rows in the file."""
+        return self._files.counted
 
     def add(self, row: list[Value]) -> None:
         """Add the row of the next point."""
         self._waiting.append(row)
 
     def write(self, *, flush: bool = False) -> None:
-        """Give the new rows to the file; with ``flush``, other processes can read them then.
+        """Give the new rows to the files; with ``flush``, other processes can read them then.
 
         Raises:
-            ConfigurationError: it cannot be written.
+            ConfigurationError: a file cannot be written; the others have their rows.
         """
         if flush:
             self.flushed_at = time.monotonic()
-        if self._file is None:
-            return
-        try:
-            with self._writing:
-                self._write(self._file)
-                if flush:
-                    self._file.flush()
-        except OSError as error:
-            raise unwritable(self._file.path, error) from error
+        with self._writing:
+            self._write()
+            if flush:
+                self._files.flush()
 
     def close(self) -> None:
-        """Write what is left and close the file.
+        """Write what is left and close the files.
 
         Raises:
-            ConfigurationError: it cannot be written.
+            ConfigurationError: a file cannot be written.
         """
-        if self._file is None or not self._writing.acquire(timeout=_CLOSE_S):
+        if not self._writing.acquire(timeout=_CLOSE_S):
             return  # another thread is writing to a disk that does not answer
         try:
             try:
-                self._write(self._file)
+                self._write()
             finally:
-                self._file.close()
-        except OSError as error:
-            raise unwritable(self._file.path, error) from error
+                self._files.close()
         finally:
             self._writing.release()
 
-    def _write(self, file: ResultFile) -> None:
+    def _write(self) -> None:
         rows, self._waiting = self._waiting, []
         if not rows:
             return
-        first, self._first = self._first, self._first + len(rows)
         columns = zip(zip(*rows, strict=True), self._types, strict=True)
-        arrays = [np.array(column, dtype=DTYPES[type_]) for column, type_ in columns]
-        file.write(self._grid.times(first, self._first), arrays)
+        self._arrays = [np.array(column, dtype=DTYPES[type_]) for column, type_ in columns]
+        try:
+            self._files.write(self._first, self._first + len(rows))
+        finally:
+            self._first += len(rows)
+
+    def _column_of(self, instance: str, variable: str) -> ReadColumn:
+        place = self._places[instance, variable]
+        return lambda first, end: self._arrays[place][first - self._first : end - self._first]

@@ -129,6 +129,7 @@ typedef struct {
   int64_t points; /* base points per own step */
   int64_t every;  /* ticks of the unit per own step */
   int64_t last_step;
+  int64_t python_at; /* the first own step that Python takes, whatever its kind */
   Output outputs[2]; /* the own ring; and outputs that somebody watches */
   Counter *counter;  /* rows of the own ring */
   char **bases;      /* room for the rows of the gates */
@@ -696,7 +697,7 @@ static int advance(Node *node, Unit *unit, int64_t *ticks) {
         }
         stamp(member, member->step + 1, 0);
         atomic_thread_fence(memory_order_release); /* the cleared stamp comes before the values */
-        if (member->kind == BY_PYTHON) {
+        if (member->kind == BY_PYTHON || member->step >= member->python_at) {
           if (move_all(member->loads, member->n_loads, member->bases) != 0) {
             member->outcome = (int64_t)SETTING << STAGE_BITS | OUT_OF_RANGE;
             result = STATUS;

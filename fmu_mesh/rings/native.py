@@ -233,6 +233,7 @@ class MemberTable(Structure):
         ("points", c_int64),
         ("every", c_int64),
         ("last_step", c_int64),
+        ("python_at", c_int64),
         ("outputs", OutputTable * 2),
         ("counter", c_void_p),
         ("bases", POINTER(c_void_p)),

@@ -88,6 +88,7 @@ class InProcessRun:
                 parent=fmus,
                 showing=self._run.options.showing,
                 loaded=self._run.loaded,
+                contents=self._run.contents,
             )
             if self._interrupted:
                 mesh.interrupt("interrupted")
@@ -116,9 +117,9 @@ class InProcessRun:
 
     def _failed(self, error: FmuMeshError) -> Outcome:
         plan, mesh = self._run.plan, self._mesh
-        point, rows = (mesh.point, mesh.rows) if mesh is not None else (0, 0)
-        file = plan.system.result_file
-        return Outcome("failed", point, plan.grid.time(point), 0.0, rows, file, error.report())
+        point, files = (mesh.point, mesh.files) if mesh is not None else (0, ())
+        file, rows = plan.system.result_file, files[0][1] if files else 0
+        return Outcome("failed", point, plan.grid.time(point), 0.0, rows, file, error.report(), files=files)
 
     def _log(self, message: LogMessage) -> None:
         point = self._mesh.point if self._mesh is not None else 0

@@ -12,7 +12,7 @@ import os
 import queue
 import signal
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 
 import msgspec
@@ -81,7 +81,7 @@ class Launcher:
         self._gateway_ended: float | None = None
         self._how: dict[str, str] = {}
         self._outcome: Outcome | None = None
-        self._rows: int | None = None
+        self._files: tuple[tuple[str, int], ...] | None = None
         self._point: int | None = None
         self._starting = True
         self._stop_watch = StopWatch(LEASE_MS / 1000, _TURN_S)
@@ -107,8 +107,8 @@ class Launcher:
                 self._turn()
         finally:
             self._end_all()
-            if self._rows is None and (result_file := self._plan.system.result_file) is not None:
-                self._rows = rows_left(result_file, self._folder)  # the master could not say it any more
+            if self._files is None:  # the master could not say it any more
+                self._files = rows_left([record.file for record in self._plan.system.records], self._folder)
             remove_run_folder(self._folder)
         return self._result()
 
@@ -185,8 +185,8 @@ class Launcher:
                 if status.state in GOING_ON and ended is not None and self._heard - ended > _GATEWAY_S:
                     self._gateway_ended = None
                     self._lost.append((_GATEWAY, 0, ended))
-            case Outcome(rows=rows, error=error):
-                self._rows = rows
+            case Outcome(files=files, error=error):
+                self._files = files
                 asked = error is not None and error.kind == Interrupted.__name__
                 if not (self._signalled and asked):  # this process has asked, and that is not why the run ends
                     self._outcome = event
@@ -303,7 +303,7 @@ class Launcher:
         Raises:
             FmuMeshError: it did not; as the master says, or as this process saw it if the master could not say it.
         """
-        outcome, file, rows = self._outcome, self._plan.system.result_file, self._rows or 0
+        outcome, file, files = self._outcome, self._plan.system.result_file, self._files or ()
         unknown = any(name in (_GATEWAY, _SERVER) for name, _, _ in self._lost)  # to the master
         if outcome is None or unknown:
             error = self._own_account()
@@ -314,11 +314,19 @@ class Launcher:
             error = self._with_cause(from_report(outcome.error), outcome)
             if isinstance(error, DeadlineExceeded) and _GATEWAY in self._processes and not self._gateway_ready:
                 error = DeadlineExceeded(f"{_GATEWAY} was not ready within {self._timeouts.start:g} s")
-        if type(error) in (Interrupted, MeshLost) and rows > (error.point or 0):
-            error.at(rows - 1, self._plan.grid.time(rows - 1))  # the last progress is older than the last row
+        last = self._last_recorded(files)
+        if type(error) in (Interrupted, MeshLost) and last > (error.point or 0):
+            error.at(last, self._plan.grid.time(last))  # the last progress is older than the last row
         point, seconds = error.point or 0, outcome.seconds if outcome is not None else 0.0
-        self.outcome = Outcome("failed", point, self._plan.grid.time(point), seconds, rows, file, error.report())
-        raise error.with_hint(what_is_kept(file, rows))
+        rows, time_s = files[0][1] if files else 0, self._plan.grid.time(point)
+        self.outcome = Outcome("failed", point, time_s, seconds, rows, file, error.report(), files=files)
+        raise error.with_hint(what_is_kept(files))
+
+    def _last_recorded(self, files: Sequence[tuple[str, int]]) -> int:
+        """The point of the last row in any of the result files."""
+        records = self._plan.system.records
+        counted = zip(records, files, strict=False)
+        return max((record.point_of(rows - 1) for record, (_, rows) in counted if rows), default=0)
 
     def _own_account(self) -> FmuMeshError:
         """Why the run ended, if the master has not said it."""

@@ -11,10 +11,11 @@ import shutil
 import tempfile
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import closing, suppress
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 
 from ..config.loading import LoadedConfig
 from ..errors import FmuError, FmuMeshError, Interrupted, TerminationRequested
@@ -27,7 +28,7 @@ from ..system.layout import Layout
 from ..system.plan import Plan
 from .local_system import LocalSystem, check_one_process, opening_of
 from .outcome import Outcome
-from .results import open_result, what_is_kept
+from .results import open_results, what_is_kept
 
 __all__ = ["LocalMesh"]
 
@@ -55,9 +56,10 @@ class LocalMesh:
         parent: an existing folder to extract FMUs into; by default the folder for temporary files.
         showing: whether and how a physics engine shows its world.
         loaded: the configuration; None: that of the plan, with paths relative to the working directory.
+        contents: the SHA-256 of the model of each instance, for the metadata of the result.
 
     Attributes:
-        rows: rows in the result file, once the run is over.
+        files: each result file and the number of its rows, once the run is over.
     """
 
     def __init__(  # noqa: PLR0913, PLR0917  what a caller may want to hear of
@@ -70,12 +72,13 @@ class LocalMesh:
         parent: Path | None = None,
         showing: Showing = Showing(),  # noqa: B008  a frozen Struct
         loaded: LoadedConfig | None = None,
+        contents: Mapping[str, str] = MappingProxyType({}),
     ) -> None:
         self._seconds = 0.0
         self._begun = False
         self._ended_by: TerminationRequested | None = None
         self._buffer: RowBuffer | None = None
-        self.rows = 0
+        self.files: tuple[tuple[str, int], ...] = ()
         self._plan = plan
         self._system = LocalSystem(plan)
         self._log = log
@@ -85,6 +88,7 @@ class LocalMesh:
         self._parent = parent
         self._showing = showing
         self._loaded = loaded if loaded is not None else LoadedConfig(plan.system.config, Path())
+        self._contents = contents
         self._stop: str | None = None
         self._stopped = threading.Event()
         self._folder: Path | None = None
@@ -125,13 +129,14 @@ class LocalMesh:
             point=self.point,
             time=self._plan.grid.time(self.point),
             seconds=self._seconds,
-            rows=self.rows,
+            rows=self.files[0][1] if self.files else 0,
             file=self._plan.system.result_file,
             ended_by=ended_by,
+            files=self.files,
         )
 
     def _kept(self) -> str | None:
-        return what_is_kept(self._plan.system.result_file, self.rows)
+        return what_is_kept(self.files)
 
     def _run(self) -> None:
         plan, system = self._plan, self._system
@@ -140,8 +145,8 @@ class LocalMesh:
         watch = CallWatch(self._take_hang)
         with tempfile.TemporaryDirectory(prefix="fmu_mesh-", dir=self._parent) as folder, closing(watch):
             self._folder = Path(folder)
-            file = open_result(self._loaded, plan.system) if plan.system.result_file else None
-            self._buffer = rows = RowBuffer(file, plan.grid, types)
+            files = open_results(self._loaded, plan.system, digest=plan.digest, contents=self._contents)
+            self._buffer = rows = RowBuffer(files, plan.grid, plan.system.records, types)
             try:
                 system.start(partial(self._guarded, folder=self._folder, watch=watch))
                 started = time.perf_counter()
@@ -223,4 +228,4 @@ class LocalMesh:
         try:
             rows.close()
         finally:
-            self.rows = rows.count
+            self.files = rows.counted

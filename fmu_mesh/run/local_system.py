@@ -27,6 +27,8 @@ from ..system.coupling_rule import CouplingRule
 from ..system.initialization_plan import Loop, Tear
 from ..system.layout import Layout
 from ..system.plan import InstancePlan, Plan
+from ..system.schedule import Course
+from ..system.series_files import courses_of
 from ..variables.value_types import Value
 from .child import is_other_python
 from .threads import one_thread_meanwhile
@@ -242,6 +244,7 @@ class _Member:
         self._points = self.plan.step_points
         self._feeds: list[_Feed] = []
         self._set_at = -1
+        self._courses: dict[str, Course] = {}
         self.step = 0
         self.settled: set[str] = set()
 
@@ -275,6 +278,7 @@ class _Member:
 
     def bind(self, grid: TimeGrid, members: Mapping[str, _Member]) -> None:
         """Prepare `step_from`: what it needs at every point is looked up here, once."""
+        self._courses = courses_of(self.plan.scenario, self.instance.description, grid, self._points)
         arrays = [column.name for column in self.plan.inputs.columns if column.shape]
         for name, value in zip(arrays, self.instance.get_values(arrays) if arrays else [], strict=True):
             self._inputs.put(0, name, value)  # elements that are not connected keep it
@@ -299,6 +303,10 @@ class _Member:
             return
         step = self.step
         start = step * self._points
+        if self._courses:
+            changes = {name: course.change(step) for name, course in self._courses.items()}
+            if prescribed := {name: value for name, value in changes.items() if value is not None}:
+                self.instance.set_in_step(prescribed)
         for read, points, lead, change, write in self._feeds:
             value = read((start + lead) // points)  # `CouplingRule.row_for`, without a call
             write(0, value if change is None else change(value))

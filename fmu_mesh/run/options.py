@@ -18,10 +18,11 @@ from msgspec.structs import replace
 from ..config.base import Base, Endpoint
 from ..config.findings import Findings
 from ..config.loading import LoadedConfig, PlainConfig
-from ..config.mesh import RecordConfig, SimulationConfig, ZenohConfig
+from ..config.mesh import Config, RecordConfig, SimulationConfig, ZenohConfig
 from ..config.structure import check
 from ..config.yaml_text import Plain, read
 from ..instances.contract import Showing
+from ..recorder.arrays_file import ENDING
 from ..text import listed, nearest
 
 __all__ = ["Flag", "OptionField", "Options", "option_fields", "with_config_values", "with_options"]
@@ -73,6 +74,9 @@ class Options(msgspec.Struct, frozen=True):
     ] = ()
     output: Annotated[
         Path | None, Flag("--output", "FILE", "record.file", "result file; its ending chooses the format")
+    ] = None
+    scenario: Annotated[
+        Path | None, Flag("--scenario", "FILE", text="values of inputs and parameters over time, from this file")
     ] = None
     listen: Annotated[tuple[Endpoint, ...], Flag("--listen", "ENDPOINT", "zenoh.listen")] = ()
     connect: Annotated[tuple[Endpoint, ...], Flag("--connect", "ENDPOINT", "zenoh.connect")] = ()
@@ -199,21 +203,37 @@ def with_options(loaded: LoadedConfig, options: Options, findings: Findings | No
         findings: collects what is wrong with the values of options; None where they were checked before.
     """
     config, overrides = loaded.config, dict(loaded.overrides)
+    if options.scenario is not None:
+        overrides["scenario"] = f"--scenario {options.scenario}"
+        config = replace(config, scenario=str(options.scenario.absolute()))
     for setting in option_fields().values():
         value, flag = getattr(options, setting.name), setting.flag
         if flag.key is None or value in (None, ()):
             continue
         section, _, key = flag.key.partition(".")
-        if flag.key in overrides and findings is not None:
-            findings.add(flag.key, f"replaced by {flag.name} as well", "one of the two options")
-        overrides[flag.key] = f"{flag.name} {_written(value)}"
+        place = f"{next(iter(config.records), section)}.{key}" if section == "record" else flag.key
+        if place in overrides and findings is not None:
+            findings.add(place, f"replaced by {flag.name} as well", "one of the two options")
+        overrides[place] = f"{flag.name} {_written(value)}"
         plain = list(value) if setting.repeatable else str(value.absolute()) if isinstance(value, Path) else value
-        config = replace(config, **{section: replace(getattr(config, section), **{key: plain})})
+        if section == "record":
+            config = replace(config, record=_with_output(config, str(plain)))
+        else:
+            config = replace(config, **{section: replace(getattr(config, section), **{key: plain})})
         if findings is not None:
             wrong = Findings(str(loaded.file), loaded.lines, overrides)
-            check(plain, _type_of(section, key), flag.key, wrong)
+            check(plain, _type_of(section, key), place, wrong)
             findings.merge(wrong)
     return replace(loaded, config=config, overrides=overrides)
+
+
+def _with_output(config: Config, file: str) -> RecordConfig | list[RecordConfig]:
+    """The section `record` with another first file; of what stays in memory there is one."""
+    first, *others = (*config.records.values(),) or (RecordConfig(),)
+    first = replace(first, file=file)
+    if isinstance(config.record, RecordConfig):
+        return first
+    return [first] if file.endswith(ENDING) else [first, *others]
 
 
 def _alternatives(kind: Any) -> tuple[Any, ...]:  # noqa: ANN401 a type, which has no common class

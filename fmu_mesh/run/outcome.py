@@ -20,12 +20,13 @@ class Outcome(msgspec.Struct, frozen=True, tag="end"):
         point: the last point that all instances reached.
         time: the simulation time of that point in s.
         seconds: wall-clock time from the first grant to the last point in s.
-        rows: number of rows in the result file.
-        file: the result file; None if nothing was recorded.
+        rows: number of rows in the first result file.
+        file: the first result file; None if nothing was recorded.
         error: why the run failed.
         ended_by: what ended the simulation before its last point although nothing failed.
         profile: where the time went, if that was asked for.
         signal: name of the signal by which the process of the master was asked to end, if it was.
+        files: each result file, and the number of its rows.
     """
 
     state: Literal["done", "failed"]
@@ -38,3 +39,4 @@ class Outcome(msgspec.Struct, frozen=True, tag="end"):
     ended_by: ErrorReport | None = None
     profile: MeshProfile | None = None
     signal: str | None = None
+    files: tuple[tuple[str, int], ...] = ()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import pwd
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from contextlib import suppress
 from pathlib import Path
@@ -15,13 +15,16 @@ from msgspec.structs import replace
 from .. import files
 from ..config.findings import Findings
 from ..config.instance_sections import InstanceSection, key_of, placed
-from ..config.loading import LoadedConfig, read_file
+from ..config.loading import LoadedConfig, read_file, read_scenario
 from ..config.mesh import LimitsConfig
-from ..errors import Finding, LoadFailed
+from ..errors import ConfigurationError, Finding, LoadFailed
 from ..instances.configuration import examine_data
+from ..instances.python.unit_names import base_unit_of
 from ..instances.registry import check_showing, content, describe, expected_model
+from ..ros.bags.scenario_bags import bag_values
 from ..ros.gateway.mapping import resolve as resolve_ros
 from ..system.plan import Plan, make_plan
+from ..system.scenario import Scenario
 from ..system.system import build
 from ..text import nearest_file
 from ..variables.model_description import ModelDescription
@@ -138,12 +141,31 @@ def planned(
     descriptions, unreadable = _descriptions(loaded, findings.places, tell, known or KnownModels())
     findings.merge(unreadable)
     resolve_ros(loaded, descriptions, findings)
-    system = build(loaded, descriptions, tuple(findings))
+    scenario = _scenario(loaded, descriptions, findings)
+    system = build(loaded, descriptions, tuple(findings), scenario)
     check_results(loaded, system)
     sections = loaded.config.instances
     contents = {name: content(Path(own.fmu), sections[name]) for name, own in system.instances.items()}
     plan = make_plan(system, file=str(loaded.file), contents=contents)
     return RunPlan(loaded, options, plan, contents)
+
+
+def _scenario(
+    loaded: LoadedConfig, descriptions: Mapping[str, ModelDescription], findings: Findings
+) -> Scenario | None:
+    """The scenario with the values of its bags; None if there is none, or after a finding."""
+    try:
+        source = read_scenario(loaded)
+    except ConfigurationError as error:
+        findings.merge(error.findings)
+        return None
+    if source is None:
+        return None
+    own = findings if source.prefix else source.findings()
+    bags = bag_values(source, loaded, descriptions, own)
+    if own is not findings:
+        findings.merge(own)
+    return Scenario(source, bags, base_unit_of)
 
 
 def _descriptions(

@@ -29,6 +29,7 @@ from ..master.pacing import Pacer
 from ..node.connecting import connect
 from ..node.engine import Engine, make_engine
 from ..node.initialization import Initialization
+from ..node.inputs import with_times
 from ..node.stepping import Position, Runner
 from ..rings import native
 from ..rings.host_memory import HostMemory
@@ -237,7 +238,8 @@ class _Run:
         plan, writer = self._plan, self.writer
         ended_by = event.report() if event is not None else None
         time_s = plan.grid.time(self.point)
-        return Outcome("done", self.point, time_s, seconds, writer.rows, writer.file, ended_by=ended_by)
+        rows, file, files = writer.rows, writer.file, writer.counted
+        return Outcome("done", self.point, time_s, seconds, rows, file, ended_by=ended_by, files=files)
 
     def interrupt(self, reason: str) -> None:
         """From any thread: see `RepeatedRuns.interrupt`."""
@@ -253,7 +255,8 @@ class _Run:
             stack.callback(instance.close)
             place = places[item.name]
             ring, counter = memory.ring(place), memory.counter(place.counter)
-            self._runners[item.name] = Runner(item, instance, node.grid, ring, counter)
+            timed = with_times(instance, item, node.grid)
+            self._runners[item.name] = Runner(item, timed, node.grid, ring, counter)
         connect(node, self._runners, memory, memory, ())
 
     def _instance(self, name: str) -> Instance:
@@ -353,11 +356,11 @@ class _Run:
 
 
 def _in_one_node(plan: Plan) -> Plan:
-    """The plan of the same system with all instances in one node; a run in one process needs no window."""
+    """The plan of the same system with all instances in one node and one result file, without a window."""
     system = plan.system
     config = replace(system.config, simulation=replace(system.config.simulation, window="auto"))
     instances = {name: replace(own, node=_NODE) for name, own in system.instances.items()}
-    return make_plan(replace(system, config=config, instances=instances))
+    return make_plan(replace(system, config=config, instances=instances, records=system.records[:1]))
 
 
 def _nothing_comes(_left_s: float) -> None:

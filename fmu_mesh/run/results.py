@@ -1,21 +1,23 @@
-"""The result file of a run: checked before the run, opened in its format, counted after its writer was killed.
+"""The result files of a run: checked before the run, opened in their formats, counted after their writer was killed.
 
 Knows no format: `fmu_mesh.system.recording` finds the format by the name of the file.
 
-A run in processes keeps a note in its folder: how many rows the operating system has. The note is written before the
-first row. So while it is empty, the result file is not that of this run.
+A run in processes keeps a note for each file in its folder: how many rows the operating system has. The note is written
+before the first row. So while it is empty, the result file is not that of this run.
 """
 
 from __future__ import annotations
 
 import os
 import struct
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from msgspec import to_builtins
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from ..config.loading import LoadedConfig
@@ -23,71 +25,120 @@ from ..errors import ConfigurationError
 from ..files import Kept, open_alone
 from ..recorder.arrays_file import ENDING
 from ..system.recording import Recording, ResultFile, ResultFormat, result_format
+from ..system.records import record_paths
+from ..system.run_metadata import metadata_of
 from ..system.system import ResolvedSystem
 
-__all__ = ["check_results", "open_result", "rows_left", "what_is_kept"]
+__all__ = ["check_results", "open_result", "open_results", "rows_left", "what_is_kept"]
 
 _NAME = "recorded"
 _NOTE = struct.Struct("<qq")
 
 
 def check_results(loaded: LoadedConfig, system: ResolvedSystem) -> None:
-    """Check that the result file can hold what is recorded.
+    """Check that the result files can hold what is recorded.
 
     Raises:
-        ConfigurationError: it cannot; carries all findings.
+        ConfigurationError: one of them cannot; carries all findings.
     """
-    if system.result_file is not None:
-        findings = loaded.findings()
-        _format(system.result_file).check(_recording(loaded, system), findings)
-        findings.raise_any()
+    findings = loaded.findings()
+    for record, recording in zip(system.records, _recordings(loaded, system), strict=True):
+        _format(record.file).check(recording, findings)
+    findings.raise_any()
 
 
-def open_result(loaded: LoadedConfig, system: ResolvedSystem, folder: Path | None = None) -> ResultFile:
-    """Open the result file of a run.
+def open_results(
+    loaded: LoadedConfig,
+    system: ResolvedSystem,
+    folder: Path | None = None,
+    *,
+    digest: str = "",
+    contents: Mapping[str, str] = {},
+) -> list[ResultFile]:
+    """Open the result files of a run, in their order; none if nothing is recorded.
 
     Args:
         loaded: the configuration.
-        system: the system of this configuration; it has a result file.
+        system: the system of this configuration.
         folder: the folder of the run, if somebody calls `rows_left` when this process was killed.
+        digest: the digest of the mesh, for the metadata.
+        contents: the SHA-256 of the model of each instance, for the metadata.
+
+    Raises:
+        ConfigurationError: a file cannot be written, or another run is writing it. All files are as they were.
+    """
+    files: list[ResultFile] = []
+    try:
+        for number, (record, recording) in enumerate(zip(system.records, _recordings(loaded, system), strict=True)):
+            path = Path(record.file)
+            metadata = metadata_of(loaded, system, record, digest=digest, contents=contents)
+            file = _format(path).open(path, replace(recording, metadata=to_builtins(metadata)))
+            files.append(_NotedFile(file, folder / _note_of(number)) if folder is not None else file)
+    except BaseException:
+        for file in files:
+            with suppress(OSError):
+                file.close()
+        raise
+    return files
+
+
+def open_result(
+    loaded: LoadedConfig, system: ResolvedSystem, *, digest: str = "", contents: Mapping[str, str] = {}
+) -> ResultFile:
+    """Open the first result file of a run; the system has one. The arguments are those of `open_results`.
 
     Raises:
         ConfigurationError: the file cannot be written, or another run is writing it.
     """
-    assert system.result_file is not None
-    path = Path(system.result_file)
-    file = _format(path).open(path, _recording(loaded, system))
-    return _NotedFile(file, folder) if folder is not None else file
+    (file,) = open_results(loaded, replace(system, records=system.records[:1]), digest=digest, contents=contents)
+    return file
 
 
-def rows_left(result_file: str, folder: Path) -> int:
-    """The number of rows that a killed process has left in its result file. What follows the last row is cut off.
+def rows_left(result_files: Sequence[str], folder: Path) -> tuple[tuple[str, int], ...]:
+    """Each result file of a killed process, and the number of rows in it. What follows the last row is cut off.
 
     Args:
-        result_file: path of the file.
+        result_files: paths of the files.
         folder: the folder of the run.
     """
-    path = Path(result_file)
+    return tuple((file, _rows_left(Path(file), folder / _note_of(number))) for number, file in enumerate(result_files))
+
+
+def what_is_kept(files: Sequence[tuple[str, int]]) -> str | None:
+    """The sentence for a run that ended early and left rows; None if there are no rows, as on a device.
+
+    Args:
+        files: each result file, and the number of its rows.
+    """
+    kept = [(file, rows) for file, rows in files if rows and Path(file).is_file()]
+    if not kept:
+        return None
+    if kept[0][0].endswith(ENDING):
+        return f"What was recorded up to then ({kept[0][1]} rows) is in the `result` of this error."
+    if len(kept) == 1:
+        return f"What was recorded up to then ({kept[0][1]} rows) is in '{kept[0][0]}'."
+    *others, last = [f"'{file}' ({rows} rows)" for file, rows in kept]
+    return f"What was recorded up to then is in {', '.join(others)} and {last}."
+
+
+def _note_of(number: int) -> str:
+    """The name of the note about a result file."""
+    return f"{_NAME}.{number}" if number else _NAME
+
+
+def _rows_left(path: Path, note: Path) -> int:
     if path.exists() and not path.is_file():
         return 0  # a device keeps nothing
     try:
-        kept = Kept(*_NOTE.unpack((folder / _NAME).read_bytes()))
+        kept = Kept(*_NOTE.unpack(note.read_bytes()))
     except (FileNotFoundError, struct.error):
         kept = None
+    growing = _format(path).growing_file(path)
     # Opening the file makes sure that no other run is writing it, and removes a draft that the process has left.
-    with suppress(ConfigurationError, OSError), open_alone(path):
-        if kept is not None and path.is_file() and path.stat().st_size >= kept.size:  # or it is another file by now
+    with suppress(ConfigurationError, OSError), open_alone(growing):
+        if kept is not None and growing.is_file() and growing.stat().st_size >= kept.size:  # or it is another file
             return _format(path).keep_whole_rows(path, kept)
     return 0
-
-
-def what_is_kept(result_file: str | None, rows: int) -> str | None:
-    """The sentence for a run that ended early and left rows; None if there are no rows, as on a device."""
-    if not rows or result_file is None or not Path(result_file).is_file():
-        return None
-    if result_file.endswith(ENDING):
-        return f"What was recorded up to then ({rows} rows) is in the `result` of this error."
-    return f"What was recorded up to then ({rows} rows) is in '{result_file}'."
 
 
 def _format(path: str | Path) -> ResultFormat:
@@ -97,9 +148,13 @@ def _format(path: str | Path) -> ResultFormat:
     return found
 
 
-def _recording(loaded: LoadedConfig, system: ResolvedSystem) -> Recording:
+def _recordings(loaded: LoadedConfig, system: ResolvedSystem) -> Iterator[Recording]:
+    """What each result file holds."""
     descriptions = {name: instance.description for name, instance in system.instances.items()}
-    return Recording(loaded, descriptions, system.recorded)
+    places = {str(file): place for place, file in record_paths(loaded).items()}
+    for record in system.records:
+        place = places.get(record.file, "record")
+        yield Recording(loaded, descriptions, record.variables, place, record.first, record.every)
 
 
 class _NotedFile:
@@ -107,12 +162,12 @@ class _NotedFile:
 
     Args:
         file: the result file; it is closed with this.
-        folder: the folder of the run.
+        note: the file of the note.
     """
 
-    def __init__(self, file: ResultFile, folder: Path) -> None:
+    def __init__(self, file: ResultFile, note: Path) -> None:
         self._file = file
-        self._descriptor = os.open(folder / _NAME, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o600)  # slow, so not later
+        self._descriptor = os.open(note, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o600)  # slow, so not later
         self._noted: Kept | None = None
 
     @property
@@ -132,6 +187,9 @@ class _NotedFile:
             self._note(Kept())
         self._file.write(times, columns)
         self._note_kept()
+
+    def note(self, entry: Mapping[str, Any]) -> None:
+        self._file.note(entry)
 
     def flush(self) -> None:
         self._file.flush()

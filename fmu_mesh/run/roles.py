@@ -28,7 +28,7 @@ from .child import is_other_python
 from .events import Event, Log, Reachable, Status
 from .outcome import Outcome
 from .process import RunProcess
-from .results import open_result
+from .results import open_results
 from .run_plan import MANUAL, NodeRun, RunPlan
 from .wiring import is_socket, wiring
 
@@ -174,11 +174,17 @@ def run_master(run: RunPlan, emit: Callable[[Event], None]) -> Outcome:
         recorder = failure = None
         try:
             if RECORDER in plan.nodes:
-                result = open_result(run.loaded, plan.system, process.folder if process.is_child else None)
+                results = open_results(
+                    run.loaded,
+                    plan.system,
+                    process.folder if process.is_child else None,
+                    digest=plan.digest,
+                    contents=run.contents,
+                )
                 with Recorder(
                     plan.nodes[RECORDER],
                     session,
-                    result,
+                    results,
                     lambda: master.has_begun,
                     launch=process.launch,
                     memory=master.memory_for(RECORDER),
@@ -212,17 +218,19 @@ def _outcome_of(
     run: RunPlan, master: Master, recorder: Recorder | None, error: FmuMeshError | None, signal: str | None
 ) -> Outcome:
     status = master.last_status()
+    files = recorder.files if recorder is not None else ()
     return Outcome(
         state="done" if error is None else "failed",
         point=status.point,
         time=status.time,
         seconds=master.seconds,
-        rows=recorder.rows if recorder is not None else 0,
+        rows=files[0][1] if files else 0,
         file=run.plan.system.result_file,
         error=error.report() if error is not None else None,
         ended_by=master.ended_by.report() if master.ended_by is not None and error is None else None,
         profile=master.profile(),
         signal=signal,
+        files=files,
     )
 
 

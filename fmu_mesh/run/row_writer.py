@@ -7,14 +7,10 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Mapping
 
-import numpy as np
-from numpy.typing import NDArray
-
-from ..files import unwritable
 from ..node.stepping import Runner
+from ..recorder.record_files import RecordFiles
 from ..recorder.recorder import RecordedSource
 from ..system.plan import RECORDER, Plan
 from ..system.recording import ResultFile
@@ -39,11 +35,8 @@ class RowWriter:
 
     def __init__(self, file: ResultFile | None) -> None:
         self.written = 0
-        self._result = file
-        self._open = file
+        self._files = RecordFiles([file] if file is not None else [])
         self._sources: list[RecordedSource] = []
-        self._columns: list[Callable[[int, int], NDArray[Any]]] = []
-        self._times: Callable[[int, int], NDArray[np.float64]]
         self._rows = 1
         self._flushed = 0.0
         self._writing = threading.Lock()
@@ -61,19 +54,24 @@ class RowWriter:
             for link in node.links_in
         }
         self._rows = node.rings[0].rows
-        self._times = plan.grid.times
         self._sources = list(sources.values())
-        self._columns = [sources[instance].column(variable) for instance, variable in node.recorded]
+        records = node.records[: len(self._files.counted)]
+        self._files.begin(plan.grid, records, lambda instance, variable: sources[instance].column(variable))
 
     @property
     def rows(self) -> int:
         """Number of rows in the file."""
-        return self._result.rows if self._result is not None else 0
+        return sum(rows for _, rows in self.counted)
 
     @property
     def file(self) -> str | None:
         """The path of the file."""
-        return str(self._result.path) if self._result is not None else None
+        return next((file for file, _ in self.counted), None)
+
+    @property
+    def counted(self) -> tuple[tuple[str, int], ...]:
+        """The file and its number of rows, if there is one."""
+        return self._files.counted
 
     @property
     def complete(self) -> int:
@@ -91,14 +89,13 @@ class RowWriter:
         if end - self.written < (1 if is_late else many):
             return
         with self._writing:
-            if (file := self._open) is not None and self._columns:
-                try:
-                    self._write(file, end)
-                    if is_late:
-                        file.flush()
-                except OSError as error:
-                    raise unwritable(file.path, error) from error
+            while self._sources and (first := self.written) < end:
+                last = min(end, first - first % self._rows + self._rows)  # read without wrap-around
+                self._files.write(first, last)
+                self.written = last
             self.written = end
+            if is_late:
+                self._files.flush()
             self._flushed = now if is_late else self._flushed
 
     def close(self) -> None:
@@ -110,25 +107,10 @@ class RowWriter:
         if not self._writing.acquire(timeout=_CLOSE_S):
             return  # another thread is writing to a disk that does not answer
         try:
-            file, self._open = self._open, None
-            if file is not None:
-                _close(file)
+            self._files.close()
         finally:
             self._writing.release()
 
     def kept(self) -> str | None:
         """The sentence about the rows of a run that ended early."""
-        return what_is_kept(self.file, self.rows)
-
-    def _write(self, file: ResultFile, end: int) -> None:
-        while (first := self.written) < end:
-            last = min(end, first - first % self._rows + self._rows)  # read without wrap-around
-            file.write(self._times(first, last), [column(first, last) for column in self._columns])
-            self.written = last
-
-
-def _close(file: ResultFile) -> None:
-    try:
-        file.close()
-    except OSError as error:
-        raise unwritable(file.path, error) from error
+        return what_is_kept(self.counted)

@@ -27,6 +27,7 @@ from ..api.mesh_builder import Mesh
 from ..api.plan_options import PlanOptions, texts_of
 from ..api.result import Result
 from ..config.loading import PlainConfig
+from ..config.yaml_text import Plain
 from ..errors import ConfigurationError, ErrorReport, FmuError, FmuMeshError, from_report
 from ..run.options import Options
 from .reductions import read_reduction, reduced_value
@@ -164,7 +165,7 @@ class _Loaded:
         self.task = task
         self._task = msgspec.msgpack.decode(task, type=SweepTask, dec_hook=path_of)
         self._reductions = [read_reduction(text) for text in self._task.reductions]
-        self._mesh = Mesh.from_configuration(PlainConfig(self._task.data, self._task.file))
+        self._mesh = Mesh.from_configuration(PlainConfig(_with_one_record(self._task.data), self._task.file))
         self._jobs: SimpleQueue[_Job | None] = SimpleQueue()
         self._hung = _Hung()
         arguments = self._mesh, self._jobs, self._hung
@@ -251,6 +252,13 @@ def _work(mesh: Mesh, jobs: SimpleQueue[_Job | None], hung: _Hung, *, reset: boo
 def curves_of(folder: Path, identity: str) -> Path:
     """The file with the curves of a run, in the folder of the curves."""
     return folder / f"{identity}.csv"
+
+
+def _with_one_record(data: Plain) -> Plain:
+    """A configuration that records the first section only: variants must not write into the same files."""
+    if not isinstance(data, dict) or not isinstance(records := data.get("record"), list):
+        return data
+    return {**data, "record": records[:1]}
 
 
 def path_of(type_: type, value: object) -> object:

@@ -23,6 +23,8 @@ from .initialization_plan import InitializationPlan, Loop, plan_initialization
 from .layout import Layout, row_bytes, rows_for
 from .linear_inputs import LinearInput, linear_inputs
 from .memory_map import MASTER, RECORDER, MemoryMap, RingPlace, map_memory
+from .records import RecordPlan, union_of
+from .schedule import Schedule
 from .system import Connection, ResolvedSystem, SystemInstance
 from .window import batch_of, recorder_window, window_of
 
@@ -46,12 +48,13 @@ class InstancePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     Attributes:
         step_points: base points per own step.
-        outputs: the columns read after every step: connected or recorded outputs.
+        outputs: the columns read after every step: connected outputs, and recorded variables of any causality.
         inputs: the connected inputs, set before every step.
         initialization: the levels of its connected outputs in Initialization Mode, by name.
         section: its section of the configuration, without the common keys: their meaning is in the other fields. It is
             decoded with the hook `fmu_mesh.instances.registry.decode_section`, because only that knows the kinds.
         linear_inputs: the inputs whose connections are extrapolated.
+        scenario: what a scenario prescribes for its variables.
     """
 
     name: str
@@ -64,6 +67,7 @@ class InstancePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     initialization: dict[str, int]
     section: InstanceSection
     linear_inputs: tuple[LinearInput, ...] = ()
+    scenario: tuple[Schedule, ...] = ()
 
 
 class Link(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -105,6 +109,7 @@ class NodePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         links_out: links that start here.
         restarts: how many times the run was restarted.
         shared_memory: whether processes of one host exchange messages through shared memory.
+        records: the result files, if it is the recorder.
     """
 
     mesh: str
@@ -125,7 +130,7 @@ class NodePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     links_out: tuple[Link, ...]
     loops: tuple[Loop, ...] = ()
     initialization: InitializationConfig = InitializationConfig()
-    recorded: tuple[tuple[str, str], ...] = ()
+    records: tuple[RecordPlan, ...] = ()
     limits: LimitsConfig = LimitsConfig()
     shared_memory: bool = True
     restarts: int = 0
@@ -138,6 +143,11 @@ class NodePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def interpreter(self) -> str | None:
         """The Python that has to run this node; None: the one that runs fmu-mesh."""
         return next((own for item in self.instances if (own := item.section.interpreter) is not None), None)
+
+    @property
+    def recorded(self) -> tuple[tuple[str, str], ...]:
+        """(instance, variable) of the columns of all result files, each once, if it is the recorder."""
+        return union_of(self.records)
 
     def peers(self) -> set[str]:
         """Names of the nodes that exchange frames with this one, without the recorder, which is part of the master."""
@@ -228,8 +238,15 @@ def _digest(system: ResolvedSystem, nodes: dict[str, NodePlan], contents: Mappin
         replace(
             node,
             limits=LimitsConfig(),
+            records=tuple(replace(record, file="") for record in node.records),
             instances=tuple(
-                replace(instance, fmu="", section=instance.section.agreed()) for instance in node.instances
+                replace(
+                    instance,
+                    fmu="",
+                    section=instance.section.agreed(),
+                    scenario=tuple(schedule.agreed() for schedule in instance.scenario),
+                )
+                for instance in node.instances
             ),
         )
         for node in nodes.values()
@@ -276,11 +293,11 @@ def _algebraic_loop(loop: list[str], connections: tuple[Connection, ...], file: 
 
 def _nodes(plan: Plan) -> dict[str, NodePlan]:
     system, config = plan.system, plan.system.config
-    outputs = {name: _output_layout(plan, name) for name in system.instances}
+    outputs = _output_layouts(plan)
     node_names = list(dict.fromkeys(instance.node for instance in system.instances.values()))
     links = _links(plan)
     windows = dict.fromkeys(node_names, plan.window)
-    if system.recorded:
+    if system.records:
         rows = [row_bytes(link.layout) for link in links if link.target_node == RECORDER]
         windows[RECORDER] = recorder_window(plan.window, rows)
     longest_step = max(instance.step_points for instance in system.instances.values())
@@ -316,7 +333,7 @@ def _nodes(plan: Plan) -> dict[str, NodePlan]:
             links_out=tuple(link for link in links if link.source_node == node),
             loops=tuple(loop for loop in plan.initialization.loops if node in loop.nodes),
             initialization=config.initialization,
-            recorded=system.recorded if node == RECORDER else (),
+            records=system.records if node == RECORDER else (),
             limits=config.limits,
             shared_memory=config.zenoh.shared_memory,
         )
@@ -342,12 +359,18 @@ def _in_cycle(plan: Plan, members: list[str], units: dict[str, tuple[str, ...]])
     return any(name in cycle and len(units[name]) < len(cycle) for name in members for cycle in plan.cycles)
 
 
-def _output_layout(plan: Plan, name: str) -> Layout:
-    """Connected and recorded outputs of an instance, in the order of its model description."""
-    wanted = {c.source.name for c in plan.connections if c.source_instance == name}
-    wanted |= {_base(plan, instance, variable) for instance, variable in plan.system.recorded if instance == name}
-    variables = plan.system.instances[name].description.variables
-    return Layout.of(v for v in variables if v.name in wanted)
+def _output_layouts(plan: Plan) -> dict[str, Layout]:
+    """Connected outputs and recorded variables of each instance, in the order of its model description."""
+    instances = plan.system.instances
+    wanted: dict[str, set[str]] = {name: set() for name in instances}
+    for c in plan.connections:
+        wanted[c.source_instance].add(c.source.name)
+    for instance, variable in plan.system.recorded:
+        wanted[instance].add(_base(plan, instance, variable))
+    return {
+        name: Layout.of(variable for variable in own.description.variables if variable.name in wanted[name])
+        for name, own in instances.items()
+    }
 
 
 def _instance_plan(plan: Plan, instance: SystemInstance, outputs: Layout) -> InstancePlan:
@@ -370,6 +393,7 @@ def _instance_plan(plan: Plan, instance: SystemInstance, outputs: Layout) -> Ins
         initialization={variable: level for (owner, variable), level in levels.items() if owner == instance.name},
         section=placed(plan.system.config.instances[instance.name]),
         linear_inputs=linear_inputs(plan.connections, instance.name),
+        scenario=instance.scenario,
     )
 
 

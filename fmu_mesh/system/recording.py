@@ -1,14 +1,14 @@
 """What a run records, the contract of what writes it into a file, and how that is found.
 
 A package offers a result format through the entry points `fmu_mesh.recorders`, under the ending of its files without
-the dot. CSV and MCAP are found in the same way. `docs/extending.md` shows how to write one.
+the dot. CSV, Parquet and MCAP are found in the same way. `docs/extending.md` shows how to write one.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol, cast
+from typing import Any, NamedTuple, Protocol, cast
 
 import msgspec
 import numpy as np
@@ -21,7 +21,17 @@ from fmu_mesh.plugins import plugin, plugin_names
 from fmu_mesh.variables.model_description import ModelDescription
 from fmu_mesh.variables.value_types import VariableType
 
-__all__ = ["Recording", "ResultFile", "ResultFormat", "has_unknown_ending", "result_endings", "result_format"]
+__all__ = [
+    "Columns",
+    "ReadableFormat",
+    "Recording",
+    "ResultFile",
+    "ResultFormat",
+    "has_unknown_ending",
+    "result_endings",
+    "result_format",
+    "with_notes",
+]
 
 _GROUP = "fmu_mesh.recorders"
 _DEFAULT = "csv"
@@ -38,18 +48,26 @@ _OTHER_FORMATS = frozenset(
 
 
 class Recording(msgspec.Struct, frozen=True):
-    """What a run records.
+    """What a run records into one file.
 
     Attributes:
         loaded: the configuration; `loaded.resolve` gives the absolute path of a path in it.
         descriptions: the model descriptions by instance name, with the units of all variables.
         recorded: (instance, variable) of every column, in order; of an array every element is a column of its own,
             as `y[1,2]`.
+        place: the path of its section in the configuration, `record` or `record[1]`, for findings.
+        first: point of the first row.
+        every: number of points from row to row.
+        metadata: about the run, as JSON can hold it; `Result.metadata` reads it from the file. May be empty.
     """
 
     loaded: LoadedConfig
     descriptions: Mapping[str, ModelDescription]
     recorded: tuple[tuple[str, str], ...]
+    place: str = "record"
+    first: int = 0
+    every: int = 1
+    metadata: Mapping[str, Any] = msgspec.field(default_factory=dict)
 
     @property
     def columns(self) -> list[tuple[str, VariableType]]:
@@ -62,21 +80,39 @@ class Recording(msgspec.Struct, frozen=True):
         return columns
 
 
+class Columns(NamedTuple):
+    """The columns of a result.
+
+    Attributes:
+        times: the times in s, shape `(rows,)`.
+        values: an array of this shape for each variable, by name: of floats, whole numbers, truth values, or of dtype
+            `object` for texts and bytes.
+        units: the units that the file has, by name.
+        metadata: those of the run, if the file has any (`Recording.metadata`, with what was noted).
+    """
+
+    times: NDArray[np.float64]
+    values: dict[str, NDArray[Any]]
+    units: Mapping[str, str] = {}
+    metadata: Mapping[str, Any] = {}
+
+
 class ResultFormat(Protocol):
-    """What an entry point names: a class with these three methods, whose instances are `ResultFile`s.
+    """What an entry point names: a class with these four methods, whose instances are `ResultFile`s.
 
     The call sequence of both is:
 
     1. `check`, before anything is started, in another process than the rest.
     2. `open`, when the run starts. Another run must not be able to open the same file, and what is at ``path`` must
        not change before the first row. `fmu_mesh.files.open_alone` opens a file in this way.
-    3. `write`, with rows in the order of their points, from point 0 on and without a gap; `flush` in between, about
-       five times a second. Both are called from one thread at a time.
+    3. `write`, with rows in the order of their points, from `Recording.first` on at every `Recording.every`-th point;
+       `flush` in between, about five times a second; `note` at any time, also before the first row. They are called
+       from one thread at a time.
     4. `close`, once, also after an error. It may be called from another thread than `write`.
     5. `keep_whole_rows`, only if the process was killed before `close`, in another process.
 
-    A format whose files cannot be read without their end writes into a file of another name, which `close` renames to
-    ``path``.
+    A format whose files cannot be read without their end writes into a file of another name, its `growing_file`, from
+    which `close` or `keep_whole_rows` makes the file at ``path``.
     """
 
     def check(self, recording: Recording, findings: Findings) -> None:
@@ -84,7 +120,8 @@ class ResultFormat(Protocol):
 
         Args:
             recording: what is to be recorded.
-            findings: where findings go, each with its path in the configuration, such as `record.variables`.
+            findings: where findings go, each with its path in the configuration: that of the section and a key, such
+                as `record.variables` or `record[1].variables`.
 
         Raises:
             ConfigurationError: a package that the format needs is missing.
@@ -103,15 +140,37 @@ class ResultFormat(Protocol):
         """
         ...
 
+    def growing_file(self, path: Path) -> Path:
+        """The file that rows are written into while the run goes on; for most formats it is ``path`` itself."""
+        ...
+
     def keep_whole_rows(self, path: Path, kept: Kept) -> int:
-        """Cut a file off after its last whole row; its writer was killed.
+        """Finish a file after its last whole row; its writer was killed. A complete file stays as it is.
 
         Args:
-            path: the file; nobody is writing it any more.
-            kept: the last `ResultFile.kept` that was noted. What follows these bytes may end within a row.
+            path: the file; nobody is writing it, or its `growing_file`, any more.
+            kept: the last `ResultFile.kept` that was noted, of the `growing_file`. What follows these bytes may end
+                within a row. (0, 0) if nothing is known.
 
         Returns:
             The number of rows in the file.
+
+        Raises:
+            ConfigurationError: it is not a result file of this format.
+            OSError: it cannot be written.
+        """
+        ...
+
+
+class ReadableFormat(Protocol):
+    """What a `ResultFormat` also has if `Result.read` can read its files."""
+
+    def read(self, path: Path) -> Columns:
+        """Read a result file.
+
+        Raises:
+            ConfigurationError: it is not a result file of this format.
+            OSError: it cannot be read.
         """
         ...
 
@@ -119,13 +178,13 @@ class ResultFormat(Protocol):
 class ResultFile(Protocol):
     """An open result file. `ResultFormat` has the call sequence.
 
-    `write`, `flush` and `close` raise OSError if the file cannot be written; the run ends with it.
+    All methods raise OSError if the file cannot be written; the run ends with it.
 
     Attributes:
         path: the file.
         rows: number of rows written so far. After `close` it is the number of rows in the file, also on a full disk.
-        kept: how many rows the operating system has, and in how many bytes of the file. These rows survive if the
-            process is killed.
+        kept: how many rows the operating system has, and in how many bytes of the file, or of the `growing_file` of
+            its format. These rows survive if the process is killed.
     """
 
     @property
@@ -144,6 +203,17 @@ class ResultFile(Protocol):
             times: simulation times in s; at least one.
             columns: an array of the same length for each of `Recording.columns`, with the dtype of its type (`object`
                 for String and Binary). The arrays are overwritten after the call; copy what is needed later.
+        """
+        ...
+
+    def note(self, entry: Mapping[str, Any]) -> None:
+        """Add what happened during the run to the metadata of the file (see `with_notes`).
+
+        The operating system has it after the next `flush` at the latest. Without a row, nothing is written. A format
+        that has no place for metadata does nothing.
+
+        Args:
+            entry: an object of JSON; it is not changed any more.
         """
         ...
 
@@ -179,6 +249,25 @@ def has_unknown_ending(path: str | Path) -> bool:
 def result_endings() -> list[str]:
     """The endings that result files can have, such as `.csv`, ours first."""
     return [f".{name}" for name in plugin_names(_GROUP) if name != _IN_MEMORY]
+
+
+def with_notes(metadata: Mapping[str, Any], entries: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
+    """The metadata of a run with all that was noted while it went on.
+
+    An entry with a `variable` is a value that was set; these are listed under `set`, in their order. The members of any
+    other entry, such as `{"end": ...}`, become members of the metadata.
+
+    Example:
+        >>> with_notes({"mesh": "pair"}, [{"variable": "u", "value": 3.0}, {"end": {"point": 5}}])
+        {'mesh': 'pair', 'set': [{'variable': 'u', 'value': 3.0}], 'end': {'point': 5}}
+    """
+    noted: dict[str, Any] = {**metadata}
+    for entry in entries:
+        if "variable" in entry:
+            noted["set"] = [*noted.get("set", ()), entry]
+        else:
+            noted |= entry
+    return noted
 
 
 def _ending(path: str | Path) -> str:

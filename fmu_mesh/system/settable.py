@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from ..variables.model_description import Variable
 from ..variables.value_conversion import ValueRefused
-from .plan import InstancePlan
 
-__all__ = ["check_settable"]
+if TYPE_CHECKING:
+    from .plan import InstancePlan
+
+__all__ = ["check_settable", "why_not_settable"]
 
 
 def check_settable(plan: InstancePlan, variable: Variable) -> None:
@@ -15,19 +19,35 @@ def check_settable(plan: InstancePlan, variable: Variable) -> None:
     Raises:
         ValueRefused: it may not; the message is the predicate of a sentence whose subject is the variable.
     """
+    source = None
+    if variable.name in plan.inputs.names:
+        layout = plan.inputs
+        source = next(
+            feed.source
+            for feed in plan.feeds
+            if variable.name in {layout.column(target).name for _, target, _, _ in feed.columns}
+        )
+    why = why_not_settable(variable, source)
+    if why is not None:
+        raise ValueRefused(why)
+
+
+def why_not_settable(variable: Variable, source: str | None) -> str | None:
+    """Why a variable may not be set between two steps; None if it may.
+
+    Args:
+        variable: the variable.
+        source: the instance that it is connected to; None if it is not connected.
+
+    Returns:
+        The predicate of a sentence whose subject is the variable.
+    """
     match variable.causality:
-        case "input" if variable.name in plan.inputs.names:
-            layout = plan.inputs
-            feed = next(
-                feed
-                for feed in plan.feeds
-                if variable.name in {layout.column(target).name for _, target, _, _ in feed.columns}
-            )
-            raise ValueRefused(f"is connected to '{feed.source}'; only unconnected inputs can be set")
+        case "input" if source is not None:
+            return f"is connected to '{source}'; only unconnected inputs can be set"
         case "parameter" | "calculatedParameter" if variable.variability != "tunable":
-            text = f"is a {variable.variability} parameter; only tunable ones can be set while it runs"
-            raise ValueRefused(text)
+            return f"is a {variable.variability} parameter; only tunable ones can be set while it runs"
         case "input" | "parameter" | "calculatedParameter":
-            return
+            return None
         case _:
-            raise ValueRefused("is no input and no parameter, so it cannot be set")
+            return "is no input and no parameter, so it cannot be set"

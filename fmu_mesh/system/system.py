@@ -23,17 +23,17 @@ from fmu_mesh.system.connections import (
     Connection,
     Variables,
     resolve_connections,
-    resolve_variable,
     unit_warnings,
 )
 from fmu_mesh.system.couplings import coupled_connections
 from fmu_mesh.system.grouping import automatic_nodes
 from fmu_mesh.system.linear_inputs import check_extrapolation
-from fmu_mesh.system.recording import has_unknown_ending, result_endings, result_format
+from fmu_mesh.system.records import RecordPlan, ending_warnings, resolve_records, union_of
+from fmu_mesh.system.scenario import ResolvedScenario, Scenario, ScenarioInput, resolve_scenario
+from fmu_mesh.system.schedule import Schedule
 from fmu_mesh.system.start_values import forbidden_start_values, resolve_start_values, sized
 from fmu_mesh.text import nearest_file, shown
 from fmu_mesh.variables.model_description import ModelDescription, Value
-from fmu_mesh.variables.value_types import element_name, is_text
 
 __all__ = ["Connection", "ResolvedSystem", "SystemInstance", "build"]
 
@@ -47,9 +47,10 @@ class SystemInstance(msgspec.Struct, frozen=True):
         name: instance name.
         fmu: absolute path of the model; empty for a kind without files.
         description: its model description.
-        start_values: start values by variable name, converted to the variable's type.
+        start_values: start values by variable name, converted to the variable's type; with those of the scenario.
         step_points: its step size as a multiple of the base step size; 1 or more.
         node: name of its node (process): its group, that of its cycle (`group: auto`), or its own name.
+        scenario: what a scenario prescribes for its variables.
     """
 
     name: str
@@ -58,6 +59,7 @@ class SystemInstance(msgspec.Struct, frozen=True):
     start_values: dict[str, Value]
     step_points: int
     node: str
+    scenario: tuple[Schedule, ...] = ()
 
 
 class ResolvedSystem(msgspec.Struct, frozen=True):
@@ -65,23 +67,38 @@ class ResolvedSystem(msgspec.Struct, frozen=True):
 
     Attributes:
         instances: in the order of the file.
-        recorded: the recorded outputs as (instance, variable), in the order of the result columns. Each element of an
-            array is a column, as `y[1,2]`.
-        result_file: absolute path of the result file, or None if nothing is recorded.
+        records: the result files; empty if nothing is recorded.
         warnings: findings that do not prevent a run, such as connections between different units.
+        scenario_files: the SHA-256 of each file with values of the scenario, by absolute path.
     """
 
     config: Config
     grid: TimeGrid
     instances: dict[str, SystemInstance]
     connections: tuple[Connection, ...]
-    recorded: tuple[tuple[str, str], ...]
-    result_file: str | None
+    records: tuple[RecordPlan, ...] = ()
     warnings: tuple[Finding, ...] = ()
+    scenario_files: dict[str, str] = {}
+
+    @property
+    def recorded(self) -> tuple[tuple[str, str], ...]:
+        """(instance, variable) of the columns of all result files, each once, in their order.
+
+        Each element of an array is a column, as `y[1,2]`.
+        """
+        return union_of(self.records)
+
+    @property
+    def result_file(self) -> str | None:
+        """Absolute path of the first result file, or None if nothing is recorded."""
+        return self.records[0].file if self.records else None
 
 
 def build(
-    loaded: LoadedConfig, descriptions: Mapping[str, ModelDescription], findings: Iterable[Finding] = ()
+    loaded: LoadedConfig,
+    descriptions: Mapping[str, ModelDescription],
+    findings: Iterable[Finding] = (),
+    scenario: Scenario | None = None,
 ) -> ResolvedSystem:
     """Resolve every name of a configuration.
 
@@ -90,6 +107,7 @@ def build(
         descriptions: the model descriptions by instance name. One may be missing because its model could not be read;
             then ``findings`` must say why, and checks that need it are left out.
         findings: earlier findings; the error has them, too.
+        scenario: the scenario, if there is one.
 
     Raises:
         ConfigurationError: there are findings; it has all of them.
@@ -113,9 +131,8 @@ def build(
     connections = resolve_connections(config.connections, variables, collected)
     check_extrapolation(connections, config.instances, descriptions, collected)
     connections += coupled_connections(config, variables, connections, collected)
-    recorded, result_file = _recorded(config, variables, collected), _result_file(loaded, collected)
-    if not recorded or result_file is None:  # both are needed to record anything
-        recorded, result_file = (), None
+    records = resolve_records(loaded, variables, grid, collected)
+    prescribed = _prescribed(scenario, variables, instances, connections, grid, collected)
     _check_zenoh(loaded, collected)
     if grid is None or len(instances) < len(config.instances):
         collected.raise_any()
@@ -126,12 +143,39 @@ def build(
         edges = [(c.source_instance, c.target_instance) for c in connections]
         nodes = automatic_nodes(config, edges, descriptions)
         instances = {name: replace(own, node=nodes.get(name, own.node)) for name, own in instances.items()}
+    instances = {name: _with_scenario(own, prescribed) for name, own in instances.items()}
     warnings = loaded.findings()
     forbidden_start_values(config, descriptions, warnings, strict=False)
     unit_warnings(connections, descriptions, warnings)
+    warnings.merge(prescribed.warnings)
     _needed_tools(config, descriptions, warnings)
-    _ending_warning(loaded, result_file, warnings)
-    return ResolvedSystem(config, grid, instances, connections, recorded, result_file, tuple(warnings))
+    ending_warnings(loaded, records, warnings)
+    return ResolvedSystem(config, grid, instances, connections, records, tuple(warnings), prescribed.files)
+
+
+def _prescribed(  # noqa: PLR0913, PLR0917  what a scenario refers to
+    scenario: Scenario | None,
+    variables: Variables,
+    instances: Mapping[str, SystemInstance],
+    connections: Iterable[Connection],
+    grid: TimeGrid | None,
+    findings: Findings,
+) -> ResolvedScenario:
+    """What the scenario prescribes; nothing without a time grid, for which there is a finding."""
+    if scenario is None or grid is None:
+        return ResolvedScenario()
+    inputs = {name: ScenarioInput(own.start_values, own.step_points) for name, own in instances.items()}
+    if scenario.source.prefix:
+        return resolve_scenario(scenario, variables, inputs, connections, grid, findings)
+    own = scenario.source.findings()
+    prescribed = resolve_scenario(scenario, variables, inputs, connections, grid, own)
+    findings.merge(own)
+    return prescribed
+
+
+def _with_scenario(instance: SystemInstance, prescribed: ResolvedScenario) -> SystemInstance:
+    start_values = instance.start_values | prescribed.start_values.get(instance.name, {})
+    return replace(instance, start_values=start_values, scenario=prescribed.schedules.get(instance.name, ()))
 
 
 def _grid(config: Config, findings: Findings) -> TimeGrid | None:
@@ -260,61 +304,6 @@ def _needed_tools(config: Config, descriptions: Mapping[str, ModelDescription], 
             found = f"the FMU of '{name}' needs an execution tool ({tool or 'it does not say which'})"
             place = f"instances.{name}.{key_of(section)}"
             findings.add(place, found, f"{tool or 'that tool'} on the host that runs it")
-
-
-def _recorded(config: Config, variables: Variables, findings: Findings) -> tuple[tuple[str, str], ...]:
-    """The recorded outputs; by default all but String and Binary."""
-    if config.record.variables is None:
-        return tuple(
-            (name, element)
-            for name, own in variables.items()
-            for variable in (own or {}).values()
-            if variable.causality == "output" and not is_text(variable.type)
-            for element in variable.elements
-        )
-    recorded: dict[tuple[str, str], str] = {}
-    for index, reference in enumerate(config.record.variables):
-        path = f"record.variables[{index}]"
-        instance, _, name = reference.partition(".")
-        first = recorded.get((instance, name))
-        end = None if first else resolve_variable(reference, path, variables, "output", findings)
-        names: tuple[str, ...] = (name,)
-        if end is not None:
-            variable, element = end
-            names = (element_name(variable.name, element),) if element else variable.elements
-            first = next((recorded[instance, one] for one in names if (instance, one) in recorded), None)
-            if variable.causality != "output":
-                findings.add(path, f"'{reference}', whose causality is {variable.causality}", "an output")
-        if first:
-            findings.add(path, f"'{reference}' a second time (first: {first})", "every variable at most once")
-        recorded.update(dict.fromkeys([(instance, one) for one in names], first or path))
-    return tuple(recorded)
-
-
-def _result_file(loaded: LoadedConfig, findings: Findings) -> str | None:
-    text = loaded.config.record.file
-    if text is None:
-        return None
-    path = loaded.resolve(text.replace("{mesh}", loaded.config.mesh))
-    try:
-        is_folder = path.is_dir()
-    except OSError as error:  # the name is too long, or the folder belongs to another user
-        findings.add("record.file", f"{shown(text)} ({error.strerror})", "a file that can be written")
-        return None
-    if is_folder:
-        findings.add("record.file", f"the folder '{text}'", "a file, or null to record nothing")
-    elif result_format(path) is None:
-        endings = " or ".join(result_endings())
-        findings.add("record.file", f"'{text}', a format that is not written", f"a name ending in {endings}")
-    return str(path)
-
-
-def _ending_warning(loaded: LoadedConfig, result_file: str | None, warnings: Findings) -> None:
-    """Warn of an ending that nobody offers: it still gives a CSV, as in version 0.1."""
-    if result_file is not None and has_unknown_ending(result_file):
-        found = f"'{loaded.config.record.file}', an ending of no installed format, so the file becomes a CSV"
-        endings = " or ".join(result_endings())
-        warnings.add("record.file", found, f"a name ending in {endings}; from version 0.3 on this is an error")
 
 
 def _check_zenoh(loaded: LoadedConfig, findings: Findings) -> None:

@@ -9,7 +9,7 @@ from typing import Literal
 
 import msgspec
 
-from ..system.memory_map import MASTER
+from ..system.memory_map import MASTER, RECORDER
 
 __all__ = ["RUN_ID_BYTES", "Keys", "RunKeys", "VariableKind", "escape", "unescape"]
 
@@ -134,6 +134,10 @@ class RunKeys(msgspec.Struct, frozen=True):
     def frames(self, source: str, target_node: str) -> str:
         """Frames of one instance for one node."""
         return f"{self.base}/frame/{source}/to={target_node}"
+
+    def settings(self, node: str) -> str:
+        """The values that others have set on the instances of a node, for the recorder."""
+        return f"{self.base}/set/{_of(node)}/to={RECORDER}"
 
     def progress(self, node: str) -> str:
         """Progress of a node, for the master."""

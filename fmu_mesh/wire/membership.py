@@ -23,7 +23,7 @@ import zenoh
 
 from ..errors import DeadlineExceeded, MeshLost, MessageRefused
 from ..rings.host_memory import HostMemory, Offer
-from ..system.plan import MASTER, NodePlan
+from ..system.plan import MASTER, RECORDER, NodePlan
 from .inbox import Inbox
 from .keys import RUN_ID_BYTES, Keys, RunKeys
 from .messages import NodeReport, decode_json
@@ -233,6 +233,8 @@ class Membership:
         deadline_s = plan.timeouts.start
         keys = self.keys(deadline_s + _GRACE_S)
         senders = {keys.frames(link.source, plan.node): link.source_node for link in plan.links_in}
+        if plan.node == RECORDER:
+            senders |= {keys.settings(node): node for node, _ in plan.windows if node != RECORDER}
         inbox.open(self._session, keys, plan.node, {**senders, self._admitted.result(0).grants: MASTER})
         hello = msgspec.json.encode(Hello(plan.node))
         for node in dict.fromkeys(link.source_node for link in plan.links_in):

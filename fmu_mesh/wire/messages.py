@@ -2,8 +2,8 @@
 
 Every message starts with 24 bytes, little endian: kind (u8), three spare bytes, number of the link (u32), count (u32),
 four spare bytes, point (i64). In a frame the rows follow (`fmu_mesh.wire.rows`), in an ABORT an `ErrorReport` as
-JSON. LAST says that no more rows of a link come, because the run has ended early. Every decoder checks sizes before it
-reads anything, and raises only `MessageRefused`.
+JSON, in a SET a `SetValue` as JSON, for the recorder. LAST says that no more rows of a link come, because the run has
+ended early. Every decoder checks sizes before it reads anything, and raises only `MessageRefused`.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from typing import Final, TypeVar
 import msgspec
 
 from ..errors import ErrorReport, MessageRefused
+from ..variables.value_types import PlainValue
 from .time_profile import NodeProfile
 
 __all__ = [
@@ -26,10 +27,13 @@ __all__ = [
     "LAST",
     "MAX_MESSAGE_SIZE",
     "PROGRESS",
+    "SET",
     "NodeReport",
+    "SetValue",
     "decode_abort",
     "decode_json",
     "encode_abort",
+    "encode_set",
 ]
 
 HEADER: Final = struct.Struct("<BxxxIIxxxxq")
@@ -40,6 +44,7 @@ PROGRESS: Final = 4
 FINISH: Final = 5
 ABORT: Final = 6
 LAST: Final = 8
+SET: Final = 9
 
 MAX_MESSAGE_SIZE: Final = 64 * 2**20
 
@@ -55,6 +60,28 @@ class NodeReport(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     profile: NodeProfile | None = None
 
 
+class SetValue(msgspec.Struct, frozen=True):
+    """A value that another program gave to an input or a parameter while the mesh ran.
+
+    Attributes:
+        instance: the instance.
+        variable: its variable.
+        value: the value, as JSON has it.
+        point: the communication point at which the instance took it: the step from there is the first that may use it.
+        time: simulation time in s from which on it holds; None: from `point` on.
+        key: the Zenoh key under which it was sent.
+        who: who sent it, as the sender says: user, host, program and process id, or `ros` and the topic.
+    """
+
+    instance: str
+    variable: str
+    value: PlainValue
+    point: int
+    time: float | None
+    key: str
+    who: str
+
+
 def encode_abort(report: ErrorReport) -> bytes:
     """An ABORT message."""
     return HEADER.pack(ABORT, 0, 0, 0) + msgspec.json.encode(report)
@@ -67,6 +94,11 @@ def decode_abort(data: bytes) -> ErrorReport:
         MessageRefused: it is not an `ErrorReport`.
     """
     return decode_json(data[HEADER.size :], ErrorReport)
+
+
+def encode_set(value: SetValue) -> bytes:
+    """A SET message: another program has set a value."""
+    return HEADER.pack(SET, 0, 0, value.point) + msgspec.json.encode(value)
 
 
 def decode_json(data: bytes, type_: type[T], most: int = MAX_MESSAGE_SIZE) -> T:

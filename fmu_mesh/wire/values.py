@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any
+from typing import Annotated, Any, Final
 
 import msgspec
 import zenoh
@@ -15,17 +15,21 @@ from ..variables.value_conversion import MAX_TEXT_SIZE, ValueRefused, checked_va
 from .messages import decode_json
 
 __all__ = [
+    "NO_ORIGIN",
+    "Origin",
     "Stamp",
     "ValueRefused",
     "attachment",
-    "decode_time",
+    "decode_origin",
     "decode_value",
-    "encode_time",
+    "encode_origin",
     "encode_value",
     "json_encoding",
 ]
 
 MAX_VALUE_SIZE = 2 * MAX_TEXT_SIZE
+
+_LONGEST_WHO: Final = 200
 
 json_encoding = zenoh.Encoding.APPLICATION_JSON
 
@@ -42,28 +46,42 @@ def attachment(point: int, time: float) -> bytes:
     return msgspec.json.encode(Stamp(point, time))
 
 
-def decode_time(data: bytes) -> float:
-    """The time in s in the attachment of a value that is sent to an input, such as `{"time": 1.5}` or a `Stamp`.
+class Origin(msgspec.Struct, frozen=True, omit_defaults=True):
+    """The attachment of a value that is sent to an input or a parameter; all of it may be missing.
+
+    Attributes:
+        time: simulation time in s from which on the value holds; None: from the next point on.
+        who: who sends it, for people and for the metadata of results.
+    """
+
+    time: float | None = None
+    who: Annotated[str, msgspec.Meta(max_length=_LONGEST_WHO)] = "unknown"
+
+
+NO_ORIGIN: Final = Origin()
+
+
+def decode_origin(data: bytes) -> Origin:
+    """When a value holds and who sends it, from its attachment, such as `{"time": 1.5, "who": "joystick"}`.
 
     Raises:
-        ValueRefused: it has none.
+        ValueRefused: the attachment is something else.
     """
     try:
-        time = decode_json(data, _Moment).time
+        origin = decode_json(data, Origin)
     except MessageRefused as error:
-        raise ValueRefused(f'its attachment has no time, such as {{"time": 1.5}} in s ({error})') from error
-    if not math.isfinite(time):
-        raise ValueRefused(f"the time {time} in its attachment is not finite")
-    return time
+        text = f'its attachment is not like {{"time": 1.5, "who": "joystick"}}, with the time in s ({error})'
+        raise ValueRefused(text) from error
+    if origin == NO_ORIGIN:
+        raise ValueRefused('its attachment has neither a time, such as {"time": 1.5} in s, nor who sends it')
+    if origin.time is not None and not math.isfinite(origin.time):
+        raise ValueRefused(f"the time {origin.time} in its attachment is not finite")
+    return origin
 
 
-def encode_time(time: float) -> bytes:
-    """The attachment of a value that is sent to an input and holds from ``time`` (s) on."""
-    return msgspec.json.encode(_Moment(time))
-
-
-class _Moment(msgspec.Struct, frozen=True):
-    time: float
+def encode_origin(time: float | None, who: str) -> bytes:
+    """The attachment of a value that holds from ``time`` (s) on, or from the next point on if that is None."""
+    return msgspec.json.encode(Origin(time, who[:_LONGEST_WHO]))
 
 
 def encode_value(value: Value) -> bytes:

@@ -116,11 +116,17 @@ class LogLine(msgspec.Struct, frozen=True):
 
 
 class SetAnswer(msgspec.Struct, frozen=True):
-    """Answer to a query that sets an input or a parameter: the point from which on the value holds."""
+    """Answer to a query that sets an input or a parameter: the point from which on the value holds.
+
+    Attributes:
+        time: of this point, in s.
+        late: whether the time that the query asked for was past.
+    """
 
     key: str
     point: int
     time: float
+    late: bool = False
 
 
 class MeshInfo(msgspec.Struct, frozen=True):

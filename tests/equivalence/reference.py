@@ -57,6 +57,7 @@ class Reference(msgspec.Struct, frozen=True):
         units: in the order in which they are stepped at a point.
         recorded: (unit, output) of each column but the time.
         loops: the pipes at which each algebraic loop at the start is torn; what comes first stands first.
+        changes: values by (unit, variable) and the point at which a step begins; each is set before this step.
     """
 
     units: Sequence[Unit]
@@ -66,6 +67,7 @@ class Reference(msgspec.Struct, frozen=True):
     recorded: Sequence[tuple[str, str]]
     start_time: float = 0.0
     loops: Sequence[Sequence[Pipe]] = ()
+    changes: Mapping[tuple[str, str], Mapping[int, float]] = {}
 
 
 def run_fmpy(reference: Reference) -> Table:
@@ -91,6 +93,7 @@ def _loop(reference: Reference, fmus: Mapping[str, _Fmu]) -> Table:
             if end % unit.points:
                 continue
             begin = end - unit.points
+            _change(reference, unit.name, begin, fmus[unit.name])
             for pipe in reference.pipes:
                 if pipe.target == unit.name:
                     value = value_at(pipe.source, pipe.output, begin if pipe.delay else end)
@@ -101,6 +104,13 @@ def _loop(reference: Reference, fmus: Mapping[str, _Fmu]) -> Table:
                     values[name, output].append(fmus[name].get(output))
         rows.append((start + end * h, *(value_at(*column, end) for column in reference.recorded)))
     return rows
+
+
+def _change(reference: Reference, name: str, begin: int, fmu: _Fmu) -> None:
+    """Set what changes in the step of a unit that begins at a point."""
+    for (owner, variable), values_at in reference.changes.items():
+        if owner == name and begin in values_at:
+            fmu.set(variable, values_at[begin])
 
 
 def _scaled(pipe: Pipe, value: float) -> float:

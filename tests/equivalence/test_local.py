@@ -106,7 +106,8 @@ class Ended(Counter):
 def test_the_rows_before_a_step_that_does_not_return_are_kept_when_the_process_is_ended(tmp_path: Path) -> None:
     result = tmp_path / "result.csv"
     plan = Scenario(("a -> b",), points=10).plan(record=True)
-    plan = msgspec.structs.replace(plan, system=msgspec.structs.replace(plan.system, result_file=str(result)))
+    records = (msgspec.structs.replace(plan.system.records[0], file=str(result)),)
+    plan = msgspec.structs.replace(plan, system=msgspec.structs.replace(plan.system, records=records))
     found: list[str] = []
 
     def clean_up() -> None:

@@ -37,6 +37,7 @@ from fmu_mesh.run.run_plan import RunPlan
 from fmu_mesh.simtime import TimeGrid
 from fmu_mesh.system.connections import Connection
 from fmu_mesh.system.plan import Plan, make_plan
+from fmu_mesh.system.records import RecordPlan
 from fmu_mesh.system.system import ResolvedSystem, SystemInstance
 from fmu_mesh.variables.model_description import Causality, ModelDescription, Value, Variable, VariableType
 from tests.scenarios.simulated import SimulatedMesh
@@ -308,10 +309,15 @@ def planned(drawn: Drawn) -> Plan:
             )
             for p, pipe in enumerate(drawn.pipes)
         ),
-        recorded=tuple((name, "y") for name in names) if drawn.recorded else (),
-        result_file="none.csv" if drawn.recorded else None,
+        records=(RecordPlan("none.csv", tuple((name, "y") for name in names)),) if drawn.recorded else (),
     )
     return make_plan(system, window=drawn.window)
+
+
+def with_file(plan: Plan, file: Path) -> Plan:
+    """The plan with its rows in this file."""
+    records = tuple(msgspec.structs.replace(record, file=str(file)) for record in plan.system.records)
+    return msgspec.structs.replace(plan, system=msgspec.structs.replace(plan.system, records=records))
 
 
 class Mixer:
@@ -458,6 +464,9 @@ class Kept:
         self.columns.append([np.array(column) for column in (times, *columns)])
         self.rows += len(times)
 
+    def note(self, entry: Mapping[str, Any]) -> None:  # noqa: ARG002  it keeps rows only
+        return
+
     def flush(self) -> None:
         return
 
@@ -561,7 +570,7 @@ def test_many_runs_end_where_a_run_point_by_point_ends(
         if slow:
             patch.setattr("fmu_mesh.node.engine._SLICE_S", 1e-7)
         file = Path(folder, "rows.csv")
-        plan = msgspec.structs.replace(plan, system=msgspec.structs.replace(plan.system, result_file=str(file)))
+        plan = with_file(plan, file)
         loaded = LoadedConfig(plan.system.config, Path())
         expected = ended(LocalMesh(plan, open_instance=instance, loaded=loaded).run), file.read_bytes()
         runs = RepeatedRuns(Path(folder), open_instance=instance)

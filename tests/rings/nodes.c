@@ -159,7 +159,7 @@ static void set_up(Participant *p, int64_t own, int64_t wait_ns, int64_t spins) 
   p->member = (Member){.gates = &p->gate, .loads = &p->load, .setters = &p->setter, .getters = &p->getter,
                        .n_gates = source >= 0, .n_loads = source >= 0, .n_setters = source >= 0, .n_getters = 1,
                        .kind = FMI2, .component = &p->model, .do_step = (void *)do_step, .said = &p->said,
-                       .base_step_size = 1.0, .step_size = 1.0, .points = 1, .every = 1, .last_step = points,
+                       .base_step_size = 1.0, .step_size = 1.0, .points = 1, .every = 1, .last_step = points, .python_at = NEVER,
                        .outputs = {{ring_of(own), ROW_BYTES, rows - 1}}, .counter = rows_of(own), .bases = p->bases,
                        .step = step};
   p->member.outputs[1] = p->member.outputs[0];

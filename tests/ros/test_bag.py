@@ -359,3 +359,56 @@ def test_what_cannot_be_played_is_told(
     for complaint, (code, error) in said.items():
         assert code == 2, error
         assert complaint in error
+
+
+# ---- a bag in a scenario ----
+
+
+@pytest.mark.parametrize("start", [None, 0.013])
+@pytest.mark.parametrize("step_size", [0.001, 0.003], ids=["each step", "larger steps"])
+def test_a_bag_in_a_scenario_gives_the_floats_of_playing_it_into_a_mesh_that_is_paused(
+    start: float | None, step_size: float, tmp_path: Path
+) -> None:
+    """The messages of the bag come every 2 ms, with stamps of simulation time from 0 s on."""
+    pytest.importorskip("rosbags", reason="the package rosbags is not installed; pip install 'fmu-mesh[test]'")
+    coupled = fmu_mesh.load(FMUS.parent / "configs/pendulum_delay.yaml")
+    coupled.configure(simulation={"stop_time": 0.2})
+    coupled.run(processes=False, output=tmp_path / "a.mcap")
+
+    def mesh() -> fmu_mesh.Mesh:
+        made = fmu_mesh.Mesh("played", step_size=0.001, stop_time=0.3)
+        made.add("gain", fmu=FMUS / "Gain.fmu", start_values={"u": 0.25}, step_size=step_size)
+        return made
+
+    with mesh().start(paused=True, record="memory") as run:
+        run.play(tmp_path / "a.mcap", topics=["/pendulum/a=gain.u"], start=start)
+        played = run.wait()["gain.y"]
+    steered = mesh()
+    more = {"start": start} if start is not None else {}
+    steered.scenario({"gain.u": {"file": tmp_path / "a.mcap", "topic": "/pendulum/a", **more}})
+
+    assert steered.run(record="memory")["gain.y"].tobytes() == played.tobytes()
+    assert steered.run(record="memory", processes=False)["gain.y"].tobytes() == played.tobytes()
+    assert len(set(played.tolist())) > 50
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        ({"topic": "/pendulum/b"}, "the unknown topic '/pendulum/b' of"),
+        ({"topic": "/pendulum/a:twist"}, "gain.u.topic: 'std_msgs/msg/Float64' has no field 'twist'"),
+        ({"topic": "/pendulum/a", "column": "a"}, "'column' for a bag"),
+        ({}, "values.gain.u.topic: missing"),
+    ],
+)
+def test_what_cannot_come_from_a_bag_is_a_finding(given: dict[str, str], expected: str, tmp_path: Path) -> None:
+    pytest.importorskip("rosbags", reason="the package rosbags is not installed; pip install 'fmu-mesh[test]'")
+    coupled = fmu_mesh.load(FMUS.parent / "configs/pendulum_delay.yaml")
+    coupled.run(processes=False, stop_time=0.01, output=tmp_path / "a.mcap")
+    mesh = fmu_mesh.Mesh("played", step_size=0.001, stop_time=0.3)
+    mesh.add("gain", fmu=FMUS / "Gain.fmu")
+    mesh.scenario({"gain.u": {"file": tmp_path / "a.mcap", **given}})
+
+    [found] = mesh.check().findings
+
+    assert expected in str(found)

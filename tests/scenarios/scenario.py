@@ -20,6 +20,7 @@ from fmu_mesh.run.local import LocalMesh
 from fmu_mesh.simtime import TimeGrid
 from fmu_mesh.system.connections import Connection
 from fmu_mesh.system.plan import Plan, make_plan
+from fmu_mesh.system.records import RecordPlan
 from fmu_mesh.system.system import ResolvedSystem, SystemInstance
 from fmu_mesh.variables.model_description import ModelDescription, Value, Variable
 from tests.scenarios.simulated import SimulatedMesh
@@ -100,8 +101,7 @@ class Scenario:
                 )
                 for index, (source, target, delay) in enumerate(ends)
             ),
-            recorded=tuple((name, "point") for name in names) if record else (),
-            result_file="none.csv" if record else None,
+            records=(RecordPlan("none.csv", tuple((name, "point") for name in names)),) if record else (),
         )
         return make_plan(system, window=window)
 

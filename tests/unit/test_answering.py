@@ -111,7 +111,8 @@ def test_a_query_before_the_first_point_waits_for_it_and_not_for_ever(
     )
     activity = SimpleNamespace(state=state, runners={"unit": runner}, status=lambda _name: 7)
     plan = SimpleNamespace(key_prefix="fmu_mesh", mesh="lab", grid=TimeGrid(0.0, 0.1, 10))
-    answers = Answers(cast("Any", plan), cast("Any", None), cast("Any", activity), cast("Any", None), cast("Any", None))
+    none = cast("Any", None)
+    answers = Answers(cast("Any", plan), none, cast("Any", activity), none, none, none)
     soon, never, everything = Query(), Query(), Query("**")
 
     answers.answer("unit", cast("Any", never))

@@ -383,6 +383,7 @@ def member_of(tables: NativeStep, outputs: Sequence[Ring], grid: TimeGrid) -> Me
         step_size=grid.step_size,
         points=1,
         last_step=NEVER,
+        python_at=NEVER,
         outputs=(OutputTable * 2)(*(OutputTable(ring.address, ring.stride, ring.mask) for ring in outputs)),
         bases=(ctypes.c_void_p * RowBase.FIRST_GATE)(),
     )

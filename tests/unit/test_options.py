@@ -85,7 +85,7 @@ def test_every_option_with_a_key_replaces_it() -> None:
     assert (simulation.step_size, simulation.stop_time, simulation.window) == (0.5, 7.0, 3)
     assert (simulation.real_time_factor, simulation.update_period, simulation.catch_up) == (2.0, 0.25, 4.0)
     assert (zenoh.listen, zenoh.connect) == (["tcp/127.0.0.1:1"], ["tcp/127.0.0.1:2"])
-    assert changed.config.record.file == str(Path("r.csv").absolute())
+    assert changed.config.records["record"].file == str(Path("r.csv").absolute())
     assert changed.overrides["simulation.catch_up"] == "--catch-up 4"
     assert changed.overrides["zenoh.listen"] == "--listen tcp/127.0.0.1:1"
     assert changed.overrides.keys() == {setting.flag.key for setting in option_fields().values()} - {None}

@@ -106,7 +106,7 @@ def mesh(tmp_path: Path) -> Iterator[Mesh]:
 
 def assert_has_ended(recorder: Recorder) -> None:
     assert "recorder" not in {thread.name for thread in threading.enumerate()}
-    assert len(Path(recorder._file.path).read_text().splitlines()) == 1 + ROWS
+    assert len(Path(recorder.files[0][0]).read_text().splitlines()) == 1 + ROWS
 
 
 def test_a_recorder_at_rest_ends_with_a_run_that_fails_and_writes_what_has_come(
@@ -114,9 +114,9 @@ def test_a_recorder_at_rest_ends_with_a_run_that_fails_and_writes_what_has_come(
 ) -> None:
     monkeypatch.setattr(module, "_REST_S", DEADLINE_S)
 
-    with suppress(MeshLost), Recorder(mesh.plan, mesh.session, mesh.file()) as recorder:
+    with suppress(MeshLost), Recorder(mesh.plan, mesh.session, [mesh.file()]) as recorder:
         mesh.put_rows()
-        wait_until(lambda: recorder.rows == ROWS, "its rows are written, and it rests")
+        wait_until(lambda: recorder.files[0][1] == ROWS, "its rows are written, and it rests")
         error = MeshLost("node 'n' was lost", instance="a, b")
         mesh.put(encode_abort(error.report()))
         raise error
@@ -126,7 +126,7 @@ def test_a_recorder_at_rest_ends_with_a_run_that_fails_and_writes_what_has_come(
 
 
 def test_a_recorder_that_reports_ends_with_a_master_that_takes_no_reports_any_more(mesh: Mesh) -> None:
-    with suppress(MeshLost), Recorder(mesh.plan, mesh.session, mesh.file()) as recorder:
+    with suppress(MeshLost), Recorder(mesh.plan, mesh.session, [mesh.file()]) as recorder:
         mesh.put_rows()
         mesh.put(HEADER.pack(FINISH, 0, 0, 0))
         assert mesh.reported.wait(DEADLINE_S)
@@ -142,9 +142,9 @@ def test_a_recorder_waits_for_no_rows_of_a_node_that_is_lost_or_has_sent_its_las
     monkeypatch.setattr(module, "_LAST_S", DEADLINE_S)
     started = time.monotonic()
 
-    with suppress(MeshLost), Recorder(mesh.plan, mesh.session, mesh.file()) as recorder:
+    with suppress(MeshLost), Recorder(mesh.plan, mesh.session, [mesh.file()]) as recorder:
         mesh.put_rows(last=sends_last)
-        wait_until(lambda: recorder.rows == ROWS, "its rows are written")
+        wait_until(lambda: recorder.files[0][1] == ROWS, "its rows are written")
         raise MeshLost("node 'n' was lost", instance=lost)
 
     assert time.monotonic() - started < DEADLINE_S
@@ -156,8 +156,8 @@ def test_a_recorder_takes_rows_that_come_after_the_end_of_the_run(mesh: Mesh, mo
     monkeypatch.setattr(module, "_LAST_S", DEADLINE_S)
 
     rows = threading.Timer(0.1, mesh.put_rows, kwargs={"last": True})
-    with suppress(MeshLost), Recorder(mesh.plan, mesh.session, mesh.file()) as recorder:
-        wait_until(lambda: recorder._columns, "it is in the mesh")
+    with suppress(MeshLost), Recorder(mesh.plan, mesh.session, [mesh.file()]) as recorder:
+        wait_until(lambda: recorder._sources, "it is in the mesh")
         rows.start()
         raise MeshLost("node 'm' was lost", instance="c")
 

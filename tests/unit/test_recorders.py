@@ -15,6 +15,7 @@ from fmu_mesh.cli.main import main
 from fmu_mesh.errors import ConfigurationError
 from fmu_mesh.files import Kept
 from fmu_mesh.recorder.csv_file import CsvFile
+from fmu_mesh.recorder.parquet_file import ParquetFile
 from fmu_mesh.ros.bags.mcap_file import McapFile
 from fmu_mesh.run.results import rows_left
 from fmu_mesh.system.recording import ResultFile, ResultFormat, result_endings, result_format
@@ -22,9 +23,9 @@ from tests.helpers import write_config
 
 Offer = Callable[..., None]
 
-FORMATS: list[ResultFormat] = [CsvFile, McapFile]
-OPENED: list[type[ResultFile]] = [CsvFile, McapFile]
-"""The type checker sees here that both keep the contract."""
+FORMATS: list[ResultFormat] = [CsvFile, McapFile, ParquetFile]
+OPENED: list[type[ResultFile]] = [CsvFile, McapFile, ParquetFile]
+"""The type checker sees here that all keep the contract."""
 
 
 @pytest.fixture
@@ -51,6 +52,7 @@ def offer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Offer:
         ("a.txt", CsvFile),
         ("a.2", CsvFile),
         ("a.mcap", McapFile),
+        ("a.parquet", ParquetFile),
     ],
 )
 def test_the_ending_of_its_name_chooses_the_format_of_a_result_file(name: str, expected: ResultFormat) -> None:
@@ -61,7 +63,7 @@ def test_a_format_of_another_package_is_found_by_its_ending(offer: Offer) -> Non
     offer("tables", "table", "fmu_mesh.recorder.csv_file:CsvFile")
 
     assert result_format("a.table") is CsvFile
-    assert result_endings() == [".csv", ".mcap", ".table"]
+    assert result_endings() == [".csv", ".mcap", ".parquet", ".table"]
 
 
 def test_only_our_own_entry_points_are_read_for_a_format_of_ours(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -79,13 +81,14 @@ def test_an_ending_that_nobody_offers_is_a_finding_that_lists_what_is_installed(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], offer: Offer
 ) -> None:
     offer("tables", "table", "fmu_mesh.recorder.csv_file:CsvFile")
-    config = write_config(tmp_path, record={"file": "pair.parquet"})
+    config = write_config(tmp_path, record={"file": "pair.feather"})
 
     codes = main(["check", str(config)]), main(["launch", str(config), "--output", "pair.json"])
 
     errors = capsys.readouterr().err
     assert codes == (2, 2)
-    assert "'pair.parquet', a format that is not written; expected a name ending in .csv or .mcap or .table" in errors
+    expected = "expected a name ending in .csv or .mcap or .parquet or .table"
+    assert f"'pair.feather', a format that is not written; {expected}" in errors
     assert "--output pair.json: " in errors
 
 
@@ -133,7 +136,7 @@ def test_rows_of_a_killed_process_count_only_in_the_file_that_it_has_written(
     if noted is not None:
         (tmp_path / "recorded").write_bytes(struct.pack("<qq", *noted))
 
-    assert rows_left(str(result), tmp_path) == rows
+    assert rows_left([str(result)], tmp_path) == ((str(result), rows),)
 
     assert result.read_bytes() == b"abc"
 
@@ -141,10 +144,10 @@ def test_rows_of_a_killed_process_count_only_in_the_file_that_it_has_written(
 def test_a_device_keeps_no_rows(tmp_path: Path) -> None:
     (tmp_path / "recorded").write_bytes(struct.pack("<qq", 2, 3))
 
-    assert rows_left(os.devnull, tmp_path) == 0
+    assert rows_left([os.devnull], tmp_path) == ((os.devnull, 0),)
 
 
-@pytest.mark.parametrize("format_", FORMATS)
+@pytest.mark.parametrize("format_", [CsvFile, McapFile])
 def test_what_follows_the_rows_that_are_known_is_no_more_than_what_is_told(
     format_: ResultFormat, tmp_path: Path
 ) -> None:

@@ -485,7 +485,6 @@ RECORD = [
      "Did you mean 'delay'?")),
     ("[delay.y, delay.y]", ("[1]: 'delay.y' a second time (first: record.variables[0]); "
      "expected every variable at most once")),
-    ("[delay.x]", "[0]: 'delay.x', whose causality is input; expected an output"),
 ]  # fmt: skip
 
 

@@ -19,7 +19,7 @@ from fmu_mesh.simtime import TimeGrid
 from fmu_mesh.system.layout import Layout
 from fmu_mesh.system.memory_map import MASTER, map_memory
 from fmu_mesh.system.plan import InstancePlan
-from fmu_mesh.wire.values import ValueRefused, decode_time
+from fmu_mesh.wire.values import Origin, ValueRefused, decode_origin, encode_origin
 from tests.helpers import FMUS
 
 STEP_SIZE = 0.1
@@ -186,11 +186,13 @@ def test_a_time_long_before_the_run_is_the_past(hold: Steps) -> None:
 
 
 def test_the_time_of_a_value_is_that_of_its_attachment() -> None:
-    assert decode_time(b'{"time": 1.5}') == 1.5
-    assert decode_time(b'{"point": 3, "time": 2}') == 2.0
+    assert decode_origin(b'{"time": 1.5}') == Origin(1.5)
+    assert decode_origin(b'{"point": 3, "time": 2}') == Origin(2.0)
+    assert decode_origin(b'{"who": "joystick"}') == Origin(None, "joystick")
+    assert decode_origin(encode_origin(None, "w" * 300)) == Origin(None, "w" * 200)
 
 
 @pytest.mark.parametrize("attachment", [b"", b"{}", b'{"time": "1"}', b"[1.5]", b"\xff\x00", b'{"time": null}'])
-def test_an_attachment_without_a_time_is_refused(attachment: bytes) -> None:
-    with pytest.raises(ValueRefused, match="its attachment has no time"):
-        decode_time(attachment)
+def test_an_attachment_that_says_nothing_is_refused(attachment: bytes) -> None:
+    with pytest.raises(ValueRefused, match=r"its attachment (is not like|has neither)"):
+        decode_origin(attachment)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
@@ -46,6 +46,11 @@ class JsonLinesFile:
         return cls(path, [name for name, _ in recording.columns])
 
     @staticmethod
+    def growing_file(path: Path) -> Path:
+        """The file itself: its rows can be read while it grows."""
+        return path
+
+    @staticmethod
     def keep_whole_rows(path: Path, kept: Kept) -> int:
         """Every line is a row, and a row without its line end is not whole."""
         with path.open("r+b") as file:
@@ -61,6 +66,9 @@ class JsonLinesFile:
             self.rows += 1
         if len(self._waiting) >= _BUFFER_BYTES:
             self.flush()
+
+    def note(self, entry: Mapping[str, Any]) -> None:
+        """Do nothing: the file has rows and nothing else."""
 
     def flush(self) -> None:
         """Give all rows to the operating system."""

@@ -6,7 +6,7 @@ Knows no communication points: `fmu_mesh.ros.bags.playing` finds the point of a 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self
 
@@ -19,18 +19,19 @@ from ...config.loading import LoadedConfig
 from ...config.mesh import RosConfig, RosTopicConfig
 from ...errors import ConfigurationError
 from ...text import listed, nearest, nearest_file
-from ...variables.model_description import Value
+from ...variables.model_description import ModelDescription, Value
 from ...variables.value_types import nested
 from ...wire.views import InstanceInfo
 from ..gateway.mapping import descriptions_of, message_types
 from ..gateway.resolver import Resolver
 from ..messages.definitions import MessageTypes, path_parts
+from ..messages.stamp import nanoseconds
 from ..messages.topics import Port, Topic
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
 
-__all__ = ["Bag", "BagSample", "chosen_topics"]
+__all__ = ["Bag", "BagSample", "chosen_topics", "timed", "topics_for"]
 
 _CHOICE = re.compile(r"(?P<topic>/?[^=:]+)(:(?P<field>[^=]+))?=(?P<variable>.+)")
 
@@ -138,6 +139,13 @@ def chosen_topics(
     Raises:
         ConfigurationError: a choice is wrong, or the mesh subscribes to no topic of the bag.
     """
+    return topics_for(loaded, descriptions_of(infos), bag, choices)
+
+
+def topics_for(
+    loaded: LoadedConfig, descriptions: Mapping[str, ModelDescription], bag: Bag, choices: Sequence[str] = ()
+) -> list[Topic]:
+    """As `chosen_topics`, for model descriptions by instance name."""
     there = bag.topics
     section = loaded.config.ros or RosConfig()
     if choices:
@@ -148,7 +156,7 @@ def chosen_topics(
     findings.raise_any()
     assert types is not None
     bag.add_types(types)
-    plan = Resolver(config, section, descriptions_of(infos), types, findings).plan()
+    plan = Resolver(config, section, descriptions, types, findings).plan()
     if choices and len(findings):
         problems = "; ".join(f"{finding.found}, where {finding.expected} is possible" for finding in findings)
         raise ConfigurationError(f"--topic: {problems}.")
@@ -168,6 +176,18 @@ def chosen_topics(
             hint="Say what goes where: --topic TOPIC=INSTANCE.VARIABLE.",
         )
     return topics
+
+
+def timed(samples: Iterable[BagSample], start: float | None) -> list[tuple[float, BagSample]]:
+    """Samples in the order of their stamps, each with its simulation time in s.
+
+    Args:
+        samples: in any order.
+        start: simulation time in s of the earliest stamp; None: stamps are simulation times.
+    """
+    ordered = sorted(samples, key=lambda sample: sample.stamp)
+    shift = 0 if start is None or not ordered else nanoseconds(start) - ordered[0].stamp
+    return [((sample.stamp + shift) / 1e9, sample) for sample in ordered]
 
 
 def _entries(choices: Sequence[str], there: Mapping[str, str]) -> Iterator[RosTopicConfig]:

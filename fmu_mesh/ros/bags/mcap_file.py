@@ -6,7 +6,7 @@ Owns which topics a recording has, and how rows become messages. `fmu_mesh.ros.m
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from io import BufferedWriter
 from pathlib import Path
 from types import TracebackType
@@ -46,13 +46,15 @@ _QOS = (
 class McapFile:
     """Writes rows of results as ROS messages into an MCAP, and `/clock` with them.
 
-    The log time and the publish time of a message are its simulation time. A topic has a message at every point at
-    which one of its variables has a new value.
+    The log time and the publish time of a message are its simulation time. A topic has a message in every row in which
+    one of its variables has a new value.
 
     Args:
         path: the file. Its folder is made; the first row replaces an older file.
         columns: (`instance.variable`, type) of every column that `write` is given.
         plan: the topics, and how often the clock ticks.
+        first: point of the first row.
+        every: number of points from row to row.
 
     Attributes:
         path: the file.
@@ -63,8 +65,11 @@ class McapFile:
         ConfigurationError: the file cannot be written, or the package `mcap` is not installed.
     """
 
-    def __init__(self, path: Path, columns: Sequence[tuple[str, str]], plan: RosPlan) -> None:
+    def __init__(
+        self, path: Path, columns: Sequence[tuple[str, str]], plan: RosPlan, *, first: int = 0, every: int = 1
+    ) -> None:
         writer = _writer_class()
+        self._first, self._every = first, every
         self.path = path
         self.rows = 0
         self.kept = Kept()
@@ -95,7 +100,12 @@ class McapFile:
         found = _topics(recording, findings)
         findings.raise_any()
         assert found is not None  # or there is a finding
-        return cls(path, recording.columns, found)
+        return cls(path, recording.columns, found, first=recording.first, every=recording.every)
+
+    @staticmethod
+    def growing_file(path: Path) -> Path:
+        """The bag itself: its messages can be read while it grows."""
+        return path
 
     @staticmethod
     def keep_whole_rows(path: Path, kept: Kept) -> int:
@@ -120,13 +130,17 @@ class McapFile:
             self._mcap.start(profile="ros2", library="fmu_mesh")
         rows = zip(*(column.tolist() for column in columns), strict=True) if columns else iter([()] * len(times))
         for time, row in zip(times.tolist(), rows, strict=True):
-            point, stamp = self.rows, nanoseconds(time)
-            if self._clock_points is not None and point % self._clock_points == 0:
+            point, stamp = self._first + self.rows * self._every, nanoseconds(time)
+            before = point - self._every if self.rows else -1
+            if self._clock_points is not None and _has_passed(self._clock_points, before, point):
                 self._add(self._clock_channel, stamp, self._clock.encode({"clock": to_stamp(time)}), point)
             for topic in self._topics:
-                if topic.due(point):
+                if topic.due(before, point):
                     self._add(topic.channel, stamp, topic.message(row, time), point)
             self.rows += 1
+
+    def note(self, entry: Mapping[str, Any]) -> None:
+        """Add an entry to the metadata."""
 
     def flush(self) -> None:
         """Give all rows to the operating system, so that they survive the end of this process."""
@@ -167,9 +181,9 @@ class _RecordedTopic:
         self._shapes = [port.variable.shape for port in topic.ports]
         self._assembler = Assembler(topic, types)
 
-    def due(self, point: int) -> bool:
-        """Whether one of the variables has a new value at ``point``."""
-        return any(point % step == 0 for step in self._steps)
+    def due(self, before: int, point: int) -> bool:
+        """Whether one of the variables has a new value at ``point`` that it did not have at the point ``before``."""
+        return any(_has_passed(step, before, point) for step in self._steps)
 
     def message(self, row: Sequence[Any], time: float) -> bytes:
         """The message of a row."""
@@ -178,6 +192,11 @@ class _RecordedTopic:
             for columns, shape in zip(self._columns, self._shapes, strict=True)
         ]
         return self._assembler.make(values, time)
+
+
+def _has_passed(step: int, before: int, point: int) -> bool:
+    """Whether one of the points after ``before``, up to ``point``, is a multiple of ``step``."""
+    return point // step > before // step
 
 
 def _topics(recording: Recording, findings: Findings) -> RosPlan | None:
@@ -208,10 +227,13 @@ def _topics(recording: Recording, findings: Findings) -> RosPlan | None:
     rest = replace(section, topics=[f"{i}.{v}" for i, v in recorded if (i, v) not in covered])
     own = Findings(str(loaded.file))
     others = Resolver(config, rest, descriptions, types, own).plan().topics
+    section_file = loaded.config.records[recording.place].file
     for finding in own:
-        findings.add("record.file", f"in '{loaded.config.record.file}': {finding.found}", finding.expected)
+        findings.add(f"{recording.place}.file", f"in '{section_file}': {finding.found}", finding.expected)
     if loaded.config.simulation.start_time < 0.0:
-        findings.add("record.file", "an MCAP of times before 0, which it cannot hold", "a CSV file, or another start")
+        findings.add(
+            f"{recording.place}.file", "an MCAP of times before 0, which it cannot hold", "a CSV file, or another start"
+        )
     return replace(plan, topics=(*configured, *others))
 
 
@@ -224,7 +246,9 @@ def _whole(recording: Recording, findings: Findings) -> list[tuple[str, str]]:
         assert variable is not None  # the system is valid
         if (instance, variable.name) not in whole and not {(instance, e) for e in variable.elements} <= columns:
             findings.add(
-                "record.variables", f"some elements of the array '{instance}.{variable.name}'", "all of it in an MCAP"
+                f"{recording.place}.variables",
+                f"some elements of the array '{instance}.{variable.name}'",
+                "all of it in an MCAP",
             )
         whole[instance, variable.name] = None
     return list(whole)

@@ -19,12 +19,12 @@ from ...config.loading import LoadedConfig
 from ...errors import ConfigurationError, DeadlineExceeded, MeshLost
 from ...instances.configuration import load
 from ...simtime import ENDLESS, TimeGrid
+from ...system.scenario import BAG_STAMP_S
 from ...variables.model_description import Value
 from ...wire.client.mesh_client import MeshClient
 from ...wire.client.readings import Target
 from ...wire.views import Command, MeshInfo
-from ..messages.stamp import nanoseconds
-from .bag import Bag, BagSample, chosen_topics
+from .bag import Bag, BagSample, chosen_topics, timed
 
 __all__ = ["Moment", "PlayOptions", "Played", "grid_of", "play", "play_bag", "schedule"]
 
@@ -142,12 +142,11 @@ def schedule(
         The moments in order of their points, the number of samples that a later one replaced, and the number of samples
         at or after the last point.
     """
-    ordered = sorted(samples, key=lambda sample: sample.stamp)
-    shift = 0 if start is None or not ordered else nanoseconds(start) - ordered[0].stamp
     moments: dict[int, dict[tuple[str, str], Value]] = {}
     merged = beyond = 0
-    for sample in ordered:
-        point = _point_of(sample.stamp + shift, grid, step_points[sample.instance])
+    for time_s, sample in timed(samples, start):
+        points = step_points[sample.instance]
+        point = grid.step_at(time_s, points, BAG_STAMP_S) * points
         if point >= grid.last_point:
             beyond += 1
             continue
@@ -243,11 +242,3 @@ def _wait_until_at(client: MeshClient, instance: str, point: int, timeout_s: flo
             )
         never.wait(look)
         look = min(2 * look, _LONGEST_LOOK_S)
-
-
-def _point_of(stamp: int, grid: TimeGrid, points: int) -> int:
-    """The first point of an instance that is not before ``stamp``, which is exact to 1 ns."""
-    exact = (stamp / 1e9 - grid.start_time) / (points * grid.step_size)
-    near = round(exact)
-    step = near if abs(nanoseconds(grid.time(near * points)) - stamp) <= 1 else math.ceil(exact)
-    return max(0, step) * points

@@ -25,7 +25,7 @@ from ...wire.keys import Keys
 from ...wire.messages import decode_json
 from ...wire.refusals import Refusals
 from ...wire.session import Question, ask, undeclare_all
-from ...wire.values import Stamp, encode_time, encode_value, json_encoding
+from ...wire.values import Stamp, encode_origin, encode_value, json_encoding
 from ...wire.views import MeshInfo
 from ..messages.assembling import Assembler, Disassembler
 from ..messages.cdr import CdrError
@@ -280,13 +280,14 @@ class _SubscribedTopic(WarnOnce):
         self.disassembler = disassembler
         self.keys = keys
         self._stop_time = stop_time
+        self._who = f"ros {disassembler.topic.name}"
 
-    def attachment(self, stamp: float | None) -> bytes | None:
-        """The time from which on a value with this stamp in s holds, encoded; None: as soon as it arrives."""
+    def attachment(self, stamp: float | None) -> bytes:
+        """Who sends a value, and from which time on it holds: its stamp in s; None: as soon as it arrives."""
         if stamp is not None and self._stop_time is not None and stamp > self._stop_time:
             self.warn(
                 "its stamps are after the end of the simulation, so its messages hold as soon as they arrive; "
                 "does its publisher run with use_sim_time?"
             )
-            return None
-        return encode_time(stamp) if stamp is not None else None
+            stamp = None
+        return encode_origin(stamp, self._who)

@@ -20,7 +20,7 @@ from ...variables.model_description import Value, Variable
 from ...wire.keys import Keys
 from ...wire.messages import decode_json
 from ...wire.session import Question, ask
-from ...wire.values import encode_value
+from ...wire.values import encode_origin, encode_value
 from ..messages.cdr import Codec, Message
 from ..messages.ros_names import absolute
 from ..messages.topics import NodeParameter, RosPlan
@@ -40,6 +40,7 @@ SERVICES = {
 """Request and response of each service (package rcl_interfaces)."""
 
 _ANSWER_S = 2.0
+_WHO = "ros set_parameters"
 _CLOSE_S = 2.0
 _NOT_SET, _BOOL, _INTEGER, _DOUBLE, _STRING = range(5)
 _VALUE_FIELDS = {_BOOL: "bool_value", _INTEGER: "integer_value", _DOUBLE: "double_value", _STRING: "string_value"}
@@ -145,7 +146,7 @@ class ParameterServices:
         """Get the value, or set a new one; returns the answer of the mesh, and why it refused or an empty text."""
         key = self._keys.variable(parameter.instance, "param", parameter.variable.name)
         payload = encode_value(value) if value is not None else None
-        question = Question(key, f"'{parameter.name}'", _ANSWER_S, payload)
+        question = Question(key, f"'{parameter.name}'", _ANSWER_S, payload, encode_origin(None, _WHO))
         try:
             return decode_json(ask(self._mesh, question), object), ""
         except FmuMeshError as error:

@@ -24,7 +24,7 @@ from ...text import fits, listed, nearest, shown
 from ..keys import Keys
 from ..messages import decode_json
 from ..session import Question, answer_of, answers, reason_of
-from ..values import encode_time, encode_value
+from ..values import encode_origin, encode_value
 from ..views import (
     Command,
     CommandAnswer,
@@ -38,6 +38,7 @@ from ..views import (
 )
 from .following import Follower
 from .readings import Reading, Target, reading_of
+from .sender import this_program
 
 __all__ = ["MeshClient", "is_key", "key_expression"]
 
@@ -193,7 +194,7 @@ class MeshClient:
         except (TypeError, msgspec.MsgspecError) as error:
             raise ConfigurationError(f"{shown(value)} is no value of a variable: {error}") from error
         who = f"'{target.instance}.{target.variable.name}'"
-        return self._view(target.key, SetAnswer, who, payload, encode_time(at) if at is not None else None)
+        return self._view(target.key, SetAnswer, who, payload, encode_origin(at, this_program()))
 
     def command(self, command: Command) -> CommandAnswer:
         """Pause, resume, step or stop the mesh; the answer comes before the mesh has paused."""

@@ -1,0 +1,197 @@
+"""`rerun`: a run again, from nothing but its result file.
+
+The metadata of the file have the configuration, the hashes of the models, and every value that another program has set
+while the mesh ran. Each value is set again while the mesh is paused at the point at which its instance took it then. So
+every float is the same as before, however long each process takes.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple, Unpack
+
+import msgspec
+
+from .. import __version__
+from ..config.loading import PlainConfig
+from ..errors import ConfigurationError, Finding, FmuMeshError
+from ..run.run_plan import RunPlan
+from ..system.run_metadata import RunMetadata
+from ..text import listed
+from ..wire.messages import SetValue
+from .mesh_builder import Mesh
+from .plan_options import StartOptions
+from .result import Result
+from .run_handle import Run
+
+__all__ = ["PlannedRerun", "planned_rerun", "rerun"]
+
+log = logging.getLogger("fmu_mesh.run")
+
+_SET = "set"
+_ALONE: Mapping[str, Any] = {"zenoh": {"mode": "peer", "listen": [], "connect": [], "config": None}, "ros": None}
+"""What a rerun has of its own: nobody else reaches it or sends anything to it."""
+
+
+class PlannedRerun(NamedTuple):
+    """A rerun before it is started.
+
+    Attributes:
+        plan: the plan of the run.
+        values: what is set in it, in the order of the points.
+        last_point: the point at which it is stopped; None: it runs to its end.
+    """
+
+    plan: RunPlan
+    values: Sequence[SetValue]
+    last_point: int | None
+
+    def run(self, **how: Unpack[StartOptions]) -> Result:
+        """Run it.
+
+        Raises:
+            FmuMeshError: it ended early; its `result` has what was recorded up to then.
+        """
+        with Run.start(self.plan, **how) as run:
+            self.drive(run)
+            return run.wait()
+
+    def drive(self, run: Run) -> None:
+        """Set the values in the run, which is paused at its first point, and stop it where the first one has ended."""
+        if self.plan.options.paused:
+            try:
+                run.replay(self.values, self.last_point)
+            except FmuMeshError:
+                run.close()
+                raise
+
+
+def rerun(
+    result: str | Path,
+    *,
+    output: str | Path | None = None,
+    allow_code: bool = False,
+    on_notice: Callable[[str], None] = log.info,
+    **how: Unpack[StartOptions],
+) -> Result:
+    """Run again what a result file has recorded: same configuration, models and values that were set from outside.
+
+    The rows are the same in every float, unless versions or machines calculate differently; `Result.compare` tells.
+
+    Example:
+        >>> import fmu_mesh
+        >>> mesh = fmu_mesh.Mesh("steered", step_size=0.01, stop_time=1.0)
+        >>> mesh.add("gain", fmu="fmus/Gain.fmu")
+        >>> with mesh.start(output="results/steered.csv", paused=True) as run:
+        ...     answer = run.step(10)
+        ...     answer = run.set("gain.u", 3.0)
+        ...     answer = run.resume()
+        ...     first = run.wait()
+        >>> [(value["variable"], value["point"]) for value in first.metadata["set"]]
+        [('u', 10)]
+        >>> again = fmu_mesh.rerun("results/steered.csv", output="results/again.csv")
+        >>> again["gain.y"].tolist() == first["gain.y"].tolist()
+        True
+
+    Args:
+        result: the result file; a CSV needs the `.json` file beside it.
+        output: the new result file; by default `NAME.rerun` with the same ending, beside the first one.
+        allow_code: run the Python code that the file names although another user owns the file.
+        on_notice: called with a sentence about what may make a difference, such as another version of fmu_mesh.
+        how: see `StartOptions`.
+
+    Returns:
+        The result of the new run.
+
+    Raises:
+        ConfigurationError: the file does not say how it was made, or a model has changed; names each.
+        FmuMeshError: the run ended early, and not where the first one has.
+    """
+    return planned_rerun(result, output=output, allow_code=allow_code, on_notice=on_notice).run(**how)
+
+
+def planned_rerun(
+    result: str | Path,
+    *,
+    output: str | Path | None = None,
+    allow_code: bool = False,
+    on_notice: Callable[[str], None] = log.info,
+) -> PlannedRerun:
+    """Plan a rerun; the arguments and errors are those of `rerun`."""
+    path = Path(result)
+    first = Result.read(path)
+    metadata, values = _metadata_of(path, first)
+    if not allow_code:
+        _check_owner(path)
+    output = Path(output) if output is not None else path.with_name(f"{path.stem}.rerun{path.suffix}")
+    if output.absolute() == path.absolute():
+        raise ConfigurationError(f"'{output}' is the result itself", hint="Give another file with --output.")
+    data = {**metadata.configuration, **_ALONE}
+    sections = data.get("record") or {}
+    section = sections[metadata.section] if isinstance(sections, list) else sections
+    data["record"] = {**section, "file": str(output.absolute())}
+    last_point = _last_point(metadata, first)
+    if last_point is not None:  # an instance may have been ahead of the rows that were left
+        values = [value for value in values if value.point < last_point]
+    mesh = Mesh.from_configuration(PlainConfig(data, Path(metadata.file)))
+    plan = mesh.plan(
+        real_time_factor=0.0,
+        paused=bool(values) or last_point is not None,
+        allow_code=allow_code,
+        on_notice=on_notice,
+    )
+    _check_models(path, metadata, plan)
+    if (version := metadata.versions.get("fmu_mesh")) != __version__:
+        on_notice(f"'{path}' was made by fmu_mesh {version}, and this is {__version__}")
+    return PlannedRerun(plan, values, last_point)
+
+
+def _metadata_of(path: Path, result: Result) -> tuple[RunMetadata, list[SetValue]]:
+    entries = dict(result.metadata)
+    values = entries.pop(_SET, [])
+    if "configuration" not in entries:
+        beside = f"The file '{path.name}.json' beside it says it." if path.suffix.lower() != ".parquet" else None
+        raise ConfigurationError(f"'{path}' does not say how it was made", hint=beside)
+    try:
+        return msgspec.convert(entries, RunMetadata), msgspec.convert(values, list[SetValue])
+    except msgspec.ValidationError as error:
+        raise ConfigurationError(f"what '{path}' says about its run is not understood: {error}") from error
+
+
+def _last_point(metadata: RunMetadata, result: Result) -> int | None:
+    """The point of the last row; None if it is the last one of the run."""
+    if not len(result.times):
+        raise ConfigurationError(f"'{result.file}' has no rows", hint="There is nothing to compare a rerun with.")
+    if metadata.stop_time is not None and metadata.stop_time - result.times[-1] < metadata.step_size / 2:
+        return None
+    return round((float(result.times[-1]) - metadata.start_time) / metadata.step_size)
+
+
+def _check_owner(path: Path) -> None:
+    """Check that this user, or root, has made the file: it may name Python code."""
+    if path.stat().st_uid not in {os.getuid(), 0}:
+        raise ConfigurationError(
+            f"'{path}' belongs to another user", hint="`--allow-code` runs it, with the Python code that it may name."
+        )
+
+
+def _check_models(path: Path, metadata: RunMetadata, plan: RunPlan) -> None:
+    """Check that the models are those of the first run.
+
+    Raises:
+        ConfigurationError: some are not; has a finding for each.
+    """
+    findings = []
+    for name, own in metadata.models.items():
+        now = plan.contents.get(name, "")
+        if own.sha256 and now != own.sha256:
+            there = plan.plan.system.instances[name].fmu
+            found = f"'{there}' has the SHA-256 {now[:12]}…"
+            findings.append(Finding(str(path), f"models.{name}", found, f"{own.sha256[:12]}…, as in the first run"))
+    if findings:
+        changed = listed([f"'{finding.path.partition('.')[2]}'" for finding in findings])
+        text = str(findings[0]) if len(findings) == 1 else f"{path}: the models of {changed} have changed"
+        raise ConfigurationError(text, findings=tuple(findings))

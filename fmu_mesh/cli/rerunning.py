@@ -1,0 +1,57 @@
+"""`rerun`: a run again, from its result file."""
+
+from __future__ import annotations
+
+import argparse
+from functools import partial
+from pathlib import Path
+
+from ..api.rerunning import planned_rerun
+from ..api.run_handle import Run
+from .arguments import CommandParser, Parsers, add_json
+from .output.display import Display, summary, teller, warn
+from .output.reports import RunReporter
+from .run_options import add_options
+from .running import add_output, interrupted_by_signals, show_event
+
+__all__ = ["PARSERS"]
+
+
+def _add_rerun(parser: CommandParser) -> None:
+    parser.add_argument("result", type=Path, metavar="RESULT", help="the result file of a run")
+    parser.add_argument(
+        "--output", type=Path, metavar="FILE", help="the new result file; default: RESULT with .rerun in its name"
+    )
+    add_options(parser, "allow_code")
+    add_output(parser)
+    add_json(parser, "print the outcome as one JSON object, and nothing else on standard output")
+    parser.set_defaults(run_command=_rerun)
+
+
+def _rerun(arguments: argparse.Namespace) -> int:
+    with RunReporter(wanted=arguments.json) as reporter:
+        again = planned_rerun(
+            arguments.result,
+            output=arguments.output,
+            allow_code=arguments.allow_code,
+            on_notice=teller(quiet=arguments.quiet),
+        )
+        reporter.planned(again.plan)
+        plan = again.plan.plan
+        if not arguments.quiet:
+            warn(plan)
+        with (
+            Display(plan, show_progress=not arguments.no_progress, quiet=arguments.quiet) as display,
+            interrupted_by_signals() as runs,
+        ):
+            run = Run.start(again.plan, on_event=partial(show_event, reporter, display))
+            runs.append(run)
+            again.drive(run)
+            outcome = run.wait().outcome
+        assert outcome is not None  # it has run
+        for line in summary(plan, outcome):
+            print(line)
+    return 0
+
+
+PARSERS: Parsers = {"rerun": _add_rerun}

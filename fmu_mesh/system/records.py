@@ -1,0 +1,304 @@
+"""Which variables each result file has, and at which points: names and patterns of the section `record`.
+
+Owns `RecordPlan` and the meaning of patterns. Formats are `fmu_mesh.system.recording`.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import msgspec
+
+from ..config.findings import Findings
+from ..config.loading import LoadedConfig
+from ..config.mesh import RecordConfig
+from ..simtime import TimeGrid, steps_between
+from ..text import listed, nearest, short_number, shown
+from ..variables.model_description import Causality, Variable
+from ..variables.value_types import element_name, is_text, split_element
+from .connections import Variables, resolve_variable
+from .recording import has_unknown_ending, result_endings, result_format
+
+__all__ = ["RecordPlan", "ending_warnings", "record_paths", "resolve_records", "union_of"]
+
+_PREFIXES: dict[str, tuple[Causality, ...]] = {
+    "out": ("output",),
+    "in": ("input",),
+    "local": ("local",),
+    "param": ("parameter", "calculatedParameter", "structuralParameter"),
+}
+"""What a pattern with one of these words and a colon before it matches."""
+
+_WORDS = {"out": "output", "in": "input", "local": "local variable", "param": "parameter"}
+
+_EXPRESSION = "re:"
+_WILDCARDS = {"*": ".*", "?": "."}
+
+
+class RecordPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One result file: its columns and its rows.
+
+    The file has a row for the points ``first``, ``first + every``, ``first + 2 * every``, ...
+
+    Example:
+        >>> plan = RecordPlan("/tmp/slow.csv", (("pendulum", "a"),), first=10, every=5)
+        >>> plan.rows_before(21), plan.point_of(2)
+        (3, 20)
+
+    Attributes:
+        file: absolute path of the file.
+        variables: (instance, variable) of every column, in order; of an array every element is a column of its own,
+            as `y[1,2]`.
+        first: point of the first row.
+        every: number of points from row to row.
+    """
+
+    file: str
+    variables: tuple[tuple[str, str], ...]
+    first: int = 0
+    every: int = 1
+
+    def point_of(self, row: int) -> int:
+        """The point of a row; rows are counted from 0."""
+        return self.first + row * self.every
+
+    def rows_before(self, point: int) -> int:
+        """Number of rows of the points before ``point``."""
+        return max(0, -((self.first - point) // self.every))
+
+    def rows_within(self, first: int, end: int) -> slice:
+        """Which ones of the points first to end - 1 have a row, as a slice of arrays with a value for each of them."""
+        return slice(self.point_of(self.rows_before(first)) - first, end - first, self.every)
+
+
+def union_of(records: Sequence[RecordPlan]) -> tuple[tuple[str, str], ...]:
+    """(instance, variable) of the columns of all files, each once, in the order of the files."""
+    if len(records) == 1:
+        return records[0].variables
+    return tuple(dict.fromkeys(column for record in records for column in record.variables))
+
+
+def resolve_records(
+    loaded: LoadedConfig, variables: Variables, grid: TimeGrid | None, findings: Findings
+) -> tuple[RecordPlan, ...]:
+    """The result files of a configuration; one without a path or without columns is left out.
+
+    Args:
+        loaded: the configuration.
+        variables: all variables of all instances; None in place of those that are not known.
+        grid: the communication points; None after a finding about them.
+        findings: where findings go.
+    """
+    records: list[RecordPlan] = []
+    first_of: dict[str, str] = {}
+    for place, section in loaded.config.records.items():
+        chosen = _chosen(section, f"{place}.variables", variables, findings)
+        file = _file(loaded, place, section, findings)
+        first = _first_point(section, f"{place}.from", grid, findings)
+        if file is None:
+            continue
+        other = first_of.setdefault(file, place)
+        if other != place:
+            findings.add(f"{place}.file", f"'{section.file}', which is also the file of {other}", "a file of its own")
+        if chosen:
+            records.append(RecordPlan(file, chosen, first, section.every))
+    return tuple(records)
+
+
+def ending_warnings(loaded: LoadedConfig, records: Sequence[RecordPlan], warnings: Findings) -> None:
+    """Warn of endings that nobody offers: they still give a CSV, as in version 0.1."""
+    files = {record.file for record in records}
+    for place, section in loaded.config.records.items():
+        file = _path(loaded, section)
+        if file is not None and str(file) in files and has_unknown_ending(file):
+            found = f"'{section.file}', an ending of no installed format, so the file becomes a CSV"
+            warnings.add(f"{place}.file", found, f"a name ending in {' or '.join(result_endings())}")
+
+
+def record_paths(loaded: LoadedConfig) -> dict[str, Path]:
+    """The absolute paths of the result files, by the places of their sections in the configuration."""
+    sections = loaded.config.records.items()
+    return {place: path for place, section in sections if (path := _path(loaded, section)) is not None}
+
+
+def _path(loaded: LoadedConfig, section: RecordConfig) -> Path | None:
+    return loaded.resolve(section.file.replace("{mesh}", loaded.config.mesh)) if section.file is not None else None
+
+
+def _file(loaded: LoadedConfig, place: str, section: RecordConfig, findings: Findings) -> str | None:
+    text, path, place = section.file, _path(loaded, section), f"{place}.file"
+    if path is None:
+        return None
+    try:
+        is_folder = path.is_dir()
+    except OSError as error:  # the name is too long, or the folder belongs to another user
+        findings.add(place, f"{shown(text)} ({error.strerror})", "a file that can be written")
+        return None
+    if is_folder:
+        findings.add(place, f"the folder '{text}'", "a file, or null to record nothing")
+    elif result_format(path) is None:
+        endings = " or ".join(result_endings())
+        findings.add(place, f"'{text}', a format that is not written", f"a name ending in {endings}")
+    return str(path)
+
+
+def _first_point(section: RecordConfig, place: str, grid: TimeGrid | None, findings: Findings) -> int:
+    """The first point that is not before the time `from`."""
+    start = section.start
+    if start is None or grid is None or start <= grid.start_time:
+        return 0
+    points = steps_between(grid.start_time, start, grid.step_size)
+    if points is None:
+        points = math.ceil((start - grid.start_time) / grid.step_size)
+    if points > grid.last_point:
+        end = grid.time(grid.last_point)
+        found = f"{short_number(start)} s, after the last communication point"
+        findings.add(place, found, f"a time up to {short_number(end)}")
+        return 0
+    return points
+
+
+def _chosen(section: RecordConfig, place: str, variables: Variables, findings: Findings) -> tuple[tuple[str, str], ...]:
+    """The columns of a file; by default all outputs but String and Binary."""
+    if section.variables is None:
+        return tuple(
+            (instance, element)
+            for instance, variable in _matched(_Pattern(re.compile(".*", re.DOTALL), ("output",)), variables)
+            for element in variable.elements
+        )
+    columns: dict[tuple[str, str], str | None] = {}  # where a column is named; None: only patterns match it
+    for index, reference in enumerate(section.variables):
+        add = _add_matched if _is_pattern(reference, variables) else _add_named
+        add(reference, f"{place}[{index}]", columns, variables, findings)
+    return tuple(columns)
+
+
+def _add_matched(
+    reference: str,
+    place: str,
+    columns: dict[tuple[str, str], str | None],
+    variables: Variables,
+    findings: Findings,
+) -> None:
+    """Add the columns of all variables that a pattern matches."""
+    pattern = _pattern(reference, place, findings)
+    if pattern is None:
+        return
+    found = _matched(pattern, variables)
+    for instance, variable in found:
+        for element in variable.elements:
+            columns.setdefault((instance, element), None)
+    if not found and all(own is not None for own in variables.values()):
+        _nothing_matches(reference, pattern, place, variables, findings)
+
+
+def _add_named(
+    reference: str,
+    place: str,
+    columns: dict[tuple[str, str], str | None],
+    variables: Variables,
+    findings: Findings,
+) -> None:
+    """Add the columns of a variable, or of an element of an array, that is named."""
+    instance, _, name = reference.partition(".")
+    first = columns.get((instance, name))
+    end = None if first else _resolved(reference, place, variables, findings)
+    names: tuple[str, ...] = (name,)
+    if end is not None:
+        variable, element = end
+        names = (element_name(variable.name, element),) if element else variable.elements
+        first = next((where for one in names if (where := columns.get((instance, one)))), None)
+        if variable.causality == "independent":
+            found = f"'{reference}', the independent variable"
+            findings.add(place, found, "another variable: its values are in the column time")
+    if first:
+        findings.add(place, f"'{reference}' a second time (first: {first})", "every variable at most once")
+    for one in names:
+        columns[instance, one] = first or place
+
+
+def _resolved(
+    reference: str, place: str, variables: Variables, findings: Findings
+) -> tuple[Variable, tuple[int, ...]] | None:
+    """As `resolve_variable`; the nearest name is that of any variable where no output is near."""
+    instance, _, name = reference.partition(".")
+    own = variables.get(instance)
+    if own and name and name not in own and split_element(name) is None:
+        outputs = [variable.name for variable in own.values() if variable.causality == "output"]
+        near = nearest(name, own) if nearest(name, outputs) is None else None
+        if near is not None:
+            found = f"the unknown variable '{name}' of instance '{instance}'"
+            findings.add(place, found, f"one of the {len(own)} variables of '{instance}'", near)
+            return None
+    return resolve_variable(reference, place, variables, "output", findings)
+
+
+class _Pattern(NamedTuple):
+    """What a pattern matches: whole names `instance.variable`, of variables with one of the causalities."""
+
+    expression: re.Pattern[str]
+    causalities: tuple[Causality, ...]
+
+
+def _is_pattern(reference: str, variables: Variables) -> bool:
+    """Whether a text is a pattern; a variable of exactly this name comes first, as names may have any characters."""
+    instance, _, name = reference.partition(".")
+    if name in (variables.get(instance) or ()):
+        return False
+    word, colon, _ = reference.partition(":")
+    is_marked = bool(colon) and (word in _PREFIXES or f"{word}:" == _EXPRESSION)
+    return is_marked or any(sign in reference for sign in _WILDCARDS)
+
+
+def _parts(reference: str) -> tuple[str, str]:
+    """The word before a pattern that says what it matches, and the pattern."""
+    word, colon, text = reference.partition(":")
+    return (word, text) if colon and word in _PREFIXES else ("out", reference)
+
+
+def _pattern(reference: str, place: str, findings: Findings) -> _Pattern | None:
+    """The pattern that a text is; None after a finding."""
+    word, text = _parts(reference)
+    if not text.startswith(_EXPRESSION):
+        written = "".join(_WILDCARDS.get(sign) or re.escape(sign) for sign in text)
+        return _Pattern(re.compile(written, re.DOTALL), _PREFIXES[word])
+    try:
+        return _Pattern(re.compile(text.removeprefix(_EXPRESSION), re.DOTALL), _PREFIXES[word])
+    except (re.error, OverflowError, RecursionError) as error:
+        findings.add(place, f"{shown(reference)} ({error})", f"a regular expression of Python after `{_EXPRESSION}`")
+        return None
+
+
+def _matched(pattern: _Pattern, variables: Variables) -> list[tuple[str, Variable]]:
+    """The variables that a pattern matches, in the order of the file and of the model descriptions."""
+    return [
+        (instance, variable)
+        for instance, own in variables.items()
+        for variable in (own or {}).values()
+        if variable.causality in pattern.causalities
+        and not is_text(variable.type)
+        and pattern.expression.fullmatch(f"{instance}.{variable.name}")
+    ]
+
+
+def _nothing_matches(reference: str, pattern: _Pattern, place: str, variables: Variables, findings: Findings) -> None:
+    """Say what a pattern that matches nothing may have been meant to be."""
+    word, text = _parts(reference)
+    found = f"{shown(reference)}, which matches no {_WORDS[word]}"
+    others = [own for own in _PREFIXES if _matched(pattern._replace(causalities=_PREFIXES[own]), variables)]
+    if others:
+        expected = f"a pattern for {_WORDS[others[0]]}s, as its matches are"
+        findings.add(place, found, expected, f"{others[0]}:{text}")
+        return
+    every = [(f"{instance}.{v.name}", v) for instance, own in variables.items() for v in (own or {}).values()]
+    texts = [name for name, v in every if is_text(v.type) and pattern.expression.fullmatch(name)]
+    names = [name for name, v in every if v.causality in pattern.causalities and not is_text(v.type)]
+    near = nearest(re.sub(r"[*?]", "", text.removeprefix(_EXPRESSION)), names)
+    if texts:
+        findings.add(place, found, "each String and Binary by its whole name", texts[0])
+    else:
+        findings.add(place, found, f"a pattern for one of {listed(names)}", near)

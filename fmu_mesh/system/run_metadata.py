@@ -1,0 +1,192 @@
+"""What a result file says about its run besides the rows: enough to run it again.
+
+Owns the names of these entries. The formats store them as they are (`fmu_mesh.recorder`), `Result.metadata` returns
+them, and `fmu-mesh rerun` starts from them.
+"""
+
+from __future__ import annotations
+
+import platform
+import socket
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any
+
+import msgspec
+
+from .. import __version__
+from ..config.instance_sections import KIND
+from ..config.loading import LoadedConfig
+from ..variables.model_description import Variable
+from ..variables.value_conversion import to_plain
+from ..variables.value_types import PlainValue
+from .records import RecordPlan
+from .system import ResolvedSystem
+
+__all__ = ["ModelOrigin", "RecordedVariable", "RunMetadata", "configuration_of", "metadata_of"]
+
+_FORMAT = 1
+_PACKAGES = {"fmpy": "fmpy", "zenoh": "eclipse-zenoh", "numpy": "numpy"}
+
+
+class ModelOrigin(msgspec.Struct, frozen=True):
+    """Which model an instance has.
+
+    Attributes:
+        path: its file, absolute.
+        sha256: the SHA-256 of its content; empty for a model without files.
+        guid: the GUID or instantiation token of its model description.
+    """
+
+    path: str
+    sha256: str
+    guid: str
+
+
+class RecordedVariable(msgspec.Struct, frozen=True):
+    """What the model description says about the variable of a column.
+
+    Attributes:
+        type: its type, such as `Float64`.
+        declared_type: its type as the model description names it, such as `Real`.
+    """
+
+    type: str
+    declared_type: str | None
+    causality: str
+    variability: str
+    unit: str | None
+    description: str
+
+
+class RunMetadata(msgspec.Struct, frozen=True):
+    """What a result file says about its run.
+
+    Attributes:
+        format: the version of these entries.
+        versions: versions of fmu_mesh, of the packages that take part in the numbers, of Python and of the system.
+        mesh: name of the mesh.
+        digest: the digest of the mesh: version, configuration and models.
+        configuration: the values of a configuration file: that of the run, with everything that options replaced.
+        file: the configuration file of the run, absolute; relative paths in `configuration` refer to its folder.
+        section: which of the sections of `record` the file belongs to, counted from 0.
+        first: point of the first row.
+        every: number of points from row to row.
+        models: the models by instance.
+        start_values: the start values that were set, by instance and variable.
+        start_time: time of point 0 in s.
+        step_size: base communication step size in s.
+        stop_time: time of the last point in s; None: the run had no end.
+        variables: the recorded variables by column.
+        started: when the run was started, in UTC, after ISO 8601.
+        host: name of the host that wrote the file.
+    """
+
+    format: int
+    versions: dict[str, str]
+    mesh: str
+    digest: str
+    configuration: dict[str, Any]
+    file: str
+    section: int
+    first: int
+    every: int
+    models: dict[str, ModelOrigin]
+    start_values: dict[str, dict[str, PlainValue]]
+    start_time: float
+    step_size: float
+    stop_time: float | None
+    variables: dict[str, RecordedVariable]
+    started: str
+    host: str
+
+
+def metadata_of(
+    loaded: LoadedConfig,
+    system: ResolvedSystem,
+    record: RecordPlan,
+    *,
+    digest: str = "",
+    contents: Mapping[str, str] = {},
+) -> RunMetadata:
+    """What a result file of this run says about it.
+
+    Args:
+        loaded: the configuration, options applied.
+        system: the system of this configuration.
+        record: the plan of the file, one of the system.
+        digest: the digest of the mesh.
+        contents: the SHA-256 of the model of each instance.
+    """
+    models = {}
+    for name, own in system.instances.items():
+        models[name] = ModelOrigin(own.fmu, contents.get(name, ""), own.description.guid)
+    grid = system.grid
+    return RunMetadata(
+        format=_FORMAT,
+        versions=_versions(),
+        mesh=loaded.config.mesh,
+        digest=digest,
+        configuration=configuration_of(loaded),
+        file=str(loaded.file.absolute()),
+        section=system.records.index(record),
+        first=record.first,
+        every=record.every,
+        models=models,
+        start_values={
+            name: {variable: to_plain(value) for variable, value in own.start_values.items()}
+            for name, own in system.instances.items()
+        },
+        start_time=grid.start_time,
+        step_size=grid.step_size,
+        stop_time=grid.stop_time,
+        variables={f"{instance}.{name}": _recorded(system, instance, name) for instance, name in record.variables},
+        started=datetime.now(UTC).isoformat(timespec="seconds"),
+        host=socket.gethostname(),
+    )
+
+
+def configuration_of(loaded: LoadedConfig) -> dict[str, Any]:
+    """The values of a configuration file that says what this configuration says, with every key; JSON can hold them."""
+    data: dict[str, Any] = msgspec.to_builtins(loaded.config, enc_hook=str)
+    for section in data["instances"].values():
+        section.pop(KIND, None)  # it follows from the keys
+    finite: dict[str, Any] = _finite(data)
+    return finite
+
+
+def _finite(value: Any) -> Any:  # noqa: ANN401  anything that a configuration can hold
+    """The value with NaN and infinities as the text that start values may have (FMI 3.0, 2.4.8)."""
+    match value:
+        case float():
+            return to_plain(value)
+        case dict():
+            return {key: _finite(inner) for key, inner in value.items()}
+        case list():
+            return [_finite(inner) for inner in value]
+        case _:
+            return value
+
+
+def _recorded(system: ResolvedSystem, instance: str, name: str) -> RecordedVariable:
+    variable: Variable | None = system.instances[instance].description.variable_of(name)
+    assert variable is not None  # the system is valid
+    return RecordedVariable(
+        variable.type,
+        variable.declared_type,
+        variable.causality,
+        variable.variability,
+        variable.unit,
+        variable.description or "",
+    )
+
+
+def _versions() -> dict[str, str]:
+    found = {"fmu_mesh": __version__}
+    for name, package in _PACKAGES.items():
+        try:
+            found[name] = version(package)
+        except PackageNotFoundError:
+            found[name] = "unknown"  # built into something else
+    return {**found, "python": platform.python_version(), "platform": platform.platform()}

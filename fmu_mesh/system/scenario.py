@@ -1,0 +1,430 @@
+"""What a scenario means: its names, types, units and times are checked, and each variable gets a `Schedule`.
+
+Owns which values the steps of a run use, and which of them are start values. Reading bags is not its business: the
+values in them are an argument, because only `fmu_mesh.ros` knows messages.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+from msgspec.structs import replace
+
+from ..config.findings import Findings
+from ..config.scenario_section import ScenarioEvent, ScenarioSource, ScenarioValues
+from ..errors import Finding
+from ..simtime import TimeGrid
+from ..text import shown
+from ..variables.model_description import Value, Variable
+from ..variables.units import BaseUnit, Linear, conversion
+from ..variables.value_conversion import ValueRefused, to_plain, to_value
+from ..variables.value_types import PlainValue, is_float
+from .connections import Connection, Variables, resolve_variable
+from .schedule import Course, Schedule, SeriesFile
+from .series_files import SeriesRefused, columns_of, content_of, course_of, read_series
+from .settable import why_not_settable
+
+__all__ = [
+    "BAG_STAMP_S",
+    "BagValues",
+    "ResolvedScenario",
+    "Scenario",
+    "ScenarioInput",
+    "is_bag",
+    "resolve_scenario",
+]
+
+BAG_STAMP_S = 1.5e-9
+"""Stamps of messages are whole nanoseconds: the largest difference in s of two equal ones."""
+
+_OF_TABLES = ("column", "time")
+_OF_BAGS = ("topic", "start", "stamps")
+
+_UNCHANGED = Linear()
+
+PlainInput = Any  # a constant of a file; `to_value` says what may be one
+
+
+class BagValues(NamedTuple):
+    """What the messages of a bag say about one variable: times in s, none before the one in front of it, and values."""
+
+    times: tuple[float, ...]
+    values: tuple[Value, ...]
+
+
+class Scenario(NamedTuple):
+    """A scenario with what is outside of its file.
+
+    Attributes:
+        source: what the file says.
+        bags: the values that come from bags, by `instance.variable`. One may be missing because its bag could not be
+            read; then there is a finding for it.
+        unit_of: the meaning of a unit by its usual name; None if it is not known.
+    """
+
+    source: ScenarioSource
+    bags: Mapping[str, BagValues] = {}
+    unit_of: Callable[[str], BaseUnit | None] = lambda _name: None
+
+
+class ScenarioInput(NamedTuple):
+    """One instance, as far as a scenario needs it: its start values and its points per own step."""
+
+    start_values: Mapping[str, Value]
+    step_points: int
+
+
+class ResolvedScenario(msgspec.Struct, frozen=True):
+    """What a scenario sets.
+
+    Attributes:
+        schedules: by instance.
+        start_values: by instance and variable: what it prescribes for the start.
+        files: the SHA-256 of each file that it reads, by absolute path.
+        warnings: what has no effect.
+    """
+
+    schedules: dict[str, tuple[Schedule, ...]] = {}
+    start_values: dict[str, dict[str, Value]] = {}
+    files: dict[str, str] = {}
+    warnings: tuple[Finding, ...] = ()
+
+
+class _Entry(NamedTuple):
+    """One entry of `values`, or the values of one variable in all events."""
+
+    instance: str
+    variable: Variable
+    path: str
+    schedule: Schedule
+
+
+def is_bag(values: ScenarioValues) -> bool:
+    """Whether values come from a bag."""
+    file = values.file or ""
+    return values.topic is not None or file.endswith((".mcap", ".db3"))
+
+
+def resolve_scenario(  # noqa: PLR0913, PLR0917  what a scenario refers to
+    scenario: Scenario,
+    variables: Variables,
+    instances: Mapping[str, ScenarioInput],
+    connections: Iterable[Connection],
+    grid: TimeGrid,
+    findings: Findings,
+) -> ResolvedScenario:
+    """Resolve a scenario.
+
+    Args:
+        scenario: the scenario.
+        variables: all variables of all instances; None for an instance without a model description.
+        instances: those with a model description.
+        connections: what is connected cannot be set.
+        grid: the communication points.
+        findings: where everything goes that is wrong; its paths are those of the file of the scenario.
+    """
+    return _Resolving(scenario, variables, instances, connections, grid, findings).resolved()
+
+
+class _Resolving:
+    """See `resolve_scenario`."""
+
+    def __init__(  # noqa: PLR0913, PLR0917  those of the function
+        self,
+        scenario: Scenario,
+        variables: Variables,
+        instances: Mapping[str, ScenarioInput],
+        connections: Iterable[Connection],
+        grid: TimeGrid,
+        findings: Findings,
+    ) -> None:
+        self._scenario = scenario
+        self._variables = variables
+        self._instances = instances
+        self._sources = {(c.target_instance, c.target.name): c.source_instance for c in connections}
+        self._grid = grid
+        self._findings = findings
+        self._files: dict[str, str] = {}
+        self._late = scenario.source.findings()
+
+    def resolved(self) -> ResolvedScenario:
+        """All schedules without a finding."""
+        entries = {(entry.instance, entry.variable.name): entry for entry in self._values()}
+        for event in self._events():
+            key = event.instance, event.variable.name
+            first = entries.get(key)
+            if first is not None and first.schedule.linear:
+                found = f"an event for '{'.'.join(key)}', which changes linearly ({first.path})"
+                self._findings.add(event.path, found, "one of the two")
+            elif first is not None:
+                entries[key] = first._replace(schedule=_merged(first.schedule, event.schedule))
+            else:
+                entries[key] = event
+        schedules: dict[str, list[Schedule]] = {}
+        start_values: dict[str, dict[str, Value]] = {}
+        for entry in entries.values():
+            if (course := self._course(entry)) is None:
+                continue
+            schedules.setdefault(entry.instance, []).append(entry.schedule)
+            self._check_end(entry, course)
+            start = course.value(0) if entry.schedule.initial else None
+            if start is not None:
+                start_values.setdefault(entry.instance, {})[entry.variable.name] = start
+                self._check_start(entry)
+        by_instance = {name: tuple(own) for name, own in schedules.items()}
+        return ResolvedScenario(by_instance, start_values, self._files, tuple(self._late))
+
+    # --- the parts of the file
+
+    def _values(self) -> Iterator[_Entry]:
+        for reference, given in self._scenario.source.config.values.items():
+            path = f"{self._scenario.source.prefix}values.{reference}"
+            end = self._settable(reference, path)
+            if end is None:
+                continue
+            if isinstance(given, ScenarioValues):
+                schedule = self._over_time(reference, given, end[1], path)
+            else:
+                schedule = self._constant(given, end[1], path)
+            if schedule is not None:
+                yield _Entry(*end, path, schedule)
+
+    def _events(self) -> Iterator[_Entry]:
+        """What all events set, by variable."""
+        found: dict[tuple[str, str], list[tuple[float, PlainValue]]] = {}
+        ends: dict[tuple[str, str], _Entry] = {}
+        given: set[tuple[str, str, float]] = set()
+        events = enumerate(self._scenario.source.config.events)
+        for index, event in sorted(events, key=lambda item: item[1].at):
+            for reference, plain, path in self._of_event(index, event):
+                end = self._settable(reference, path)
+                value = self._value(plain, end[1], path) if end is not None else None
+                if end is None or value is None:
+                    continue
+                key = end[0], end[1].name
+                if (*key, event.at) in given:
+                    text = f"'{reference}' at {event.at:g} s a second time"
+                    self._findings.add(path, text, "one event for a variable at a time")
+                given.add((*key, event.at))
+                found.setdefault(key, []).append((event.at, value))
+                ends.setdefault(key, _Entry(*end, path, Schedule(end[1].name, (), ())))
+        for key, pairs in found.items():
+            times, values = zip(*pairs, strict=True)
+            yield ends[key]._replace(schedule=Schedule(key[1], times, values))
+
+    def _of_event(self, index: int, event: ScenarioEvent) -> Iterator[tuple[str, PlainInput, str]]:
+        for reference, plain in event.set.items():
+            yield reference, plain, f"{self._scenario.source.prefix}events[{index}].set.{reference}"
+
+    def _settable(self, reference: str, path: str) -> tuple[str, Variable] | None:
+        """The instance and the variable of a reference that may be set; None after a finding, or without a model."""
+        end = resolve_variable(reference, path, self._variables, "input", self._findings)
+        if end is None:
+            return None
+        (variable, index), instance = end, reference.partition(".")[0]
+        if index:
+            found = f"'{reference}', an element of the array '{variable.name}'"
+            self._findings.add(path, found, f"the whole array: {instance}.{variable.name}")
+            return None
+        why = why_not_settable(variable, self._sources.get((instance, variable.name)))
+        if why is not None:
+            expected = "an input that is not connected, or a tunable parameter"
+            self._findings.add(path, f"'{reference}', which {why.partition(';')[0]}", expected)
+            return None
+        return instance, variable
+
+    # --- one variable
+
+    def _constant(self, plain: PlainInput, variable: Variable, path: str) -> Schedule | None:
+        value = self._value(plain, variable, path)
+        return Schedule(variable.name, (self._grid.start_time,), (value,)) if value is not None else None
+
+    def _over_time(self, reference: str, given: ScenarioValues, variable: Variable, path: str) -> Schedule | None:
+        linear = given.interpolation == "linear"
+        if linear and not (is_float(variable.type) and variable.causality == "input"):
+            found = f"linear for '{reference}', {_what(variable)}"
+            self._findings.add(f"{path}.interpolation", found, "hold; inputs of type Real may be linear")
+            return None
+        change = self._unit(given.unit, variable, path)
+        if change is None or not self._keys_fit(given, path):
+            return None
+        if given.file is None:
+            schedule = self._listed(given, variable, change, path)
+        elif is_bag(given):
+            schedule = self._bag(reference, given, variable, change, path)
+        else:
+            schedule = self._table(reference, given, variable, change, path)
+        return replace(schedule, linear=linear) if schedule is not None else None
+
+    def _keys_fit(self, given: ScenarioValues, path: str) -> bool:
+        """Whether the keys go together: either a file, or times with values."""
+        before = len(self._findings)
+        if given.file is None:
+            for key in (*_OF_TABLES, *_OF_BAGS):
+                if getattr(given, key) is not None:
+                    self._findings.add(f"{path}.{key}", f"'{key}' without a file", "file: with the values")
+            if len(self._findings) == before and (given.times is None or given.values is None):
+                missing = "times" if given.times is None else "values"
+                self._findings.add(f"{path}.{missing}", "missing", "times: and values:, or file: with both")
+        else:
+            others = _OF_TABLES if is_bag(given) else _OF_BAGS
+            for key in ("times", "values", *others):
+                if getattr(given, key) is not None:
+                    what = "a bag" if is_bag(given) else "a table"
+                    self._findings.add(f"{path}.{key}", f"'{key}' for {what}, '{given.file}'", "no such key here")
+            if is_bag(given) and given.topic is None:
+                self._findings.add(f"{path}.topic", "missing", "the topic and field, such as /cmd:linear.x")
+        return len(self._findings) == before
+
+    def _listed(self, given: ScenarioValues, variable: Variable, change: Linear, path: str) -> Schedule | None:
+        times, plain = given.times or [], given.values or []
+        if len(times) != len(plain) or not times:
+            found = f"{len(plain)} values for {len(times)} times"
+            self._findings.add(f"{path}.values", found, "one value for each time, and at least one")
+            return None
+        for index in range(1, len(times)):
+            if times[index] < times[index - 1]:
+                found = f"{times[index]:g} s after {times[index - 1]:g} s"
+                self._findings.add(f"{path}.times[{index}]", found, "a time that is not before the one in front of it")
+                return None
+        values = [self._value(one, variable, f"{path}.values[{i}]", change) for i, one in enumerate(plain)]
+        if any(value is None for value in values):
+            return None
+        return Schedule(variable.name, tuple(times), tuple(value for value in values if value is not None))
+
+    def _bag(
+        self, reference: str, given: ScenarioValues, variable: Variable, change: Linear, path: str
+    ) -> Schedule | None:
+        found = self._scenario.bags.get(reference)
+        if found is None:
+            return None
+        values = []
+        for time, one in zip(*found, strict=True):
+            value = self._value(one, variable, f"{path}.topic", change, f" at {time:.9g} s")
+            if value is None:
+                return None
+            values.append(value)
+        self._hash(self._scenario.source.resolve(given.file or ""))
+        return Schedule(variable.name, found.times, tuple(values), initial=False, tolerance=BAG_STAMP_S)
+
+    def _table(
+        self, reference: str, given: ScenarioValues, variable: Variable, change: Linear, path: str
+    ) -> Schedule | None:
+        file = self._scenario.source.resolve(given.file or "")
+        try:
+            digest = self._hash(file)
+            column, time = given.column, given.time or "time"
+            if column is None:
+                names = columns_of(file)
+                others = [name for name in names if name != time]
+                near = [name for name in (reference, variable.name) if name in others]
+                column = near[0] if near else others[0] if len(others) == 1 else reference
+            series = SeriesFile(str(file), digest, time, column, change.factor, change.offset)
+            read_series(series, variable)
+        except SeriesRefused as refused:
+            self._findings.add(f"{path}.{refused.key}", str(refused), refused.expected, refused.suggestion)
+            return None
+        return Schedule(variable.name, (), (), file=series)
+
+    def _hash(self, file: Path) -> str:
+        """The SHA-256 of a file; of a folder, that is not known."""
+        if file.is_dir():
+            return ""
+        if str(file) not in self._files:
+            self._files[str(file)] = content_of(file)
+        return self._files[str(file)]
+
+    def _value(
+        self, plain: PlainInput, variable: Variable, path: str, change: Linear = _UNCHANGED, where: str = ""
+    ) -> PlainValue | None:
+        """A value in the unit of the variable; None after a finding."""
+        try:
+            return to_plain(to_value(_changed(plain, change), variable))
+        except ValueRefused as refused:
+            found = f"{shown(plain)}{where} for the {variable.type_name} '{variable.name}'"
+            if refused.out_of_range:
+                found = f"{shown(plain)}{where} for '{variable.name}', which is out of its range"
+            self._findings.add(path, found, refused.expected, refused.suggestion)
+            return None
+
+    def _unit(self, unit: str | None, variable: Variable, path: str) -> Linear | None:
+        """What brings values into the unit of a variable; None after a finding."""
+        if unit is None or unit == variable.unit:
+            return _UNCHANGED
+        if not is_float(variable.type):
+            self._findings.add(f"{path}.unit", f"a unit for '{variable.name}', {_what(variable)}", "no unit here")
+            return None
+        base = self._base_unit(unit)
+        if base is None:
+            self._findings.add(f"{path}.unit", f"the unknown unit '{unit}'", f"a unit such as {variable.unit or 'N.m'}")
+        elif variable.base_unit is None:
+            what = f"its model does not define '{variable.unit}'" if variable.unit else "it has no unit"
+            found = f"'{unit}' for '{variable.name}', which cannot be converted: {what}"
+            self._findings.add(f"{path}.unit", found, "values in the unit of the variable, and no unit here")
+        else:
+            change = conversion(base, variable.base_unit, relative=variable.relative_quantity)
+            if change is not None:
+                return change
+            found = f"'{unit}' ({base}) for '{variable.name}' in {variable.unit} ({variable.base_unit})"
+            self._findings.add(f"{path}.unit", found, "a unit of the same dimension")
+        return None
+
+    def _base_unit(self, unit: str) -> BaseUnit | None:
+        """A unit as a model of this mesh defines it, or by its usual name."""
+        for own in self._variables.values():
+            for variable in (own or {}).values():
+                if variable.unit == unit and variable.base_unit is not None:
+                    return variable.base_unit
+        return self._scenario.unit_of(unit)
+
+    # --- the run
+
+    def _course(self, entry: _Entry) -> Course | None:
+        try:
+            return course_of(entry.schedule, entry.variable, self._grid, self._instances[entry.instance].step_points)
+        except SeriesRefused as refused:
+            self._findings.add(f"{entry.path}.{refused.key}", str(refused), refused.expected)
+            return None
+
+    def _check_end(self, entry: _Entry, course: Course) -> None:
+        """Warn of what comes after the last step: most likely the stop time, or the unit of a time, is wrong."""
+        begin = course.first_step * self._instances[entry.instance].step_points
+        if begin >= self._grid.last_point > 0:
+            found = f"the first value of '{entry.instance}.{entry.variable.name}' comes after the last step"
+            stop = self._grid.stop_time
+            self._late.add(entry.path, found, f"a time before {stop:g} s" if stop is not None else "an earlier time")
+
+    def _check_start(self, entry: _Entry) -> None:
+        """A value for the start is a start value: there must be no other one, and it must be allowed."""
+        name = f"{entry.instance}.{entry.variable.name}"
+        other = self._instances[entry.instance].start_values.get(entry.variable.name)
+        if other is not None:
+            found = f"a value of '{name}' at the start, which has the start value {shown(other)}, too"
+            self._findings.add(entry.path, found, "one of the two")
+        elif not entry.variable.settable_before_start:
+            found = f"a value of '{name}' at the start, {entry.variable.role} that cannot be set before the start"
+            self._findings.add(entry.path, found, f"values after {self._grid.start_time:g} s")
+
+
+def _merged(values: Schedule, events: Schedule) -> Schedule:
+    """Values over time with those of events; at equal times an event counts."""
+    pairs = [*zip(values.times, values.values, strict=True), *zip(events.times, events.values, strict=True)]
+    ordered = sorted(pairs, key=lambda pair: pair[0])
+    return replace(values, times=tuple(time for time, _ in ordered), values=tuple(value for _, value in ordered))
+
+
+def _changed(plain: PlainInput, change: Linear) -> PlainInput:
+    if change.identity:
+        return plain
+    if isinstance(plain, list):
+        return [_changed(one, change) for one in plain]
+    is_number = isinstance(plain, int | float) and not isinstance(plain, bool)
+    return change.factor * plain + change.offset if is_number else plain
+
+
+def _what(variable: Variable) -> str:
+    article = "an" if variable.causality[0] in "aeiou" else "a"
+    return f"{article} {variable.causality} of type {variable.type_name}"

@@ -1,0 +1,195 @@
+"""The values that a scenario prescribes for one variable: which one each own step of its instance uses.
+
+A `Schedule` is the part of a plan; a `Course` answers for a step. Owns the evaluation, which every engine shares. How a
+value gets into an instance is not its business.
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_left, bisect_right
+from collections.abc import Sequence
+
+import msgspec
+
+from ..simtime import ENDLESS, TimeGrid
+from ..variables.model_description import Value
+from ..variables.value_types import PlainValue
+
+__all__ = ["Course", "Schedule", "SeriesFile", "between"]
+
+
+class SeriesFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The columns of a table that values come from.
+
+    Attributes:
+        path: absolute path of the file.
+        sha256: of its content when the run was planned.
+        time: the column with the times in s.
+        column: the column with the values.
+        factor: the value is factor * number + offset, for a conversion of units; ``offset`` likewise.
+    """
+
+    path: str
+    sha256: str
+    time: str
+    column: str
+    factor: float = 1.0
+    offset: float = 0.0
+
+
+class Schedule(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The values of one variable over time.
+
+    Attributes:
+        variable: its name.
+        times: in s, none before the one in front of it.
+        values: the value from each time on.
+        linear: whether it changes linearly between two times.
+        initial: whether a value for the start or earlier is a start value, and not set in the first step.
+        tolerance: times that differ by this much (s) are equal; rounding is allowed for in any case.
+        file: a table with more times and values, which come before ``times`` where both are equal.
+    """
+
+    variable: str
+    times: tuple[float, ...]
+    values: tuple[PlainValue, ...]
+    linear: bool = False
+    initial: bool = True
+    tolerance: float = 0.0
+    file: SeriesFile | None = None
+
+    def agreed(self) -> Schedule:
+        """The schedule without what may differ between hosts: where the file is."""
+        if self.file is None:
+            return self
+        return msgspec.structs.replace(self, file=msgspec.structs.replace(self.file, path=""))
+
+
+class Course:
+    """What each own step of an instance uses for one variable: the prescribed value at the start of the step.
+
+    A value is set in the steps in which it changes. So a value that somebody else sets holds until then.
+
+    Example:
+        >>> course = Course([0.0, 0.25, 2.0], [1.0, 5.0, 7.0], TimeGrid(0.0, 0.1, 100), 1)
+        >>> course.value(0), course.value(2), course.value(3), course.change(3), course.change(4)
+        (1.0, 1.0, 5.0, 5.0, None)
+        >>> course.next_change(4)
+        20
+
+    Args:
+        times: in s, none before the one in front of it; at least one.
+        values: the value from each time on. Of equal times the last one counts.
+        grid: the communication points.
+        points: points per own step.
+        linear: whether numbers change linearly between two times.
+        initial: whether the value for step 0 is set before the run, as a start value.
+        tolerance: see `Schedule`.
+    """
+
+    def __init__(  # noqa: PLR0913  what a schedule has, and the steps
+        self,
+        times: Sequence[float],
+        values: Sequence[Value],
+        grid: TimeGrid,
+        points: int,
+        *,
+        linear: bool = False,
+        initial: bool = True,
+        tolerance: float = 0.0,
+    ) -> None:
+        self._grid = grid
+        self._points = points
+        self._linear = linear
+        self._initial = initial
+        self._times: list[float] = []
+        self._values: list[Value] = []
+        self._steps: list[int] = []
+        """The first own step that begins at each time or later."""
+        for time, value in zip(times, values, strict=True):
+            step = grid.step_at(time, points, tolerance)
+            last = self._times[-1] if self._times else None
+            replaced = last is not None and (time == last if linear else step == self._steps[-1])
+            if replaced:
+                self._times.pop(), self._values.pop(), self._steps.pop()
+            if linear or not self._values or not _same(self._values[-1], value):
+                self._times.append(time)
+                self._values.append(value)
+                self._steps.append(step)
+
+    def value(self, step: int) -> Value | None:
+        """The prescribed value for an own step; None before the first one."""
+        place = bisect_right(self._steps, step) - 1
+        if place < 0:
+            return None
+        value = self._values[place]
+        if not self._linear or place + 1 == len(self._values) or _same(value, self._values[place + 1]):
+            return value
+        time = self._grid.time(step * self._points)
+        start, end = self._times[place], self._times[place + 1]
+        # Its step begins at this time, or differs from it by rounding only.
+        if start >= time - self._grid.rounding(time):
+            return value
+        return between(value, self._values[place + 1], min((time - start) / (end - start), 1.0))
+
+    def change(self, step: int) -> Value | None:
+        """The value to set before an own step; None if the prescribed value is that of the step before it."""
+        value = self.value(step)
+        if value is None or (step == 0 and self._initial):
+            return None
+        before = self.value(step - 1) if step else None
+        return None if before is not None and _same(before, value) else value
+
+    def next_change(self, step: int) -> int:
+        """The first own step from ``step`` on that may have a `change`; `ENDLESS` if there is none."""
+        if step == 0 and self._initial:
+            step = 1
+        steps = self._steps
+        place = bisect_left(steps, step)
+        if self._linear and 0 < place < len(steps) and not _same(self._values[place - 1], self._values[place]):
+            return step
+        return steps[place] if place < len(steps) else ENDLESS
+
+    @property
+    def first_step(self) -> int:
+        """The first own step with a prescribed value."""
+        return self._steps[0]
+
+    @property
+    def last_step(self) -> int:
+        """The own step from which on the value does not change any more."""
+        return self._steps[-1]
+
+    @property
+    def end(self) -> Value:
+        """The last value."""
+        return self._values[-1]
+
+    @property
+    def changes(self) -> int:
+        """Number of times at which the value, or its slope, changes."""
+        return len(self._steps)
+
+
+def between(left: Value, right: Value, weight: float) -> Value:
+    """The value between two values; of an array, element by element.
+
+    With a weight below 1, the result stays between the two values, which may be the limits of the variable.
+    """
+    if isinstance(left, list) and isinstance(right, list):
+        return [between(one, other, weight) for one, other in zip(left, right, strict=True)]
+    assert isinstance(left, float)
+    assert isinstance(right, float)
+    return left + (right - left) * weight
+
+
+def _same(left: Value, right: Value) -> bool:
+    """Whether two values are equal bit for bit, but for the payload of a NaN."""
+    if isinstance(left, list) and isinstance(right, list):
+        return len(left) == len(right) and all(_same(one, other) for one, other in zip(left, right, strict=True))
+    if isinstance(left, float) and isinstance(right, float):
+        if left == right:
+            return left != 0.0 or math.copysign(1.0, left) == math.copysign(1.0, right)
+        return math.isnan(left) and math.isnan(right)
+    return left == right
