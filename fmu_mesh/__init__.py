@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from .adapter import FMIAdapter
     from .api.attaching import attach, meshes
+    from .api.comparison import Comparison
     from .api.inspection import Inspection, inspect
     from .api.mesh_builder import Mesh, load
     from .api.mesh_check import Check
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from .api.result import Result
     from .api.run_handle import Run
     from .api.samples import Sample
+    from .api.system_graph import SystemGraph
     from .errors import (
         CallRefused,
         ConfigurationError,
@@ -49,6 +51,7 @@ if TYPE_CHECKING:
 __all__ = [
     "CallRefused",
     "Check",
+    "Comparison",
     "Component",
     "ConfigurationError",
     "DeadlineExceeded",
@@ -77,6 +80,7 @@ __all__ = [
     "Sweep",
     "SweepResult",
     "System",
+    "SystemGraph",
     "SystemState",
     "UnknownName",
     "__version__",
@@ -93,6 +97,7 @@ __all__ = [
 _PLACES = {
     "FMIAdapter": "adapter",
     "Check": "api.mesh_check",
+    "Comparison": "api.comparison",
     "Mesh": "api.mesh_builder",
     "load": "api.mesh_builder",
     "Component": "instances.python.component",
@@ -106,6 +111,7 @@ _PLACES = {
     "Range": "sweeps.variants",
     "Sample": "api.samples",
     "System": "api.open_system",
+    "SystemGraph": "api.system_graph",
     "SystemState": "api.open_system",
     "attach": "api.attaching",
     "Inspection": "api.inspection",

@@ -290,10 +290,14 @@ ALLOWED: dict[str, dict[str, str]] = {
         "instances/call_guard.py: CallWatch._position": "what the present call says of itself: state, no behaviour",
         "instances/fmi/model_exchange/model_exchange.py: _TimedEquations._line": "inputs of the present step: state",
     },
-    "large_modules": {"api/mesh_builder.py": "one class: all that a program can say about a mesh, with examples"},
+    "large_modules": {
+        "api/mesh_builder.py": "one public class, and half of it are docstrings with examples",
+        "api/run_handle.py": "one public class, and half of it are docstrings with examples",
+    },
     "importers_of_kinds": {
         "fmu_mesh: fmu_mesh.instances.python": "what a component derives from is public",
         "fmu_mesh.api.mesh_builder: fmu_mesh.instances.python": "a program gives a class, not the place of a class",
+        "fmu_mesh.api.result: fmu_mesh.instances.python": "a file has units by the names that components use",
         "fmu_mesh.run.preparing: fmu_mesh.instances.python": "a scenario has units by the names that components use",
         "fmu_mesh.adapter.adapter: fmu_mesh.instances.fmi": "FMIAdapter is one FMU, by what it promises",
         "fmu_mesh.api.inspection: fmu_mesh.instances.fmi": "`inspect` shows what is in an .fmu file",

@@ -1,6 +1,6 @@
-"""Results as a picture: axes by unit, distinguishable lines, and a legend beside them.
+"""What all pictures have in common: the figure, colours and dashes, legends, files.
 
-Owns how a picture looks. matplotlib is optional, so it is imported when something is drawn.
+matplotlib is optional, so it is imported when something is drawn.
 """
 
 from __future__ import annotations
@@ -8,18 +8,16 @@ from __future__ import annotations
 import importlib.util
 import math
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import ConfigurationError
 from ..files import replaced
-from .result_reading import Columns
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -30,27 +28,34 @@ if TYPE_CHECKING:
 __all__ = [
     "COLOURS",
     "DASHES",
-    "FLAGS",
     "MAX_POINTS",
-    "VALUE",
-    "Curve",
+    "PALETTE",
     "add_legend",
     "draw",
     "empty_figure",
-    "figure_of",
+    "legend_rows",
+    "limited",
     "reduced",
     "require_matplotlib",
     "short",
 ]
 
-FLAGS = "true (1) or false (0)"
-"""Label of the axis of Booleans."""
-VALUE = "value"
-"""Label of the axis of numbers whose unit is unknown or that have none."""
-
 MAX_POINTS = 4000
 """Points per line: more than twice the width of the picture in pixels would not be visible."""
-COLOURS = 10
+PALETTE = (
+    "#0057a0",
+    "#e8890c",
+    "#7a1f6b",
+    "#29a3a3",
+    "#222222",
+    "#d1495b",
+    "#56b4e9",
+    "#6b4a1f",
+    "#9a9a9a",
+    "#3d6b35",
+)
+"""Colours that are told apart by the colour-blind; neighbours differ in their brightness as well."""
+COLOURS = len(PALETTE)
 DASHES: tuple[Any, ...] = (
     "solid",
     (0, (5, 2)),
@@ -62,10 +67,6 @@ DASHES: tuple[Any, ...] = (
     (0, (3, 1.2, 1, 1.2)),
 )
 """With ten colours each: 80 distinguishable lines."""
-_OVER = (4.0, 2.0, 1.0)
-"""Lengths of the dashes, with a period of 8, of lines that cover another one, so that all are visible."""
-_SAME = 1 / 400
-"""Two lines look like one if their distance is nowhere larger than this fraction of the height of the axes."""
 _GREATEST = 1e300
 """Largest value that is drawn: matplotlib adds and subtracts the limits of its axes."""
 _ROWS = 40
@@ -73,22 +74,6 @@ _ROWS = 40
 _NAMES = 100
 """Largest number of names in a legend."""
 _CHARACTERS = 60
-_AXES_INCHES = (8.4, 2.8)
-"""Width, and least height, of axes with their labels in inches."""
-_FEW_AXES = 40
-"""More axes than this are lower."""
-
-
-class Curve(msgspec.Struct, frozen=True):
-    """How one variable is drawn.
-
-    Attributes:
-        axis: label of its axis; variables with the same label share one.
-        note: added to its name in the legend.
-    """
-
-    axis: str
-    note: str = ""
 
 
 def require_matplotlib() -> None:
@@ -121,33 +106,6 @@ def draw(figure: Figure, output: Path) -> None:
         raise ConfigurationError(f"the plot '{output}' cannot be written: {reason}.") from error
 
 
-def figure_of(results: Columns, title: str, curves: Mapping[str, Curve]) -> Figure:
-    """The matplotlib figure: one axes below the other, each as high as its legend.
-
-    Args:
-        results: the columns; those of texts are left out.
-        title: the title of the picture.
-        curves: by name of a variable, how to draw it if more than its values is known.
-
-    Raises:
-        ConfigurationError: matplotlib is not installed.
-    """
-    groups: dict[str, list[str]] = {}
-    for name, values in results.values.items():
-        if values.dtype == object:
-            continue
-        curve = curves.get(name)
-        axis = curve.axis if curve is not None else FLAGS if values.dtype == bool else VALUE
-        groups.setdefault(axis, []).append(name)
-    groups = groups or {VALUE: []}
-    figure = empty_figure()
-    # A character that is not in the font is drawn as a box, without a word.
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        _lay_out(figure, results, title, curves, groups)
-    return figure
-
-
 def empty_figure() -> Figure:
     """A figure without axes, as all pictures begin.
 
@@ -164,74 +122,13 @@ def empty_figure() -> Figure:
     return figure
 
 
-def _lay_out(
-    figure: Figure, results: Columns, title: str, curves: Mapping[str, Curve], groups: Mapping[str, Sequence[str]]
-) -> None:
-    least = _AXES_INCHES[1] * min(1.0, _FEW_AXES / len(groups))
-    heights = [max(least, 0.4 + 0.18 * _legend_rows(len(names))) for names in groups.values()]
-    all_axes = figure.subplots(len(groups), 1, sharex=True, squeeze=False, height_ratios=heights)[:, 0]
-    all_axes[0].set_title(short(title), fontweight="bold", parse_math=False)
-    legend_width = 0.0
-    for axes, (label, names) in zip(all_axes, groups.items(), strict=True):
-        _draw_axes(axes, results, names, label)
-        axes.label_outer()
-        if names:
-            labels = [short(name) + (curves[name].note if name in curves else "") for name in names]
-            legend = add_legend(axes, axes.lines, labels)
-            legend_width = max(legend_width, legend.get_window_extent().width / figure.dpi)
-    all_axes[-1].set_xlabel("time in s")
-    figure.set_size_inches(_AXES_INCHES[0] + legend_width, 1.2 + sum(heights) + (1.0 if len(groups) == 1 else 0.0))
-
-
-def _draw_axes(axes: Axes, results: Columns, names: Sequence[str], label: str) -> None:
-    lone = "o" if len(results.times) == 1 else None  # a line of one point is invisible
-    for number, (name, below) in enumerate(zip(names, _lines_below(results, names), strict=True)):
-        times, values = reduced(results.times, results.values[name].astype(np.float64), MAX_POINTS)
-        dashes = DASHES[number // COLOURS % len(DASHES)]
-        if below:
-            on = _OVER[min(below, len(_OVER)) - 1]
-            dashes = (0, (on, 8.0 - on))
-        axes.plot(
-            times,
-            values,
-            color=f"C{number % COLOURS}",
-            linestyle=dashes,
-            drawstyle="default" if results.values[name].dtype.kind == "f" else "steps-post",
-            linewidth=1.8 if below else 1.4,
-            marker=lone,
-        )
-    axes.set_ylabel(short(label), parse_math=False)
-    axes.grid(visible=True, alpha=0.35)
-    axes.margins(x=0.01)
-    if names and all(results.values[name].dtype == bool for name in names):
-        axes.set_yticks([0, 1])
-        axes.set_ylim(-0.1, 1.1)
-    if not len(results.times):
-        axes.text(0.5, 0.5, "no points were recorded", ha="center", va="center", transform=axes.transAxes)
-
-
-def _lines_below(results: Columns, names: Sequence[str]) -> list[int]:
-    """For each variable, how many earlier ones look like the same line.
-
-    All 0 if the lines differ in their dashes anyway.
-    """
-    if not 1 < len(names) <= COLOURS or len(results.times) < 2:
-        return [0] * len(names)
-    stride = 1 + len(results.times) // MAX_POINTS
-    table = np.array([results.values[name][::stride].astype(np.float64) for name in names]).clip(-_GREATEST, _GREATEST)
-    near = _SAME * float(np.nan_to_num(table).max() - np.nan_to_num(table).min())
-    return [
-        sum(np.allclose(table[before], row, rtol=0.0, atol=near, equal_nan=True) for before in range(number))
-        for number, row in enumerate(table)
-    ]
-
-
 def _legend_columns(count: int) -> int:
     """Number of columns of a legend with this number of names."""
     return math.ceil(min(count, _NAMES + 1) / _ROWS) or 1
 
 
-def _legend_rows(count: int) -> int:
+def legend_rows(count: int) -> int:
+    """Number of rows of a legend with this number of names."""
     return math.ceil(min(count, _NAMES + 1) / _legend_columns(count))
 
 
@@ -275,7 +172,7 @@ def reduced(
     times: NDArray[np.float64], values: NDArray[np.float64], most: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """About ``most`` points that look like all of them: the minimum and maximum of every section."""
-    values = np.clip(np.where(np.isinf(values), np.nan, values), -_GREATEST, _GREATEST)
+    values = limited(values)
     if len(times) <= most:
         return times, values
     size = -(-len(times) // (most // 2))
@@ -286,3 +183,8 @@ def reduced(
     highest = first + np.where(np.isnan(sections), -np.inf, sections).argmax(axis=1)
     picked = np.unique(np.concatenate(([0, len(times) - 1], lowest, highest)))
     return times[picked], values[picked]
+
+
+def limited(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Values as they can be drawn: infinite ones are gaps, and very large ones are smaller."""
+    return np.clip(np.where(np.isinf(values), np.nan, values), -_GREATEST, _GREATEST)

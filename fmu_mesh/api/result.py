@@ -2,24 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from types import ModuleType
+from types import MappingProxyType, ModuleType
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from ..errors import ConfigurationError, UnknownName
+from ..errors import CallRefused, ConfigurationError, UnknownName
+from ..instances.python.unit_names import base_unit_of
 from ..run.outcome import Outcome
 from ..run.run_plan import RunPlan
 from ..system.system import ResolvedSystem
-from ..text import listed
+from ..text import listed, short_path
 from ..variables.model_description import Variable
+from ..variables.units import BaseUnit
 from ..variables.value_types import VariableType, is_float
-from .drawing import FLAGS, VALUE, Curve, figure_of
+from .comparison import Comparison, Side, compared, differences_of, values_in_unit_of
+from .result_drawing import FLAGS, NUMBERS, Curve, Curves, Picture, figure_of
 from .result_reading import Columns, chosen_names, read_result
 
 if TYPE_CHECKING:
@@ -28,8 +31,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Result", "imported_pandas", "result_of", "summary_of", "types_of"]
 
-_DIMENSIONLESS = ("1", "-")
-"""Units that mean no unit."""
+_HELD = ("constant", "fixed", "tunable", "discrete")
+"""Variabilities of variables whose values hold between two events."""
 
 
 class Result(Mapping[str, NDArray[Any]]):
@@ -154,21 +157,97 @@ class Result(Mapping[str, NDArray[Any]]):
         pd = imported_pandas()
         return pd.DataFrame(dict(self), index=pd.Index(self.times, name="time"))
 
-    def plot(self, *names: str, title: str | None = None) -> Figure:
+    def plot(
+        self,
+        *names: str,
+        title: str | None = None,
+        x: str | None = None,
+        others: Sequence[Result] = (),
+        difference: bool = False,
+        annotate: Mapping[tuple[float, str], str] = MappingProxyType({}),
+    ) -> Figure:
         """Draw variables over time, with one axes for each unit; all of them if none is named.
 
         Example:
             >>> import fmu_mesh
-            >>> result = fmu_mesh.load("configs/pendulum_delay.yaml").run(stop_time=1.0, record="memory")
+            >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
+            >>> result = mesh.run(stop_time=1.0, record="memory")
             >>> result.plot("pendulum.a", "delay.y").savefig("angles.png")
+            >>> longer = mesh.run(stop_time=1.0, record="memory", start_values={"pendulum.l": 3.0})
+            >>> picture = result.plot("*.a", others=[longer], difference=True, annotate={(0.0, "pendulum.a"): "start"})
+            >>> [axes.get_ylabel() for axes in picture.axes]
+            ['a in rad', 'difference in rad']
+
+        Args:
+            names: names of variables, or patterns such as `motor.*`.
+            title: the title; default: the name of the mesh, or of the file.
+            x: the variable on the horizontal axis, for a phase plot; default: time.
+            others: other results: a variable has one colour, and a result one kind of line.
+            difference: whether axes show the differences of the others to this result.
+            annotate: texts at points of this result, by time in s and variable.
 
         Raises:
             ConfigurationError: there is no such variable, or matplotlib is not installed.
+            CallRefused: there is no other result to show the difference to; or ``x`` has texts.
         """
-        chosen = chosen_names(self.title, self.names, names)
-        columns = Columns(self.times, {name: self[name] for name in chosen})
-        curves = {name: self._curve(*self._variables[name]) for name in chosen if name in self._variables}
-        return figure_of(columns, title if title is not None else self.title, curves)
+        if difference and (not others or x is not None):
+            raise CallRefused(
+                "a difference needs another result" if not others else "a difference is drawn over time only",
+                hint="Name two results." if not others else "Leave the horizontal axis out.",
+            )
+        results = (self, *others)
+        there = [*dict.fromkeys(name for result in results for name in result)]
+        chosen = [*chosen_names(self.title, there, names)]
+        for name in (*([x] if x is not None else []), *(name for _, name in annotate)):
+            chosen_names(self.title, there, [name])
+        drawn: list[Curves] = []
+        curves: dict[str, Curve] = {}
+        for label, result in zip(_titles(results), results, strict=True):
+            drawn.append(self._drawn(result, label, chosen, x, difference=difference))
+            curves = self._curves_of(result, drawn[-1].values) | curves
+        meshes = dict.fromkeys(str(result.metadata.get("mesh", result.title)) for result in results)
+        title = title if title is not None else " and ".join(meshes)
+        return figure_of(drawn, Picture(title, curves, x, difference, annotate))
+
+    def compare(
+        self, other: Result, *, rtol: float = 0.0, atol: float = 0.0, variables: Sequence[str] = ()
+    ) -> Comparison:
+        """Compare with another result, by default bit for bit; NaN equals NaN, and -0.0 equals 0.0.
+
+        Two numbers are equal if `|a - b| <= atol + rtol * max(|a|, |b|)`. If the results have different times, the rows
+        at times that both have are compared. If not all times of one are in the other, the other result is interpolated
+        at the times of this one. Values in other units are converted, if both units are known.
+
+        Example:
+            >>> import fmu_mesh
+            >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
+            >>> one = mesh.run(record="memory", stop_time=1.0)
+            >>> print(one.compare(mesh.run(record="memory", stop_time=1.0, processes=False)))
+            this result and the other one are equal: 2 variables, 501 rows
+            >>> assert one.compare(one, variables=["pendulum.*"])
+
+        Args:
+            other: the other result.
+            rtol: relative tolerance.
+            atol: absolute tolerance, in the unit of each variable.
+            variables: names, or patterns such as `motor.*`; default: all of both.
+
+        Returns:
+            The comparison, which is true if the results are equal.
+
+        Raises:
+            ConfigurationError: neither of them has such a variable.
+            CallRefused: a tolerance is no number of 0 or more.
+        """
+        for name, tolerance in (("rtol", rtol), ("atol", atol)):
+            if not tolerance >= 0.0:
+                raise CallRefused(f"{name} is {tolerance!r}, and a tolerance is a number of 0 or more")
+        here, there = self._side, other._side
+        if here.title == there.title:
+            here, there = here._replace(title="this result"), there._replace(title="the other one")
+        names = chosen_names(f"{here.title}' or '{there.title}", [*dict.fromkeys([*self, *other])], variables)
+        comparison = compared(here, there, names, rtol=rtol, atol=atol)
+        return replace(comparison, drawn=lambda chosen: self.plot(*chosen, others=(other,), difference=True))
 
     def __getitem__(self, name: str) -> NDArray[Any]:
         """The values of one variable, one per row; elements of arrays are variables of their own, such as `a.y[1,2]`.
@@ -207,20 +286,67 @@ class Result(Mapping[str, NDArray[Any]]):
         outcome = replace(self.outcome, file=file, rows=rows)
         return Result(self.title, file=Path(file), outcome=outcome, system=self._system, record=number)
 
+    def _drawn(self, other: Result, label: str, names: Sequence[str], x: str | None, *, difference: bool) -> Curves:
+        """What is drawn of a result, in the units of this one."""
+        here, there = self._side, other._side
+        values = {
+            name: values_in_unit_of(here, there, name)
+            for name in dict.fromkeys([*names, *([x] if x is not None else [])])
+            if name in other
+        }
+        has_difference = difference and other is not self
+        return Curves(label, other.times, values, differences_of(here, there, names) if has_difference else {})
+
+    def _curves_of(self, other: Result, names: Iterable[str]) -> dict[str, Curve]:
+        return {name: other._curve(name) for name in names}
+
+    @property
+    def _side(self) -> Side:
+        """This result, as it is compared with another one."""
+        return Side(
+            str(short_path(self.file)) if self.file is not None else self.title,
+            self.times,
+            [*self],
+            self._columns.values.__getitem__,
+            self._unit,
+            self._base_unit,
+            self._point,
+        )
+
+    def _base_unit(self, name: str) -> BaseUnit | None:
+        """The unit of a variable in SI base units: as its model defines it, or by its usual name."""
+        if name in self._variables and (defined := self._variables[name][1].base_unit) is not None:
+            return defined
+        unit = self._unit(name)
+        return base_unit_of(unit) if unit is not None else None
+
+    def _point(self, row: int) -> int:
+        """The communication point of a row; its number, counted from 0, where a file does not say more."""
+        if self._system is None:
+            said = self._columns.metadata
+            return int(said.get("first", 0)) + row * int(said.get("every", 1))
+        grid = self._system.grid
+        return round((float(self.times[row]) - grid.start_time) / grid.step_size)
+
     def _unit(self, name: str) -> str | None:
         return self._variables[name][1].unit if name in self._variables else self._columns.units.get(name)
 
-    def _curve(self, instance: str, variable: Variable) -> Curve:
-        """On which axes a variable is drawn: one for each unit."""
+    def _curve(self, name: str) -> Curve:
+        """How a variable is drawn: one axes for each unit, and steps for what holds between two points."""
+        if name not in self._variables:
+            values, said = self[name], self._columns.metadata.get("variables", {}).get(name, {})
+            held = values.dtype.kind != "f" or said.get("variability") in _HELD
+            axis = FLAGS if values.dtype == bool else NUMBERS if said and values.dtype.kind in "iu" else ""
+            return Curve(self._unit(name) or "", axis=axis, held=held)
+        instance, variable = self._variables[name]
+        held = not is_float(variable.type) or variable.variability in _HELD
         if variable.type == "Boolean":
-            return Curve(FLAGS)
+            return Curve(axis=FLAGS, held=True)
         if not is_float(variable.type):
-            return Curve("number")
+            return Curve(axis=NUMBERS, held=True)
         assert self._system is not None
         unit = variable.unit or _unit_passed_on(self._system, instance, variable)
-        if unit is None or unit in _DIMENSIONLESS:
-            return Curve(VALUE)
-        return Curve(f"value in {unit}", note="" if variable.unit else " (no unit)")
+        return Curve(unit or "", note="" if variable.unit or not unit else " (no unit)", held=held)
 
 
 def imported_pandas() -> ModuleType:
@@ -250,6 +376,17 @@ def types_of(system: ResolvedSystem | None, record: int = 0) -> dict[str, Variab
     if system is None:
         return None
     return {name: variable.type for name, (_, variable) in _recorded(system, record).items()}
+
+
+def _titles(results: Sequence[Result]) -> list[str]:
+    """Names of results that tell them apart: those of their files, or of their meshes with a number."""
+    for names in (
+        [result.file.name if result.file is not None else result.title for result in results],
+        [str(short_path(result.file)) if result.file is not None else result.title for result in results],
+    ):
+        if len({*names}) == len(names):
+            return names
+    return [f"{result.title} ({number})" for number, result in enumerate(results, 1)]
 
 
 def _recorded(system: ResolvedSystem | None, record: int) -> dict[str, tuple[str, Variable]]:

@@ -24,6 +24,7 @@ __all__ = ["Columns", "chosen_names", "read_csv", "read_result", "require_readab
 
 _TIME = "time"
 _FLAGS: Final = {"true": True, "false": False}
+_WILD: Final = {"*": ".*", "?": "."}
 _FIELD = re.compile(rb'"((?:[^"]|"")*)"|([^,]*)')
 
 
@@ -189,15 +190,42 @@ _READERS: dict[VariableType, Callable[[bytes], object]] = {
 def chosen_names(path: Path | str, names: Sequence[str], wanted: Sequence[str]) -> Sequence[str]:
     """The wanted variables of a result; all of them if none is named.
 
+    A name may be that of an array, which means all of its elements, or a pattern: `*` stands for any characters, `?`
+    for one, and `re:` begins a regular expression.
+
+    Example:
+        >>> chosen_names("demo.csv", ["arm.a", "arm.v", "motor.i[1]", "motor.i[2]"], ["motor.i", "arm.?"])
+        ['motor.i[1]', 'motor.i[2]', 'arm.a', 'arm.v']
+
     Raises:
-        ConfigurationError: one is not there; with the nearest name.
+        ConfigurationError: one is not there; with the nearest name. Or a regular expression is none.
     """
-    unknown = [name for name in wanted if name not in names]
+    found: dict[str, None] = {}
+    unknown = []
+    for text in wanted:
+        own = [text] if text in names else _matching(text, names)
+        found.update(dict.fromkeys(own))
+        unknown += [text] if not own else []
     if unknown:
         meant = [name for text in unknown for name in _meant(text, names)]
         hint = f"Did you mean {_either(meant)}?" if meant else f"There are: {listed(names)}."
         raise ConfigurationError(f"'{path}' has no variable {_either(unknown)}.", hint=hint)
-    return wanted or names
+    return [*found] or names
+
+
+def _matching(pattern: str, names: Sequence[str]) -> list[str]:
+    """The names that a pattern means, or the elements of an array."""
+    if pattern.startswith("re:"):
+        try:
+            matches = re.compile(pattern.removeprefix("re:")).fullmatch
+        except re.error as error:
+            raise ConfigurationError(f"'{pattern}' is no regular expression: {error}.") from error
+    elif "*" in pattern or "?" in pattern:
+        parts = (_WILD.get(character, re.escape(character)) for character in pattern)
+        matches = re.compile("".join(parts), re.DOTALL).fullmatch
+    else:
+        matches = re.compile(re.escape(pattern) + r"\[[0-9]+(,[0-9]+)*\]").fullmatch
+    return [name for name in names if matches(name)]
 
 
 def _meant(text: str, names: Sequence[str]) -> list[str]:

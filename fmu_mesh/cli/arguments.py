@@ -25,6 +25,7 @@ __all__ = [
     "endpoint",
     "number",
     "positive_seconds",
+    "tolerance",
     "whole",
 ]
 
@@ -127,6 +128,14 @@ def positive_seconds(text: str) -> float:
     value = _read(text)
     if not (math.isfinite(value) and value > 0.0):
         raise argparse.ArgumentTypeError(f"{text} is not a time above 0")
+    return value
+
+
+def tolerance(text: str) -> float:
+    """A finite number of 0 or more."""
+    value = _read(text)
+    if not (math.isfinite(value) and value >= 0.0):
+        raise argparse.ArgumentTypeError(f"{text} is not a number of 0 or more")
     return value
 
 

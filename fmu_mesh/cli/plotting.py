@@ -25,13 +25,23 @@ __all__ = ["PARSERS", "check_plot", "plot_results", "plotted_where_it_ends"]
 
 
 def _add_plot(parser: CommandParser) -> None:
-    parser.add_argument("results", type=Path, metavar="RESULTS.csv", help="the result file, or the folder of a sweep")
+    parser.add_argument(
+        "results", type=Path, nargs="+", metavar="RESULTS.csv", help="result files, or the folder of a sweep"
+    )
     parser.add_argument(
         "--output", type=Path, metavar="FILE.png", help="file of the picture; default: beside the result file"
     )
     parser.add_argument(
-        "--variables", nargs="+", metavar="INSTANCE.VARIABLE", help="plot only these; default: all of the file"
+        "--variables",
+        nargs="+",
+        metavar="INSTANCE.VARIABLE",
+        help="plot only these, or patterns such as 'motor.*'; default: all of the file",
     )
+    parser.add_argument("--x", metavar="NAME", help="the variable on the horizontal axis; default: time")
+    parser.add_argument(
+        "--difference", action="store_true", help="also draw the differences of the other files to the first one"
+    )
+    parser.add_argument("--title", metavar="TEXT", help="the title; default: the names of the files")
     sweep = parser.add_argument_group("of a sweep")
     sweep.add_argument(
         "--colour", metavar="NAME", help="the parameter or column that colours the curves; default: the first parameter"
@@ -48,18 +58,44 @@ def _add_plot(parser: CommandParser) -> None:
 
 def _plot(arguments: argparse.Namespace) -> int:
     require_matplotlib()
-    results, variables = arguments.results, arguments.variables or ()
-    if is_sweep(results):
-        figure, name = _of_sweep(SweepResult.read(results), arguments)
-        default = results / f"{name.replace('/', '_')}.png"
+    first, *others = arguments.results
+    sweeps = [str(path) for path in arguments.results if is_sweep(path)]
+    of_curves = arguments.x or arguments.difference or arguments.title
+    if sweeps and (others or of_curves):
+        raise ConfigurationError(
+            f"'{sweeps[0]}' is the folder of a sweep, which is drawn alone, over time and with its own title.",
+            hint="Leave other files, --x, --difference and --title out.",
+        )
+    if sweeps:
+        figure, name = _of_sweep(SweepResult.read(first), arguments)
+        default = first / f"{name.replace('/', '_')}.png"
     elif arguments.colour or arguments.heat_map or arguments.axes:
-        raise ConfigurationError(f"'{results}' is not the folder of a sweep, which --colour and --heat-map are for.")
+        raise ConfigurationError(f"'{first}' is not the folder of a sweep, which --colour and --heat-map are for.")
     else:
-        figure, default = Result.read(results).plot(*variables), results.with_suffix(".png")
+        figure, default = _of_files(arguments), first.with_suffix(".png")
     output = arguments.output if arguments.output is not None else default
     draw(figure, output)
     print(f"plot: {output}")
     return 0
+
+
+def _of_files(arguments: argparse.Namespace) -> Figure:
+    """A picture of one or several result files.
+
+    Raises:
+        ConfigurationError: a file cannot be read or has no such variable, or options cannot be combined.
+    """
+    result, *others = map(Result.read, arguments.results)
+    if arguments.difference and (not others or arguments.x is not None):
+        hint = "Name two result files." if not others else "Leave --x out."
+        raise ConfigurationError("--difference draws the difference of two result files over time.", hint=hint)
+    return result.plot(
+        *(arguments.variables or ()),
+        title=arguments.title,
+        x=arguments.x,
+        others=others,
+        difference=arguments.difference,
+    )
 
 
 def _of_sweep(sweep: SweepResult, arguments: argparse.Namespace) -> tuple[Figure, str]:

@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 
 from ..api.result import Result, imported_pandas
+from ..api.result_drawing import in_unit
 from ..api.result_reading import chosen_names
 from ..errors import CallRefused, UnknownName
 from ..system.system import ResolvedSystem
@@ -239,7 +240,7 @@ class SweepResult(Sequence[SweepRow]):
     def _axis(self, name: str) -> str:
         """The label of an axis."""
         unit = self._wanted.units.get(name)
-        return f"{name} in {unit}" if unit else name
+        return in_unit(name, unit or "")
 
     def _row(self, number: int, row: Row) -> SweepRow:
         return SweepRow(

@@ -86,7 +86,7 @@ def test_a_plot_has_axes_by_unit_and_the_chosen_names(folder: Path) -> None:
     figure = result.plot("pendulum.a", "delay.y", title="angles")
 
     [axes] = figure.axes
-    assert (axes.get_title(), axes.get_ylabel()) == ("angles", "value in rad")
+    assert (axes.get_title(), axes.get_ylabel()) == ("angles", "a, y in rad")
     with pytest.raises(fmu_mesh.ConfigurationError, match=r"has no variable 'pendulum\.x'"):
         result.plot("pendulum.x")
 

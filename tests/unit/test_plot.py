@@ -15,11 +15,13 @@ import numpy as np
 import pytest
 from matplotlib import image
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from fmu_mesh.api.drawing import figure_of, reduced
+from fmu_mesh.api.drawing import reduced
 from fmu_mesh.api.result import Result
+from fmu_mesh.api.result_drawing import Curves, Picture, figure_of
 from fmu_mesh.api.result_reading import Columns, read_csv
 from fmu_mesh.cli.main import main
 from fmu_mesh.cli.plotting import plot_results, plotted_where_it_ends
@@ -27,6 +29,7 @@ from fmu_mesh.errors import ConfigurationError, StepFailed
 from fmu_mesh.run.preparing import prepare
 from fmu_mesh.system.plan import Plan
 from fmu_mesh.system.records import RecordPlan
+from fmu_mesh.variables.model_description import Variability
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 
@@ -176,7 +179,7 @@ def test_with_a_plan_every_unit_has_axes_of_its_own(tmp_path: Path) -> None:
 
     assert pixels(picture).shape[0] == 1488  # rad, rad/s, rad/s2 and none
     drawn = text.read_text(encoding="utf-8")
-    for words in ("chain8", "value in rad", "value in rad/s2", "value", "time in s", *names):
+    for words in ("chain8", "a in rad", "der(a) in rad/s", "der(a,2) in rad/s²", "y", "time in s", *names):
         assert f"<!-- {words} -->" in drawn
 
 
@@ -244,8 +247,8 @@ def with_unit(plan: Plan, instance: str, name: str, unit: str) -> Plan:
 def test_what_an_fmu_only_passes_on_shares_the_axes_of_what_it_gets(tmp_path: Path) -> None:
     drawn = plotted(prepare(CONFIGS / "pendulum_delay.yaml"), tmp_path)
 
-    assert drawn.count("<!-- value") == 1
-    for words in ("value in rad", "pendulum.a", "delay.y (no unit)"):
+    assert drawn.count(" in rad -->") == 1
+    for words in ("a, y in rad", "pendulum.a", "delay.y (no unit)"):
         assert f"<!-- {words} -->" in drawn
 
 
@@ -255,21 +258,36 @@ def test_a_unit_that_says_that_there_is_none_is_no_label(tmp_path: Path, unit: s
 
     drawn = plotted(plan, tmp_path)
 
-    assert drawn.count("<!-- value") == 2
-    assert "<!-- value -->" in drawn
-    assert "value in -" not in drawn
-    assert "value in 1" not in drawn
+    assert "<!-- a in rad -->" in drawn
+    assert "<!-- y -->" in drawn
+    assert " in -" not in drawn
+    assert " in 1" not in drawn
 
 
-def results_of(columns: Mapping[str, Sequence[float]]) -> Columns:
-    """Results at 0, 1, 2 … s."""
+@pytest.mark.parametrize(("variability", "style"), [("continuous", "default"), ("discrete", "steps-post")])
+def test_a_float_that_only_changes_at_events_is_drawn_in_steps(variability: Variability, style: str) -> None:
+    system = prepare(CONFIGS / "pendulum_delay.yaml").system
+    own = system.instances["delay"]
+    variables = tuple(replace(variable, variability=variability) for variable in own.description.variables)
+    own = replace(own, description=replace(own.description, variables=variables))
+    system = replace(system, instances={**system.instances, "delay": own})
+    columns = Columns(np.arange(2.0), {"pendulum.a": np.ones(2), "delay.y": np.ones(2)})
+
+    (axes,) = Result("drawn", system=system, columns=columns).plot("delay.y").axes
+
+    assert [line.get_drawstyle() for line in axes.lines] == [style]
+
+
+def drawn_of(columns: Mapping[str, Sequence[float]]) -> Figure:
+    """The picture of results at 0, 1, 2 … s."""
     arrays = {name: np.array(values, dtype=np.float64) for name, values in columns.items()}
-    return Columns(np.arange(len(next(iter(arrays.values()))), dtype=np.float64), arrays)
+    times = np.arange(len(next(iter(arrays.values()))), dtype=np.float64)
+    return figure_of([Curves("drawn", times, arrays)], Picture("drawn"))
 
 
 def test_78_lines_can_be_told_apart_and_their_legend_covers_nothing() -> None:
     names = [f"plant.subsystem.actuator[{number}].flange.angularVelocity" for number in range(78)]
-    figure = figure_of(results_of({name: [number, -number] for number, name in enumerate(names)}), "many", {})
+    figure = drawn_of({name: [number, -number] for number, name in enumerate(names)})
 
     figure.canvas.draw()  # lays it out; a layout for which there is no room is a warning, and so an error here
 
@@ -290,10 +308,10 @@ def test_lines_that_lie_on_one_another_all_show() -> None:
     wave = [0.0, 1.0, 0.0, -1.0]
     columns = {"engine.a": wave, "fmu.a": wave, "other.a": [-value for value in wave], "third.a": wave}
 
-    (axes,) = figure_of(results_of(columns), "same", {}).axes
+    (axes,) = drawn_of(columns).axes
 
     first, second, other, third = axes.lines
-    assert [line.is_dashed() for line in (first, second, other, third)] == [False, True, False, True]
+    assert [line.is_dashed() for line in (first, second, other, third)] == [False, True, True, True]
     assert second._dash_pattern != third._dash_pattern  # type: ignore[attr-defined] # no public name
 
 
