@@ -11,7 +11,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Collection, Mapping, Sequence
 from types import TracebackType
-from typing import Any, Final, Self
+from typing import Any, Final, NamedTuple, Self
 
 import foxglove
 from foxglove import Channel, ConnectionGraph, Context, Parameter, StatusLevel
@@ -124,11 +124,11 @@ class FoxgloveServer:
             topic: Channel(topic, schema=schema, metadata=metadata, context=self._context)
             for topic, (schema, metadata) in schemas.items()
         }
-        self._listener.serve(parameters, changed)
+        self._listener.serve(_Served(parameters, changed))
 
     def end(self) -> None:
         """Take back the topics and parameters of a run."""
-        self._listener.serve(None, lambda: None)
+        self._listener.serve(None)
         for channel in self._variables.values():
             channel.close()
         self._variables = {}
@@ -206,20 +206,25 @@ class FoxgloveServer:
         self._server.remove_status(list(about))
 
 
+class _Served(NamedTuple):
+    """A run that clients ask for: its parameters, and what is called when they want other topics."""
+
+    parameters: MeshParameters
+    changed: Callable[[], None]
+
+
 class _Requests(ServerListener):
     """What clients ask for; the SDK calls it on threads of its own."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._parameters: MeshParameters | None = None
-        self._changed: Callable[[], None] = lambda: None
+        self._served: _Served | None = None
         self._touched: set[str] = set()
         self._subscribed: dict[str, None] = {}
 
-    def serve(self, parameters: MeshParameters | None, changed: Callable[[], None]) -> None:
-        """Answer from these parameters from now on; None: there are none."""
-        with self._lock:
-            self._parameters, self._changed = parameters, changed
+    def serve(self, served: _Served | None) -> None:
+        """Answer for this run from now on; None: for none."""
+        self._served = served
 
     def take_touched(self) -> set[str]:
         with self._lock:
@@ -243,8 +248,8 @@ class _Requests(ServerListener):
         param_names: list[str],
         request_id: str | None = None,  # noqa: ARG002  the SDK passes it
     ) -> list[Parameter]:
-        parameters = self._parameters
-        return parameters.values(param_names) if parameters is not None else []
+        served = self._served
+        return served.parameters.values(param_names) if served is not None else []
 
     def on_set_parameters(
         self,
@@ -252,8 +257,8 @@ class _Requests(ServerListener):
         parameters: list[Parameter],
         request_id: str | None = None,  # noqa: ARG002  the SDK passes it
     ) -> list[Parameter]:
-        run = self._parameters
-        return run.set(parameters) if run is not None else []
+        served = self._served
+        return served.parameters.set(parameters) if served is not None else []
 
     def on_parameters_subscribe(self, param_names: list[str]) -> None:
         with self._lock:
@@ -267,8 +272,8 @@ class _Requests(ServerListener):
     def _touch(self, topic: str) -> None:
         with self._lock:
             self._touched.add(topic)
-            changed = self._changed
-        changed()
+        if (served := self._served) is not None:
+            served.changed()
 
 
 def _not_started(host: str, port: int, error: Exception) -> ConfigurationError:
