@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import struct
 import time
 from collections import defaultdict
@@ -62,9 +63,7 @@ class FoxgloveClient:
         """Subscribe to topics, as soon as they are advertised."""
         for topic in topics:
             self.until(partial(self._offers, topic), f"the topic {topic}")
-            number = len(self._topics) + 1
-            self._topics[number] = topic
-            self.send(op="subscribe", subscriptions=[{"id": number, "channelId": self.channels[topic]["id"]}])
+            self._subscribe(topic)
 
     def values(self, topic: str) -> list[tuple[int, int, Any]]:
         """(log time in ns, point, value) of all messages about a variable."""
@@ -108,6 +107,11 @@ class FoxgloveClient:
             except TimeoutError:
                 raise AssertionError(f"not within {DEADLINE_S:g} s: {what}; {self.texts[-5:]}") from None
 
+    def _subscribe(self, topic: str) -> None:
+        number = len(self._topics) + 1
+        self._topics[number] = topic
+        self.send(op="subscribe", subscriptions=[{"id": number, "channelId": self.channels[topic]["id"]}])
+
     def _offers(self, topic: str) -> bool:
         return topic in self.channels
 
@@ -138,5 +142,9 @@ class FoxgloveClient:
             case "unadvertise":
                 gone = set(text["channelIds"])
                 self.channels = {topic: c for topic, c in self.channels.items() if c["id"] not in gone}
+            case "status" if (unknown := re.fullmatch(r"Unknown channel ID: (\d+)", text["message"])) is not None:
+                # The SDK (0.30) tells clients about a channel just before it takes subscriptions to it.
+                for topic in [topic for topic, c in self.channels.items() if c["id"] == int(unknown[1])]:
+                    self._subscribe(topic)
             case _:
                 self.texts.append(text)

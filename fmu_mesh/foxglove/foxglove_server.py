@@ -119,12 +119,12 @@ class FoxgloveServer:
             self._time_ns = -1
         with self._logging:
             self._lines.clear()
-        self._server.clear_session()
+        self._listener.serve(_Served(parameters, changed))
+        self._server.clear_session()  # whereupon clients ask for parameters again
         self._variables = {
             topic: Channel(topic, schema=schema, metadata=metadata, context=self._context)
             for topic, (schema, metadata) in schemas.items()
         }
-        self._listener.serve(_Served(parameters, changed))
 
     def end(self) -> None:
         """Take back the topics and parameters of a run."""
