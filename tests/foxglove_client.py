@@ -36,7 +36,11 @@ class FoxgloveClient:
 
     def __init__(self, url: str) -> None:
         self._connection = connect(
-            url, subprotocols=[Subprotocol("foxglove.sdk.v1")], max_size=None, open_timeout=DEADLINE_S
+            url,
+            subprotocols=[Subprotocol("foxglove.sdk.v1")],
+            max_size=None,
+            open_timeout=DEADLINE_S,
+            ping_interval=None,  # a client that does not read takes no answer to a ping either
         )
         self._topics: dict[int, str] = {}
         self.info: dict[str, Any] = {}

@@ -114,7 +114,8 @@ class FoxgloveServer:
             parameters: what clients may read and set.
             changed: called on a thread of the SDK when a client subscribes to a topic or unsubscribes.
         """
-        self.end()
+        for channel in self._variables.values():
+            channel.close()
         with self._clock:
             self._time_ns = -1
         with self._logging:
@@ -127,11 +128,8 @@ class FoxgloveServer:
         }
 
     def end(self) -> None:
-        """Take back the topics and parameters of a run."""
+        """Take back the parameters of a run. Its topics stay: messages may still be on their way to clients."""
         self._listener.serve(None)
-        for channel in self._variables.values():
-            channel.close()
-        self._variables = {}
 
     def take_touched(self) -> set[str]:
         """The topics to which clients have subscribed or from which they have unsubscribed since the last call."""

@@ -11,6 +11,18 @@ from pathlib import Path
 from tests.foxglove_client import FoxgloveClient
 from tests.helpers import Launched, Place, assert_readable, rows_of, wait_until, write_config
 
+TALKER = """
+import fmu_mesh
+
+class Talker(fmu_mesh.Component):
+    text = fmu_mesh.Output(type="String")
+    number = fmu_mesh.Output()
+
+    def step(self, time, step_size):
+        self.number += 1.0
+        self.text = "x" * 10_000
+"""
+
 
 def start(place: Place, *arguments: str | Path) -> tuple[Launched, str]:
     """Start the command at a free port; returns it with the address of the server."""
@@ -55,7 +67,7 @@ def test_values_are_the_recorded_ones_at_their_simulation_times(place: Place) ->
         shown = client.values(topic)
         assert shown == [(round(rows[point][0] * 1e9), point, rows[point][column]) for _, point, _ in shown]
         points = [point for _, point, _ in shown]
-        assert points == list(range(points[0], len(rows)))
+        assert points == list(range(points[0], points[0] + len(points)))
     assert client.times == sorted(client.times)
     assert client.messages["/mesh/status"]
 
@@ -134,18 +146,21 @@ def test_the_mesh_may_start_later_and_again(place: Place) -> None:
 
     with FoxgloveClient(url) as client:
         client.until(lambda: client.info, "the server")
-        sessions = []
+        sessions = [client.info["sessionId"]]
         for _ in range(2):
             mesh = place.start("launch", config, "--no-progress")
+            client.until(lambda: client.info["sessionId"] not in sessions, "a new session")
+            client.until(lambda: "/delay/y" in client.channels, "its topics")
             client.subscribe("/delay/y")
             sessions.append(client.info["sessionId"])
             client.messages.clear()
             client.until(lambda: len(client.messages["/delay/y"]) > 3, "values")
             assert client.values("/delay/y")[0][1] < 1000
             place.run("stop", "pair")
-            client.until(lambda: "/delay/y" not in client.channels, "the end of the topics")
+            client.until(client.ended, "the end")
             assert mesh.wait() == 130
-        assert len(set(sessions)) == 2
+            client.texts.clear()
+        assert len({*sessions}) == 3
 
     served.signal(signal.SIGINT)
     assert served.wait() == 130
@@ -153,22 +168,31 @@ def test_the_mesh_may_start_later_and_again(place: Place) -> None:
 
 
 def test_a_client_that_does_not_read_slows_nobody(place: Place) -> None:
-    config = write_config(place.folder, stop_time=3600.0, simulation={"real_time_factor": 1.0})
+    # A text of 10 kB in each message fills the buffers of the operating system soon.
+    (place.folder / "talker.py").write_text(TALKER)
+    config = write_config(
+        place.folder,
+        instances={"talker": {"python": "talker.py:Talker"}},
+        connections=[],
+        stop_time=3600.0,
+        simulation={"real_time_factor": 1.0, "step_size": 0.002},
+    )
     mesh = place.start("launch", config, "--no-progress")
     _, url = start(place, "pair")
-    topics = ("/pendulum/a", "/delay/y", "/mesh/status")
 
     with FoxgloveClient(url) as stuck, FoxgloveClient(url) as client:
-        stuck.subscribe(*topics)
-        client.subscribe(*topics)
-        client.until(lambda: len(client.messages["/delay/y"]) >= 5000, "many values")
+        stuck.subscribe("/talker/text", "/talker/number")
+        client.subscribe("/talker/text", "/talker/number")
+        client.until(lambda: len(client.messages["/talker/number"]) >= 3000, "many values")
+        number = client.values("/talker/number")
         place.run("stop", "pair")
         client.until(client.ended, "the end")
-        assert len(stuck.messages["/delay/y"]) < 5000
+        stuck.until(stuck.ended, "the end")
 
     assert mesh.wait() == 130
-    points = [point for _, point, _ in client.values("/delay/y")]
-    assert points == list(range(points[0], len(rows_of(place.folder / "pair.csv"))))
+    assert all(value == float(point) for _, point, value in number)
+    assert [point for _, point, _ in number] == sorted({point for _, point, _ in number})
+    assert len(stuck.messages["/talker/number"]) < len(client.messages["/talker/number"])
 
 
 def test_log_messages_are_shown_also_those_from_before(place: Place) -> None:
