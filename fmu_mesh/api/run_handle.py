@@ -20,6 +20,7 @@ from ..errors import (
     MeshLost,
 )
 from ..wire.client.mesh_client import MeshClient
+from ..wire.client.readings import Target
 from ..wire.client.waiting import rest, wait_for, wait_for_start
 from ..wire.views import (
     Command,
@@ -85,6 +86,7 @@ class Run:
         self._opening = threading.RLock()
         self._closed = False
         self._begun = False
+        self._targets: dict[str, list[Target]] = {}  # what a mesh has does not change, so a name is looked up once
         self._ended: Future[Result] | None = own.future if own is not None else None
 
     @classmethod
@@ -197,7 +199,9 @@ class Run:
     def samples(self, *names: str) -> list[Sample]:
         """The current values of several variables, each with its point; `*` in a name stands for any characters."""
         client = self._running()
-        targets = {target.key: target for name in names for target in targets_of(client, name)}
+        for name in names:
+            self._targets[name] = self._targets.get(name) or targets_of(client, name)
+        targets = {target.key: target for name in names for target in self._targets[name]}
         return [sample_of(reading, targets[reading.key].variable) for reading in client.get(list(targets.values()))]
 
     def set(self, name: str, value: object, *, at: float | None = None) -> SetAnswer:

@@ -1,4 +1,4 @@
-"""`top`: a live table of all instances of a mesh.
+"""`top`: a live table of all instances of a mesh, and the course of chosen variables.
 
 Owns the rates and shares, which are those between two looks (at the first look those since the first point), and which
 columns fit into a terminal.
@@ -9,24 +9,30 @@ from __future__ import annotations
 import argparse
 import shutil
 import sys
+import threading
 from collections.abc import Sequence
-from typing import Final
+from types import TracebackType
+from typing import Any, Final, Self
 
 import msgspec
+import numpy as np
 
 from ..api.attaching import attach
 from ..api.run_handle import Run
 from ..api.tables import shortened, table, width_of
-from ..errors import DeadlineExceeded, Interrupted
+from ..errors import DeadlineExceeded, FmuMeshError, Interrupted
 from ..wire.views import InstanceStatus, MeshStatus
 from .arguments import CommandParser, Parsers, add_json, add_reaching, positive_seconds
 from .output.pages import progress, seconds
 from .output.screen import Screen
+from .output.sparklines import Histories, sparkline_signs
 from .output.terminal import may_draw
 
 __all__ = ["PARSERS", "page"]
 
 _INTERVAL_S = 1.0
+_VALUES_PER_LOOK: Final = 4
+"""Values of a variable in the time between two looks."""
 _HEADING = ["instance", "state", "point", "time", "step time", "wait", "points/s", "factor", "restarts", "activity"]
 _LEAST_NAME: Final = 12
 _GOOD_NAME: Final = 32
@@ -45,30 +51,107 @@ def _add_top(parser: CommandParser) -> None:
     parser.add_argument(
         "--interval", type=positive_seconds, default=_INTERVAL_S, metavar="S", help="time between two looks in s (1)"
     )
+    parser.add_argument(
+        "--watch",
+        nargs="+",
+        default=[],
+        metavar="INSTANCE.VARIABLE",
+        help="also show the course of these variables (`*`: any characters)",
+    )
     add_json(parser, "JSON, one object per look")
     parser.set_defaults(run_command=_top)
 
 
 def _top(arguments: argparse.Namespace) -> int:
-    with attach(arguments.mesh, connect=arguments.connect, timeout=arguments.timeout) as run:
+    with (
+        attach(arguments.mesh, connect=arguments.connect, timeout=arguments.timeout) as run,
+        _Courses(run, arguments.watch, arguments.interval) as courses,
+    ):
         if arguments.once:
-            _show_once(run.all_status(), as_json=arguments.json)
+            _show_once(run.all_status(), courses, as_json=arguments.json)
             return 0
         try:
-            return _follow(run, arguments.interval, as_json=arguments.json)
+            return _follow(run, courses, as_json=arguments.json)
         except KeyboardInterrupt:
             return Interrupted.exit_code
 
 
-def _show_once(look: Look, *, as_json: bool) -> None:
+class _Courses:
+    """The course of variables, as long as the `with` block lasts.
+
+    A thread asks for the values, because `top` has to show the state of a mesh whose values do not come.
+
+    Args:
+        run: the mesh.
+        names: the variables; none: nothing is asked for.
+        interval_s: time between two looks at the mesh in s.
+
+    Attributes:
+        per_look: number of values in the time between two looks.
+        interval_s: time between two values in s.
+
+    Raises:
+        UnknownName: there is no such variable.
+    """
+
+    def __init__(self, run: Run, names: Sequence[str], interval_s: float) -> None:
+        self.per_look = _VALUES_PER_LOOK if names else 1
+        self.interval_s = interval_s / self.per_look
+        self._run = run
+        self._names = tuple(names)
+        self._histories = Histories()
+        self._lock = threading.Lock()
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._ask, name="values", daemon=True)
+
+    def __enter__(self) -> Self:
+        if self._names:
+            self._histories.add(self._run.samples(*self._names))
+            self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._over.set()
+        if self._names and self._thread.ident is not None:
+            self._thread.join()
+
+    def lines(self, width: int | None) -> list[str]:
+        """The lines below the table; none without variables."""
+        with self._lock:
+            lines = self._histories.lines(width, sparkline_signs(sys.stdout.encoding))
+        return ["", *lines] if lines else []
+
+    def values(self) -> dict[str, list[dict[str, Any]]]:
+        """The current values as JSON has them; nothing without variables."""
+        with self._lock:
+            newest = [sample._asdict() for sample in self._histories.newest]
+        for value in newest:
+            if isinstance(value["value"], np.ndarray):
+                value["value"] = value["value"].tolist()
+        return {"values": newest} if self._names else {}
+
+    def _ask(self) -> None:
+        while not self._over.wait(self.interval_s):
+            try:
+                samples = self._run.samples(*self._names)
+            except FmuMeshError:  # the mesh ends, or an instance does not answer now
+                continue
+            with self._lock:
+                self._histories.add(samples)
+
+
+def _show_once(look: Look, courses: _Courses, *, as_json: bool) -> None:
     if as_json:
-        print(msgspec.json.encode({"mesh": look[0], "instances": list(look[1].values())}).decode(), flush=True)
+        content = {"mesh": look[0], "instances": list(look[1].values()), **courses.values()}
+        print(msgspec.json.encode(content).decode(), flush=True)
     else:
         width = shutil.get_terminal_size().columns if sys.stdout.isatty() else None
-        print("\n".join(page(look, width=width)), flush=True)
+        print("\n".join([*page(look, width=width), *courses.lines(width)]), flush=True)
 
 
-def _follow(run: Run, interval_s: float, *, as_json: bool) -> int:
+def _follow(run: Run, courses: _Courses, *, as_json: bool) -> int:
     """Look again and again until the mesh ends, or `q`; where there is no terminal, one table after the other."""
     with Screen(drawn=may_draw(sys.stdout) and not as_json) as screen, run.until_end(screen.wake) as ended:
         before: Look | None = None
@@ -79,13 +162,14 @@ def _follow(run: Run, interval_s: float, *, as_json: bool) -> int:
                 if ended.is_set():
                     break
                 raise
-            if screen.drawn:
-                screen.show(page(look, before, width=screen.width))
-            else:
-                _show_once(look, as_json=as_json)
+            if not screen.drawn:
+                _show_once(look, courses, as_json=as_json)
+            for _ in range(courses.per_look):
+                if screen.drawn and not ended.is_set():
+                    screen.show([*page(look, before, width=screen.width), *courses.lines(screen.width)])
+                if screen.quits_within(courses.interval_s):
+                    return 0
             before = look
-            if screen.quits_within(interval_s):
-                return 0
     if not as_json:
         print(f"mesh '{run.name}' has ended")
     return 0

@@ -103,7 +103,7 @@ def from_plain(plain: PlainValue, type_: str, shape: tuple[int, ...] = ()) -> An
         return np.array(elements, DTYPES[cast("VariableType", type_)]).reshape(shape)
     if type_ == "Binary" and isinstance(plain, str):
         return base64.b64decode(plain)
-    if type_ in ("Float64", "Float32") and isinstance(plain, str | int):
+    if type_ in ("Float64", "Float32", "Real") and isinstance(plain, str | int):
         return _NOT_FINITE[plain] if isinstance(plain, str) else float(plain)
     return plain
 

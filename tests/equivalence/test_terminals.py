@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from fmu_mesh.cli.output.sparklines import BLOCKS
 from tests.helpers import FMUS, Place, wait_until, write_config
 from tests.terminal import Terminal
 
@@ -75,6 +76,34 @@ def test_top_fits_its_terminal_and_has_one_head_line(place: Place, columns: int)
         assert shown[3].endswith("which feeds 'delay.x'") == (columns > 100)
         assert max(map(len, shown)) <= columns
         assert ("factor" in shown[2].split()) == (columns > 80)
+
+
+@pytest.mark.parametrize("columns", [80, 200])
+def test_top_draws_the_course_of_watched_variables(place: Place, columns: int) -> None:
+    start_pair(place)
+
+    with Terminal(place, "top", "--interval", "0.1", "--watch", "pendulum.a", "delay.y", columns=columns) as top:
+
+        def course() -> Sequence[str] | None:
+            """A whole page on which the sparkline of the angle has several heights."""
+            shown = top.shown
+            return shown if len(shown) == 8 and len({*shown[6]} & {*BLOCKS}) > 4 else None
+
+        shown = wait_until(course, "a sparkline")
+
+    assert [line.split()[0] for line in shown[6:]] == ["pendulum.a", "delay.y"]
+    assert shown[6].endswith(" rad")
+    assert max(map(len, shown)) <= columns
+
+
+def test_top_draws_with_plain_signs_where_the_terminal_has_no_blocks(place: Place) -> None:
+    start_pair(place)
+    place.environment = {**place.environment, "PYTHONIOENCODING": "ascii:replace"}
+
+    with Terminal(place, "top", "--interval", "0.1", "--watch", "pendulum.a") as top:
+        shown = top.wait_for("#")
+
+    assert not {*"".join(shown)} & {*BLOCKS}
 
 
 @pytest.mark.parametrize("columns", [80, 200])

@@ -31,3 +31,28 @@ def test_top_shows_all_instances_until_the_mesh_ends(place: Place) -> None:
     assert mesh.wait() == 0  # it has no stop time
     assert place.run("top").wait() == 2
     place.assert_nothing_left()
+
+
+def test_watched_variables_have_a_line_and_a_value_in_json(place: Place) -> None:
+    config = write_config(place.folder, stop_time=3600.0, simulation={"real_time_factor": 1.0, "step_size": 0.01})
+    place.start("launch", config, "--no-progress")
+    assert place.run("wait").wait() == 0
+
+    once = place.run("top", "--once", "--watch", "pendulum.a", "delay.*")
+    as_json = place.run("top", "--once", "--json", "--watch", "pendulum.a")
+    unknown = place.run("top", "--watch", "pendulum.b")
+    following = place.start("top", "--interval", "0.1", "--watch", "pendulum.a", "--json")
+    wait_until(lambda: following.output.count("\n") >= 3, "three looks")
+    place.run("stop")
+
+    names = [line.split()[0] for line in once.output.splitlines() if "." in line.partition(" ")[0]]
+    assert names[0] == "pendulum.a"
+    assert {"delay.x", "delay.y"} < {*names}
+    [value] = json.loads(as_json.output)["values"]
+    assert (value["name"], value["unit"]) == ("pendulum.a", "rad")
+    assert unknown.wait() == 2
+    assert "instance 'pendulum' has no variable 'b'" in unknown.message
+    assert following.wait() == 0
+    points = [json.loads(line)["values"][0]["point"] for line in following.output.splitlines()]
+    assert points == sorted(points)
+    assert points[-1] > points[0]

@@ -50,7 +50,7 @@ WHOLE: dict[str, dict[str, str]] = {
 }
 """Instances, by their FMUs, of the file that the fragments of a page are part of."""
 
-UNTIL_CTRL_C = re.compile(r"fmu-mesh (top|watch (?!.*--count))")
+UNTIL_CTRL_C = re.compile(r"fmu-mesh (foxglove|top|watch (?!.*--count))")
 SOCKET = re.compile(r"unixsock-stream//run/user/\d+/fmu_mesh/\w+\.\d+/\w+\.sock")
 
 
@@ -239,6 +239,11 @@ NOT_RUN = [
         "docs/commands.md",
         "$ fmu-mesh launch configs/pendulum_delay.yaml --real-time-factor 1 --restarts 3",
         "somebody kills a process there; tests/faults/test_lost_processes.py does",
+    ),
+    (
+        "docs/foxglove.md",
+        "ssh -L 8765:127.0.0.1:8765 robot fmu-mesh foxglove",
+        "robot is yours; tests/equivalence/test_foxglove.py connects to the port",
     ),
     (
         "docs/gazebo.md",

@@ -11,6 +11,7 @@ import pytest
 from benchmarks.comparing import Reference, compare
 from benchmarks.first_step import Started
 from benchmarks.jobs import JOBS, OTHER, Entry, Job, with_checkout
+from benchmarks.recording import main as measure_recording
 from benchmarks.report import Report, write_docs
 from benchmarks.running import Measured
 from benchmarks.targets import TARGETS, Figure, Target
@@ -152,3 +153,12 @@ def test_the_tables_replace_those_of_the_page_and_nothing_else(tmp_path: Path) -
     page.write_text("no markers")
     with pytest.raises(ValueError, match="no markers"):
         write_docs(page, report)
+
+
+def test_the_cost_of_recording_is_measured_for_each_format(capsys: pytest.CaptureFixture[str]) -> None:
+    code = measure_recording(["--formats", "none", "csv", "--points", "1000", "--repeat", "1"])
+
+    rows = [line.split(" | ") for line in capsys.readouterr().out.splitlines()[-2:]]
+    assert code == 0
+    assert [row[0] for row in rows] == ["| none", "| csv"]
+    assert rows[0][2] == "100 %"

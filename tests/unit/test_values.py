@@ -9,6 +9,7 @@ import pytest
 
 from fmu_mesh.errors import MessageRefused
 from fmu_mesh.variables.model_description import Value, Variable, VariableType
+from fmu_mesh.variables.value_conversion import from_plain
 from fmu_mesh.wire.messages import decode_json
 from fmu_mesh.wire.values import (
     MAX_VALUE_SIZE,
@@ -136,3 +137,8 @@ def test_an_attachment_holds_point_and_time() -> None:
 def test_another_attachment_is_refused(data: bytes) -> None:
     with pytest.raises(MessageRefused):
         decode_json(data, Stamp)
+
+
+def test_what_is_not_finite_is_a_float_for_a_program_in_every_version_of_fmi() -> None:
+    assert [from_plain("INF", name) for name in ("Float64", "Float32", "Real")] == [math.inf] * 3
+    assert from_plain("INF", "String") == "INF"

@@ -1,0 +1,120 @@
+"""What recording costs: a mesh whose steps take about a microsecond, with and without a result file.
+
+Run it with `python -m benchmarks.recording`; `--formats` are endings of result files, and `none`. Rounds are
+interleaved, so what else the machine does meets all of them. The rate is that from the first grant to the last point,
+so the time of the whole command is shown as well: a writer that is behind at the last point needs it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import json
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from benchmarks.contestants.entry import FMUS
+from benchmarks.environment import loads, machine
+
+__all__ = ["Recorded", "configuration", "main"]
+
+_NOTHING = "none"
+_HEADER = "| result file | points/s | of the rate without | whole command, s | file, MB |"
+_DEADLINE_S = 600
+
+
+@dataclass
+class Recorded:
+    """A format, and what each round has shown.
+
+    Attributes:
+        rates: points per second.
+        commands_s: time of the whole command in s.
+        megabytes: size of the file in MB.
+        problem: why it cannot be measured; empty if it can.
+    """
+
+    format: str
+    rates: list[float] = field(default_factory=list)
+    commands_s: list[float] = field(default_factory=list)
+    megabytes: float = 0.0
+    problem: str = ""
+
+    def row(self, without: float) -> str:
+        """The row of the table; ``without`` is the rate without a result file, 0 if it was not measured."""
+        if self.problem:
+            return f"| {self.format} | {self.problem} | | | |"
+        rate = statistics.median(self.rates)
+        share = f"{100.0 * rate / without:.0f} %" if without else ""
+        command_s = statistics.median(self.commands_s)
+        return f"| {self.format} | {rate:,.0f} | {share} | {command_s:.2f} | {self.megabytes:.1f} |"
+
+
+def configuration(instances: int, points: int) -> dict[str, Any]:
+    """A chain of gains in one node, all outputs of which are recorded."""
+    names = [f"gain_{number}" for number in range(instances)]
+    return {
+        "mesh": "recording",
+        "simulation": {"stop_time": points * 0.001, "step_size": 0.001},
+        "instances": {name: {"fmu": str(FMUS / "Gain.fmu"), "group": "gains"} for name in names},
+        "connections": [f"{source}.y -> {target}.u" for source, target in itertools.pairwise(names)],
+        "record": {"variables": [f"{name}.y" for name in names]},
+    }
+
+
+def measure(recorded: Recorded, config: Path, points: int) -> None:
+    """Run the mesh once with a result file of this format."""
+    file = config.with_name(f"recording.{recorded.format}")
+    chosen = ["--set-config", "record.file=null"] if recorded.format == _NOTHING else ["--output", str(file)]
+    command = [sys.executable, "-m", "fmu_mesh", "launch", str(config), "--no-progress", "--json", *chosen]
+    started = time.perf_counter()
+    done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=_DEADLINE_S)
+    wall_s = time.perf_counter() - started
+    outcome = json.loads(done.stdout)
+    if done.returncode:
+        recorded.problem = str(outcome["error"]["message"]).rpartition("', ")[2]  # without the path
+        return
+    recorded.rates.append(points / outcome["seconds"])
+    recorded.commands_s.append(wall_s)
+    if file.exists():
+        recorded.megabytes = file.stat().st_size / 1e6
+        file.unlink()
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Measure all formats."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.recording", description=__doc__)
+    parser.add_argument(
+        "--formats", nargs="+", default=[_NOTHING, "csv", "parquet"], metavar="ENDING", help="none csv parquet"
+    )
+    parser.add_argument("--instances", type=int, default=4, metavar="N", help="instances with one output each (4)")
+    parser.add_argument("--points", type=int, default=500_000, metavar="N", help="points of a run (500000)")
+    parser.add_argument("--repeat", type=int, default=5, metavar="N", help="interleaved rounds (5)")
+    options = parser.parse_args(arguments)
+    measured = [Recorded(name) for name in options.formats]
+    before = loads()
+    with tempfile.TemporaryDirectory(prefix="recording-") as folder:
+        config = Path(folder) / "recording.yaml"
+        config.write_text(json.dumps(configuration(options.instances, options.points)))  # JSON is YAML
+        for number, recorded in itertools.product(range(options.repeat), measured):
+            if not recorded.problem:
+                print(f"round {number + 1}: {recorded.format}", file=sys.stderr)
+                measure(recorded, config, options.points)
+    rates = {one.format: statistics.median(one.rates) for one in measured if one.rates}
+    print(f"{options.instances} instances, {options.points:,} points, median of {options.repeat} interleaved rounds; ")
+    print(f"{machine()}; load average before {before}, after {loads()}\n")
+    print(_HEADER)
+    print("|---|" + "---:|" * (_HEADER.count("|") - 2))
+    for recorded in measured:
+        print(recorded.row(rates.get(_NOTHING, 0.0)))
+    return int(not rates)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

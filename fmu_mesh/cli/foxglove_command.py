@@ -1,0 +1,63 @@
+"""`foxglove`: serves the live values of a mesh to Foxglove until Ctrl-C."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+
+from ..errors import ConfigurationError
+from .arguments import CommandParser, Parsers, add_quiet, add_reaching
+
+__all__ = ["PARSERS"]
+
+_HOST = "127.0.0.1"
+_PORT = 8765
+
+
+def _add_foxglove(parser: CommandParser) -> None:
+    add_reaching(parser)
+    add_quiet(parser)
+    parser.add_argument("mesh", nargs="?", metavar="MESH", help="name or key of the mesh; default: the only one")
+    parser.add_argument(
+        "--variables",
+        nargs="+",
+        default=[],
+        metavar="INSTANCE.VARIABLE",
+        help="offer only these (`*`: any characters); default: all outputs",
+    )
+    parser.add_argument("--host", default=_HOST, metavar="ADDRESS", help=f"the address to listen at ({_HOST})")
+    parser.add_argument("--port", type=_port, default=_PORT, metavar="N", help=f"the port, 0 for a free one ({_PORT})")
+    parser.add_argument("--read-only", action="store_true", help="clients cannot set inputs and parameters")
+    parser.set_defaults(run_command=_foxglove)
+
+
+def _foxglove(arguments: argparse.Namespace) -> int:
+    try:
+        from ..foxglove.serving import Serving, serve  # noqa: PLC0415  an extra
+    except ImportError as error:
+        hint = "Install it with `pip install 'fmu-mesh[foxglove]'`."
+        raise ConfigurationError("The package foxglove-sdk is not installed.", hint=hint) from error
+    serving = Serving(
+        mesh=arguments.mesh,
+        connect=tuple(arguments.connect),
+        timeout_s=arguments.timeout,
+        variables=tuple(arguments.variables),
+        host=arguments.host,
+        port=arguments.port,
+        read_only=arguments.read_only,
+    )
+    if serving.leaves_host:
+        can = "read" if serving.read_only else "read and set"
+        text = f"warning: whoever can reach this host at {serving.host}, port {serving.port} can {can} this mesh"
+        print(f"fmu-mesh: {text}", file=sys.stderr, flush=True)
+    serve(serving, lambda text: print(text, flush=True))
+    return 0
+
+
+def _port(text: str) -> int:
+    if not (text.isdecimal() and int(text) < 1 << 16):
+        raise argparse.ArgumentTypeError(f"'{text}' is no port from 0 to 65535")
+    return int(text)
+
+
+PARSERS: Parsers = {"foxglove": _add_foxglove}
