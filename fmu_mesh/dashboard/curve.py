@@ -42,7 +42,8 @@ class Curve:
     """The values of one variable from the start on, at most 2048 intervals of equal length.
 
     When the intervals do not reach far enough, each two of them become one. The order in which values come does not
-    matter, so older ones can be added while new ones come. Memory: 80 kB, however long the run is. Any thread may call it.
+    matter, so older ones can be added while new ones come. Memory: 80 kB, however long the run is. All methods may be
+    called from any thread.
 
     Args:
         start: the start time in s.

@@ -12,7 +12,7 @@ import socket
 from collections.abc import Callable, Sequence
 from http import HTTPStatus
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import msgspec
 
@@ -20,6 +20,9 @@ from ..errors import ConfigurationError
 from .access import Access, is_loopback
 from .mesh_directory import MeshDirectory
 from .mesh_follower import CurveQuestion
+
+if TYPE_CHECKING:
+    from fastapi import Request
 
 __all__ = ["DashboardOptions", "serve"]
 
@@ -76,7 +79,7 @@ def _serve(
     options: DashboardOptions, listener: socket.socket, directory: MeshDirectory, ready: Callable[[str], None]
 ) -> None:
     import uvicorn  # noqa: PLC0415  an extra, and slow to import
-    from fastapi import FastAPI, Request, Response  # noqa: PLC0415  as above
+    from fastapi import FastAPI, Response  # noqa: PLC0415  as above
     from fastapi.staticfiles import StaticFiles  # noqa: PLC0415  as above
     from nicegui import ui  # noqa: PLC0415  as above
 
@@ -110,7 +113,7 @@ def _serve(
     token = secrets.token_urlsafe(24)
     names = frozenset() if is_loopback(options.host) else frozenset((socket.gethostname().lower(), socket.getfqdn()))
     config = uvicorn.Config(
-        Access(application, token, options.host, port, names),  # type: ignore[arg-type]  its own types of messages
+        Access(application, token, options.host, port, names),
         log_config=None,
         log_level="error",
         access_log=False,
@@ -122,14 +125,14 @@ def _serve(
     uvicorn.Server(config).run([listener])
 
 
-async def _body(request: object) -> bytes:
+async def _body(request: Request) -> bytes:
     """The body of a request.
 
     Raises:
         ValueError: it is too long.
     """
     body = bytearray()
-    async for piece in request.stream():  # type: ignore[attr-defined]  a starlette.requests.Request
+    async for piece in request.stream():
         body += piece
         if len(body) > _QUESTION_BYTES:
             raise ValueError

@@ -1,13 +1,14 @@
 """The page: which elements it has, what they show, and what happens when somebody uses them.
 
-Each open page has a `_MeshPage` for the mesh that it shows. It asks the follower four times a second, on the event loop; what
-waits for a mesh is done on another thread. `static/plots.js` draws the curves.
+Each open page has a `_MeshPage` for the mesh that it shows. It asks the follower four times a second, on the event
+loop; what waits for a mesh is done on another thread. `static/plots.js` draws the curves.
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any, Final
 
 from fastapi import Request
@@ -43,8 +44,9 @@ _COLUMNS: Final = {
     "activity": "activity",
 }
 _BAR: Final = """
-<q-td :props="props"><div class="fm-bar" :title="props.row.shares"><div :style="{width: props.row.share[0] + '%'}"></div>
-<div :style="{width: props.row.share[1] + '%'}"></div></div></q-td>
+<q-td :props="props"><div class="fm-bar" :title="props.row.shares">
+<div :style="{width: props.row.share[0] + '%'}"></div><div :style="{width: props.row.share[1] + '%'}"></div>
+</div></q-td>
 """
 
 
@@ -181,7 +183,7 @@ class _MeshPage:
     def build(self, head: Any, body: Any) -> None:  # noqa: ANN401  elements of NiceGUI
         """Make the elements, in the head and in the body of the page."""
         ui.run_javascript(f"fmuMeshPlots.show({json.dumps(self.key)}, {self.run})")
-        with head, ui.row().classes("items-center col") as row:
+        with head, ui.row().classes("items-center col self-center") as row:
             self._parts.append(row)
             self._state = ui.badge("").classes("text-body2 fm-state")
             self._numbers = ui.label().classes("fm-numbers")
@@ -221,9 +223,8 @@ class _MeshPage:
 
     def _add_plots(self) -> None:
         with ui.row().classes("items-center"):
-            ui.select(_SPANS, value=0, label="time", on_change=lambda event: _show_span(event.value)).props(
-                "dense outlined"
-            )
+            span = ui.select(_SPANS, value=0, label="time", on_change=lambda event: _show_span(event.value))
+            span.props("dense outlined")
             ui.button("Add a plot", icon="add", on_click=self._add_plot).props("dense flat")
         self._charts = ui.element("div").classes("fm-column")
         with self._charts:
@@ -273,9 +274,8 @@ class _MeshPage:
                 return
             first = [name for name, v in settable.items() if not v.shape][:_FIELDS] or [*settable][:_FIELDS]
             if len(settable) > len(first):
-                ui.select(
-                    [*settable], value=first, multiple=True, label="variables", on_change=self._choose_fields
-                ).props("dense outlined use-chips use-input").style("width: 100%")
+                choice = ui.select([*settable], value=first, multiple=True, label="variables", with_input=True)
+                choice.props("dense outlined use-chips").style("width: 100%").on_value_change(self._choose_fields)
             self._settings = ui.element("div").classes("fm-column").style("gap: 4px")
             self._show_fields(first)
 
@@ -384,7 +384,7 @@ class _Plot:
     def build(self) -> None:
         """Make its elements."""
         elements = self._page.view.catalogue.elements
-        with ui.card().classes("fm-card").props("flat bordered") as self._card:
+        with ui.card().classes("fm-card fm-plot-card").props("flat bordered") as self._card:
             with ui.row().classes("items-center no-wrap").style("width: 100%"):
                 choice = ui.select([*elements], value=self.names, multiple=True, label="variables", with_input=True)
                 choice.props("dense outlined use-chips").classes("col").on_value_change(self._choose)
@@ -426,7 +426,13 @@ def _options(view: MeshView, names: Sequence[str]) -> dict[str, Any]:
             "top": 0,
             "itemSize": 11,
         },
-        "xAxis": {"type": "value", "name": "time in s", "nameLocation": "middle", "nameGap": 24, "min": "dataMin"},
+        "xAxis": {
+            "type": "value",
+            "name": "time in s",
+            "nameLocation": "middle",
+            "nameGap": 24,
+            "axisLabel": {"showMaxLabel": False, "showMinLabel": False},
+        },
         "yAxis": {"type": "value", "scale": True, "name": f"in {unit}" if unit else "", "nameLocation": "end"},
         "series": [
             {
@@ -509,7 +515,7 @@ def _values(follower: MeshFollower, names: Sequence[str]) -> Mapping[str, Any]:
     values = {}
     for name in names:
         try:
-            values[name] = follower.ask(lambda mesh, name=name: mesh.get(name))  # type: ignore[misc]  bound at once
+            values[name] = follower.ask(partial(Run.get, name=name))
         except FmuMeshError:
             break  # it does not run any more
     return values

@@ -1,7 +1,7 @@
 """Follows one mesh on threads of its own, and keeps what pages show of it.
 
-Owns the handle of the mesh, the history of chosen variables, the log, and who sets and commands. Pages ask it as often as
-they like: an answer is made of what is there, and never waits for the mesh.
+Owns the handle of the mesh, the history of chosen variables, and the log. Pages ask it as often as they like: an answer
+is made of what is there, and never waits for the mesh.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from ..wire.views import InstanceInfo, InstanceStatus, LogLine, MeshInfo, MeshSt
 from .curve import Curve, CurveChange
 from .result_tail import ResultTail
 
-__all__ = ["Catalogue", "MOST_CURVES", "CurveQuestion", "MeshFollower", "MeshView"]
+__all__ = ["MOST_CURVES", "Catalogue", "CurveQuestion", "MeshFollower", "MeshView"]
 
 MOST_CURVES: Final = 64
 """Variables whose history is kept for one mesh; beyond it, that of the one that no page has asked for longest goes."""
@@ -183,14 +183,14 @@ class MeshFollower:
         info = run.info()
         with run.until_end(self._wake.set) as ended:
             infos = {name: run.instance_info(name) for name in info.instances}
-            before = self._view
+            before, catalogue = self._view, _catalogue_of(infos)
             with self._lock:
                 if before.info is None or before.info.run != info.run:
                     self._curves.clear()
                     self._log.clear()
                     before = MeshView(self._key, run=before.run + 1)
                 self._view = msgspec.structs.replace(
-                    before, info=info, infos=infos, catalogue=_catalogue_of(infos), ended=False, trouble=None
+                    before, info=info, infos=infos, catalogue=catalogue, ended=False, trouble=None
                 )
             self._run = run
             sampler = threading.Thread(target=self._sample, args=(run, info, ended), name="sample", daemon=True)

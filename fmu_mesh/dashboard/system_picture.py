@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from ..errors import FmuMeshError
 from .mesh_follower import MeshFollower
 
@@ -9,9 +11,9 @@ __all__ = ["system_picture"]
 
 
 def system_picture(follower: MeshFollower) -> str | None:
-    """The SVG of the mesh with its present state; None if there is none. The table of instances is there in any case."""
+    """The SVG of the mesh with its present state; None if there is none, and the table of instances must do."""
     try:
-        graph = follower.ask(lambda mesh: getattr(mesh, "graph", lambda: None)())
+        graph: Any = follower.ask(lambda mesh: getattr(mesh, "graph", lambda: None)())
     except FmuMeshError:
         return None
-    return None if graph is None else str(graph.svg())  # type: ignore[attr-defined]  a fmu_mesh.SystemGraph
+    return None if graph is None else str(graph.svg())
