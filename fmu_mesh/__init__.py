@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from .api.result import Result
     from .api.run_handle import Run
     from .api.samples import Sample
+    from .api.system_graph import SystemGraph
     from .errors import (
         CallRefused,
         ConfigurationError,
@@ -75,6 +76,7 @@ __all__ = [
     "Sweep",
     "SweepResult",
     "System",
+    "SystemGraph",
     "SystemState",
     "UnknownName",
     "__version__",
@@ -100,6 +102,7 @@ _PLACES = {
     "Range": "sweeps.variants",
     "Sample": "api.samples",
     "System": "api.open_system",
+    "SystemGraph": "api.system_graph",
     "SystemState": "api.open_system",
     "attach": "api.attaching",
     "Inspection": "api.inspection",

@@ -286,6 +286,10 @@ ALLOWED: dict[str, dict[str, str]] = {
         "instances/call_guard.py: CallWatch._position": "what the present call says of itself: state, no behaviour",
         "instances/fmi/model_exchange/model_exchange.py: _TimedEquations._line": "inputs of the present step: state",
     },
+    "large_modules": {
+        "api/mesh_builder.py": "one public class, and half of it are docstrings with examples",
+        "api/run_handle.py": "one public class, and half of it are docstrings with examples",
+    },
     "importers_of_kinds": {
         "fmu_mesh: fmu_mesh.instances.python": "what a component derives from is public",
         "fmu_mesh.api.mesh_builder: fmu_mesh.instances.python": "a program gives a class, not the place of a class",

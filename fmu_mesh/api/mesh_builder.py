@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from .open_system import System
     from .repeated_mesh import RepeatedMesh
     from .result import Result
+    from .system_graph import SystemGraph
 
 __all__ = ["Mesh", "load"]
 
@@ -328,6 +329,28 @@ class Mesh:
         data = with_config_values(self._plain._replace(file=self._shown_file), chosen.config_values)
         loaded, findings = examine_data(data, chosen.start_values)
         return planned(loaded, findings, chosen, options.get("on_notice", log.info), self._known)
+
+    def graph(self, **options: Unpack[PlanOptions]) -> SystemGraph:
+        """The graph of the mesh: instances, connections, processes and cycles, as a picture or as text.
+
+        Example:
+            >>> import fmu_mesh
+            >>> print(fmu_mesh.load("configs/pendulum_delay.yaml").graph().text())
+            pendulum_delay: 2 instances in 2 processes, 1 connection
+            <BLANKLINE>
+            pendulum  DampedPendulum.fmu
+              a -> delay.x  rad
+            delay  TransportDelay.fmu
+
+        Args:
+            options: see `PlanOptions`.
+
+        Raises:
+            ConfigurationError: the configuration, a model or an option is wrong; carries all findings.
+        """
+        from .system_graph import graph_of_plan  # noqa: PLC0415  only this needs it
+
+        return graph_of_plan(self.plan(**options).plan)
 
     def run(self, **options: Unpack[RunOptions]) -> Result:
         """Run the mesh to its end, and return what it has recorded.

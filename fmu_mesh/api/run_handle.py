@@ -44,6 +44,7 @@ if TYPE_CHECKING:  # whoever attaches to a mesh needs nothing that plans or star
     from .plan_options import StartOptions
     from .result import Result
     from .run_thread import RunThread
+    from .system_graph import SystemGraph
 
 __all__ = ["TIMEOUT_S", "Run"]
 
@@ -148,6 +149,30 @@ class Run:
             ('paused', ['delay', 'pendulum'])
         """
         return self._client().all_status()
+
+    def graph(self) -> SystemGraph:
+        """The graph of the mesh, with the state and the speed of each instance while it runs.
+
+        `SystemGraph.with_status` renews these without another question for what does not change.
+
+        Example:
+            >>> import fmu_mesh
+            >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
+            >>> with mesh.start(record="memory", paused=True) as run:
+            ...     point = run.wait_for("paused").point
+            ...     print([(node.instance, node.state) for node in run.graph().nodes])
+            [('pendulum', 'running'), ('delay', 'running')]
+        """
+        from .system_graph import graph_of_infos, graph_of_plan  # noqa: PLC0415  only this needs it
+
+        if self._own is None:
+            client = self._client()
+            infos = [client.instance_info(name) for name in client.info().instances]
+            return graph_of_infos(self.name, infos).with_status(client.all_status()[1])
+        graph = graph_of_plan(self._own.plan.plan)
+        if self._own.in_process or self._own.future.done():
+            return graph
+        return graph.with_status(self._client().all_status()[1])
 
     @property
     def variables(self) -> dict[str, VariableView]:

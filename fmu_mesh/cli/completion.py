@@ -29,12 +29,14 @@ _PATIENCE_S: Final = 1.0
 _RESULTS: Final = ("csv", "mcap")
 _FILES: Final[Mapping[str, tuple[str, ...]]] = {
     "CONFIG": ("yaml", "yml", "ssp"),
+    "CONFIG|MESH": ("yaml", "yml", "ssp"),
     "MODEL.fmu": ("fmu",),
     "FMU": ("fmu",),
     "RESULTS.csv": _RESULTS,
     "BAG": ("mcap",),
     "FILE": _RESULTS,
     "FILE.png": ("png", "svg", "pdf"),
+    "FILE.svg": ("svg", "png", "pdf", "txt"),
     "FILE.mp4": ("mp4", "gif"),
     "FILE.json": ("json",),
     "FILE.yaml": ("yaml", "yml"),
@@ -76,7 +78,7 @@ def _offered(prefix: str, action: argparse.Action, parsed_args: argparse.Namespa
     name = action.metavar if isinstance(action.metavar, str) else ""
     if name in _FILES:
         files: Iterable[str] = FilesCompleter(_FILES[name])(prefix)
-        return files
+        return [*files, *_meshes(prefix, parsed_args)] if name == "CONFIG|MESH" else files
     if action.dest in _from_running:
         return _from_running[action.dest](prefix, parsed_args)
     if action.dest == "algorithm":

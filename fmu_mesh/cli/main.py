@@ -31,6 +31,7 @@ COMMANDS: Final[Mapping[str, tuple[str, str]]] = {
     "sweep": ("sweep", "run a mesh many times with other values, into one table"),
     "new": ("new_mesh", "write a configuration for FMUs, with suggested connections"),
     "check": ("checking", "check a configuration and show its plan, without running it"),
+    "graph": ("graphing", "draw the graph of a configuration or of a running mesh"),
     "inspect": ("inspecting", "show the properties of an FMU, without running it"),
     "schema": ("checking", "print the JSON Schema of configurations"),
     "ls": ("looking", "list meshes, instances and variables"),

@@ -1,0 +1,279 @@
+"""The graph of a mesh: instances, connections, processes and cycles, as a picture or as text.
+
+Owns what the graph says; `graph_layout` has where things lie, and `graph_drawing` how they look.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import groupby
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import msgspec
+from msgspec.structs import replace
+
+from ..system.graph import strongly_connected, topological_order
+from .graph_drawing import GraphEdge, GraphNode, GraphVariable, drawing_of
+from .graph_layout import going_back
+from .graph_pictures import figure_of_drawing, svg_of_drawing
+from .tables import shortened, table
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from ..system.plan import Plan
+    from ..wire.views import InstanceInfo, InstanceStatus
+
+__all__ = ["SystemGraph", "graph_of", "graph_of_infos", "graph_of_plan"]
+
+_COLUMNS = 80
+_NAME = 30
+
+
+class SystemGraph(msgspec.Struct, frozen=True):
+    """The graph of a mesh: its instances, and the connections between them.
+
+    Example:
+        >>> import fmu_mesh
+        >>> graph = fmu_mesh.load("configs/cycle2.yaml").graph()
+        >>> [node.instance for node in graph.nodes], graph.cycles
+        (['position', 'velocity'], (('position', 'velocity'),))
+        >>> [(edge.source, edge.target, edge.delay, edge.closes_cycle) for edge in graph.edges]
+        [('velocity', 'position', 1, False), ('position', 'velocity', 1, True)]
+        >>> print(graph.text())
+        cycle2: 2 instances in 2 processes, 2 connections, 1 cycle
+        <BLANKLINE>
+        position  Integrator.fmu
+          y -> velocity.u  closes a cycle
+        velocity  Integrator.fmu
+          y -> position.u  delay 1
+        <BLANKLINE>
+        cycle  position, velocity
+
+    Attributes:
+        mesh: name of the mesh.
+        nodes: the instances, in the order in which they step.
+        edges: the connections, those from one instance to another with the same delay together.
+        cycles: the instances of each cycle.
+    """
+
+    mesh: str
+    nodes: tuple[GraphNode, ...]
+    edges: tuple[GraphEdge, ...]
+    cycles: tuple[tuple[str, ...], ...] = ()
+
+    @property
+    def title(self) -> str:
+        """One line: how many instances, processes, connections and cycles there are."""
+        counts = [
+            _count(len(self.nodes), "instance") + f" in {_count(len({n.group for n in self.nodes}), 'process')}",
+            _count(sum(len(edge.variables) for edge in self.edges), "connection"),
+            *([_count(len(self.cycles), "cycle")] if self.cycles else []),
+        ]
+        return f"{self.mesh}: {', '.join(counts)}"
+
+    def with_status(
+        self, instances: Mapping[str, InstanceStatus], before: Mapping[str, InstanceStatus] | None = None
+    ) -> SystemGraph:
+        """The same graph with the state of each instance, as `Run.all_status` has it.
+
+        Example:
+            >>> import fmu_mesh
+            >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
+            >>> with mesh.start(record="memory", paused=True) as run:
+            ...     _ = run.wait_for("paused")
+            ...     graph = run.graph()
+            ...     [node.state for node in graph.with_status(run.all_status()[1]).nodes]
+            ['running', 'running']
+
+        Args:
+            instances: the status of each instance; one that is missing gets no values.
+            before: that of an earlier look, for the speed since then; None: the mean speed since the first point.
+        """
+        nodes = [_live(node, instances.get(node.instance), (before or {}).get(node.instance)) for node in self.nodes]
+        return replace(self, nodes=tuple(nodes))
+
+    def svg(self) -> str:
+        """The picture as the text of an SVG file; needs no library.
+
+        Example:
+            >>> import fmu_mesh
+            >>> picture = fmu_mesh.load("configs/cycle2.yaml").graph().svg()
+            >>> picture[:4], 'data-instance="velocity"' in picture
+            ('<svg', True)
+
+        Every instance is a group of the class `instance` with the attribute `data-instance`. Every edge is one of the
+        class `edge` with `data-source` and `data-target`.
+        """
+        return svg_of_drawing(drawing_of(self.title, self.nodes, self.edges, self.cycles))
+
+    def figure(self) -> Figure:
+        """The picture as a figure of matplotlib.
+
+        Example:
+            >>> import fmu_mesh
+            >>> fmu_mesh.load("configs/cycle2.yaml").graph().figure().savefig("cycle2.pdf")
+
+        Raises:
+            ConfigurationError: matplotlib is not installed.
+        """
+        return figure_of_drawing(drawing_of(self.title, self.nodes, self.edges, self.cycles))
+
+    def text(self) -> str:
+        """The graph as text of at most 80 columns: below each instance, what its outputs are connected to."""
+        members = sorted(self.nodes, key=lambda node: self._first_of_group[node.group])
+        lines = [shortened(self.title, _COLUMNS), ""]
+        for group, of_group in groupby(members, key=lambda node: node.group):
+            nodes = list(of_group)
+            indent = 2 if len(nodes) > 1 else 0
+            if indent:
+                lines.append(f"group {shortened(group, _COLUMNS - 30)}, one process")
+            for node in nodes:
+                lines += self._lines_of(node, indent)
+        if self.cycles:
+            lines += ["", *_wrapped([("cycle", cycle) for cycle in self.cycles])]
+        return "\n".join(line.rstrip() for line in lines)
+
+    @property
+    def _first_of_group(self) -> dict[str, int]:
+        first: dict[str, int] = {}
+        for number, node in enumerate(self.nodes):
+            first.setdefault(node.group, number)
+        return first
+
+    def _lines_of(self, node: GraphNode, indent: int) -> list[str]:
+        heading = [shortened(node.instance, _NAME), shortened(node.model, _NAME), node.live]
+        rows = [
+            (
+                variable.source,
+                f"{edge.target}.{variable.target}",
+                shortened(variable.unit_text, 14),
+                "closes a cycle" if edge.closes_cycle else "delay 1" if edge.delay else "",
+            )
+            for edge in self.edges
+            if edge.source == node.instance
+            for variable in edge.variables
+        ]
+        first = shortened(" " * indent + "  ".join(filter(None, heading)), _COLUMNS)
+        return [first, *_fitted(rows, indent + 2)]
+
+
+def graph_of_plan(plan: Plan) -> SystemGraph:
+    """The graph of a mesh that is planned."""
+    nodes = [
+        GraphNode(own.name, Path(own.fmu).name or own.description.model_name, own.node)
+        for own in plan.system.instances.values()
+    ]
+    connections = [
+        (
+            (c.source_instance, c.target_instance, c.delay or 0),
+            GraphVariable(c.source_name, c.target_name, c.source.unit or "", c.target.unit or "", c.factor, c.offset),
+        )
+        for c in plan.connections
+    ]
+    return graph_of(plan.system.config.mesh, nodes, connections)
+
+
+def graph_of_infos(mesh: str, infos: Sequence[InstanceInfo]) -> SystemGraph:
+    """The graph of a mesh that runs, from what its instances tell."""
+    units = {f"{own.instance}.{v.name}": v.unit or "" for own in infos for v in own.variables}
+    nodes = [GraphNode(own.instance, Path(own.fmu).name or own.model_name, own.node) for own in infos]
+    connections = []
+    for own in infos:
+        for c in own.connections:
+            source, _, output = c.source.partition(".")
+            target, _, input_ = c.target.partition(".")
+            both = [units.get(end, units.get(end.partition("[")[0], "")) for end in (c.source, c.target)]
+            variable = GraphVariable(output, input_, both[0], both[1], c.factor, c.offset)
+            connections.append(((source, target, c.delay), variable))
+    return graph_of(mesh, nodes, connections)
+
+
+def graph_of(
+    mesh: str, nodes: Sequence[GraphNode], connections: Iterable[tuple[tuple[str, str, int], GraphVariable]]
+) -> SystemGraph:
+    """The graph of instances and connections, each as ((source, target, delay), variable).
+
+    Raises:
+        ValueError: the connections with delay 0 form a cycle.
+    """
+    edges: dict[tuple[str, str, int], list[GraphVariable]] = {}
+    for key, variable in connections:
+        edges.setdefault(key, []).append(variable)
+    by_name = {node.instance: node for node in nodes}
+    order = topological_order(by_name, [(source, target) for source, target, delay in edges if not delay])
+    keys = list(edges)
+    back = going_back(order, keys)
+    ends = [(source, target) for source, target, _ in keys]
+    parts = [part for part in strongly_connected(by_name, ends) if len(part) > 1 or (part[0], part[0]) in ends]
+    cycles = sorted((tuple(sorted(part, key=order.index)) for part in parts), key=lambda cycle: order.index(cycle[0]))
+    return SystemGraph(
+        mesh,
+        tuple(by_name[name] for name in order),
+        tuple(
+            GraphEdge(
+                source=key[0],
+                target=key[1],
+                delay=key[2],
+                variables=tuple(edges[key]),
+                closes_cycle=number in back,
+                cycle=next((n for n, c in enumerate(cycles) if key[0] in c and key[1] in c), None),
+            )
+            for number, key in enumerate(keys)
+        ),
+        tuple(cycles),
+    )
+
+
+def _live(node: GraphNode, status: InstanceStatus | None, before: InstanceStatus | None) -> GraphNode:
+    if status is None:
+        return replace(node, state=None, point=None, points_per_second=None, wait=None)
+    start: tuple[int, float, float] = (0, 0.0, 0.0)
+    if before is not None and before.running_time < status.running_time and before.point <= status.point:
+        start = before.point, before.running_time, before.wait_time
+    wall_s = status.running_time - start[1]
+    return replace(
+        node,
+        state=status.state,
+        point=status.point,
+        points_per_second=(status.point - start[0]) / wall_s if wall_s > 0.0 else 0.0,
+        wait=min((status.wait_time - start[2]) / wall_s, 1.0) if wall_s > 0.0 else 0.0,
+    )
+
+
+def _count(number: int, what: str) -> str:
+    many = "" if number == 1 else "es" if what.endswith("s") else "s"
+    return f"{number} {what}{many}"
+
+
+def _fitted(rows: Sequence[tuple[str, str, str, str]], indent: int) -> list[str]:
+    """A table of connections in 80 columns: both ends, unit and remark; long names without their middle."""
+    others = max((len(row[2]) for row in rows), default=0) + max((len(row[3]) for row in rows), default=0) + 4
+    room = _COLUMNS - indent - others - len(" -> ")
+    for_source = min(
+        max((len(row[0]) for row in rows), default=0), max(room // 2, room - max(map(_end_of, rows), default=0))
+    )
+    ends = [
+        f"{shortened(row[0], for_source)} -> {shortened(row[1], room - min(len(row[0]), for_source))}" for row in rows
+    ]
+    return table([(end, *row[2:]) for end, row in zip(ends, rows, strict=True)], indent=indent)
+
+
+def _end_of(row: tuple[str, str, str, str]) -> int:
+    return len(row[1])
+
+
+def _wrapped(lists: Iterable[tuple[str, Sequence[str]]]) -> list[str]:
+    """Names in lines of at most 80 columns, each list with its title."""
+    lines = []
+    for title, names in lists:
+        line = f"{title} "
+        for number, name in enumerate(names):
+            text = f" {shortened(name, _NAME)}" + ("," if number < len(names) - 1 else "")
+            if len(line) + len(text) > _COLUMNS:
+                lines.append(line)
+                line = " " * (len(title) + 1)
+            line += text
+        lines.append(line)
+    return lines

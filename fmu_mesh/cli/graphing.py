@@ -1,0 +1,88 @@
+"""`graph`: the graph of a configuration or of a running mesh, as text or as a picture."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from ..api.attaching import attach
+from ..api.drawing import draw
+from ..api.mesh_builder import load
+from ..api.system_graph import SystemGraph
+from ..errors import ConfigurationError
+from ..files import replaced
+from .arguments import CommandParser, Parsers, add_json, add_quiet, add_reaching
+from .output.json_output import print_json
+
+__all__ = ["PARSERS"]
+
+_CONFIGURATIONS = (".yaml", ".yml", ".ssp")
+
+
+def _add_graph(parser: CommandParser) -> None:
+    parser.add_argument(
+        "of",
+        nargs="?",
+        metavar="CONFIG|MESH",
+        help="a configuration file, or the name or key of a running mesh; default: the only one that runs",
+    )
+    parser.add_argument(
+        "--output",
+        type=Path,
+        metavar="FILE.svg",
+        help="write it into a .svg, .png, .pdf or .txt file; default: text on the terminal",
+    )
+    parser.add_argument(
+        "--allow-code",
+        action="store_true",
+        help="run the Python code that CONFIG names although another user owns the file",
+    )
+    add_quiet(parser)
+    add_json(parser, "JSON: one object with all instances and connections")
+    add_reaching(parser)
+    parser.set_defaults(run_command=_graph)
+
+
+def _graph(arguments: argparse.Namespace) -> int:
+    output = arguments.output
+    if output is not None and output.suffix.lower() not in (".svg", ".png", ".pdf", ".txt"):
+        raise ConfigurationError(f"a graph cannot be written as '{output}'.", hint="Name it .svg, .png, .pdf or .txt.")
+    graph = _graph_of(arguments)
+    if output is not None:
+        write(graph, output)
+    if arguments.json:
+        print_json(graph)
+    elif output is not None:
+        print(f"graph: {output}")
+    else:
+        print(graph.text())
+    return 0
+
+
+def _graph_of(arguments: argparse.Namespace) -> SystemGraph:
+    of = arguments.of
+    if of is not None and (Path(of).suffix.lower() in _CONFIGURATIONS or Path(of).is_file()):
+        return load(of).graph(allow_code=arguments.allow_code)
+    with attach(of, connect=arguments.connect, timeout=arguments.timeout) as run:
+        return run.graph()
+
+
+def write(graph: SystemGraph, output: Path) -> None:
+    """Write a graph into a file; its suffix gives the format.
+
+    Raises:
+        ConfigurationError: the file cannot be written.
+    """
+    suffix = output.suffix.lower()
+    if suffix in (".png", ".pdf"):
+        draw(graph.figure(), output)
+        return
+    try:
+        output.parent.mkdir(parents=True, exist_ok=True)
+        with replaced(output) as draft:
+            draft.write_text(graph.svg() if suffix == ".svg" else f"{graph.text()}\n", encoding="utf-8")
+    except OSError as error:
+        raise ConfigurationError(f"the graph '{output}' cannot be written: {error.strerror}.") from error
+
+
+PARSERS: Parsers = {"graph": _add_graph}
