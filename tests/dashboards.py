@@ -100,7 +100,7 @@ class Browser:
 
     def run(self, script: str, *arguments: object) -> Any:  # noqa: ANN401  what the script returns
         """Run JavaScript in the page."""
-        return self.driver.execute_script(script, *arguments)  # type: ignore[no-untyped-call]  # selenium leaves it open
+        return self.driver.execute_script(script, *arguments)
 
     @property
     def text(self) -> str:
@@ -172,6 +172,6 @@ def browser(folder: Path, width: int = 1500, height: int = 1150) -> Iterator[Bro
     service = Service(str(_PROGRAMS["chromedriver"]))
     driver = webdriver.Chrome(options=options, service=service)
     try:
-        yield Browser(driver, int(service.process.pid))  # type: ignore[union-attr]  # it has been started
+        yield Browser(driver, int(service.process.pid))
     finally:
         driver.quit()

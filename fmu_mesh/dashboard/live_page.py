@@ -20,7 +20,6 @@ from ..wire.views import InstanceStatus, VariableView
 from .mesh_directory import MeshDirectory
 from .mesh_follower import MeshFollower, MeshView
 from .setting_fields import SettingField
-from .system_picture import system_picture
 
 __all__ = ["LivePage"]
 
@@ -261,7 +260,7 @@ class _MeshPage:
             self._table.add_slot("body-cell-share", _BAR)
 
     def _add_picture(self) -> None:
-        with ui.card().classes("fm-card").props("flat bordered") as self._picture_card:
+        with ui.card().classes("fm-card").props("flat bordered"):
             ui.label("Connections").classes("fm-title")
             self._picture = ui.html("", sanitize=False).classes("fm-graph")  # our own SVG, in which names are escaped
 
@@ -320,8 +319,7 @@ class _MeshPage:
                 self._log.push(f"{line.instance} at point {line.point}: {line.status.lower()}: {line.message}")
 
     async def _draw_picture(self) -> None:
-        picture = await run.io_bound(system_picture, self._follower)
-        self._picture_card.set_visibility(picture is not None)
+        picture = await run.io_bound(self._follower.picture)
         if picture is not None and picture != self._picture.content:
             self._picture.set_content(picture)
 

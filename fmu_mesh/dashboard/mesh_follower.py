@@ -19,6 +19,7 @@ import numpy as np
 
 from ..api.attaching import attach
 from ..api.run_handle import Run
+from ..api.system_graph import SystemGraph, graph_of_infos
 from ..errors import FmuMeshError, MeshLost
 from ..variables.value_types import element_names
 from ..wire.views import InstanceInfo, InstanceStatus, LogLine, MeshInfo, MeshStatus, VariableView
@@ -47,11 +48,13 @@ class Catalogue(NamedTuple):
         variables: all of them by `instance.variable`.
         elements: what can be drawn: of each number and each element of an array its variable, and which element it is.
         settable: the unconnected inputs and the tunable parameters.
+        graph: instances and connections, without their state.
     """
 
     variables: Mapping[str, VariableView]
     elements: Mapping[str, tuple[str, int]]
     settable: Mapping[str, VariableView]
+    graph: SystemGraph
 
 
 class MeshView(msgspec.Struct, frozen=True):
@@ -75,7 +78,7 @@ class MeshView(msgspec.Struct, frozen=True):
     instances: Mapping[str, InstanceStatus] = {}
     before: Mapping[str, InstanceStatus] = {}
     infos: Mapping[str, InstanceInfo] = {}
-    catalogue: Catalogue = Catalogue({}, {}, {})
+    catalogue: Catalogue = Catalogue({}, {}, {}, SystemGraph("", (), ()))
     ended: bool = False
     trouble: str | None = None
     run: int = 0
@@ -108,6 +111,8 @@ class MeshFollower:
         self._curves: OrderedDict[str, Curve] = OrderedDict()
         self._asked: dict[str, float] = {}
         self._log: deque[LogLine] = deque(maxlen=_LOG_LINES)
+        self._drawing = threading.Lock()
+        self._drawn: tuple[tuple[int, Mapping[str, InstanceStatus]], str] | None = None
         self._closing = threading.Event()
         self._wake = threading.Event()
         self._thread = threading.Thread(target=self._live, name=f"follow {key}", daemon=True)
@@ -117,6 +122,15 @@ class MeshFollower:
     def view(self) -> MeshView:
         """What is known now."""
         return self._view
+
+    def picture(self) -> str:
+        """The SVG of the graph with the state and the speed of each instance; pages share it."""
+        view = self._view
+        with self._drawing:
+            if self._drawn is None or self._drawn[0] != (view.run, view.instances):
+                graph = view.catalogue.graph.with_status(view.instances, view.before)
+                self._drawn = (view.run, view.instances), graph.svg()
+            return self._drawn[1]
 
     @property
     def log(self) -> list[LogLine]:
@@ -183,7 +197,7 @@ class MeshFollower:
         info = run.info()
         with run.until_end(self._wake.set) as ended:
             infos = {name: run.instance_info(name) for name in info.instances}
-            before, catalogue = self._view, _catalogue_of(infos)
+            before, catalogue = self._view, _catalogue_of(info.mesh, infos)
             with self._lock:
                 if before.info is None or before.info.run != info.run:
                     self._curves.clear()
@@ -357,7 +371,7 @@ def _feed(tail: ResultTail, curves: Mapping[str, Curve]) -> bool:
     return False
 
 
-def _catalogue_of(infos: Mapping[str, InstanceInfo]) -> Catalogue:
+def _catalogue_of(mesh: str, infos: Mapping[str, InstanceInfo]) -> Catalogue:
     variables = {f"{name}.{v.name}": v for name, info in infos.items() for v in info.variables}
     fed = {connection.target for info in infos.values() for connection in info.connections}
     elements = {
@@ -367,7 +381,7 @@ def _catalogue_of(infos: Mapping[str, InstanceInfo]) -> Catalogue:
         for number, element in enumerate(element_names(v.name, v.shape))
     }
     settable = {name: v for name, v in variables.items() if _may_be_set(name, v, fed)}
-    return Catalogue(variables, elements, settable)
+    return Catalogue(variables, elements, settable, graph_of_infos(mesh, [*infos.values()]))
 
 
 def _may_be_set(name: str, variable: VariableView, fed: set[str]) -> bool:
