@@ -98,7 +98,7 @@ class _Content:
             ui.label("fmu_mesh").classes("text-h6")
             self._choice = ui.select({}, value=None, label="mesh", on_change=self._clear).props("dense dark outlined")
             self._choice.classes("fm-mesh").style("min-width: 180px")
-            self._head = ui.row().classes("items-center col")
+            self._head = ui.row().classes("fm-line col")
         self._body = ui.column().classes("fm-content")
         with self._body:
             self._nothing = ui.label()
@@ -182,7 +182,7 @@ class _MeshPage:
     def build(self, head: Any, body: Any) -> None:  # noqa: ANN401  elements of NiceGUI
         """Make the elements, in the head and in the body of the page."""
         ui.run_javascript(f"fmuMeshPlots.show({json.dumps(self.key)}, {self.run})")
-        with head, ui.row().classes("items-center col self-center") as row:
+        with head, ui.row().classes("fm-line col") as row:
             self._parts.append(row)
             self._state = ui.badge("").classes("text-body2 fm-state")
             self._numbers = ui.label().classes("fm-numbers")
@@ -221,7 +221,7 @@ class _MeshPage:
         ui.button("Stop", icon="stop", color="negative", on_click=self._stop).props("dense unelevated")
 
     def _add_plots(self) -> None:
-        with ui.row().classes("items-center"):
+        with ui.row().classes("fm-line"):
             span = ui.select(_SPANS, value=0, label="time", on_change=lambda event: _show_span(event.value))
             span.props("dense outlined")
             ui.button("Add a plot", icon="add", on_click=self._add_plot).props("dense flat")
@@ -261,7 +261,10 @@ class _MeshPage:
 
     def _add_picture(self) -> None:
         with ui.card().classes("fm-card").props("flat bordered"):
-            ui.label("Connections").classes("fm-title")
+            with ui.row().classes("fm-line").style("width: 100%"):
+                ui.label("Connections").classes("fm-title")
+                ui.space()
+                ui.switch("full size", on_change=self._enlarge).props("dense")
             self._picture = ui.html("", sanitize=False).classes("fm-graph")  # our own SVG, in which names are escaped
 
     def _add_settings(self) -> None:
@@ -307,7 +310,8 @@ class _MeshPage:
         if not self._read_only:
             self._pausing.set_visibility(state != "paused")
             self._resuming.set_visibility(state == "paused")
-        rows = [_row(own, view.before.get(own.instance)) for own in view.instances.values()]
+        names = [name for name in view.infos if name in view.instances]
+        rows = [_row(view.instances[name], view.before.get(name)) for name in names]
         if rows != self._table.rows:
             self._table.update_rows(rows)
         self._show_log()
@@ -317,6 +321,9 @@ class _MeshPage:
             if line.number > self._last_line:
                 self._last_line = line.number
                 self._log.push(f"{line.instance} at point {line.point}: {line.status.lower()}: {line.message}")
+
+    def _enlarge(self, event: Any) -> None:  # noqa: ANN401  an event of NiceGUI
+        self._picture.classes(add="fm-full") if event.value else self._picture.classes(remove="fm-full")
 
     async def _draw_picture(self) -> None:
         picture = await run.io_bound(self._follower.picture)

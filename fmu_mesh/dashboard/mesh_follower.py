@@ -37,6 +37,8 @@ _ASKED_S: Final = 10.0
 """A value that is in no result file is asked for this long after the last page has shown it."""
 _LOG_LINES: Final = 500
 _PIECES: Final = 8
+_OLD_PIECES: Final = 2
+"""Of older rows fewer are read at once, so that new ones are not late."""
 _FAR_BEHIND: Final = 64 << 20
 """Bytes of a result file that the dashboard reads late; beyond it, it leaves rows out."""
 
@@ -338,7 +340,7 @@ class _ResultSource:
         if added and self._old is None and (old := ResultTail.open(self._new.path)) is not None:
             self._old, self._filling = old, added
             self._filled = {name: curve for name, curve in self._filled.items() if name in curves} | added
-        if self._old is not None and _feed(self._old, self._filling):
+        if self._old is not None and _feed(self._old, self._filling, _OLD_PIECES):
             self._old.close()
             self._old = None
 
@@ -359,9 +361,9 @@ class _ResultSource:
         self._filled = {}
 
 
-def _feed(tail: ResultTail, curves: Mapping[str, Curve]) -> bool:
+def _feed(tail: ResultTail, curves: Mapping[str, Curve], pieces: int = _PIECES) -> bool:
     """Add some rows to curves; True at the end of the file."""
-    for _ in range(_PIECES):
+    for _ in range(pieces):
         rows = tail.read(list(curves))
         if rows is None:
             return True
