@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import psutil
-import pytest
+from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
 
@@ -74,6 +74,7 @@ def _field(page: Browser, name: str, selector: str) -> Any:  # noqa: ANN401  an 
 def test_the_page_shows_the_run_from_its_start_and_asks_no_other_host(place: Place) -> None:
     config = write_config(place.folder, stop_time=3600.0, simulation=PACED)
     place.start("launch", config, "--no-progress")
+    place.run("wait", "pair")
     wait_until(lambda: _status(place, "pair")["point"] > 1000, "some points")
     dashboard = Dashboard(place)
 
@@ -105,9 +106,10 @@ def test_its_elements_steer_the_mesh_and_set_values(place: Place) -> None:
     with browser(place.folder) as page:
         _open(page, dashboard.url)
 
-        slider = _field(page, "drive.speed", "[role=slider]")
-        slider.send_keys(Keys.ARROW_RIGHT, Keys.ARROW_RIGHT)
-        wait_until(lambda: _value(place, "drive.speed") == pytest.approx(0.2), "the speed of the slider")
+        slider = _field(page, "drive.speed", ".q-slider")
+        right = ActionChains(page.driver).move_to_element_with_offset(slider, slider.size["width"] // 4, 0)
+        right.click().perform()
+        wait_until(lambda: 4.0 < _value(place, "drive.speed") < 6.0, "the speed of the slider")
         number = _field(page, "gain.k", "input")
         number.send_keys(Keys.CONTROL, "a")
         number.send_keys("2.5", Keys.ENTER)
