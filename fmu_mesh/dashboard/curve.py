@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["BUCKETS", "Curve", "CurveChange"]
+__all__ = ["BUCKETS", "BoundedCurve", "CurveChange"]
 
 BUCKETS: Final = 2048
 """Intervals of a curve. A screen has fewer columns of pixels than half of this."""
@@ -38,7 +38,7 @@ class CurveChange(msgspec.Struct, frozen=True, rename={"t_low": "tl", "t_high": 
     high: list[float]
 
 
-class Curve:
+class BoundedCurve:
     """The values of one variable from the start on, at most 2048 intervals of equal length.
 
     When the intervals do not reach far enough, each two of them become one. The order in which values come does not

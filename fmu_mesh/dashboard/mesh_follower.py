@@ -23,7 +23,7 @@ from ..api.system_graph import SystemGraph, graph_of_infos
 from ..errors import FmuMeshError, MeshLost
 from ..variables.value_types import element_names
 from ..wire.views import InstanceInfo, InstanceStatus, LogLine, MeshInfo, MeshStatus, VariableView
-from .curve import Curve, CurveChange
+from .curve import BoundedCurve, CurveChange
 from .result_tail import ResultTail
 
 __all__ = ["MOST_CURVES", "Catalogue", "CurveQuestion", "MeshFollower", "MeshView"]
@@ -110,7 +110,7 @@ class MeshFollower:
         self._lock = threading.Lock()
         self._view = MeshView(key)
         self._run: Run | None = None
-        self._curves: OrderedDict[str, Curve] = OrderedDict()
+        self._curves: OrderedDict[str, BoundedCurve] = OrderedDict()
         self._asked: dict[str, float] = {}
         self._log: deque[LogLine] = deque(maxlen=_LOG_LINES)
         self._drawing = threading.Lock()
@@ -152,7 +152,7 @@ class MeshFollower:
                     continue
                 curve = self._curves.get(name)
                 if curve is None:
-                    curve = self._curves[name] = Curve(view.info.start_time, view.info.step_size)
+                    curve = self._curves[name] = BoundedCurve(view.info.start_time, view.info.step_size)
                     self._wake.set()
                 self._curves.move_to_end(name)
                 self._asked[name] = now
@@ -267,7 +267,7 @@ class MeshFollower:
         finally:
             source.close()
 
-    def _held(self) -> dict[str, Curve]:
+    def _held(self) -> dict[str, BoundedCurve]:
         with self._lock:
             return dict(self._curves)
 
@@ -277,7 +277,7 @@ class MeshFollower:
             for name in self._curves:
                 info = self._view.info
                 assert info is not None  # it was there before there were samples
-                self._curves[name] = Curve(info.start_time, info.step_size)
+                self._curves[name] = BoundedCurve(info.start_time, info.step_size)
 
     def _ask_for_values(self, run: Run, in_file: Sequence[str]) -> None:
         """Ask for the values that are in no file and on a page."""
@@ -309,15 +309,15 @@ class _ResultSource:
         self._path = path
         self._new: ResultTail | None = None
         self._old: ResultTail | None = None
-        self._filling: dict[str, Curve] = {}
-        self._filled: dict[str, Curve] = {}
+        self._filling: dict[str, BoundedCurve] = {}
+        self._filled: dict[str, BoundedCurve] = {}
 
     @property
     def names(self) -> Sequence[str]:
         """The variables in the file."""
         return self._new.names if self._new is not None else ()
 
-    def read(self, held: Callable[[], Mapping[str, Curve]], forget: Callable[[], None]) -> None:
+    def read(self, held: Callable[[], Mapping[str, BoundedCurve]], forget: Callable[[], None]) -> None:
         """Read some megabytes, so that this returns soon.
 
         Args:
@@ -344,7 +344,7 @@ class _ResultSource:
             self._old.close()
             self._old = None
 
-    def read_all(self, held: Callable[[], Mapping[str, Curve]]) -> None:
+    def read_all(self, held: Callable[[], Mapping[str, BoundedCurve]]) -> None:
         """Read to the end of a file that nobody writes any more."""
         if self._new is not None:
             while not _feed(self._new, {n: c for n, c in held().items() if n in self._new.names}):
@@ -361,7 +361,7 @@ class _ResultSource:
         self._filled = {}
 
 
-def _feed(tail: ResultTail, curves: Mapping[str, Curve], pieces: int = _PIECES) -> bool:
+def _feed(tail: ResultTail, curves: Mapping[str, BoundedCurve], pieces: int = _PIECES) -> bool:
     """Add some rows to curves; True at the end of the file."""
     for _ in range(pieces):
         rows = tail.read(list(curves))

@@ -8,7 +8,7 @@ from __future__ import annotations
 import csv
 import io
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Final, Self
 
@@ -29,37 +29,38 @@ class ResultTail:
 
     Args:
         path: the file.
-        file: the open file.
+        file: the open file, read up to some byte of a row.
+        names: the columns without `time`.
+        waiting: what was read of that row.
 
     Attributes:
         path: the file.
         names: the columns without `time`.
     """
 
-    def __init__(self, path: Path, file: io.FileIO) -> None:
+    def __init__(self, path: Path, file: io.FileIO, names: Sequence[str], waiting: bytes) -> None:
         self.path = path
+        self.names = names
         self._file = file
-        self._waiting = b""
+        self._waiting = waiting
         self._cut = False  # the next byte may be in the middle of a row
-        self.names: Sequence[str] = ()
 
     @classmethod
     def open(cls, path: Path) -> Self | None:
         """Open a result file; None if there is none that this process can read."""
         try:
-            tail = cls(path, io.FileIO(path))
+            file = io.FileIO(path)
         except OSError:
             return None
-        heading, end, tail._waiting = tail._file.read(_PIECE).partition(b"\n")
+        heading, end, waiting = file.read(_PIECE).partition(b"\n")
         try:
             names = next(csv.reader([heading.decode()]), [])
         except (UnicodeDecodeError, csv.Error):
             names = []
         if not end or names[:1] != ["time"]:
-            tail.close()
+            file.close()
             return None
-        tail.names = names[1:]
-        return tail
+        return cls(path, file, names[1:], waiting)
 
     @property
     def replaced(self) -> bool:
@@ -115,8 +116,8 @@ def _table(data: bytes, at: Sequence[int], width: int) -> NDArray[np.float64]:
         return _texts([[cell.decode(errors="replace") for cell in row] for row in rows], at, 0)
 
 
-def _texts(rows: object, at: Sequence[int], width: int) -> NDArray[np.float64]:
-    whole = [row for row in rows if len(row) > max(at) and width in (0, len(row))]  # type: ignore[attr-defined]
+def _texts(rows: Iterable[Sequence[str]], at: Sequence[int], width: int) -> NDArray[np.float64]:
+    whole = [row for row in rows if len(row) > max(at) and width in (0, len(row))]
     return np.array([[_number(row[i].encode()) for row in whole] for i in at]).reshape(len(at), len(whole))
 
 

@@ -83,7 +83,7 @@ class SettingField:
             with ui.row().classes("no-wrap items-center").style("gap: 12px"):
                 self._slider = self._make_slider(value)
                 field.move(ui.context.slot.parent)
-                field.style("width: 96px")
+                field.style("width: 104px")
         return self._field(field, float if variable.type in _REALS else int)
 
     @property

@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fmu_mesh.dashboard.curve import BUCKETS, Curve, CurveChange
+from fmu_mesh.dashboard.curve import BUCKETS, BoundedCurve, CurveChange
 
 
 def _points(change: CurveChange) -> set[tuple[float, float]]:
@@ -22,7 +22,7 @@ def _apply(cells: dict[int, tuple[float, float, float, float]], change: CurveCha
 
 
 def test_a_short_history_has_every_value() -> None:
-    curve = Curve(0.0, 0.1)
+    curve = BoundedCurve(0.0, 0.1)
     times, values = np.arange(5, dtype=np.float64) * 0.1, np.array([1.0, 3.0, 2.0, -1.0, 0.0])
 
     curve.add(times, values)
@@ -31,7 +31,7 @@ def test_a_short_history_has_every_value() -> None:
 
 
 def test_a_long_history_has_the_smallest_and_the_largest_values_and_no_more_intervals() -> None:
-    curve = Curve(0.0, 1e-3)
+    curve = BoundedCurve(0.0, 1e-3)
     times = np.arange(1_000_000, dtype=np.float64) * 1e-3
     values = np.sin(times)
     values[123_456], values[654_321] = 7.0, -9.0
@@ -56,7 +56,7 @@ def test_a_page_that_takes_changes_has_what_a_new_page_gets(
 ) -> None:
     order = list(points)
     random.shuffle(order)  # type: ignore[attr-defined]  # a random.Random
-    curve, cells, version = Curve(0.0, 1.0), dict[int, tuple[float, float, float, float]](), 0
+    curve, cells, version = BoundedCurve(0.0, 1.0), dict[int, tuple[float, float, float, float]](), 0
 
     for part in range(parts):
         some = order[part::parts]
@@ -74,7 +74,7 @@ def test_a_page_that_takes_changes_has_what_a_new_page_gets(
 
 
 def test_values_that_are_not_finite_are_left_out() -> None:
-    curve = Curve(0.0, 1.0)
+    curve = BoundedCurve(0.0, 1.0)
 
     curve.add(np.array([0.0, 1.0, 2.0]), np.array([np.nan, np.inf, 5.0]))
 
@@ -82,7 +82,7 @@ def test_values_that_are_not_finite_are_left_out() -> None:
 
 
 def test_nothing_is_sent_twice() -> None:
-    curve = Curve(0.0, 1.0)
+    curve = BoundedCurve(0.0, 1.0)
     curve.add(np.array([0.0]), np.array([1.0]))
 
     change = curve.since(curve.since(0).version)
@@ -92,7 +92,7 @@ def test_nothing_is_sent_twice() -> None:
 
 
 def test_a_page_with_a_version_of_another_curve_gets_all() -> None:
-    curve = Curve(0.0, 1.0)
+    curve = BoundedCurve(0.0, 1.0)
     curve.add(np.array([0.0]), np.array([1.0]))
 
     assert curve.since(99).whole
