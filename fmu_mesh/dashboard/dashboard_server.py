@@ -28,8 +28,10 @@ __all__ = ["DashboardOptions", "serve"]
 
 STATIC: Final = Path(__file__).parent / "static"
 _QUESTION_BYTES: Final = 64 << 10
-_HISTORY: Final = 20
+_HISTORY: Final = 100
 """Messages that the server keeps for a page whose connection breaks; a page that misses more loads itself again."""
+_PATIENCE_S: Final = 30.0
+"""A page that does not answer for this long is forgotten, and loads itself again; a busy browser needs some time."""
 _CLOSING_S: Final = 1
 
 
@@ -107,6 +109,7 @@ def _serve(
         dark=None,
         tailwind=False,
         message_history_length=_HISTORY,
+        reconnect_timeout=_PATIENCE_S,
         show_welcome_message=False,
     )
     port = listener.getsockname()[1]

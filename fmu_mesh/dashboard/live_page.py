@@ -18,6 +18,8 @@ from .mesh_page import MeshPage
 __all__ = ["LivePage"]
 
 _LOOK_S: Final = 0.25
+_BUSY_S: Final = 60.0
+"""On a busy machine, a page may take this long to be made."""
 
 
 class LivePage:
@@ -34,7 +36,7 @@ class LivePage:
 
     def register(self) -> None:
         """Let NiceGUI serve it."""
-        ui.page("/")(self._open)
+        ui.page("/", response_timeout=_BUSY_S)(self._open)
 
     async def _open(self, request: Request) -> None:
         """A browser opens the page: `?mesh=KEY&curve=0:instance.variable` says what it shows."""

@@ -21,7 +21,10 @@ from .setting_fields import SettingField
 
 __all__ = ["MeshPage"]
 
+_TABLE_S: Final = 1.0
 _PICTURE_S: Final = 1.0
+_INSTANCE_S: Final = 0.05
+"""A picture of 64 instances takes a browser a tenth of a second or more, so it gets one every 3 s."""
 _VALUES_S: Final = 2.0
 _FIELDS: Final = 8
 _SPANS: Final = {0: "from the start", 1: "last 1 s", 10: "last 10 s", 60: "last 60 s", 600: "last 600 s"}
@@ -86,7 +89,8 @@ class MeshPage:
                     self._add_settings()
                 self._add_picture()
                 self._add_log()
-        self._parts.append(ui.timer(_PICTURE_S, self._draw_picture))
+        self._parts.append(ui.timer(_TABLE_S, self._show_table))
+        self._parts.append(ui.timer(max(_PICTURE_S, _INSTANCE_S * len(self._view.infos)), self._draw_picture))
         if not self._read_only:
             self._parts.append(ui.timer(_VALUES_S, self._read_values))
 
@@ -191,8 +195,10 @@ class MeshPage:
         if not self._read_only:
             self._pausing.set_visibility(state != "paused")
             self._resuming.set_visibility(state == "paused")
-        self._table.show(view)
         self._show_log()
+
+    def _show_table(self) -> None:
+        self._table.show(self._view)
 
     def _show_log(self) -> None:
         for line in self._follower.log:
