@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 __all__ = ["BUCKETS", "BoundedCurve", "CurveChange"]
 
-BUCKETS: Final = 2048
-"""Intervals of a curve. A screen has fewer columns of pixels than half of this."""
+BUCKETS: Final = 1024
+"""Intervals of a curve. A plot on a page has about as many columns of pixels."""
 
 
 class CurveChange(msgspec.Struct, frozen=True, rename={"t_low": "tl", "t_high": "th", "low": "l", "high": "h"}):
@@ -39,10 +39,10 @@ class CurveChange(msgspec.Struct, frozen=True, rename={"t_low": "tl", "t_high": 
 
 
 class BoundedCurve:
-    """The values of one variable from the start on, at most 2048 intervals of equal length.
+    """The values of one variable from the start on, at most 1024 intervals of equal length.
 
     When the intervals do not reach far enough, each two of them become one. The order in which values come does not
-    matter, so older ones can be added while new ones come. Memory: 80 kB, however long the run is. All methods may be
+    matter, so older ones can be added while new ones come. Memory: 40 kB, however long the run is. All methods may be
     called from any thread.
 
     Args:

@@ -102,7 +102,7 @@ def _options(catalogue: Catalogue, names: Sequence[str]) -> dict[str, Any]:
                 "name": f"{name} in {v.unit}" if v.unit and unit is None else name,
                 "showSymbol": False,
                 "step": "end" if _holds(v) else False,
-                "lineStyle": {"width": 1.5},
+                "lineStyle": {"width": 1, "join": "bevel"},
                 "data": [],
             }
             for name, v in zip(names, variables, strict=True)

@@ -83,7 +83,9 @@ window.fmuMeshPlots = (() => {
   function draw(changed) {
     for (const [id, one] of plots) {
       const chart = getElement(id)?.chart;
-      if (!chart || (one.drawn && !one.names.some((name) => changed.has(name)))) continue;
+      if (!chart) continue;
+      if (one.names.some((name) => changed.has(name))) one.drawn = false;
+      if (one.drawn || !isOnScreen(chart.getDom())) continue;
       const series = one.names.map((name) => ({ data: curves.get(name)?.cells.flat() ?? [] }));
       const ends = series.filter((own) => own.data.length).map((own) => own.data[own.data.length - 1][0]);
       const last = Math.max(...ends);
@@ -93,6 +95,11 @@ window.fmuMeshPlots = (() => {
       one.drawn = true;
       window.fmuMeshPlots.pictures += 1;
     }
+  }
+
+  function isOnScreen(element) {
+    const place = element.getBoundingClientRect();
+    return place.bottom > 0 && place.top < window.innerHeight;
   }
 
   return { show, plot, span, drop, pictures: 0, curves };
