@@ -24,12 +24,14 @@ __all__ = [
     "count",
     "endpoint",
     "number",
+    "port_number",
     "positive_seconds",
     "tolerance",
     "whole",
 ]
 
 _TIMEOUT_S = 5.0
+_LAST_PORT = 65535
 
 _NEGATIVE = re.compile(r"-(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?$|-\.?(?:inf|Inf|INF)$")
 
@@ -145,6 +147,13 @@ def count(text: str) -> int:
     if value < 1:
         raise argparse.ArgumentTypeError(f"'{text}' is not a whole number of 1 or more")
     return value
+
+
+def port_number(text: str) -> int:
+    """A TCP port, or 0 for a free one."""
+    if not (text.isdecimal() and int(text) <= _LAST_PORT):
+        raise argparse.ArgumentTypeError(f"'{text}' is no port: expected 0 to {_LAST_PORT}")
+    return int(text)
 
 
 def endpoint(text: str) -> str:

@@ -37,6 +37,7 @@ COMMANDS: Final[Mapping[str, tuple[str, str]]] = {
     "ls": ("looking", "list meshes, instances and variables"),
     "status": ("looking", "show the state and progress of a mesh or an instance"),
     "top": ("top", "show a live table of all instances of a mesh"),
+    "dashboard": ("dashboard", "show and steer running meshes on a page in a browser"),
     "foxglove": ("foxglove_command", "show a mesh live in Foxglove"),
     "info": ("looking", "show information about a mesh or an instance"),
     "get": ("looking", "show current values"),

@@ -321,6 +321,9 @@ def instance_info(plan: NodePlan, runner: Runner) -> InstanceInfo:
                 start_values.get(v.name, to_plain(v.start) if v.start is not None else None),
                 v.description,
                 v.shape,
+                v.minimum,
+                v.maximum,
+                v.items,
             )
             for v in description.variables
             if (kind := kind_of(v)) is not None

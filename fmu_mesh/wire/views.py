@@ -33,7 +33,14 @@ GOING_ON: frozenset[MeshState] = frozenset(("starting", "initializing", "running
 
 
 class VariableView(msgspec.Struct, frozen=True, omit_defaults=True):
-    """One variable in `info`; ``key`` is the key of its value, ``shape`` the sizes of an array's dimensions."""
+    """One variable in `info`.
+
+    Attributes:
+        key: the key of its value, below that of the instance.
+        shape: the sizes of an array's dimensions.
+        minimum: the smallest value that its model description allows; None without one. So is ``maximum``.
+        items: item names and values of an Enumeration.
+    """
 
     name: str
     key: str
@@ -44,6 +51,9 @@ class VariableView(msgspec.Struct, frozen=True, omit_defaults=True):
     start: PlainValue | None = None
     description: str | None = None
     shape: tuple[int, ...] = ()
+    minimum: float | None = None
+    maximum: float | None = None
+    items: tuple[tuple[str, int], ...] = ()
 
 
 class ConnectionView(msgspec.Struct, frozen=True):

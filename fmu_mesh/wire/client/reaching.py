@@ -82,6 +82,11 @@ class Meshes:
         self._found = [*(self._shown() if self._endpoints else self._noted())]
         self._found.sort(key=lambda found: found.keys.mesh)
 
+    @property
+    def roots(self) -> list[str]:
+        """The keys of the meshes that were found by the last look, whether they answer or not."""
+        return [found.keys.root for found in self._found]
+
     @contextmanager
     def changes(self) -> Iterator[Callable[[float], None]]:
         """Within the context: a function that waits until the meshes may have changed, for at most some seconds."""

@@ -1,0 +1,402 @@
+"""Follows one mesh on threads of its own, and keeps what pages show of it.
+
+Owns the handle of the mesh, the history of chosen variables, and the log. Pages ask it as often as they like: an answer
+is made of what is there, and never waits for the mesh.
+"""
+
+from __future__ import annotations
+
+import socket
+import threading
+import time
+from collections import OrderedDict, deque
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import msgspec
+import numpy as np
+
+from ..api.attaching import attach
+from ..api.run_handle import Run
+from ..api.system_graph import SystemGraph, graph_of_infos
+from ..errors import FmuMeshError, MeshLost
+from ..variables.value_types import element_names
+from ..wire.views import InstanceInfo, InstanceStatus, LogLine, MeshInfo, MeshStatus, VariableView
+from .curve import BoundedCurve, CurveChange
+from .result_tail import ResultTail
+
+__all__ = ["MOST_CURVES", "Catalogue", "CurveQuestion", "MeshFollower", "MeshView"]
+
+MOST_CURVES: Final = 64
+"""Variables whose history is kept for one mesh; beyond it, that of the one that no page has asked for longest goes."""
+_LOOK_S: Final = 0.25
+_SAMPLE_S: Final = 0.05
+_AGAIN_S: Final = 1.0
+_ASKED_S: Final = 10.0
+"""A value that is in no result file is asked for this long after the last page has shown it."""
+_LOG_LINES: Final = 500
+_PIECES: Final = 8
+_OLD_PIECES: Final = 2
+"""Of older rows fewer are read at once, so that new ones are not late."""
+_FAR_BEHIND: Final = 64 << 20
+"""Bytes of a result file that the dashboard reads late; beyond it, it leaves rows out."""
+
+
+class Catalogue(NamedTuple):
+    """The variables of a mesh.
+
+    Attributes:
+        variables: all of them by `instance.variable`.
+        elements: what can be drawn: of each number and each element of an array its variable, and which element it is.
+        settable: the unconnected inputs and the tunable parameters.
+        graph: instances and connections, without their state.
+    """
+
+    variables: Mapping[str, VariableView]
+    elements: Mapping[str, tuple[str, int]]
+    settable: Mapping[str, VariableView]
+    graph: SystemGraph
+
+
+class MeshView(msgspec.Struct, frozen=True):
+    """What is known of a mesh at one moment.
+
+    Attributes:
+        key: its key, by which it is known here.
+        info: None before it was reached.
+        status: the newest one; after the end the last one.
+        instances: the newest statuses by instance.
+        before: those of the look before, for rates.
+        infos: what the instances are, in the order of the mesh.
+        ended: whether it runs no more.
+        trouble: why it is not reached.
+        run: counts the runs of a mesh of this name that were seen.
+    """
+
+    key: str
+    info: MeshInfo | None = None
+    status: MeshStatus | None = None
+    instances: Mapping[str, InstanceStatus] = {}
+    before: Mapping[str, InstanceStatus] = {}
+    infos: Mapping[str, InstanceInfo] = {}
+    catalogue: Catalogue = Catalogue({}, {}, {}, SystemGraph("", (), ()))
+    ended: bool = False
+    trouble: str | None = None
+    run: int = 0
+
+
+class CurveQuestion(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What a page asks: of each variable the version that it has drawn; ``run`` is that of its `MeshView`."""
+
+    mesh: str
+    run: int
+    curves: dict[str, int]
+
+
+class MeshFollower:
+    """Follows a mesh, also through its end and its next run, until it is closed.
+
+    Args:
+        key: name or key of the mesh.
+        connect: Zenoh endpoints, as those of `attach`.
+        timeout: deadline of every question in s.
+    """
+
+    def __init__(self, key: str, connect: Sequence[str], timeout: float) -> None:
+        self._key = key
+        self._connect = tuple(connect)
+        self._timeout = timeout
+        self._lock = threading.Lock()
+        self._view = MeshView(key)
+        self._run: Run | None = None
+        self._curves: OrderedDict[str, BoundedCurve] = OrderedDict()
+        self._asked: dict[str, float] = {}
+        self._log: deque[LogLine] = deque(maxlen=_LOG_LINES)
+        self._drawing = threading.Lock()
+        self._drawn: tuple[tuple[int, Mapping[str, InstanceStatus]], str] | None = None
+        self._closing = threading.Event()
+        self._wake = threading.Event()
+        self._thread = threading.Thread(target=self._live, name=f"follow {key}", daemon=True)
+        self._thread.start()
+
+    @property
+    def view(self) -> MeshView:
+        """What is known now."""
+        return self._view
+
+    def picture(self) -> str:
+        """The SVG of the graph with the state and the speed of each instance; pages share it."""
+        view = self._view
+        with self._drawing:
+            if self._drawn is None or self._drawn[0] != (view.run, view.instances):
+                graph = view.catalogue.graph.with_status(view.instances, view.before)
+                self._drawn = (view.run, view.instances), graph.svg()
+            return self._drawn[1]
+
+    @property
+    def log(self) -> list[LogLine]:
+        """The newest 500 log messages, the oldest first."""
+        with self._lock:
+            return list(self._log)
+
+    def changes(self, question: CurveQuestion) -> dict[str, CurveChange]:
+        """What has changed in curves since a page has drawn them; from now on they are kept."""
+        view, now = self._view, time.monotonic()
+        if view.info is None:
+            return {}
+        known, answer = view.catalogue.elements, {}
+        with self._lock:
+            for name, version in list(question.curves.items())[:MOST_CURVES]:
+                if name not in known:
+                    continue
+                curve = self._curves.get(name)
+                if curve is None:
+                    curve = self._curves[name] = BoundedCurve(view.info.start_time, view.info.step_size)
+                    self._wake.set()
+                self._curves.move_to_end(name)
+                self._asked[name] = now
+                change = curve.since(version if question.run == view.run else 0)
+                if change.at or change.whole:
+                    answer[name] = change
+            while len(self._curves) > MOST_CURVES:
+                oldest, _ = self._curves.popitem(last=False)
+                self._asked.pop(oldest, None)
+        return answer
+
+    def ask(self, question: Callable[[Run], object]) -> object:
+        """Ask the mesh itself, such as for a value, or to set one; waits for the answer.
+
+        Raises:
+            FmuMeshError: it refuses, does not answer in time, or does not run.
+        """
+        run = self._run
+        if run is None:
+            raise MeshLost(f"mesh '{self._key}' does not run")
+        return question(run)
+
+    def close(self) -> None:
+        """End the threads and let go of the mesh."""
+        self._closing.set()
+        self._wake.set()
+        self._thread.join()
+
+    # --- on the thread of the mesh
+
+    def _live(self) -> None:
+        while not self._closing.is_set():
+            try:
+                with attach(self._key, connect=self._connect, timeout=self._timeout) as run:
+                    self._follow(run)
+            except FmuMeshError as error:
+                ended = self._view.ended or self._view.info is not None
+                self._change(trouble=None if ended else str(error), ended=ended)
+            finally:
+                self._run = None
+            self._closing.wait(_AGAIN_S)
+
+    def _follow(self, run: Run) -> None:
+        info = run.info()
+        with run.until_end(self._wake.set) as ended:
+            infos = {name: run.instance_info(name) for name in info.instances}
+            before, catalogue = self._view, _catalogue_of(info.mesh, infos)
+            with self._lock:
+                if before.info is None or before.info.run != info.run:
+                    self._curves.clear()
+                    self._log.clear()
+                    before = MeshView(self._key, run=before.run + 1)
+                self._view = msgspec.structs.replace(
+                    before, info=info, infos=infos, catalogue=catalogue, ended=False, trouble=None
+                )
+            self._run = run
+            sampler = threading.Thread(target=self._sample, args=(run, info, ended), name="sample", daemon=True)
+            logger = threading.Thread(target=self._read_log, args=(run,), name="log", daemon=True)
+            for thread in (sampler, logger):
+                thread.start()
+            try:
+                while not (ended.is_set() or self._closing.is_set()):
+                    self._look(run)
+                    ended.wait(_LOOK_S)
+            finally:
+                if not self._closing.is_set():
+                    self._change(ended=True)
+                self._run = None
+                sampler.join()
+        # The thread of the log ends with the mesh, or with the session that `attach` closes.
+
+    def _look(self, run: Run) -> None:
+        try:
+            status, instances = run.all_status()
+        except FmuMeshError as error:
+            self._change(trouble=str(error))
+            return
+        before = self._view
+        # Rates are those of about a second: in a shorter time an instance may take no step at all.
+        old = before.instances if _is_a_second(before.before, before.instances) else before.before
+        self._change(status=status, instances=instances, before=old, trouble=None)
+
+    def _change(self, **fields: object) -> None:
+        with self._lock:
+            self._view = msgspec.structs.replace(self._view, **fields)
+
+    def _read_log(self, run: Run) -> None:
+        try:
+            for line in run.logs(follow=True):
+                with self._lock:
+                    self._log.append(line)
+                if self._closing.is_set():
+                    return
+        except FmuMeshError:
+            return  # it has ended
+
+    # --- on the thread of the samples
+
+    def _sample(self, run: Run, info: MeshInfo, ended: threading.Event) -> None:
+        path = Path(info.result_file) if info.result_file is not None and info.host == socket.gethostname() else None
+        source = _ResultSource(path if path is not None and path.suffix == ".csv" else None)
+        try:
+            while not self._closing.is_set():
+                last = ended.is_set()
+                source.read(self._held, self._forget)
+                if last:
+                    source.read_all(self._held)
+                    return
+                self._ask_for_values(run, source.names)
+                self._wake.wait(_SAMPLE_S)
+                self._wake.clear()
+        finally:
+            source.close()
+
+    def _held(self) -> dict[str, BoundedCurve]:
+        with self._lock:
+            return dict(self._curves)
+
+    def _forget(self) -> None:
+        """The file has been replaced: what was read is of another run."""
+        with self._lock:
+            for name in self._curves:
+                info = self._view.info
+                assert info is not None  # it was there before there were samples
+                self._curves[name] = BoundedCurve(info.start_time, info.step_size)
+
+    def _ask_for_values(self, run: Run, in_file: Sequence[str]) -> None:
+        """Ask for the values that are in no file and on a page."""
+        now = time.monotonic()
+        with self._lock:
+            names = [n for n in self._curves if n not in in_file and now - self._asked.get(n, 0.0) < _ASKED_S]
+        for name in names:
+            try:
+                variable, number = self._view.catalogue.elements[name]
+                sample = run.samples(variable)[0]
+                value = float(np.asarray(sample.value, float).reshape(-1)[number])
+            except (FmuMeshError, ValueError, TypeError, LookupError):
+                continue  # it has ended, or the value is no number
+            with self._lock:
+                if (curve := self._curves.get(name)) is not None:
+                    curve.add(np.array([sample.time]), np.array([value]))
+            if self._closing.is_set():
+                return
+
+
+class _ResultSource:
+    """Feeds curves from a result file: new rows as they come, and for a new curve the older ones, piece by piece.
+
+    Args:
+        path: the file; None: there is none that can be read here.
+    """
+
+    def __init__(self, path: Path | None) -> None:
+        self._path = path
+        self._new: ResultTail | None = None
+        self._old: ResultTail | None = None
+        self._filling: dict[str, BoundedCurve] = {}
+        self._filled: dict[str, BoundedCurve] = {}
+
+    @property
+    def names(self) -> Sequence[str]:
+        """The variables in the file."""
+        return self._new.names if self._new is not None else ()
+
+    def read(self, held: Callable[[], Mapping[str, BoundedCurve]], forget: Callable[[], None]) -> None:
+        """Read some megabytes, so that this returns soon.
+
+        Args:
+            held: gives the curves.
+            forget: called when the file is another one than before.
+        """
+        if self._new is not None and self._new.replaced:
+            self.close()
+            forget()
+        if self._new is None:
+            if self._path is None or (new := ResultTail.open(self._path)) is None:
+                return
+            self._new = new
+            new.skip()
+        curves = {name: curve for name, curve in held().items() if name in self._new.names}
+        if self._new.behind > _FAR_BEHIND or not curves:
+            self._new.skip()
+        _feed(self._new, curves)
+        added = {name: curve for name, curve in curves.items() if self._filled.get(name) is not curve}
+        if added and self._old is None and (old := ResultTail.open(self._new.path)) is not None:
+            self._old, self._filling = old, added
+            self._filled = {name: curve for name, curve in self._filled.items() if name in curves} | added
+        if self._old is not None and _feed(self._old, self._filling, _OLD_PIECES):
+            self._old.close()
+            self._old = None
+
+    def read_all(self, held: Callable[[], Mapping[str, BoundedCurve]]) -> None:
+        """Read to the end of a file that nobody writes any more."""
+        if self._new is not None:
+            while not _feed(self._new, {n: c for n, c in held().items() if n in self._new.names}):
+                pass
+        while self._old is not None and not _feed(self._old, self._filling):
+            pass
+
+    def close(self) -> None:
+        """Close the files."""
+        for tail in (self._new, self._old):
+            if tail is not None:
+                tail.close()
+        self._new = self._old = None
+        self._filled = {}
+
+
+def _feed(tail: ResultTail, curves: Mapping[str, BoundedCurve], pieces: int = _PIECES) -> bool:
+    """Add some rows to curves; True at the end of the file."""
+    for _ in range(pieces):
+        rows = tail.read(list(curves))
+        if rows is None:
+            return True
+        times, values = rows
+        for curve, column in zip(curves.values(), values, strict=True):
+            curve.add(times, column)
+    return False
+
+
+def _catalogue_of(mesh: str, infos: Mapping[str, InstanceInfo]) -> Catalogue:
+    variables = {f"{name}.{v.name}": v for name, info in infos.items() for v in info.variables}
+    fed = {connection.target for info in infos.values() for connection in info.connections}
+    elements = {
+        f"{name.partition('.')[0]}.{element}": (name, number)
+        for name, v in variables.items()
+        if v.type not in ("String", "Binary")
+        for number, element in enumerate(element_names(v.name, v.shape))
+    }
+    settable = {name: v for name, v in variables.items() if _may_be_set(name, v, fed)}
+    return Catalogue(variables, elements, settable, graph_of_infos(mesh, [*infos.values()]))
+
+
+def _may_be_set(name: str, variable: VariableView, fed: set[str]) -> bool:
+    if variable.causality == "input":
+        elements = element_names(name, variable.shape)
+        return name not in fed and not any(element in fed for element in elements)
+    return variable.causality in ("parameter", "calculatedParameter") and variable.variability == "tunable"
+
+
+def _is_a_second(old: Mapping[str, InstanceStatus], new: Mapping[str, InstanceStatus]) -> bool:
+    """Whether the newest of two looks is a second later."""
+    return not old or any(
+        own.running_time - old[name].running_time >= 1.0 or own.running_time < old[name].running_time
+        for name, own in new.items()
+        if name in old
+    )

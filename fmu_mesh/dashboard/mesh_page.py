@@ -1,0 +1,282 @@
+"""What a page shows of one run of a mesh, and what happens when somebody uses it.
+
+The page asks the follower four times a second, on the event loop; what waits for a mesh is done on another thread.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any, Final
+
+from nicegui import run, ui
+
+from ..api.run_handle import Run
+from ..errors import FmuMeshError
+from .instance_table import InstanceTable
+from .mesh_follower import MeshFollower, MeshView
+from .plot_card import PlotCard, first_plots
+from .setting_fields import SettingField
+
+__all__ = ["MeshPage"]
+
+_TABLE_S: Final = 1.0
+_PICTURE_S: Final = 1.0
+_INSTANCE_S: Final = 0.05
+"""A picture of 64 instances takes a browser a tenth of a second or more, so it gets one every 3 s."""
+_VALUES_S: Final = 2.0
+_FIELDS: Final = 8
+_SPANS: Final = {0: "from the start", 1: "last 1 s", 10: "last 10 s", 60: "last 60 s", 600: "last 600 s"}
+_STATES: Final = {"running": "positive", "paused": "warning", "failed": "negative"}
+
+
+class MeshPage:
+    """One run of a mesh on one page.
+
+    Args:
+        follower: of the mesh.
+        view: what is known of it.
+        plots: the curves of each plot; empty: the first outputs, by unit.
+        read_only: whether nothing can be set or steered.
+    """
+
+    def __init__(self, follower: MeshFollower, view: MeshView, plots: list[list[str]], *, read_only: bool) -> None:
+        self.key = view.key
+        self.run = view.run
+        self._follower = follower
+        self._view = view
+        self._read_only = read_only
+        known = [[name for name in names if name in view.catalogue.elements] for names in plots]
+        self._plots = [
+            self._plot(names) for names in [names for names in known if names] or first_plots(view.catalogue)
+        ]
+        self._fields: dict[str, SettingField] = {}
+        self._last_line = 0
+        self._parts: list[Any] = []
+
+    @property
+    def plots(self) -> list[list[str]]:
+        """The curves of each plot."""
+        return [plot.names for plot in self._plots]
+
+    def remove(self) -> None:
+        """Take it from the page."""
+        for part in self._parts:
+            part.delete()
+
+    # --- its elements
+
+    def build(self, head: Any, body: Any) -> None:  # noqa: ANN401  elements of NiceGUI
+        """Make the elements, in the head and in the body of the page."""
+        ui.run_javascript(f"fmuMeshPlots.show({json.dumps(self.key)}, {self.run})")
+        with head, ui.row().classes("fm-line col") as row:
+            self._parts.append(row)
+            self._state = ui.badge("").classes("text-body2 fm-state")
+            self._numbers = ui.label().classes("fm-numbers")
+            ui.space()
+            if self._read_only:
+                ui.badge("read only", color="grey").classes("text-body2")
+            else:
+                self._add_buttons()
+        with body, ui.element("div").classes("fm-columns") as columns:
+            self._parts.append(columns)
+            with ui.element("div").classes("fm-column"):
+                self._add_plots()
+                self._add_instances()
+            with ui.element("div").classes("fm-column"):
+                if not self._read_only:
+                    self._add_settings()
+                self._add_picture()
+                self._add_log()
+        self._parts.append(ui.timer(_TABLE_S, self._show_table))
+        self._parts.append(ui.timer(max(_PICTURE_S, _INSTANCE_S * len(self._view.infos)), self._draw_picture))
+        if not self._read_only:
+            self._parts.append(ui.timer(_VALUES_S, self._read_values))
+
+    def _add_buttons(self) -> None:
+        self._pausing = ui.button("Pause", icon="pause", on_click=self._pause).props("dense unelevated color=secondary")
+        self._resuming = ui.button("Resume", icon="play_arrow", on_click=self._resume)
+        self._resuming.props("dense unelevated color=secondary")
+        self._points = ui.number(value=1, min=1, precision=0, label="points").props("dense dark outlined")
+        self._points.style("width: 90px")
+        ui.button("Step", icon="skip_next", on_click=self._step).props("dense unelevated color=secondary")
+        with ui.dialog() as dialog, ui.card():
+            ui.label(f"Stop the run of '{self.key}'? Its result file keeps what was recorded.")
+            with ui.row():
+                ui.button("Stop the run", color="negative", on_click=lambda: dialog.submit(True))  # noqa: FBT003  its value
+                ui.button("Cancel", on_click=lambda: dialog.submit(False)).props("flat")  # noqa: FBT003  its value
+        self._dialog = dialog
+        ui.button("Stop", icon="stop", color="negative", on_click=self._stop).props("dense unelevated")
+
+    def _add_plots(self) -> None:
+        with ui.row().classes("fm-line"):
+            span = ui.select(_SPANS, value=0, label="time", on_change=lambda event: _show_span(event.value))
+            span.props("dense outlined")
+            ui.button("Add a plot", icon="add", on_click=self._add_plot).props("dense flat")
+        self._charts = ui.element("div").classes("fm-column")
+        with self._charts:
+            for plot in self._plots:
+                plot.build()
+        self._remember()
+
+    def _add_plot(self) -> None:
+        plot = self._plot([])
+        self._plots.append(plot)
+        with self._charts:
+            plot.build()
+
+    def _plot(self, names: list[str]) -> PlotCard:
+        return PlotCard(self._view.catalogue, names, self._remember, self._drop_plot)
+
+    def _drop_plot(self, plot: PlotCard) -> None:
+        self._plots.remove(plot)
+        self._remember()
+
+    def _remember(self) -> None:
+        """Put the curves into the address of the page, so that it shows them again when it is loaded."""
+        curves = [f"{number}:{name}" for number, plot in enumerate(self._plots) for name in plot.names]
+        query = json.dumps([["mesh", self.key], *(["curve", curve] for curve in curves)])
+        ui.run_javascript(f"history.replaceState(null, '', '/?' + new URLSearchParams({query}))")
+
+    def _add_instances(self) -> None:
+        with ui.card().classes("fm-card").props("flat bordered"):
+            ui.label("Instances").classes("fm-title")
+            self._table = InstanceTable()
+
+    def _add_picture(self) -> None:
+        with ui.card().classes("fm-card").props("flat bordered"):
+            with ui.row().classes("fm-line").style("width: 100%"):
+                ui.label("Connections").classes("fm-title")
+                ui.space()
+                ui.switch("full size", on_change=self._enlarge).props("dense")
+            self._picture = ui.html("", sanitize=False).classes("fm-graph")  # our own SVG, in which names are escaped
+
+    def _add_settings(self) -> None:
+        settable = self._view.catalogue.settable
+        with ui.card().classes("fm-card").props("flat bordered"):
+            ui.label("Values to set").classes("fm-title")
+            if not settable:
+                ui.label("This mesh has no unconnected input and no tunable parameter.")
+                return
+            first = [name for name, v in settable.items() if not v.shape][:_FIELDS] or [*settable][:_FIELDS]
+            if len(settable) > len(first):
+                choice = ui.select([*settable], value=first, multiple=True, label="variables", with_input=True)
+                choice.props("dense outlined use-chips").style("width: 100%").on_value_change(self._choose_fields)
+            self._settings = ui.element("div").classes("fm-column").style("gap: 4px")
+            self._show_fields(first)
+
+    def _add_log(self) -> None:
+        with ui.card().classes("fm-card").props("flat bordered"):
+            ui.label("Log").classes("fm-title")
+            self._log = ui.log(max_lines=500).classes("fm-log")
+
+    # --- what it shows
+
+    def look(self, view: MeshView) -> None:
+        """Show what is known now."""
+        self._view = view
+        status = view.status
+        assert status is not None  # otherwise there is no page yet
+        state = "ended" if view.ended and status.state not in ("done", "failed") else status.state
+        self._state.set_text(state)
+        self._state.props(f"color={_STATES.get(state, 'grey')}")
+        last = f"/{status.last_point}" if view.info is not None and view.info.stop_time is not None else ""
+        parts = [
+            f"t = {status.time:.6g} s",
+            f"point {status.point}{last}",
+            f"{status.points_per_second:.0f} points/s",
+            f"real-time factor {status.real_time_factor:.3g}",
+            *([f"{status.overruns} overruns"] if status.overruns else []),
+            *([status.error.message] if status.error is not None else []),
+            *([view.trouble] if view.trouble is not None else []),
+        ]
+        self._numbers.set_text(" · ".join(parts))
+        if not self._read_only:
+            self._pausing.set_visibility(state != "paused")
+            self._resuming.set_visibility(state == "paused")
+        self._show_log()
+
+    def _show_table(self) -> None:
+        self._table.show(self._view)
+
+    def _show_log(self) -> None:
+        for line in self._follower.log:
+            if line.number > self._last_line:
+                self._last_line = line.number
+                self._log.push(f"{line.instance} at point {line.point}: {line.status.lower()}: {line.message}")
+
+    def _enlarge(self, event: Any) -> None:  # noqa: ANN401  an event of NiceGUI
+        self._picture.classes(add="fm-full") if event.value else self._picture.classes(remove="fm-full")
+
+    async def _draw_picture(self) -> None:
+        picture = await run.io_bound(self._follower.picture)
+        if picture is not None and picture != self._picture.content:
+            self._picture.set_content(picture)
+
+    # --- what it does
+
+    def _choose_fields(self, event: Any) -> None:  # noqa: ANN401  an event of NiceGUI
+        self._show_fields(event.value or [])
+
+    def _show_fields(self, names: Sequence[str]) -> None:
+        settable = self._view.catalogue.settable
+        self._fields = {}
+        self._settings.clear()
+        with self._settings:
+            for name in names:
+                self._fields[name] = SettingField(name, settable[name], self._set)
+
+    async def _read_values(self) -> None:
+        fields = dict(self._fields)
+        if self._view.ended or not fields:
+            return
+        values = await run.io_bound(_values, self._follower, [*fields])
+        for name, value in (values or {}).items():
+            fields[name].show(value)
+
+    async def _set(self, name: str, value: object) -> None:
+        answer = await self._act(lambda mesh: mesh.set(name, value))
+        if answer is not None and (field := self._fields.get(name)) is not None:
+            field.say(f"from t = {answer.time:.6g} s")
+
+    async def _pause(self) -> None:
+        await self._act(Run.pause)
+
+    async def _resume(self) -> None:
+        await self._act(Run.resume)
+
+    async def _step(self) -> None:
+        points = int(self._points.value or 1)
+        await self._act(lambda mesh: mesh.step(points))
+
+    async def _stop(self) -> None:
+        if await self._dialog:
+            await self._act(Run.stop)
+
+    async def _act(self, action: Callable[[Run], Any]) -> Any:  # noqa: ANN401  the answers of a Run
+        """Do something to the mesh; None if it refuses, after saying why."""
+        try:
+            return await run.io_bound(_act, self._follower, action)
+        except FmuMeshError as error:
+            ui.notify(str(error), type="negative", close_button=True, timeout=10000)
+            return None
+
+
+def _show_span(seconds: int) -> None:
+    ui.run_javascript(f"fmuMeshPlots.span({seconds})")
+
+
+def _act(follower: MeshFollower, action: Callable[[Run], Any]) -> Any:  # noqa: ANN401  the answers of a Run
+    return follower.ask(action)
+
+
+def _values(follower: MeshFollower, names: Sequence[str]) -> Mapping[str, Any]:
+    """The current values, as far as they are answered."""
+    values = {}
+    for name in names:
+        try:
+            values[name] = follower.ask(partial(Run.get, name=name))
+        except FmuMeshError:
+            break  # it does not run any more
+    return values

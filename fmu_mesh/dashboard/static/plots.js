@@ -1,0 +1,106 @@
+// Draws the curves of the page. It asks for what has changed, draws it, and only then asks again: so a browser that is
+// slow or asleep asks less often or not at all, and the server keeps nothing for it.
+"use strict";
+
+window.fmuMeshPlots = (() => {
+  const LEAST_MS = 50; // 20 pictures per second
+  const SHARE = 2; // of the time between two pictures, at most a third is drawing
+  const AGAIN_MS = 1000;
+  const plots = new Map(); // by the id of a chart: {names, span}
+  const curves = new Map(); // by name: {version, cells}
+  let mesh = null;
+  let run = 0;
+  let going = false;
+
+  function show(key, number) {
+    if (key !== mesh || number !== run) curves.clear();
+    mesh = key;
+    run = number;
+    plots.clear();
+    if (!going) {
+      going = true;
+      live();
+    }
+  }
+
+  function plot(id, names) {
+    plots.set(id, { names, span: plots.get(id)?.span ?? 0, drawn: false });
+  }
+
+  function span(seconds) {
+    for (const one of plots.values()) Object.assign(one, { span: seconds, drawn: false });
+  }
+
+  function drop(id) {
+    plots.delete(id);
+  }
+
+  async function live() {
+    for (;;) {
+      const began = performance.now();
+      let pause = LEAST_MS;
+      try {
+        const changed = await ask();
+        const drawing = performance.now();
+        draw(changed);
+        pause = Math.max(LEAST_MS - (drawing - began), SHARE * (performance.now() - drawing));
+      } catch (error) {
+        pause = AGAIN_MS;
+      }
+      await new Promise((resolve) => setTimeout(resolve, Math.max(0, pause)));
+      while (document.hidden) await new Promise((resolve) => setTimeout(resolve, AGAIN_MS));
+    }
+  }
+
+  async function ask() {
+    const names = new Set([...plots.values()].flatMap((one) => one.names));
+    for (const name of curves.keys()) if (!names.has(name)) curves.delete(name);
+    if (mesh === null || names.size === 0) return new Set();
+    const asked = { mesh, run, curves: {} };
+    for (const name of names) asked.curves[name] = curves.get(name)?.version ?? 0;
+    const answer = await fetch("/dashboard/curves", { method: "POST", body: JSON.stringify(asked) });
+    if (!answer.ok) throw new Error(`${answer.status}`);
+    const changes = await answer.json();
+    if (asked.mesh !== mesh || asked.run !== run) return new Set(); // the page shows another mesh by now
+    for (const [name, change] of Object.entries(changes)) take(name, change);
+    return new Set(Object.keys(changes));
+  }
+
+  function take(name, change) {
+    let curve = curves.get(name);
+    if (curve === undefined || change.whole) {
+      curve = { cells: [] };
+      curves.set(name, curve);
+    }
+    curve.version = change.version;
+    change.at.forEach((at, i) => {
+      const low = [change.tl[i], change.l[i]];
+      const high = [change.th[i], change.h[i]];
+      curve.cells[at] = low[0] === high[0] ? [low] : low[0] < high[0] ? [low, high] : [high, low];
+    });
+  }
+
+  function draw(changed) {
+    for (const [id, one] of plots) {
+      const chart = getElement(id)?.chart;
+      if (!chart) continue;
+      if (one.names.some((name) => changed.has(name))) one.drawn = false;
+      if (one.drawn || !isOnScreen(chart.getDom())) continue;
+      const series = one.names.map((name) => ({ data: curves.get(name)?.cells.flat() ?? [] }));
+      const ends = series.filter((own) => own.data.length).map((own) => own.data[own.data.length - 1][0]);
+      const last = Math.max(...ends);
+      const from = one.span > 0 && ends.length ? last - one.span : "dataMin";
+      const to = ends.length ? last : "dataMax";
+      chart.setOption({ xAxis: { min: from, max: to }, series }, { lazyUpdate: true });
+      one.drawn = true;
+      window.fmuMeshPlots.pictures += 1;
+    }
+  }
+
+  function isOnScreen(element) {
+    const place = element.getBoundingClientRect();
+    return place.bottom > 0 && place.top < window.innerHeight;
+  }
+
+  return { show, plot, span, drop, pictures: 0, curves };
+})();

@@ -1,0 +1,175 @@
+"""The dashboard as a process: who may open it, what it knows of a mesh, and that the run does not notice it."""
+
+from __future__ import annotations
+
+import signal
+import socket
+from pathlib import Path
+
+import pytest
+
+from tests.dashboards import Dashboard
+from tests.helpers import Place, rows_of, wait_until, write_config
+
+KEY = "fmu_mesh/pair"
+PACED = {"real_time_factor": 1.0, "step_size": 0.002}
+
+
+def _reached(dashboard: Dashboard, key: str = KEY, run: int = 1) -> dict[str, dict[str, list[float]]]:
+    """The curve of the pendulum as soon as it begins at the start of the run."""
+    return wait_until(
+        lambda: (
+            found
+            if (found := dashboard.curves(key, run, pendulum__a=0)) and found["pendulum.a"]["tl"][:1] == [0.0]
+            else None
+        ),
+        "the history from the start",
+    )
+
+
+def test_only_requests_with_the_token_and_a_name_of_this_host_get_the_page(place: Place) -> None:
+    dashboard = Dashboard(place)
+
+    inside, headers, page = dashboard.ask()
+    stranger = dashboard.ask(headers={"Cookie": ""})
+    script = dashboard.ask("/dashboard/static/plots.js", headers={"Cookie": "fmu_mesh_dashboard=x"})
+    rebound = dashboard.ask(headers={"Host": f"evil.example:{dashboard.port}"})
+    other_page = dashboard.ask("/dashboard/curves", b"{}", {"Origin": "http://127.0.0.1:1"})
+
+    assert inside == 200
+    assert b"http://" not in page.replace(b"http://www.w3.org/", b"")
+    assert headers["x-frame-options"] == "DENY"
+    assert [answer[0] for answer in (stranger, script, rebound, other_page)] == [403, 403, 403, 403]
+    assert b"token" in stranger[2]
+
+
+def test_ctrl_c_ends_it_and_leaves_nothing(place: Place) -> None:
+    dashboard = Dashboard(place)
+    dashboard.ask()
+
+    dashboard.process.signal(signal.SIGINT)
+
+    assert dashboard.process.wait() == 130
+    assert dashboard.process.errors == ""
+    place.assert_nothing_left()
+
+
+def test_sigterm_ends_it_and_leaves_nothing(place: Place) -> None:
+    dashboard = Dashboard(place)
+
+    dashboard.process.signal(signal.SIGTERM)
+
+    assert dashboard.process.wait() in (-signal.SIGTERM, 128 + signal.SIGTERM)
+    assert dashboard.process.errors == ""
+    place.assert_nothing_left()
+
+
+def test_a_port_that_is_taken_and_a_mesh_that_does_not_run_are_errors_with_a_way_out(place: Place) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        on_port = place.run("dashboard", "--no-browser", "--port", str(port))
+    absent = place.run("dashboard", "--no-browser", "missing")
+    elsewhere = place.run("dashboard", "--no-browser", "--host", "203.0.113.1")
+    no_port = place.run("dashboard", "--port", "65536")
+
+    assert [one.wait() for one in (on_port, absent, elsewhere, no_port)] == [2, 2, 2, 2]
+    assert on_port.message == (
+        f"fmu-mesh: port {port} of 127.0.0.1 is taken by another program. `--port 0` takes a free one."
+    )
+    assert "no mesh is running here" in absent.message
+    assert "203.0.113.1" in elsewhere.message
+    assert "0 to 65535" in no_port.message
+
+
+def test_beyond_loopback_it_warns(place: Place) -> None:
+    dashboard = Dashboard(place, "--host", "0.0.0.0")  # noqa: S104  this is what is warned of
+
+    assert "everybody who can reach 0.0.0.0" in dashboard.process.errors
+
+
+@pytest.mark.parametrize("body", [b"", b"{", b'{"mesh":1}', b'{"mesh":"a","run":1,"curves":{},"x":1}', b"[" * 70_000])
+def test_a_malformed_question_is_refused(place: Place, body: bytes) -> None:
+    dashboard = Dashboard(place)
+
+    assert dashboard.ask("/dashboard/curves", body)[0] == 400
+    assert dashboard.curves("fmu_mesh/nobody", a__b=0) == {}
+
+
+def test_history_begins_at_the_start_also_for_a_dashboard_that_comes_later(place: Place) -> None:
+    config = write_config(place.folder, stop_time=3600.0, simulation=PACED)
+    place.start("launch", config, "--no-progress")
+    wait_until((place.folder / "pair.csv").exists, "the first row")
+    wait_until(lambda: len((place.folder / "pair.csv").read_bytes()) > 20_000, "some rows")
+
+    dashboard = Dashboard(place)
+    curve = _reached(dashboard)["pendulum.a"]
+    newer = wait_until(
+        lambda: (
+            found["pendulum.a"]
+            if (found := dashboard.curves(KEY, pendulum__a=curve["version"]))  # type: ignore[arg-type]  # a number
+            and max(found["pendulum.a"]["tl"]) > max(curve["tl"])
+            else None
+        ),
+        "newer values",
+    )
+    place.run("stop", "pair")
+
+    wait_until(lambda: not place.processes("master"), "the end of the mesh")
+    rows = {time: values[0] for time, *values in rows_of(place.folder / "pair.csv")}
+    for change in (curve, newer):
+        assert all(rows[time] == value for time, value in zip(change["tl"], change["l"], strict=True))
+        assert all(rows[time] == value for time, value in zip(change["th"], change["h"], strict=True))
+
+
+def test_values_that_are_not_recorded_are_asked_for(place: Place) -> None:
+    config = write_config(
+        place.folder,
+        stop_time=3600.0,
+        simulation=PACED,
+        record={"file": "pair.csv", "variables": ["pendulum.a"]},
+    )
+    place.start("launch", config, "--no-progress")
+
+    dashboard = Dashboard(place)
+    found = wait_until(
+        lambda: len(dashboard.curves(KEY, delay__y=0).get("delay.y", {}).get("at", [])) > 3, "some values"
+    )
+
+    assert found
+    place.run("stop", "pair")
+
+
+def test_a_mesh_that_starts_later_appears_and_its_next_run_begins_anew(place: Place) -> None:
+    dashboard = Dashboard(place)
+    config = write_config(place.folder, stop_time=3600.0, simulation=PACED)
+
+    for run in (1, 2):
+        place.start("launch", config, "--no-progress")
+        curve = _reached(dashboard, run=run)["pendulum.a"]
+        assert curve["l"][0] == rows_of_first(place.folder / "pair.csv")
+        place.run("stop", "pair")
+        wait_until(lambda: not place.processes("master"), "the end of the mesh")
+    assert _reached(dashboard, run=2)  # what was seen stays
+
+
+def rows_of_first(file: Path) -> float:
+    """The first value of the first row."""
+    return float(file.read_text().splitlines()[1].split(",")[1])
+
+
+def test_the_result_is_the_same_bytes_with_a_dashboard_that_reads_all_the_time(place: Place) -> None:
+    config = write_config(place.folder, stop_time=20.0)
+    place.run("launch", config, "--no-progress", "--output", place.folder / "alone.csv")
+
+    dashboard = Dashboard(place)
+    run = place.start("launch", config, "--no-progress", "--set", "pendulum.d=0.0")
+    asked = 0
+    while run.running:
+        dashboard.curves(KEY, pendulum__a=0, delay__y=0, delay__d=0)
+        asked += 1
+    assert run.wait() == 0
+    assert asked > 0
+
+    alone = place.run("launch", config, "--no-progress", "--local", "--set", "pendulum.d=0.0", "--output", "again.csv")
+    assert alone.wait() == 0
+    assert (place.folder / "pair.csv").read_bytes() == (place.folder / "again.csv").read_bytes()
