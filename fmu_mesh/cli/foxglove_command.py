@@ -6,7 +6,7 @@ import argparse
 import sys
 
 from ..errors import ConfigurationError
-from .arguments import CommandParser, Parsers, add_quiet, add_reaching
+from .arguments import CommandParser, Parsers, add_quiet, add_reaching, port_number
 
 __all__ = ["PARSERS"]
 
@@ -26,8 +26,10 @@ def _add_foxglove(parser: CommandParser) -> None:
         help="offer only these (`*`: any characters); default: all outputs",
     )
     parser.add_argument("--host", default=_HOST, metavar="ADDRESS", help=f"the address to listen at ({_HOST})")
-    parser.add_argument("--port", type=_port, default=_PORT, metavar="N", help=f"the port, 0 for a free one ({_PORT})")
-    parser.add_argument("--read-only", action="store_true", help="clients cannot set inputs and parameters")
+    parser.add_argument(
+        "--port", type=port_number, default=_PORT, metavar="N", help=f"the port, 0 for a free one ({_PORT})"
+    )
+    parser.add_argument("--steer", action="store_true", help="clients may set inputs and parameters")
     parser.set_defaults(run_command=_foxglove)
 
 
@@ -44,7 +46,7 @@ def _foxglove(arguments: argparse.Namespace) -> int:
         variables=tuple(arguments.variables),
         host=arguments.host,
         port=arguments.port,
-        read_only=arguments.read_only,
+        read_only=not arguments.steer,
     )
     if serving.leaves_host:
         can = "read" if serving.read_only else "read and set"
@@ -52,12 +54,6 @@ def _foxglove(arguments: argparse.Namespace) -> int:
         print(f"fmu-mesh: {text}", file=sys.stderr, flush=True)
     serve(serving, lambda text: print(text, flush=True))
     return 0
-
-
-def _port(text: str) -> int:
-    if not (text.isdecimal() and int(text) < 1 << 16):
-        raise argparse.ArgumentTypeError(f"'{text}' is no port from 0 to 65535")
-    return int(text)
 
 
 PARSERS: Parsers = {"foxglove": _add_foxglove}

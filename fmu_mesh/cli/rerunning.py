@@ -7,6 +7,7 @@ from functools import partial
 from pathlib import Path
 
 from ..api.rerunning import planned_rerun
+from ..api.result import Result
 from ..api.run_handle import Run
 from .arguments import CommandParser, Parsers, add_json
 from .output.display import Display, summary, teller, warn
@@ -15,6 +16,8 @@ from .run_options import add_options
 from .running import add_output, interrupted_by_signals, show_event
 
 __all__ = ["PARSERS"]
+
+_DIFFERENT = 1
 
 
 def _add_rerun(parser: CommandParser) -> None:
@@ -51,7 +54,13 @@ def _rerun(arguments: argparse.Namespace) -> int:
         assert outcome is not None  # it has run
         for line in summary(plan, outcome):
             print(line)
-    return 0
+        assert outcome.file is not None  # it records what the first run has recorded
+        comparison = Result.read(arguments.result).compare(Result.read(outcome.file))
+        if comparison.equal:
+            print(f"every value is that of '{arguments.result}'")
+            return 0
+        print(comparison.text)
+    return _DIFFERENT
 
 
 PARSERS: Parsers = {"rerun": _add_rerun}

@@ -70,7 +70,7 @@ class MeshParameters:
             more = f" Did you mean '{near}'?" if near is not None else ""
             self._tell(f"'{name}' cannot be set: it is no unconnected input and no tunable parameter.{more}")
         elif self._read_only:
-            self._tell(f"'{name}' is not set: `fmu-mesh foxglove` was started with --read-only")
+            self._tell(f"'{name}' is not set: `fmu-mesh foxglove` was started without --steer")
         elif value is None:
             self._tell(f"'{name}' cannot be removed")
         else:

@@ -41,7 +41,7 @@ class Serving(msgspec.Struct, frozen=True):
     variables: tuple[str, ...] = ()
     host: str = "127.0.0.1"
     port: int = PORT
-    read_only: bool = False
+    read_only: bool = True
 
     @property
     def leaves_host(self) -> bool:

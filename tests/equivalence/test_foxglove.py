@@ -93,7 +93,7 @@ def test_a_channel_says_what_its_variable_is(place: Place) -> None:
 
 def test_parameters_are_those_that_can_be_set_and_setting_them_changes_the_mesh(place: Place) -> None:
     place.start("launch", gains(place), "--no-progress")
-    _, url = start(place, "pair")
+    _, url = start(place, "pair", "--steer")
 
     with FoxgloveClient(url) as client, FoxgloveClient(url) as other:
         other.subscribe("/second/y")
@@ -114,14 +114,14 @@ def test_parameters_are_those_that_can_be_set_and_setting_them_changes_the_mesh(
     assert answer == {"first.u": 3.0, "second.k": 2.0}
 
 
-def test_nothing_can_be_set_with_read_only(place: Place) -> None:
+def test_nothing_can_be_set_without_steer(place: Place) -> None:
     place.start("launch", gains(place), "--no-progress")
-    _, url = start(place, "pair", "--read-only")
+    _, url = start(place, "pair")
 
     with FoxgloveClient(url) as client:
         client.until(lambda: "/second/y" in client.channels, "the topics")
         assert client.set(second__k=5.0) == {"second.k": 1.0}
-        client.until(lambda: [text for text in client.statuses() if "--read-only" in text], "the refusal")
+        client.until(lambda: [text for text in client.statuses() if "--steer" in text], "the refusal")
 
 
 def test_a_client_that_comes_while_the_mesh_is_paused_sees_the_current_values(place: Place) -> None:
