@@ -20,6 +20,7 @@ LOCAL = pytest.mark.parametrize("options", [(), ("--local",)], ids=["distributed
 PACED = {"real_time_factor": 1.0, "step_size": 0.01}
 FIELDS = {
     "mesh", "state", "exit_code", "point", "time", "seconds", "rows", "file", "restarts", "error", "ended_by",
+    "files",
 }  # fmt: skip
 
 
@@ -51,6 +52,7 @@ def test_a_launch_for_programs_prints_its_outcome_and_nothing_else(place: Place,
         "restarts": 0,
         "error": None,
         "ended_by": None,
+        "files": [{"file": str(place.folder / "pair.csv"), "rows": 1001}],
     }
 
 
@@ -123,6 +125,8 @@ def test_a_check_for_programs_prints_the_plan(place: Place) -> None:
     assert plan["instances"][0]["start_values"] == {"l": 2.0}
     assert plan["recorded"] == ["pendulum.a", "pendulum.der(a)", "pendulum.der(a,2)", "delay.y"]
     assert plan["result_file"] == str(place.folder / "pair.csv")
+    [record] = plan["records"]
+    assert record == {"file": plan["result_file"], "variables": plan["recorded"], "first": 0, "every": 1}
 
 
 def test_options_of_a_launch_replace_keys_of_the_file(place: Place) -> None:

@@ -7,6 +7,7 @@ import signal
 import sys
 import threading
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -106,3 +107,70 @@ def test_a_result_may_go_into_a_pipe(place: Place, options: tuple[str, ...]) -> 
     assert (piped.wait(), plain.wait()) == (0, 0), piped.errors
     reader.join(10.0)
     assert read == [(place.folder / "pair.csv").read_bytes()]
+
+
+TWO: Any = [{"file": "first.csv"}, {"file": "second.csv", "variables": ["pendulum.a", "in:delay.x"], "every": 3}]
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason=f"{sys.platform} has no /dev/full")
+@pytest.mark.parametrize("broken", [0, 1])
+@MODES
+def test_a_full_disk_of_one_file_leaves_the_rows_of_the_other(
+    place: Place, options: tuple[str, ...], broken: int
+) -> None:
+    records: Any = [
+        {**section, "file": "/dev/full"} if index == broken else section for index, section in enumerate(TWO)
+    ]
+    config = write_config(place.folder, stop_time=100.0, record=records)
+
+    launched = place.run("launch", config, *options)
+
+    assert launched.wait() == 2
+    assert "the result file '/dev/full' cannot be written: No space left on device" in launched.message
+    other = place.folder / str(TWO[1 - broken]["file"])
+    rows = rows_of(other)
+    assert f"({len(rows)} rows) is in '{other}'" in launched.message
+    assert [row[0] for row in rows] == [point * 0.001 for point in range(0, 100_001, 1 if broken else 3)][: len(rows)]
+    assert 0 < len(rows) < 100_001 // (1 if broken else 3)
+    place.assert_nothing_left()
+
+
+@MODES
+def test_files_that_cannot_all_be_opened_stay_as_they_were(place: Place, options: tuple[str, ...]) -> None:
+    in_a_file = place.folder / "file"
+    in_a_file.touch()
+    (place.folder / "first.csv").write_bytes(b"older")
+    records: Any = [TWO[0], {"file": "file/second.csv"}]
+    config = write_config(place.folder, record=records)
+
+    launched = place.run("launch", config, *options)
+
+    assert launched.wait() == 2
+    assert str(in_a_file) in launched.errors
+    assert (place.folder / "first.csv").read_bytes() == b"older"
+    assert not list(place.folder.glob("*.starting"))
+    place.assert_nothing_left()
+
+
+def test_all_files_of_a_killed_master_end_with_a_whole_row(place: Place) -> None:
+    """They are the beginning of what a run to the end writes."""
+    records: Any = [*TWO, {"file": "late.csv", "every": 2, "from": 0.01}]
+    config = write_config(place.folder, stop_time=20.0, record=records)
+    names = [str(section["file"]) for section in records]
+    assert place.run("launch", config, "--local").wait() == 0
+    whole = [(place.folder / name).read_bytes() for name in names]
+    for name in names:
+        (place.folder / name).unlink()
+    launched = place.start("launch", config, "--real-time-factor", "1")
+    wait_until(lambda: not launched.running or row_count(place.folder / "late.csv") > 100, "rows of all files")
+
+    launched.child("master").kill()
+
+    assert launched.wait() == 4
+    for name, expected in zip(names, whole, strict=True):
+        found = (place.folder / name).read_bytes()
+        assert found.endswith(b"\n")
+        assert expected.startswith(found)
+        rows = found.count(b"\n") - 1
+        assert f"'{place.folder / name}' ({rows} rows)" in launched.message
+    place.assert_nothing_left()
