@@ -15,7 +15,7 @@ from __future__ import annotations
 import io
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Self
@@ -328,17 +328,18 @@ class _GroupWriter:
         self._schema = schema
         self._levels: list[list[Any]] = [[]]
         self._rows = self._size = self._written = 0
-        self._replacing = replaced(path)
-        self._file = self._replacing.__enter__().open("wb")
         floats = [field.name for field in schema if str(field.type) in ("double", "float")]
-        self._writer = _parquet().ParquetWriter(
-            self._file,
-            schema,
-            compression="zstd",
-            compression_level=1,
-            use_dictionary=[field.name for field in schema if field.name not in floats],
-            use_byte_stream_split=floats,
-        )
+        others = [field.name for field in schema if field.name not in floats]
+        ways = {
+            "compression": "zstd",
+            "compression_level": 1,
+            "use_dictionary": others,
+            "use_byte_stream_split": floats,
+        }
+        with ExitStack() as draft:
+            file = draft.enter_context(draft.enter_context(replaced(path)).open("wb"))
+            self._writer = _parquet().ParquetWriter(file, schema, **ways)
+            self._draft = draft.pop_all()
 
     def __enter__(self) -> Self:
         return self
@@ -374,9 +375,8 @@ class _GroupWriter:
             metadata = with_notes(_decoded(self._schema), notes)
             self._writer.add_key_value_metadata({_KEY: msgspec.json.encode(metadata)})
             self._writer.close()
-            self._file.close()
             self._writer = None
-            self._replacing.__exit__(None, None, None)
+            self._draft.close()
         return self._written
 
     def abandon(self) -> None:
@@ -386,10 +386,8 @@ class _GroupWriter:
             return
         with suppress(OSError):
             writer.close()
-        with suppress(OSError):
-            self._file.close()
-        with suppress(_Abandoned):
-            self._replacing.__exit__(_Abandoned, _Abandoned(), None)
+        with suppress(_Abandoned, OSError), self._draft:
+            raise _Abandoned
 
     def _keep(self, batch: Any) -> None:  # noqa: ANN401  pyarrow has no types
         """Keep a batch for the row group; many small ones become a large one, which takes less memory."""
