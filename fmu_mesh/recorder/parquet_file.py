@@ -17,7 +17,6 @@ import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Final, Self
 
 import msgspec
@@ -26,27 +25,21 @@ from numpy.typing import NDArray
 
 from ..config.findings import Findings
 from ..errors import ConfigurationError
-from ..files import Kept, exists, is_file, open_alone, replaced
+from ..files import Kept, exists, is_file, open_alone
 from ..system.recording import Columns, Recording, with_notes
 from ..variables.model_description import Variable
 from ..variables.value_types import DTYPES, VariableType, is_text
+from .parquet_groups import KEY, GroupWriter, decoded, parquet_module, pyarrow_module
 
 __all__ = ["ParquetFile"]
 
 _STREAM: Final = ".arrows"
-_KEY: Final = b"fmu_mesh"
 _TIME: Final = "time"
 _UNIT: Final = b"unit"
 
 _BLOCK_ROWS: Final = 16384
 _BLOCK_BYTES: Final = 1 << 22
 """A batch has at most so many rows, and numbers of so many bytes; likewise texts, but at least one row."""
-
-_GROUP_ROWS: Final = 131072
-_GROUP_BYTES: Final = 1 << 26
-"""A row group of the Parquet file has at most so many rows, and about so many bytes before they are compressed."""
-
-_MERGED: Final = 32
 
 _ARROW_TYPES: Final[dict[VariableType, str]] = {
     "Float64": "float64",
@@ -84,7 +77,7 @@ class ParquetFile:
     """
 
     def __init__(self, path: Path, columns: Sequence[tuple[str, VariableType]], schema: Any) -> None:  # noqa: ANN401  pyarrow has no types
-        _parquet()  # importing it with the first rows would delay the run
+        parquet_module()  # importing it with the first rows would delay the run
         self.path = path
         self.rows = 0
         self.kept = Kept()
@@ -100,13 +93,13 @@ class ParquetFile:
         self._file = open_alone(self.growing_file(path), path)
         self._sink = _Sink()
         self._stream: Any = None
-        self._groups: _GroupWriter | None = None
+        self._groups: GroupWriter | None = None
         self._stream_only = False  # the draft could not be written
 
     @classmethod
     def check(cls, recording: Recording, findings: Findings) -> None:  # noqa: ARG003  it can hold values of all types
         """Check that pyarrow is installed."""
-        _pyarrow()
+        pyarrow_module()
 
     @classmethod
     def open(cls, path: Path, recording: Recording) -> Self:
@@ -129,7 +122,7 @@ class ParquetFile:
             return _rows_of(path) if is_file(path) else 0
         rows = 0
         if stream.stat().st_size:
-            with _Stream(stream) as batches, _GroupWriter(path, batches.schema) as groups:
+            with _Stream(stream) as batches, GroupWriter(path, batches.schema) as groups:
                 for batch in batches:
                     groups.add(batch)
                 rows = groups.finish(batches.notes)
@@ -139,18 +132,18 @@ class ParquetFile:
     @staticmethod
     def read(path: Path) -> Columns:
         """Read a result file; while its run goes on, or after it was killed, the complete batches of its stream."""
-        pa = _pyarrow()
+        pa = pyarrow_module()
         stream = ParquetFile.growing_file(path)
         try:
             if stream.is_file() and not path.exists():
                 with _Stream(stream) as batches:
                     table = pa.Table.from_batches(list(batches), batches.schema)
-                    metadata = with_notes(_decoded(table.schema), batches.notes)
+                    metadata = with_notes(decoded(table.schema), batches.notes)
             else:
                 with path.open("rb") as file:
-                    content = _parquet().ParquetFile(file)
+                    content = parquet_module().ParquetFile(file)
                     table = content.read()
-                    metadata = _decoded(content.metadata)
+                    metadata = decoded(content.metadata)
         except (pa.ArrowException, msgspec.DecodeError) as error:
             raise _no_result(path, str(error)) from error
         if not table.column_names or table.column_names[0] != _TIME or not pa.types.is_float64(table.schema[0].type):
@@ -215,7 +208,7 @@ class ParquetFile:
 
     def _send(self) -> None:
         """Write the rows that are waiting as one batch."""
-        pa = _pyarrow()
+        pa = pyarrow_module()
         fields = zip(self._block, self._schema, strict=True)
         arrays = [_arrow_array(array[: self._waiting], field.type) for array, field in fields]
         self._waiting = 0
@@ -224,7 +217,7 @@ class ParquetFile:
         self._noted += notes
         if self._stream is None:
             self._stream = pa.ipc.new_stream(self._sink, self._schema)
-        self._stream.write_batch(batch, {_KEY: msgspec.json.encode(notes)} if notes else None)
+        self._stream.write_batch(batch, {KEY: msgspec.json.encode(notes)} if notes else None)
         left = memoryview(self._sink.taken())
         try:
             while left:
@@ -239,7 +232,7 @@ class ParquetFile:
             return
         try:
             if self._groups is None:
-                self._groups = _GroupWriter(self.path, self._schema)
+                self._groups = GroupWriter(self.path, self._schema)
             self._groups.add(batch)
         except OSError:
             groups, self._groups, self._stream_only = self._groups, None, True
@@ -267,7 +260,7 @@ class _Stream:
 
     def __init__(self, path: Path) -> None:
         self.notes: list[Mapping[str, Any]] = []
-        self._pa = _pyarrow()
+        self._pa = pyarrow_module()
         self._file = path.open("rb")
         try:
             self._reader = self._pa.ipc.open_stream(self._file)
@@ -287,7 +280,7 @@ class _Stream:
             try:
                 batch, own = self._reader.read_next_batch_with_custom_metadata()
                 if own is not None:
-                    self.notes += msgspec.json.decode(own[_KEY], type=list[dict[str, Any]])
+                    self.notes += msgspec.json.decode(own[KEY], type=list[dict[str, Any]])
             except (StopIteration, self._pa.ArrowException, OSError):  # the end, or a batch that is cut off
                 return
             yield batch
@@ -314,105 +307,6 @@ class _Sink(io.RawIOBase):
         return taken
 
 
-class _GroupWriter:
-    """Writes a draft of the Parquet file, which gets its name at the end; a context manager, which removes the draft.
-
-    A batch is kept until its row group is complete. So it must own its memory.
-
-    Args:
-        path: the file.
-        schema: its columns and metadata.
-    """
-
-    def __init__(self, path: Path, schema: Any) -> None:  # noqa: ANN401  pyarrow has no types
-        self._schema = schema
-        self._levels: list[list[Any]] = [[]]
-        self._rows = self._size = self._written = 0
-        self._replacing = replaced(path)
-        self._file = self._replacing.__enter__().open("wb")
-        floats = [field.name for field in schema if str(field.type) in ("double", "float")]
-        self._writer = _parquet().ParquetWriter(
-            self._file,
-            schema,
-            compression="zstd",
-            compression_level=1,
-            use_dictionary=[field.name for field in schema if field.name not in floats],
-            use_byte_stream_split=floats,
-        )
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.abandon()
-
-    def add(self, batch: Any) -> None:  # noqa: ANN401  pyarrow has no types
-        """Add the rows of a batch.
-
-        Raises:
-            OSError: the draft cannot be written; it is removed.
-        """
-        while batch.num_rows:
-            part = batch.slice(0, _GROUP_ROWS - self._rows)
-            batch = batch.slice(part.num_rows)
-            self._keep(part)
-            self._rows, self._size = self._rows + part.num_rows, self._size + part.nbytes
-            if self._rows == _GROUP_ROWS or self._size >= _GROUP_BYTES:
-                self._write()
-
-    def finish(self, notes: Sequence[Mapping[str, Any]]) -> int:
-        """Write the end, and give the file its name; return the number of its rows. Without a row, there is no file.
-
-        Raises:
-            OSError: the draft cannot be written; it is removed.
-        """
-        if self._rows:
-            self._write()
-        if self._written:
-            metadata = with_notes(_decoded(self._schema), notes)
-            self._writer.add_key_value_metadata({_KEY: msgspec.json.encode(metadata)})
-            self._writer.close()
-            self._file.close()
-            self._writer = None
-            self._replacing.__exit__(None, None, None)
-        return self._written
-
-    def abandon(self) -> None:
-        """Remove the draft, unless it has become the file."""
-        writer, self._writer = self._writer, None
-        if writer is None:
-            return
-        with suppress(OSError):
-            writer.close()
-        with suppress(OSError):
-            self._file.close()
-        with suppress(_Abandoned):
-            self._replacing.__exit__(_Abandoned, _Abandoned(), None)
-
-    def _keep(self, batch: Any) -> None:  # noqa: ANN401  pyarrow has no types
-        """Keep a batch for the row group; many small ones become a large one, which takes less memory."""
-        for level in self._levels:
-            level.append(batch)
-            if len(level) < _MERGED:
-                return
-            [batch] = _pyarrow().Table.from_batches(level).combine_chunks().to_batches()
-            level.clear()
-        self._levels.append([batch])
-
-    def _write(self) -> None:
-        """Write what is waiting as one row group."""
-        table = _pyarrow().Table.from_batches([batch for level in reversed(self._levels) for batch in level])
-        self._written += self._rows
-        self._levels, self._rows, self._size = [[]], 0, 0
-        self._writer.write_table(table, row_group_size=_GROUP_ROWS)
-
-
-class _Abandoned(Exception):
-    """A draft is of no use."""
-
-
 def _rows_of(path: Path) -> int:
     """The number of rows of a complete Parquet file.
 
@@ -421,22 +315,22 @@ def _rows_of(path: Path) -> int:
     """
     try:
         with path.open("rb") as file:
-            rows: int = _parquet().ParquetFile(file).metadata.num_rows
-    except _pyarrow().ArrowException as error:
+            rows: int = parquet_module().ParquetFile(file).metadata.num_rows
+    except pyarrow_module().ArrowException as error:
         raise _no_result(path, str(error)) from error
     return rows
 
 
 def _schema_of(recording: Recording) -> Any:  # noqa: ANN401  pyarrow has no types
     """The columns of a recording as pyarrow has them, with what is known of each variable."""
-    pa = _pyarrow()
+    pa = pyarrow_module()
     fields = [pa.field(_TIME, pa.float64(), nullable=False, metadata={"unit": "s"})]
     for (instance, name), (column, type_) in zip(recording.recorded, recording.columns, strict=True):
         variable = recording.descriptions[instance].variable_of(name)
         assert variable is not None  # the system is valid
         arrow_type = getattr(pa, _ARROW_TYPES[type_])()
         fields.append(pa.field(column, arrow_type, nullable=False, metadata=_about(variable)))
-    return pa.schema(fields, {_KEY: msgspec.json.encode(recording.metadata)})
+    return pa.schema(fields, {KEY: msgspec.json.encode(recording.metadata)})
 
 
 def _about(variable: Variable) -> dict[str, str]:
@@ -452,7 +346,7 @@ def _about(variable: Variable) -> dict[str, str]:
 
 def _arrow_array(values: NDArray[Any], type_: Any) -> Any:  # noqa: ANN401  pyarrow has no types
     """A copy of the values as pyarrow has it. `pyarrow.array` would import pandas, which takes half a second."""
-    pa = _pyarrow()
+    pa = pyarrow_module()
     if values.dtype == object:
         texts = [value.encode() if isinstance(value, str) else value for value in values.tolist()]
         ends = np.zeros(1 + len(texts), np.int32)
@@ -467,33 +361,11 @@ def _arrow_array(values: NDArray[Any], type_: Any) -> Any:  # noqa: ANN401  pyar
 
 def _array(column: Any) -> NDArray[Any]:  # noqa: ANN401  pyarrow has no types
     """A column as numpy has it, of its own memory; `object` for texts and bytes."""
-    pa = _pyarrow()
+    pa = pyarrow_module()
     if pa.types.is_string(column.type) or pa.types.is_binary(column.type):
         return np.array([*column.to_pylist(), None], object)[:-1]  # never an array of more dimensions
     return np.array(column.to_numpy())
 
 
-def _decoded(container: Any) -> dict[str, Any]:  # noqa: ANN401  a schema of pyarrow, or the end of a file
-    return msgspec.json.decode((container.metadata or {}).get(_KEY, b"{}"), type=dict[str, Any])
-
-
 def _no_result(path: Path, why: str) -> ConfigurationError:
     return ConfigurationError(f"'{path}' is no result file: {why}.".replace("..", "."))
-
-
-def _pyarrow() -> Any:  # noqa: ANN401  an optional dependency
-    try:
-        import pyarrow as pa  # noqa: PLC0415  an optional dependency
-        from pyarrow import ipc  # noqa: F401, PLC0415  an optional dependency; `pa.ipc`
-    except ImportError as error:
-        raise ConfigurationError(
-            "results in .parquet need the package pyarrow", hint="Install it: pip install 'fmu-mesh[parquet]'."
-        ) from error
-    return pa
-
-
-def _parquet() -> Any:  # noqa: ANN401  an optional dependency
-    _pyarrow()
-    from pyarrow import parquet  # noqa: PLC0415  slow to import, and writing rows does without
-
-    return parquet

@@ -24,7 +24,7 @@ from fmu_mesh.config.loading import LoadedConfig
 from fmu_mesh.errors import ConfigurationError
 from fmu_mesh.files import Kept
 from fmu_mesh.instances.configuration import parse
-from fmu_mesh.recorder import parquet_file
+from fmu_mesh.recorder import parquet_file, parquet_groups
 from fmu_mesh.recorder.csv_file import CsvFile
 from fmu_mesh.recorder.parquet_file import ParquetFile
 from fmu_mesh.ros.bags.mcap_file import McapFile
@@ -331,7 +331,7 @@ def test_pandas_and_pyarrow_read_a_parquet_file_with_its_types_and_units(tmp_pat
 def test_row_groups_are_bounded_and_small_batches_become_large_ones(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(parquet_file, "_GROUP_ROWS", 5000)
+    monkeypatch.setattr(parquet_groups, "_GROUP_ROWS", 5000)
     path, types = tmp_path / "a.parquet", ["Float64", "String"]
     file = ParquetFile.open(path, recording(types))  # type: ignore[arg-type]  # literals
 
