@@ -41,6 +41,7 @@ GIVEN: dict[str, tuple[str | None, Any]] = {
     "paused": (None, True),
     "allow_code": (None, True),
     "view": (None, True),
+    "scenario": ("drive.yaml", Path("drive.yaml")),
     "video": ("film.gif", Path("film.gif")),
     "profile": ("p.json", Path("p.json")),
 }
