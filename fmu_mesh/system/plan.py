@@ -24,7 +24,7 @@ from .layout import Layout, row_bytes, rows_for
 from .linear_inputs import LinearInput, linear_inputs
 from .memory_map import MASTER, RECORDER, MemoryMap, RingPlace, map_memory
 from .records import RecordPlan, union_of
-from .schedule import Schedule
+from .schedule import Schedule, row_of
 from .system import Connection, ResolvedSystem, SystemInstance
 from .window import batch_of, recorder_window, window_of
 
@@ -401,17 +401,8 @@ def _instance_plan(plan: Plan, instance: SystemInstance, outputs: Layout) -> Ins
         section=placed(plan.system.config.instances[instance.name]),
         linear_inputs=linear_inputs(plan.connections, instance.name),
         scenario=instance.scenario,
-        row=_row(instance, connected),
+        row=row_of(instance.description, instance.scenario, connected),
     )
-
-
-def _row(instance: SystemInstance, connected: set[str]) -> Layout | None:
-    """The inputs that are set in every step; None if these are the connected ones."""
-    driven = {schedule.variable for schedule in instance.scenario}
-    variables = instance.description.variables
-    driven = {v.name for v in variables if v.name in driven and v.causality == "input" and not v.shape}
-    driven = {v.name for v in variables if v.name in driven and v.type == "Float64"}
-    return Layout.of(v for v in variables if v.name in connected | driven) if driven else None
 
 
 def _links(plan: Plan) -> tuple[Link, ...]:

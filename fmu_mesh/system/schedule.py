@@ -9,16 +9,18 @@ from __future__ import annotations
 import math
 from bisect import bisect_left, bisect_right
 from collections.abc import Sequence
+from collections.abc import Set as AbstractSet
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from ..simtime import ENDLESS, TimeGrid
-from ..variables.model_description import Value
+from ..variables.model_description import ModelDescription, Value
 from ..variables.value_types import PlainValue
+from .layout import Layout
 
-__all__ = ["Course", "Schedule", "SeriesFile", "between"]
+__all__ = ["Course", "Schedule", "SeriesFile", "between", "row_of"]
 
 
 class SeriesFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -195,6 +197,17 @@ class Course:
     def changes(self) -> int:
         """Number of times at which the value, or its slope, changes."""
         return len(self._steps)
+
+
+def row_of(description: ModelDescription, schedules: Sequence[Schedule], connected: AbstractSet[str]) -> Layout | None:
+    """The inputs that are set in every step: connected ones, and those of a scenario that are a single Float64.
+
+    None if these are the connected ones.
+    """
+    names = {schedule.variable for schedule in schedules}
+    inputs = (v for v in description.with_causality("input") if v.type == "Float64" and not v.shape)
+    driven = {v.name for v in inputs if v.name in names}
+    return Layout.of(v for v in description.variables if v.name in connected | driven) if driven else None
 
 
 def between(left: Value, right: Value, weight: float) -> Value:

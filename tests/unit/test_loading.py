@@ -265,7 +265,7 @@ TEXTS = [
     pytest.param(
         "- 1\n",
         "mesh.yaml:1: a list; expected a mapping with mesh, simulation, instances, group, connections, initialization, "
-        "record, zenoh and 5 more",
+        "record, scenario and 6 more",
         id="a list",
     ),
     pytest.param(

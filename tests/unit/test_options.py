@@ -41,6 +41,7 @@ GIVEN: dict[str, tuple[str | None, Any]] = {
     "paused": (None, True),
     "allow_code": (None, True),
     "view": (None, True),
+    "scenario": ("drive.yaml", Path("drive.yaml")),
     "video": ("film.gif", Path("film.gif")),
     "profile": ("p.json", Path("p.json")),
 }
@@ -88,7 +89,10 @@ def test_every_option_with_a_key_replaces_it() -> None:
     assert changed.config.records["record"].file == str(Path("r.csv").absolute())
     assert changed.overrides["simulation.catch_up"] == "--catch-up 4"
     assert changed.overrides["zenoh.listen"] == "--listen tcp/127.0.0.1:1"
-    assert changed.overrides.keys() == {setting.flag.key for setting in option_fields().values()} - {None}
+    assert changed.config.scenario == str(Path("drive.yaml").absolute())
+    assert changed.overrides.keys() == {setting.flag.key for setting in option_fields().values()} - {None} | {
+        "scenario"
+    }
 
 
 def test_options_that_are_not_given_leave_the_configuration_as_it_is() -> None:
