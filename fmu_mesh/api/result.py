@@ -21,8 +21,9 @@ from ..text import listed, short_path
 from ..variables.model_description import Variable
 from ..variables.units import BaseUnit
 from ..variables.value_types import VariableType, is_float
-from .comparison import Comparison, Side, compared, differences_of, values_in_unit_of
-from .result_drawing import FLAGS, NUMBERS, Curve, Curves, Picture, figure_of
+from .compared_rows import Side, compared, differences_of, values_in_unit_of
+from .comparison import Comparison
+from .result_drawing import FLAGS, NUMBERS, Curve, Curves, PictureOptions, figure_of
 from .result_reading import Columns, chosen_names, read_result
 
 if TYPE_CHECKING:
@@ -207,7 +208,7 @@ class Result(Mapping[str, NDArray[Any]]):
             curves = self._curves_of(result, drawn[-1].values) | curves
         meshes = dict.fromkeys(str(result.metadata.get("mesh", result.title)) for result in results)
         title = title if title is not None else " and ".join(meshes)
-        return figure_of(drawn, Picture(title, curves, x, difference, annotate))
+        return figure_of(drawn, PictureOptions(title, curves, x, difference, annotate))
 
     def compare(
         self, other: Result, *, rtol: float = 0.0, atol: float = 0.0, variables: Sequence[str] = ()

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
-__all__ = ["FLAGS", "NUMBERS", "Curve", "Curves", "Picture", "figure_of", "in_unit"]
+__all__ = ["FLAGS", "NUMBERS", "Curve", "Curves", "PictureOptions", "figure_of", "in_unit"]
 
 FLAGS = "true (1) or false (0)"
 """The axes of Booleans, and their label."""
@@ -99,7 +99,7 @@ class Curves(NamedTuple):
     differences: Mapping[str, tuple[NDArray[np.float64], NDArray[np.float64]]] = {}
 
 
-class Picture(NamedTuple):
+class PictureOptions(NamedTuple):
     """What a picture shows beside its curves.
 
     Attributes:
@@ -148,7 +148,7 @@ def _factor(text: str) -> str:
     return f"{_UNIT_NAMES.get(name, name)}{exponent.translate(_SUPERSCRIPTS)}" if name else text
 
 
-def figure_of(results: Sequence[Curves], picture: Picture) -> Figure:
+def figure_of(results: Sequence[Curves], picture: PictureOptions) -> Figure:
     """The matplotlib figure: one axes below the other, each as high as its legend.
 
     Args:
@@ -170,7 +170,7 @@ def figure_of(results: Sequence[Curves], picture: Picture) -> Figure:
 class _Drawer:
     """Draws one picture."""
 
-    def __init__(self, figure: Figure, results: Sequence[Curves], picture: Picture) -> None:
+    def __init__(self, figure: Figure, results: Sequence[Curves], picture: PictureOptions) -> None:
         self._figure, self._results, self._picture = figure, results, picture
         self._names = [
             name

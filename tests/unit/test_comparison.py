@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fmu_mesh.api.comparison import Side, compared
+from fmu_mesh.api.compared_rows import Side, compared
 from fmu_mesh.api.mesh_builder import Mesh, load
 from fmu_mesh.api.result import Result
 from fmu_mesh.api.result_reading import Columns

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from fmu_mesh.api.drawing import reduced
 from fmu_mesh.api.result import Result
-from fmu_mesh.api.result_drawing import Curves, Picture, figure_of
+from fmu_mesh.api.result_drawing import Curves, PictureOptions, figure_of
 from fmu_mesh.api.result_reading import Columns, read_csv
 from fmu_mesh.cli.main import main
 from fmu_mesh.cli.plotting import plot_results, plotted_where_it_ends
@@ -282,7 +282,7 @@ def drawn_of(columns: Mapping[str, Sequence[float]]) -> Figure:
     """The picture of results at 0, 1, 2 … s."""
     arrays = {name: np.array(values, dtype=np.float64) for name, values in columns.items()}
     times = np.arange(len(next(iter(arrays.values()))), dtype=np.float64)
-    return figure_of([Curves("drawn", times, arrays)], Picture("drawn"))
+    return figure_of([Curves("drawn", times, arrays)], PictureOptions("drawn"))
 
 
 def test_78_lines_can_be_told_apart_and_their_legend_covers_nothing() -> None:

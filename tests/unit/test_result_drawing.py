@@ -15,7 +15,7 @@ from matplotlib.text import Annotation
 from fmu_mesh.api.drawing import PALETTE
 from fmu_mesh.api.mesh_builder import load
 from fmu_mesh.api.result import Result
-from fmu_mesh.api.result_drawing import Curve, Curves, Picture, figure_of, in_unit
+from fmu_mesh.api.result_drawing import Curve, Curves, PictureOptions, figure_of, in_unit
 from fmu_mesh.api.result_reading import Columns
 from fmu_mesh.cli.main import main
 from fmu_mesh.errors import CallRefused, ConfigurationError
@@ -69,7 +69,7 @@ def test_an_axis_has_a_name_and_a_unit(unit: str, label: str) -> None:
 )
 def test_variables_with_one_unit_share_axes_that_are_named_after_them(names: list[str], label: str) -> None:
     values = dict.fromkeys(names, TIMES)
-    picture = Picture("made", {name: Curve("rad") for name in names})
+    picture = PictureOptions("made", {name: Curve("rad") for name in names})
 
     (axes,) = figure_of([Curves("made", TIMES, values)], picture).axes
 

@@ -18,6 +18,7 @@ from fmu_mesh.api.mesh_builder import load
 from fmu_mesh.api.system_graph import SystemGraph, graph_of
 from fmu_mesh.cli.main import main
 from fmu_mesh.wire.views import InstanceStatus
+from tests.helpers import Place
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 SVG = "{http://www.w3.org/2000/svg}"
@@ -62,6 +63,13 @@ def made(count: int, edges: Edges, together: int) -> SystemGraph:
 @pytest.fixture(params=CASES)
 def graph(request: pytest.FixtureRequest) -> SystemGraph:
     return made(*CASES[request.param])
+
+
+@pytest.fixture
+def runtime(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nobody else's meshes are found from here."""
+    for name in ("FMU_MESH_RUNTIME_DIR", "TMPDIR"):
+        monkeypatch.setenv(name, place.environment[name])
 
 
 def shapes_of(graph: SystemGraph) -> Drawing:
@@ -270,7 +278,7 @@ def test_the_graph_of_a_configuration_has_models_units_and_delays() -> None:
     ]
 
 
-@pytest.mark.usefixtures("place")
+@pytest.mark.usefixtures("runtime")
 def test_the_graph_of_a_running_mesh_is_that_of_its_configuration() -> None:
     mesh = load(CONFIGS / "chain8.yaml")
     planned = mesh.graph()
@@ -344,7 +352,7 @@ def test_the_command_answers_programs_in_json(capsys: pytest.CaptureFixture[str]
     assert graph == load(CONFIGS / "cycle2.yaml").graph()
 
 
-@pytest.mark.usefixtures("place")
+@pytest.mark.usefixtures("runtime")
 def test_a_mesh_that_does_not_run_is_refused_with_the_way_out(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["graph", "pendulum"]) == 2
     assert "no mesh" in capsys.readouterr().err
