@@ -50,8 +50,8 @@ class CurveChange(msgspec.Struct, frozen=True, rename={"t_low": "tl", "t_high": 
 class BoundedCurve:
     """The values of one variable: from the start on in 1024 intervals, and the newest ones in finer intervals.
 
-    The order in which values come does not matter, so older ones can be added while new ones come. Memory: 150 kB, for a run
-    of any length. All methods may be called from any thread.
+    The order in which values come does not matter, so older ones can be added while new ones come. Memory: 150 kB.
+    All methods may be called from any thread.
 
     Args:
         start: the start time in s.
