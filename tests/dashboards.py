@@ -119,7 +119,7 @@ class Browser:
 
     def curve(self, name: str) -> list[list[float]]:
         """The points of a curve that the page has."""
-        script = "return fmuMeshPlots.curves.get(arguments[0])?.cells.flat() ?? []"
+        script = "return fmuMeshPlots.curves.get(arguments[0])?.points ?? []"
         return [[float(x) for x in point] for point in self.run(script, name)]
 
     def click(self, label: str) -> None:

@@ -5,6 +5,7 @@ Knows neither meshes nor pages.
 
 from __future__ import annotations
 
+import itertools
 import threading
 from typing import Final
 
@@ -12,10 +13,18 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["BUCKETS", "BoundedCurve", "CurveChange"]
+__all__ = ["BUCKETS", "SPANS", "BoundedCurve", "CurveChange"]
 
 BUCKETS: Final = 1024
-"""Intervals of a curve. A plot on a page has about as many columns of pixels."""
+"""Intervals of a curve from the start on. A plot on a page has about as many columns of pixels."""
+SPANS: Final = (1, 10, 60, 600)
+"""The last so many seconds of a curve are also kept in finer intervals."""
+_RECENT: Final = 512
+
+_first_versions = itertools.count(1 << 32, 1 << 32)
+"""A page that has drawn another curve of this name has no version of this one. A script has 53 bits for a number."""
+
+Numbers = NDArray[np.float64]
 
 
 class CurveChange(msgspec.Struct, frozen=True, rename={"t_low": "tl", "t_high": "th", "low": "l", "high": "h"}):
@@ -39,11 +48,10 @@ class CurveChange(msgspec.Struct, frozen=True, rename={"t_low": "tl", "t_high": 
 
 
 class BoundedCurve:
-    """The values of one variable from the start on, at most 1024 intervals of equal length.
+    """The values of one variable: from the start on in 1024 intervals, and the newest ones in finer intervals.
 
-    When the intervals do not reach far enough, each two of them become one. The order in which values come does not
-    matter, so older ones can be added while new ones come. Memory: 40 kB, however long the run is. All methods may be
-    called from any thread.
+    The order in which values come does not matter, so older ones can be added while new ones come. Memory: 150 kB.
+    All methods may be called from any thread.
 
     Args:
         start: the start time in s.
@@ -52,17 +60,10 @@ class BoundedCurve:
 
     def __init__(self, start: float, width: float) -> None:
         self._lock = threading.Lock()
-        self._start = start
-        self._width = width
-        self._low = np.full(BUCKETS, np.nan)
-        self._high = np.full(BUCKETS, np.nan)
-        self._t_low = np.zeros(BUCKETS)
-        self._t_high = np.zeros(BUCKETS)
-        self._changed = np.zeros(BUCKETS, np.int64)
-        self._version = 0
-        self._whole_since = 0
+        self._whole = _FromStart(start, width)
+        self._recent = {span: _Recent(start, max(span / _RECENT, width)) for span in SPANS}
 
-    def add(self, times: NDArray[np.float64], values: NDArray[np.float64]) -> None:
+    def add(self, times: Numbers, values: Numbers) -> None:
         """Add values; those that are not finite are left out.
 
         Args:
@@ -71,22 +72,63 @@ class BoundedCurve:
         """
         finite = np.isfinite(values) & np.isfinite(times)
         times, values = times[finite], values[finite]
-        if len(times):
-            with self._lock:
-                self._add(times, values)
+        if not len(times):
+            return
+        with self._lock:
+            self._whole.add(times, values)
+            for recent in self._recent.values():
+                recent.add(times, values)
+
+    def since(self, version: int, span: int = 0) -> CurveChange:
+        """What has changed since a version; 0 stands for a page that has nothing yet.
+
+        Args:
+            version: that of the newest change that the page has.
+            span: one of `SPANS`; 0: from the start on.
+        """
+        with self._lock:
+            return self._recent[span].since(version) if span in self._recent else self._whole.since(version)
+
+    @property
+    def size(self) -> int:
+        """Memory of its values in bytes."""
+        return self._whole.size + sum(recent.size for recent in self._recent.values())
+
+
+class _Intervals:
+    """The smallest and the largest value of each of some intervals.
+
+    Args:
+        count: how many there are.
+    """
+
+    def __init__(self, count: int) -> None:
+        self._count = count
+        self._low = np.full(count, np.nan)
+        self._high = np.full(count, np.nan)
+        self._t_low = np.zeros(count)
+        self._t_high = np.zeros(count)
+        self._changed = np.zeros(count, np.int64)
+        self._version = self._whole_since = next(_first_versions)
+
+    @property
+    def size(self) -> int:
+        """Memory in bytes."""
+        return sum(part.nbytes for part in vars(self).values() if isinstance(part, np.ndarray))
 
     def since(self, version: int) -> CurveChange:
-        """What has changed since a version; 0 stands for a page that has nothing yet."""
-        with self._lock:
-            whole = version < self._whole_since or version > self._version or version == 0
-            at = np.flatnonzero(self._changed > (0 if whole else version))
-            columns = (self._t_low, self._low, self._t_high, self._high)
-            return CurveChange(self._version, whole, at.tolist(), *(column[at].tolist() for column in columns))
+        """As `BoundedCurve.since`."""
+        whole = not self._whole_since <= version <= self._version
+        at = np.flatnonzero(self._changed > (0 if whole else version))
+        columns = (self._t_low, self._low, self._t_high, self._high)
+        return CurveChange(self._version, whole, self._names(at), *(column[at].tolist() for column in columns))
 
-    def _add(self, times: NDArray[np.float64], values: NDArray[np.float64]) -> None:
-        self._reach(float(times.max()))
-        # Rounding may put a value at the very start just before it.
-        at = np.maximum(((times - self._start) / self._width).astype(np.int64), 0)
+    def _names(self, at: NDArray[np.int64]) -> list[int]:
+        """The numbers of intervals for a page."""
+        return [int(number) for number in at]
+
+    def _put(self, at: NDArray[np.int64], times: Numbers, values: Numbers) -> None:
+        """Put each value into its interval."""
         order = np.lexsort((values, at))
         at, times, values = at[order], times[order], values[order]
         first = np.flatnonzero(np.diff(at, prepend=-1))
@@ -102,11 +144,27 @@ class BoundedCurve:
             self._changed[below] = self._version
             self._changed[above] = self._version
 
-    def _reach(self, time: float) -> None:
-        """Make the intervals long enough for a time."""
-        while (time - self._start) / self._width >= BUCKETS:
+
+class _FromStart(_Intervals):
+    """All values; when the intervals do not reach far enough, each two of them become one.
+
+    Args:
+        start: the start time in s.
+        width: length of an interval in s at first.
+    """
+
+    def __init__(self, start: float, width: float) -> None:
+        super().__init__(BUCKETS)
+        self._start = start
+        self._width = width
+
+    def add(self, times: Numbers, values: Numbers) -> None:
+        """Add values that are finite; at least one."""
+        while (float(times.max()) - self._start) / self._width >= BUCKETS:
             self._width *= 2.0
             self._merge()
+        # Rounding may put a value at the very start just before it.
+        self._put(np.maximum(((times - self._start) / self._width).astype(np.int64), 0), times, values)
 
     def _merge(self) -> None:
         """Each two intervals become one."""
@@ -127,3 +185,36 @@ class BoundedCurve:
         self._whole_since = self._version
         self._changed[:half] = np.where(np.isnan(self._low[:half]), 0, self._version)
         self._changed[half:] = 0
+
+
+class _Recent(_Intervals):
+    """The newest values, in a ring of intervals.
+
+    Args:
+        start: the start time in s.
+        width: length of an interval in s.
+    """
+
+    def __init__(self, start: float, width: float) -> None:
+        super().__init__(_RECENT)
+        self._start = start
+        self._width = width
+        self._number = np.full(_RECENT, -1, np.int64)
+        self._newest = 0
+
+    def add(self, times: Numbers, values: Numbers) -> None:
+        """Add values that are finite; older ones than those in the ring are left out."""
+        numbers = np.maximum(((times - self._start) / self._width).astype(np.int64), 0)
+        self._newest = max(self._newest, int(numbers.max()))
+        recent = numbers > self._newest - _RECENT
+        if not recent.any():
+            return
+        numbers = numbers[recent]
+        at = numbers % _RECENT
+        old = at[self._number[at] != numbers]
+        self._low[old] = self._high[old] = np.nan
+        self._number[at] = numbers
+        self._put(at, times[recent], values[recent])
+
+    def _names(self, at: NDArray[np.int64]) -> list[int]:
+        return [int(number) for number in self._number[at]]

@@ -87,11 +87,19 @@ class MeshView(msgspec.Struct, frozen=True):
 
 
 class CurveQuestion(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a page asks: of each variable the version that it has drawn; ``run`` is that of its `MeshView`."""
+    """What a page asks.
+
+    Attributes:
+        mesh: its key.
+        run: that of the `MeshView` that the page shows.
+        curves: of each variable the version that it has drawn.
+        span: the last so many seconds; 0: from the start on.
+    """
 
     mesh: str
     run: int
     curves: dict[str, int]
+    span: int = 0
 
 
 class MeshFollower:
@@ -115,6 +123,8 @@ class MeshFollower:
         self._log: deque[LogLine] = deque(maxlen=_LOG_LINES)
         self._drawing = threading.Lock()
         self._drawn: tuple[tuple[int, Mapping[str, InstanceStatus]], str] | None = None
+        self._sampler: threading.Thread | None = None
+        self._next_run = threading.Event()
         self._closing = threading.Event()
         self._wake = threading.Event()
         self._thread = threading.Thread(target=self._live, name=f"follow {key}", daemon=True)
@@ -156,7 +166,7 @@ class MeshFollower:
                     self._wake.set()
                 self._curves.move_to_end(name)
                 self._asked[name] = now
-                change = curve.since(version if question.run == view.run else 0)
+                change = curve.since(version if question.run == view.run else 0, question.span)
                 if change.at or change.whole:
                     answer[name] = change
             while len(self._curves) > MOST_CURVES:
@@ -180,6 +190,7 @@ class MeshFollower:
         self._closing.set()
         self._wake.set()
         self._thread.join()
+        self._stop_sampling()
 
     # --- on the thread of the mesh
 
@@ -209,7 +220,10 @@ class MeshFollower:
                     before, info=info, infos=infos, catalogue=catalogue, ended=False, trouble=None
                 )
             self._run = run
-            sampler = threading.Thread(target=self._sample, args=(run, info, ended), name="sample", daemon=True)
+            self._stop_sampling()
+            sampler = self._sampler = threading.Thread(
+                target=self._sample, args=(run, info, ended), name="sample", daemon=True
+            )
             logger = threading.Thread(target=self._read_log, args=(run,), name="log", daemon=True)
             for thread in (sampler, logger):
                 thread.start()
@@ -221,8 +235,15 @@ class MeshFollower:
                 if not self._closing.is_set():
                     self._change(ended=True)
                 self._run = None
-                sampler.join()
         # The thread of the log ends with the mesh, or with the session that `attach` closes.
+
+    def _stop_sampling(self) -> None:
+        """End the thread that reads the result file of the run before."""
+        if self._sampler is not None:
+            self._next_run.set()
+            self._wake.set()
+            self._sampler.join()
+            self._next_run.clear()
 
     def _look(self, run: Run) -> None:
         try:
@@ -255,14 +276,16 @@ class MeshFollower:
         path = Path(info.result_file) if info.result_file is not None and info.host == socket.gethostname() else None
         source = _ResultSource(path if path is not None and path.suffix == ".csv" else None)
         try:
-            while not self._closing.is_set():
-                last = ended.is_set()
-                source.read(self._held, self._forget)
-                if last:
+            while not (self._closing.is_set() or self._next_run.is_set()):
+                over = ended.is_set()
+                if over:  # a page may still choose other curves
+                    if source.replaced:
+                        return
                     source.read_all(self._held)
-                    return
-                self._ask_for_values(run, source.names)
-                self._wake.wait(_SAMPLE_S)
+                else:
+                    source.read(self._held, self._forget)
+                    self._ask_for_values(run, source.names)
+                self._wake.wait(_LOOK_S if over else _SAMPLE_S)
                 self._wake.clear()
         finally:
             source.close()
@@ -344,8 +367,14 @@ class _ResultSource:
             self._old.close()
             self._old = None
 
+    @property
+    def replaced(self) -> bool:
+        """Whether another file has its name by now."""
+        return self._new is None or self._new.replaced
+
     def read_all(self, held: Callable[[], Mapping[str, BoundedCurve]]) -> None:
         """Read to the end of a file that nobody writes any more."""
+        self.read(held, lambda: None)
         if self._new is not None:
             while not _feed(self._new, {n: c for n, c in held().items() if n in self._new.names}):
                 pass

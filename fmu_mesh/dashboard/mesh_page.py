@@ -78,7 +78,8 @@ class MeshPage:
             if self._read_only:
                 ui.badge("read only", color="grey").classes("text-body2")
             else:
-                self._add_buttons()
+                with ui.row().classes("fm-line") as self._buttons:
+                    self._add_buttons()
         with body, ui.element("div").classes("fm-columns") as columns:
             self._parts.append(columns)
             with ui.element("div").classes("fm-column"):
@@ -195,6 +196,7 @@ class MeshPage:
         if not self._read_only:
             self._pausing.set_visibility(state != "paused")
             self._resuming.set_visibility(state == "paused")
+            self._buttons.set_visibility(not view.ended)
         self._show_log()
 
     def _show_table(self) -> None:

@@ -20,11 +20,16 @@ def _reached(dashboard: Dashboard, key: str = KEY, run: int = 1) -> dict[str, di
     return wait_until(
         lambda: (
             found
-            if (found := dashboard.curves(key, run, pendulum__a=0)) and found["pendulum.a"]["tl"][:1] == [0.0]
+            if (found := dashboard.curves(key, run, pendulum__a=0)) and _first_time(found["pendulum.a"]) == 0.0
             else None
         ),
         "the history from the start",
     )
+
+
+def _first_time(curve: dict[str, list[float]]) -> float | None:
+    """The time of the first value that a curve has."""
+    return min(curve["tl"][0], curve["th"][0]) if curve["tl"] else None
 
 
 def test_only_requests_with_the_token_and_a_name_of_this_host_get_the_page(place: Place) -> None:
@@ -146,7 +151,7 @@ def test_a_mesh_that_starts_later_appears_and_its_next_run_begins_anew(place: Pl
     for run in (1, 2):
         place.start("launch", config, "--no-progress")
         curve = _reached(dashboard, run=run)["pendulum.a"]
-        assert curve["l"][0] == rows_of_first(place.folder / "pair.csv")
+        assert curve["h"][0] == rows_of_first(place.folder / "pair.csv")  # the pendulum falls
         place.run("stop", "pair")
         wait_until(lambda: not place.processes("master"), "the end of the mesh")
     assert _reached(dashboard, run=2)  # what was seen stays
@@ -173,3 +178,22 @@ def test_the_result_is_the_same_bytes_with_a_dashboard_that_reads_all_the_time(p
     alone = place.run("launch", config, "--no-progress", "--local", "--set", "pendulum.d=0.0", "--output", "again.csv")
     assert alone.wait() == 0
     assert (place.folder / "pair.csv").read_bytes() == (place.folder / "again.csv").read_bytes()
+
+
+def test_curves_that_are_chosen_after_the_end_of_the_run_are_there_as_well(place: Place) -> None:
+    config = write_config(place.folder, stop_time=2.0, simulation=PACED)
+    dashboard = Dashboard(place)
+    run = place.start("launch", config, "--no-progress")
+    _reached(dashboard)
+    assert run.wait() == 0
+
+    last = wait_until(
+        lambda: (
+            found["delay.y"]
+            if (found := dashboard.curves(KEY, delay__y=0)) and max(found["delay.y"]["th"], default=0.0) == 2.0
+            else None
+        ),
+        "the last point of a new curve",
+    )
+
+    assert _first_time(last) == 0.0

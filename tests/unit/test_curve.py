@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fmu_mesh.dashboard.curve import BUCKETS, BoundedCurve, CurveChange
+from fmu_mesh.dashboard.curve import BUCKETS, SPANS, BoundedCurve, CurveChange
 
 
 def _points(change: CurveChange) -> set[tuple[float, float]]:
@@ -43,7 +44,7 @@ def test_a_long_history_has_the_smallest_and_the_largest_values_and_no_more_inte
     assert BUCKETS // 2 <= len(change.at) <= BUCKETS
     assert (times[123_456], 7.0) in _points(change)
     assert (times[654_321], -9.0) in _points(change)
-    assert sum(part.nbytes for part in vars(curve).values() if isinstance(part, np.ndarray)) <= 40 * BUCKETS
+    assert curve.size == BoundedCurve(0.0, 1.0).size < 150_000
 
 
 @given(
@@ -94,5 +95,30 @@ def test_nothing_is_sent_twice() -> None:
 def test_a_page_with_a_version_of_another_curve_gets_all() -> None:
     curve = BoundedCurve(0.0, 1.0)
     curve.add(np.array([0.0]), np.array([1.0]))
+    other = BoundedCurve(0.0, 1.0)
 
     assert curve.since(99).whole
+    assert other.since(curve.since(0).version).whole
+
+
+@pytest.mark.parametrize("span", SPANS)
+def test_the_last_seconds_are_kept_in_finer_intervals(span: int) -> None:
+    curve, cells, version = BoundedCurve(0.0, 1e-3), dict[int, tuple[float, float, float, float]](), 0
+    times = np.arange(700_000, dtype=np.float64) * 1e-3
+    values = np.sin(7.0 * times)
+
+    for part in np.array_split(np.arange(len(times)), 50)[::-1]:  # new ones first
+        curve.add(times[part], values[part])
+        change = curve.since(version, span)
+        _apply(cells, change)
+        version = change.version
+
+    newest = times[-1] - span * 0.99
+    kept = {(t, v) for a, b, c, d in cells.values() for t, v in ((a, b), (c, d)) if t >= newest}
+    assert min(t for t, _ in kept) < newest + 2.0 * span / 512
+    assert max(t for t, _ in kept) > times[-1] - 2.0 * span / 512
+    assert kept <= {*zip(times.tolist(), values.tolist(), strict=True)}
+    assert max(v for _, v in kept) == values[times >= newest].max()
+    fresh = dict[int, tuple[float, float, float, float]]()
+    _apply(fresh, curve.since(0, span))
+    assert {at: cells[at] for at in fresh} == fresh

@@ -6,8 +6,9 @@ window.fmuMeshPlots = (() => {
   const LEAST_MS = 50; // 20 pictures per second
   const SHARE = 2; // of the time between two pictures, at most a third is drawing
   const AGAIN_MS = 1000;
-  const plots = new Map(); // by the id of a chart: {names, span}
-  const curves = new Map(); // by name: {version, cells}
+  const plots = new Map(); // by the id of a chart: {names, drawn}
+  const curves = new Map(); // by name: {version, cells}, and cells by the number of an interval
+  let shown = 0; // the last so many seconds; 0: from the start on
   let mesh = null;
   let run = 0;
   let going = false;
@@ -24,11 +25,12 @@ window.fmuMeshPlots = (() => {
   }
 
   function plot(id, names) {
-    plots.set(id, { names, span: plots.get(id)?.span ?? 0, drawn: false });
+    plots.set(id, { names, drawn: false });
   }
 
   function span(seconds) {
-    for (const one of plots.values()) Object.assign(one, { span: seconds, drawn: false });
+    shown = seconds;
+    curves.clear();
   }
 
   function drop(id) {
@@ -56,12 +58,12 @@ window.fmuMeshPlots = (() => {
     const names = new Set([...plots.values()].flatMap((one) => one.names));
     for (const name of curves.keys()) if (!names.has(name)) curves.delete(name);
     if (mesh === null || names.size === 0) return new Set();
-    const asked = { mesh, run, curves: {} };
+    const asked = { mesh, run, curves: {}, span: shown };
     for (const name of names) asked.curves[name] = curves.get(name)?.version ?? 0;
     const answer = await fetch("/dashboard/curves", { method: "POST", body: JSON.stringify(asked) });
     if (!answer.ok) throw new Error(`${answer.status}`);
     const changes = await answer.json();
-    if (asked.mesh !== mesh || asked.run !== run) return new Set(); // the page shows another mesh by now
+    if (asked.mesh !== mesh || asked.run !== run || asked.span !== shown) return new Set(); // the page shows another mesh by now
     for (const [name, change] of Object.entries(changes)) take(name, change);
     return new Set(Object.keys(changes));
   }
@@ -69,15 +71,21 @@ window.fmuMeshPlots = (() => {
   function take(name, change) {
     let curve = curves.get(name);
     if (curve === undefined || change.whole) {
-      curve = { cells: [] };
+      curve = { cells: new Map() };
       curves.set(name, curve);
     }
     curve.version = change.version;
     change.at.forEach((at, i) => {
       const low = [change.tl[i], change.l[i]];
       const high = [change.th[i], change.h[i]];
-      curve.cells[at] = low[0] === high[0] ? [low] : low[0] < high[0] ? [low, high] : [high, low];
+      curve.cells.set(at, low[0] === high[0] ? [low] : low[0] < high[0] ? [low, high] : [high, low]);
     });
+    curve.points = [...curve.cells.keys()].sort((a, b) => a - b).flatMap((at) => curve.cells.get(at));
+    if (shown > 0 && curve.points.length > 0) {
+      const from = curve.points[curve.points.length - 1][0] - shown;
+      for (const [at, cell] of curve.cells) if (cell[cell.length - 1][0] < from) curve.cells.delete(at);
+      curve.points = curve.points.filter((point) => point[0] >= from);
+    }
   }
 
   function draw(changed) {
@@ -86,10 +94,10 @@ window.fmuMeshPlots = (() => {
       if (!chart) continue;
       if (one.names.some((name) => changed.has(name))) one.drawn = false;
       if (one.drawn || !isOnScreen(chart.getDom())) continue;
-      const series = one.names.map((name) => ({ data: curves.get(name)?.cells.flat() ?? [] }));
+      const series = one.names.map((name) => ({ data: curves.get(name)?.points ?? [] }));
       const ends = series.filter((own) => own.data.length).map((own) => own.data[own.data.length - 1][0]);
       const last = Math.max(...ends);
-      const from = one.span > 0 && ends.length ? last - one.span : "dataMin";
+      const from = shown > 0 && ends.length ? last - shown : "dataMin";
       const to = ends.length ? last : "dataMax";
       chart.setOption({ xAxis: { min: from, max: to }, series }, { lazyUpdate: true });
       one.drawn = true;
