@@ -49,7 +49,7 @@ COMMANDS: Final[Mapping[str, tuple[str, str]]] = {
     "resume": ("steering", "resume a paused mesh"),
     "step": ("steering", "run a mesh for some points and pause it again"),
     "stop": ("steering", "end the run of a mesh"),
-    "rerun": ("rerunning", "run again what a result file has recorded"),
+    "rerun": ("rerun_command", "run again what a result file has recorded"),
     "play": ("play", "play a recorded bag into the inputs of a mesh"),
     "plot": ("plotting", "plot result files"),
     "compare": ("comparing", "compare two result files"),
