@@ -14,10 +14,12 @@ from fmu_mesh.config.loading import LoadedConfig, read_text
 from fmu_mesh.errors import ConfigurationError
 from fmu_mesh.instances.configuration import examine_data, parse
 from fmu_mesh.run.options import Options, with_options
+from fmu_mesh.system.recording import result_endings
 from fmu_mesh.system.records import RecordPlan
 from fmu_mesh.system.system import build
 from tests.unit.test_system import ARRAYS, DESCRIPTIONS, FILE, built, findings_of, text
 
+ENDINGS = " or ".join(result_endings())
 OUTPUTS = ["pendulum.a", "pendulum.der(a,2)", "pendulum.count", "pendulum.flag", "pendulum.mode", "delay.y"]
 
 
@@ -153,7 +155,7 @@ SECTIONS = [
     ("[{}, {file: a.csv}, {file: ../configs/a.csv}]",
      "record[2].file: '../configs/a.csv', which is also the file of record[1]; expected a file of its own"),
     ("[{}, {file: a.xlsx}]",
-     "record[1].file: 'a.xlsx', a format that is not written; expected a name ending in .csv or .mcap"),
+     f"record[1].file: 'a.xlsx', a format that is not written; expected a name ending in {ENDINGS}"),
     ("[{file: a.csv}, {evry: 2}]", ("record[1].evry: an unknown key; expected one of file, variables, every, from. "
      "Did you mean 'every'?")),
     ("a.csv", "record: 'a.csv'; expected a mapping with file, variables, every, from"),
