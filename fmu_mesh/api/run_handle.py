@@ -294,7 +294,7 @@ class Run:
             CallRefused: a variable cannot be set, or takes no such value.
             MeshLost: the mesh has ended, or another program controls it too.
         """
-        from .replaying import replay  # noqa: PLC0415  not for those who only look
+        from .rerunning import replay  # noqa: PLC0415  not for those who only look
 
         replay(self._running(), values, last_point)
         if last_point is not None:

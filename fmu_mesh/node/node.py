@@ -119,7 +119,6 @@ class Node:
         self._progress_sent = -1
         self._progress_told_at = 0.0
         self._runners: dict[str, Runner] = {}
-        self._put_set: Callable[[bytes], None] | None = None
         self._receivers: dict[int, FrameReceiver | Link] = {}
         self._own_memory = HostMemory.private(plan.memory, plan.node)
         self._memory = self._own_memory
@@ -222,8 +221,8 @@ class Node:
             links.append(OutLink(link, layout, runner.outputs, put))
         self._receivers = connect(plan, self._runners, self._memory, self._own_memory, shares)
         self._put_progress = membership.sender(keys.progress(plan.node))
-        if RECORDER in dict(plan.windows):
-            self._put_set = membership.sender(keys.settings(plan.node))
+        self._is_recorded = RECORDER in dict(plan.windows)
+        self._put_set = membership.sender(keys.settings(plan.node))
 
     def _initialize(self) -> Engine:
         """Initialization Mode: set, get and exchange values level by level; then the outputs are those of point 0."""
@@ -430,7 +429,7 @@ class Node:
 
     def _tell_set(self, value: SetValue) -> None:
         """Tell the recorder which value another program has set."""
-        if self._put_set is not None:
+        if self._is_recorded:
             self._put_set(encode_set(value))
 
     def _has_no_master(self) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Hashable, Iterable, Mapping, Sequence
+from collections.abc import Collection, Hashable, Iterable, Mapping, Sequence
 from typing import TypeVar
 
 __all__ = ["cycle_through", "feedback_edges", "reaches", "strongly_connected", "topological_order"]
@@ -111,6 +111,11 @@ def reaches(successors: Mapping[V, Iterable[V]], start: V, goal: V) -> bool:
                 visited.add(target)
                 stack.append(target)
     return False
+
+
+def is_cycle(component: Sequence[V], edges: Collection[tuple[V, V]]) -> bool:
+    """Whether a strongly connected component has a cycle: a single vertex needs an edge to itself."""
+    return len(component) > 1 or (component[0], component[0]) in edges
 
 
 def cycle_through(component: Sequence[V], edges: Iterable[tuple[V, V]]) -> list[V]:

@@ -6,7 +6,7 @@ Owns the synchronization model (docs/architecture.md) as data. The plan is a pur
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 
 import msgspec
 from msgspec.structs import replace
@@ -18,7 +18,7 @@ from ..simtime import TimeGrid
 from ..variables.value_conversion import to_plain
 from ..variables.value_types import PlainValue
 from .digest import digest_of
-from .graph import cycle_through, feedback_edges, strongly_connected, topological_order
+from .graph import cycle_through, feedback_edges, is_cycle, strongly_connected, topological_order
 from .initialization_plan import InitializationPlan, Loop, plan_initialization
 from .layout import Layout, row_bytes, rows_for
 from .linear_inputs import LinearInput, linear_inputs
@@ -213,14 +213,14 @@ def make_plan(
     """
     connections, closing = _with_delays(system)
     instant = [(c.source_instance, c.target_instance) for c in connections if c.delay == 0]
-    loops = [loop for loop in strongly_connected(system.instances, instant) if _is_cycle(loop, instant)]
+    loops = [loop for loop in strongly_connected(system.instances, instant) if is_cycle(loop, instant)]
     if loops:
         findings = tuple(_algebraic_loop(loop, connections, file) for loop in loops)
         text = f"{file}: {len(findings)} algebraic loops" if len(findings) > 1 else str(findings[0])
         raise ConfigurationError(text, findings=findings)
     edges = [(c.source_instance, c.target_instance) for c in connections]
     order = topological_order(system.instances, instant)
-    cycles = tuple(tuple(part) for part in strongly_connected(system.instances, edges) if _is_cycle(part, edges))
+    cycles = tuple(tuple(part) for part in strongly_connected(system.instances, edges) if is_cycle(part, edges))
     initialization = plan_initialization(system, connections)
     points = window if window is not None else window_of(system)
     plan = Plan(
@@ -277,11 +277,6 @@ def _with_delays(system: ResolvedSystem) -> tuple[tuple[Connection, ...], tuple[
         connections.append(replace(connection, delay=delay))
     chosen = tuple(new for old, new in zip(system.connections, connections, strict=True) if id(old) in closing)
     return tuple(connections), chosen
-
-
-def _is_cycle(part: Iterable[str], edges: list[tuple[str, str]]) -> bool:
-    members = list(part)
-    return len(members) > 1 or (members[0], members[0]) in edges
 
 
 def _algebraic_loop(loop: list[str], connections: tuple[Connection, ...], file: str) -> Finding:
@@ -373,7 +368,7 @@ def _output_layouts(plan: Plan) -> dict[str, Layout]:
     for c in plan.connections:
         wanted[c.source_instance].add(c.source.name)
     for instance, variable in plan.system.recorded:
-        wanted[instance].add(_base(plan, instance, variable))
+        wanted[instance].add(plan.system.base_of(instance, variable))
     return {
         name: Layout.of(variable for variable in own.description.variables if variable.name in wanted[name])
         for name, own in instances.items()
@@ -413,7 +408,7 @@ def _links(plan: Plan) -> tuple[Link, ...]:
         if target_node != plan.node_of(c.source_instance):
             needed.setdefault((c.source_instance, target_node), set()).add(c.source.name)
     for name, variable in plan.system.recorded:
-        needed.setdefault((name, RECORDER), set()).add(_base(plan, name, variable))
+        needed.setdefault((name, RECORDER), set()).add(plan.system.base_of(name, variable))
     links = []
     ends = sorted(needed, key=lambda end: (end[0], end[1] == RECORDER, end[1]))
     initial = _needed_initially(plan, needed)
@@ -445,13 +440,7 @@ def _needed_initially(plan: Plan, needed: dict[tuple[str, str], set[str]]) -> di
     for loop in plan.initialization.loops:
         for node in loop.nodes:
             for tear in loop.tears:
-                output = _base(plan, tear.source, tear.output)
+                output = plan.system.base_of(tear.source, tear.output)
                 if node != plan.node_of(tear.source) and output not in needed.get((tear.source, node), ()):
                     initial.setdefault((tear.source, node), set()).add(output)
     return initial
-
-
-def _base(plan: Plan, instance: str, name: str) -> str:
-    """The name of the variable of a column or of an end of a connection, which may be an array element."""
-    variable = plan.system.instances[instance].description.variable_of(name)
-    return variable.name if variable is not None else name

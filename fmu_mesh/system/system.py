@@ -88,6 +88,11 @@ class ResolvedSystem(msgspec.Struct, frozen=True):
         """
         return union_of(self.records)
 
+    def base_of(self, instance: str, name: str) -> str:
+        """The variable of a column or of an end of a connection, which may be an element of an array, as `y[1,2]`."""
+        variable = self.instances[instance].description.variable_of(name)
+        return variable.name if variable is not None else name
+
     @property
     def result_file(self) -> str | None:
         """Absolute path of the first result file, or None if nothing is recorded."""

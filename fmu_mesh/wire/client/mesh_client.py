@@ -7,12 +7,17 @@ there are deadlines, and names instead of keys.
 
 from __future__ import annotations
 
+import os
+import pwd
+import socket
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import partial
 from itertools import chain
+from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import msgspec
@@ -38,7 +43,6 @@ from ..views import (
 )
 from .following import Follower
 from .readings import Reading, Target, reading_of
-from .sender import this_program
 
 __all__ = ["MeshClient", "is_key", "key_expression"]
 
@@ -194,7 +198,7 @@ class MeshClient:
         except (TypeError, msgspec.MsgspecError) as error:
             raise ConfigurationError(f"{shown(value)} is no value of a variable: {error}") from error
         who = f"'{target.instance}.{target.variable.name}'"
-        return self._view(target.key, SetAnswer, who, payload, encode_origin(at, this_program()))
+        return self._view(target.key, SetAnswer, who, payload, encode_origin(at, _this_program()))
 
     def command(self, command: Command) -> CommandAnswer:
         """Pause, resume, step or stop the mesh; the answer comes before the mesh has paused."""
@@ -314,6 +318,21 @@ class MeshClient:
             return [sample for reply in replies if (sample := answer_of(reply)) is not None]
         except MeshLost as error:
             raise ConfigurationError(error.message) from error
+
+
+_OURS = ("fmu-mesh", "__main__.py")
+
+
+def _this_program() -> str:
+    """This process in words: `anna@lab fmu-mesh set (pid 4711)`, or `anna@lab steer.py (pid 4711)`."""
+    try:
+        user = pwd.getpwuid(os.getuid()).pw_name
+    except KeyError:  # a container may have users without names
+        user = str(os.getuid())
+    program, command = Path(sys.argv[0] if sys.argv else "").name, sys.argv[1:2]
+    if program in _OURS:
+        program = " ".join(["fmu-mesh", *command])
+    return f"{user}@{socket.gethostname()} {program or 'python'} (pid {os.getpid()})"
 
 
 def is_key(reference: str, keys: Keys) -> bool:
