@@ -241,6 +241,11 @@ NOT_RUN = [
         "somebody kills a process there; tests/faults/test_lost_processes.py does",
     ),
     (
+        "docs/dashboard.md",
+        "fmu-mesh dashboard",
+        "it serves until somebody ends it; tests/equivalence/test_dashboard_page.py opens the page in a browser",
+    ),
+    (
         "docs/gazebo.md",
         "instances:",
         "it needs Gazebo classic 11; tests/physics/test_gazebo_classic.py runs such a file",
