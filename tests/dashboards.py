@@ -117,6 +117,12 @@ class Browser:
         """How many pictures of plots were drawn."""
         return int(self.run("return window.fmuMeshPlots?.pictures ?? 0"))
 
+    @property
+    def instances(self) -> list[str]:
+        """The instances in the picture of the mesh, which is replaced again and again."""
+        script = "return [...document.querySelectorAll('.fm-graph [data-instance]')].map((e) => e.dataset.instance)"
+        return [str(name) for name in self.run(script)]
+
     def curve(self, name: str) -> list[list[float]]:
         """The points of a curve that the page has."""
         script = "return fmuMeshPlots.curves.get(arguments[0])?.points ?? []"

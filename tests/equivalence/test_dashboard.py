@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import socket
 from pathlib import Path
@@ -84,6 +85,23 @@ def test_a_port_that_is_taken_and_a_mesh_that_does_not_run_are_errors_with_a_way
     assert "no mesh is running here" in absent.message
     assert "203.0.113.1" in elsewhere.message
     assert "0 to 65535" in no_port.message
+
+
+def test_without_the_extra_it_says_how_to_install_it(place: Place) -> None:
+    folder = place.folder / "site"
+    folder.mkdir()
+    (folder / "sitecustomize.py").write_text('import sys\nsys.modules["nicegui"] = None\n')
+    place.environment = {
+        **place.environment,
+        "PYTHONPATH": os.pathsep.join([str(folder), os.environ.get("PYTHONPATH", "")]),
+    }
+
+    missing = place.run("dashboard", "--no-browser")
+
+    assert missing.wait() == 2
+    assert missing.message == (
+        "fmu-mesh: the dashboard needs NiceGUI. Install it with `pip install 'fmu-mesh[dashboard]'`."
+    )
 
 
 def test_beyond_loopback_it_warns(place: Place) -> None:

@@ -83,12 +83,10 @@ def test_the_page_shows_the_run_from_its_start_and_asks_no_other_host(place: Pla
         wait_until(lambda: page.curve("pendulum.a")[:1] == [[0.0, page.curve("pendulum.a")[0][1]]], "the start")
         first = len(page.curve("pendulum.a"))
         wait_until(lambda: len(page.curve("pendulum.a")) > first, "new values")
-        picture = wait_until(
-            lambda: page.driver.find_elements(By.CSS_SELECTOR, ".fm-graph [data-instance]"), "the graph of the mesh"
-        )
+        drawn = wait_until(lambda: page.instances, "the graph of the mesh")
         address = page.driver.current_url
 
-        assert [element.get_attribute("data-instance") for element in picture] == ["pendulum", "delay"]
+        assert drawn == ["pendulum", "delay"]
         assert "real-time factor" in page.text
         assert "token" not in address
         assert "curve=" in address
@@ -180,12 +178,9 @@ def test_the_page_of_64_instances_shows_all_of_them(place: Place) -> None:
     with browser(place.folder) as page:
         _open(page, dashboard.url)
 
-        drawn = wait_until(
-            lambda: len(page.driver.find_elements(By.CSS_SELECTOR, ".fm-graph [data-instance]")) == 64, "the graph"
-        )
+        wait_until(lambda: len(page.instances) == 64, "the graph")
         wait_until(lambda: "gain3" in page.text, "the table")
         wait_until(lambda: page.curve("gain0.y"), "a curve")
-        assert drawn
         assert page.problems() == []
     place.run("stop", "many")
 

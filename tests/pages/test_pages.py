@@ -246,6 +246,11 @@ NOT_RUN = [
         "robot is yours; tests/equivalence/test_foxglove.py connects to the port",
     ),
     (
+        "docs/dashboard.md",
+        "fmu-mesh dashboard",
+        "it serves until somebody ends it; tests/equivalence/test_dashboard_page.py opens the page in a browser",
+    ),
+    (
         "docs/gazebo.md",
         "instances:",
         "it needs Gazebo classic 11; tests/physics/test_gazebo_classic.py runs such a file",
