@@ -125,7 +125,7 @@ class _CollectedRows:
         self._plan = plan
         self._file = None
         if memory_of(plan) is None:
-            self._file = open_result(plan.loaded, plan.plan.system, digest=plan.plan.digest, contents=plan.contents)
+            self._file = open_result(plan.loaded, plan.plan.system)
         self._times: list[NDArray[np.float64]] = []
         self._blocks: list[list[NDArray[Any]]] = []
         self.rows = 0

@@ -32,6 +32,7 @@ from .notes_file import NotesFile
 
 __all__ = ["CsvFile", "NativeLines", "python_lines"]
 
+_DEVICES: Final = ("/dev", "/dev/fd", "/proc/self/fd")
 _READ_BYTES = 1 << 20
 _TIME: Final = b"time"
 
@@ -62,7 +63,7 @@ class CsvFile(BlockFile):
         self, path: Path, columns: Sequence[tuple[str, VariableType]], metadata: Mapping[str, Any] | None = None
     ) -> None:
         super().__init__(path, 1 + len(columns))
-        is_device = exists(path) and not is_file(path)
+        is_device = str(path.parent) in _DEVICES or (exists(path) and not is_file(path))
         self._notes = NotesFile(path, metadata) if metadata and not is_device else None
         header = io.StringIO()
         csv.writer(header, lineterminator="\n").writerow(["time", *(name for name, _ in columns)])

@@ -221,9 +221,11 @@ def serve(control: int, job: Callable[..., Job]) -> Job | None:
         Interrupted: the server was asked to end.
     """
     from ..instances.registry import preload  # noqa: PLC0415 only the server needs it
+    from ..system.run_metadata import versions  # noqa: PLC0415 as above
     from . import roles  # noqa: F401, PLC0415 as above
 
     preload()
+    versions()
     gc.collect()
     gc.freeze()  # otherwise the next collection in a forked process would copy the memory that it shares
     return _Server(control, job).run()

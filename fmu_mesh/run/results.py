@@ -61,7 +61,7 @@ def open_results(
         loaded: the configuration.
         system: the system of this configuration.
         folder: the folder of the run, if somebody calls `rows_left` when this process was killed.
-        digest: the digest of the mesh, for the metadata.
+        digest: the digest of the mesh, for the metadata; without it the files have none.
         contents: the SHA-256 of the model of each instance, for the metadata.
 
     Raises:
@@ -71,8 +71,10 @@ def open_results(
     try:
         for number, (record, recording) in enumerate(zip(system.records, _recordings(loaded, system), strict=True)):
             path = Path(record.file)
-            metadata = metadata_of(loaded, system, record, digest=digest, contents=contents)
-            file = _format(path).open(path, replace(recording, metadata=to_builtins(metadata)))
+            if digest:
+                metadata = metadata_of(loaded, system, record, digest=digest, contents=contents)
+                recording = replace(recording, metadata=to_builtins(metadata))  # noqa: PLW2901  with what belongs to it
+            file = _format(path).open(path, recording)
             files.append(_NotedFile(file, folder / _note_of(number)) if folder is not None else file)
     except BaseException:
         for file in files:
@@ -82,15 +84,13 @@ def open_results(
     return files
 
 
-def open_result(
-    loaded: LoadedConfig, system: ResolvedSystem, *, digest: str = "", contents: Mapping[str, str] = {}
-) -> ResultFile:
-    """Open the first result file of a run; the system has one. The arguments are those of `open_results`.
+def open_result(loaded: LoadedConfig, system: ResolvedSystem) -> ResultFile:
+    """Open the first result file of one of many runs; the system has one. It has no metadata, which take milliseconds.
 
     Raises:
         ConfigurationError: the file cannot be written, or another run is writing it.
     """
-    (file,) = open_results(loaded, replace(system, records=system.records[:1]), digest=digest, contents=contents)
+    (file,) = open_results(loaded, replace(system, records=system.records[:1]))
     return file
 
 

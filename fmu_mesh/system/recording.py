@@ -259,7 +259,7 @@ def with_notes(metadata: Mapping[str, Any], entries: Iterable[Mapping[str, Any]]
 
     Example:
         >>> with_notes({"mesh": "pair"}, [{"variable": "u", "value": 3.0}, {"end": {"point": 5}}])
-        {'mesh': 'pair', 'set': [{'variable': 'u', 'value': 3.0}], 'end': {'point': 5}}
+        {'mesh': 'pair', 'end': {'point': 5}, 'set': [{'variable': 'u', 'value': 3.0}]}
     """
     noted: dict[str, Any] = {**metadata}
     values = [*noted.get("set", ())]

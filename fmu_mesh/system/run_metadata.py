@@ -10,6 +10,7 @@ import platform
 import socket
 from collections.abc import Mapping
 from datetime import UTC, datetime
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
@@ -25,7 +26,15 @@ from .records import RecordPlan
 from .series_files import content_of
 from .system import ResolvedSystem
 
-__all__ = ["ModelOrigin", "RecordedVariable", "RunMetadata", "configuration_of", "metadata_of", "scenario_files"]
+__all__ = [
+    "ModelOrigin",
+    "RecordedVariable",
+    "RunMetadata",
+    "configuration_of",
+    "metadata_of",
+    "scenario_files",
+    "versions",
+]
 
 _FORMAT = 1
 _PACKAGES = {"fmpy": "fmpy", "zenoh": "eclipse-zenoh", "numpy": "numpy"}
@@ -128,7 +137,7 @@ def metadata_of(
     grid = system.grid
     return RunMetadata(
         format=_FORMAT,
-        versions=_versions(),
+        versions=versions(),
         mesh=loaded.config.mesh,
         digest=digest,
         configuration=configuration_of(loaded),
@@ -195,7 +204,12 @@ def _recorded(system: ResolvedSystem, instance: str, name: str) -> RecordedVaria
     )
 
 
-def _versions() -> dict[str, str]:
+@cache
+def versions() -> dict[str, str]:
+    """The versions of fmu_mesh, of the packages that take part in the numbers, of Python and of the system.
+
+    The first call imports what reads metadata of packages, which takes some milliseconds.
+    """
     found = {"fmu_mesh": __version__}
     for name, package in _PACKAGES.items():
         try:

@@ -40,7 +40,10 @@ def test_the_end_of_a_script_of_ci_names_the_stages_and_closes_with_the_line_of_
 def test_a_stage_that_there_is_not_is_refused() -> None:
     done = subprocess.run([ROOT / ".ci" / "long", "zenohd"], capture_output=True, text=True, check=False)
 
-    assert (done.returncode, done.stderr) == (2, "zenohd is no stage; there are: bridge browser gazebo kills slurm tsan\n")
+    assert (done.returncode, done.stderr) == (
+        2,
+        "zenohd is no stage; there are: bridge browser gazebo kills slurm tsan\n",
+    )
 
 
 @pytest.mark.parametrize("name", ["run", "long"])

@@ -501,7 +501,7 @@ def test_a_folder_is_no_result_file(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["result.xlsx", "result.H5", "result.json"])
 def test_a_format_that_is_not_written_is_refused(name: str) -> None:
     assert findings_of(text(rest=f"record: {{file: {name}}}")) == [
-        f"7: record.file: '{name}', a format that is not written; expected a name ending in .csv or .mcap"
+        f"7: record.file: '{name}', a format that is not written; expected a name ending in .csv or .mcap or .parquet"
     ]
 
 
@@ -515,7 +515,7 @@ def test_other_names_of_result_files_are_taken(name: str) -> None:
 def test_an_ending_that_nobody_offers_is_still_a_csv_with_a_warning() -> None:
     (warning,) = built(text(rest="record: {file: result.dat}")).warnings
     assert "'result.dat', an ending of no installed format, so the file becomes a CSV" in str(warning)
-    assert "a name ending in .csv or .mcap; from version 0.3 on this is an error" in str(warning)
+    assert "a name ending in .csv or .mcap or .parquet; from version 0.3 on this is an error" in str(warning)
 
 
 def test_a_client_needs_a_router() -> None:
