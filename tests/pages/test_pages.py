@@ -241,14 +241,14 @@ NOT_RUN = [
         "somebody kills a process there; tests/faults/test_lost_processes.py does",
     ),
     (
-        "docs/foxglove.md",
-        "ssh -L 8765:127.0.0.1:8765 robot fmu-mesh foxglove",
-        "robot is yours; tests/equivalence/test_foxglove.py connects to the port",
-    ),
-    (
         "docs/dashboard.md",
         "fmu-mesh dashboard",
         "it serves until somebody ends it; tests/equivalence/test_dashboard_page.py opens the page in a browser",
+    ),
+    (
+        "docs/foxglove.md",
+        "ssh -L 8765:127.0.0.1:8765 robot fmu-mesh foxglove",
+        "robot is yours; tests/equivalence/test_foxglove.py connects to the port",
     ),
     (
         "docs/gazebo.md",
