@@ -126,7 +126,7 @@ def test_a_parquet_file_for_whose_end_there_is_no_room_is_recovered_later(place:
 
     assert launched.wait() == 2
     assert "cannot be written" in launched.message
-    assert f"is in '{result}.arrows': `fmu-mesh recover {result}` makes the file" in launched.message
+    assert f"is in '{result}.arrows', from which `fmu-mesh recover {result}` makes" in launched.message
     in_the_way.rmdir()
     recovered = place.run("recover", result)
     rows = len(fmu_mesh.Result.read(result).times)
