@@ -64,7 +64,8 @@ def test_values_are_the_recorded_ones_at_their_simulation_times(place: Place) ->
     header = next(csv.reader((place.folder / "pair.csv").read_text().splitlines()))
     for topic, name in (("/pendulum/a", "pendulum.a"), ("/delay/y", "delay.y")):
         column = header.index(name)
-        shown = client.values(topic)
+        shown = [value for value in client.values(topic) if value[1] < len(rows)]  # a node may be ahead of the stop
+        assert len(shown) >= 20
         assert shown == [(round(rows[point][0] * 1e9), point, rows[point][column]) for _, point, _ in shown]
         points = [point for _, point, _ in shown]
         assert points == list(range(points[0], points[0] + len(points)))

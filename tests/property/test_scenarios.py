@@ -109,11 +109,12 @@ def prescribed(drawn: Drawn, name: str, begin: int) -> float | None:
     if not before:
         return None
     start, value = before[-1]
-    if not linear or not after or start == now or same(value, after[0][1]):
+    end, later = [pair for pair in after if pair[0] == after[0][0]][-1] if after else before[-1]  # the last one counts
+    if not linear or not after or start == now or same(value, later):
         return value
-    first, last = drawn.time(start), drawn.time(after[0][0])
+    first, last = drawn.time(start), drawn.time(end)
     time = drawn.start_time + begin * drawn.step_size
-    return value + (after[0][1] - value) * ((time - first) / (last - first))
+    return value + (later - value) * ((time - first) / (last - first))
 
 
 def expected_of(drawn: Drawn) -> list[list[float]]:
