@@ -27,6 +27,7 @@ __all__ = ["Recorded", "configuration", "main"]
 _NOTHING = "none"
 _HEADER = "| result file | points/s | of the rate without | whole command, s | file, MB |"
 _DEADLINE_S = 600
+_STEP_SIZE_S = 0.03125
 
 
 @dataclass
@@ -57,14 +58,20 @@ class Recorded:
 
 
 def configuration(instances: int, points: int) -> dict[str, Any]:
-    """A chain of gains in one node, all outputs of which are recorded."""
-    names = [f"gain_{number}" for number in range(instances)]
+    """Pendulums in one node, with all their outputs recorded; a step of 30 ms takes one of them a microsecond."""
+    names = [f"pendulum_{number}" for number in range(instances)]
     return {
         "mesh": "recording",
-        "simulation": {"stop_time": points * 0.001, "step_size": 0.001},
-        "instances": {name: {"fmu": str(FMUS / "Gain.fmu"), "group": "gains"} for name in names},
-        "connections": [f"{source}.y -> {target}.u" for source, target in itertools.pairwise(names)],
-        "record": {"variables": [f"{name}.y" for name in names]},
+        "simulation": {"stop_time": points * _STEP_SIZE_S, "step_size": _STEP_SIZE_S},
+        "instances": {
+            name: {
+                "fmu": str(FMUS / "DampedPendulum.fmu"),
+                "group": "pendulums",
+                "start_values": {"a": 1.0 + number / instances},
+            }
+            for number, name in enumerate(names)
+        },
+        "record": {"variables": [f"{name}.*" for name in names]},
     }
 
 
@@ -93,8 +100,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument(
         "--formats", nargs="+", default=[_NOTHING, "csv", "parquet"], metavar="ENDING", help="none csv parquet"
     )
-    parser.add_argument("--instances", type=int, default=4, metavar="N", help="instances with one output each (4)")
-    parser.add_argument("--points", type=int, default=500_000, metavar="N", help="points of a run (500000)")
+    parser.add_argument("--instances", type=int, default=1, metavar="N", help="instances with three outputs each (1)")
+    parser.add_argument("--points", type=int, default=1_000_000, metavar="N", help="points of a run (1000000)")
     parser.add_argument("--repeat", type=int, default=5, metavar="N", help="interleaved rounds (5)")
     options = parser.parse_args(arguments)
     measured = [Recorded(name) for name in options.formats]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, suppress
 from pathlib import Path
 from types import TracebackType
@@ -29,7 +30,9 @@ _MERGED: Final = 32
 class GroupWriter:
     """Writes a draft of the Parquet file, which gets its name at the end; a context manager, which removes the draft.
 
-    A batch is kept until its row group is complete. So it must own its memory.
+    A batch is kept until its row group is complete. So it must own its memory. A row group is compressed on a thread of
+    its own, because that takes tens of milliseconds, in which nodes would have to wait for the recorder. If two groups
+    are waiting, `add` waits too.
 
     Args:
         path: the file.
@@ -52,6 +55,8 @@ class GroupWriter:
             file = draft.enter_context(draft.enter_context(replaced(path)).open("wb"))
             self._writer = parquet_module().ParquetWriter(file, schema, **ways)
             self._draft = draft.pop_all()
+        self._compressing = ThreadPoolExecutor(1, "parquet")
+        self._begun: Future[None] | None = None
 
     def __enter__(self) -> Self:
         return self
@@ -83,6 +88,8 @@ class GroupWriter:
         """
         if self._rows:
             self._write()
+        self._wait()
+        self._compressing.shutdown()
         if self._written:
             metadata = with_notes(decoded(self._schema), notes)
             self._writer.add_key_value_metadata({KEY: msgspec.json.encode(metadata)})
@@ -96,6 +103,7 @@ class GroupWriter:
         writer, self._writer = self._writer, None
         if writer is None:
             return
+        self._compressing.shutdown(cancel_futures=True)
         with suppress(OSError):
             writer.close()
         with suppress(_Abandoned, OSError), self._draft:
@@ -112,11 +120,22 @@ class GroupWriter:
         self._levels.append([batch])
 
     def _write(self) -> None:
-        """Write what is waiting as one row group."""
+        """Begin to write what is waiting as one row group, as soon as the one before it is written."""
         table = pyarrow_module().Table.from_batches([batch for level in reversed(self._levels) for batch in level])
         self._written += self._rows
         self._levels, self._rows, self._size = [[]], 0, 0
-        self._writer.write_table(table, row_group_size=_GROUP_ROWS)
+        self._wait()
+        self._begun = self._compressing.submit(self._writer.write_table, table, row_group_size=_GROUP_ROWS)
+
+    def _wait(self) -> None:
+        """Wait until the row group that was begun is written.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        begun, self._begun = self._begun, None
+        if begun is not None:
+            begun.result()
 
 
 class _Abandoned(Exception):
