@@ -17,19 +17,19 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any, Final, TypeVar, cast
+from typing import Any, Final, TypeVar
 
 import msgspec
 
 from ..config.mesh import TimeoutsConfig
 from ..errors import FmuError, InitializationFailed, LoadFailed, StepFailed
-from ..rings.native import NativeStep, Stage
+from ..rings.native import Stage
 from ..rings.ring import Ring
 from ..simtime import TimeGrid
 from ..text import short_path
 from ..variables.model_description import Value
-from .contract import Instance, StepsNatively
-from .instance_wrapper import AroundInstance
+from .contract import Instance
+from .instance_wrapper import AroundNativeSteps
 
 __all__ = [
     "DEFAULT_MODE",
@@ -316,7 +316,7 @@ def call_named(name: str, function: Callable[..., Result], *arguments: Any, **ke
         _functions.pop(thread, None)
 
 
-class Guarded(AroundInstance[Instance]):
+class Guarded(AroundNativeSteps):
     """An instance whose calls have a deadline and leave the state of the process unchanged; steps are as they were.
 
     Args:
@@ -344,20 +344,6 @@ class Guarded(AroundInstance[Instance]):
         """Let `do_step` work on these rings."""
         super().bind(inputs, outputs, grid, points, step)
         self._running = True
-
-    @property
-    def native(self) -> NativeStep | None:
-        """See `StepsNatively`; None if the inner instance has no such steps."""
-        return self._instance.native if isinstance(self._instance, StepsNatively) else None
-
-    @property
-    def stage(self) -> int:
-        """See `StepsNatively`; `IN_PYTHON` if the inner instance has no such steps."""
-        return self._instance.stage if isinstance(self._instance, StepsNatively) else Stage.IN_PYTHON
-
-    def finish(self, step: int, outcome: int) -> None:
-        """See `StepsNatively`; only called if there is `native`."""
-        cast("StepsNatively", self._instance).finish(step, outcome)
 
     def set_in_step(self, values: Mapping[str, Value]) -> None:
         """As `set_values`, as a part of a step: whoever watches the steps watches this, too, and it takes less time."""

@@ -11,12 +11,13 @@ from typing import Any, Generic, TypeVar, cast
 import msgspec
 
 from ..errors import FmuError, FmuMeshError
+from ..rings.native import NativeStep, Stage
 from ..rings.ring import Ring
 from ..simtime import TimeGrid
 from ..variables.model_description import ModelDescription, Value
-from .contract import Instance, KeepsState
+from .contract import Instance, KeepsState, StepsNatively
 
-__all__ = ["AroundInstance", "of_kind", "packed", "unpacked"]
+__all__ = ["AroundInstance", "AroundNativeSteps", "of_kind", "packed", "unpacked"]
 
 Within = TypeVar("Within", bound=Instance)
 Own = TypeVar("Own")
@@ -116,6 +117,24 @@ def unpacked(data: bytes, kind: type[Own], instance: str | None) -> tuple[Own, b
         return msgspec.msgpack.decode(data, type=tuple[kind, bytes])  # type: ignore[valid-type]  # a variable here
     except msgspec.DecodeError as error:
         raise FmuMeshError(f"this is no state of an instance: {error}", instance=instance) from error
+
+
+class AroundNativeSteps(AroundInstance[Instance]):
+    """Also forwards the calls of `StepsNatively`, where the inner instance has such steps."""
+
+    @property
+    def native(self) -> NativeStep | None:
+        """See `StepsNatively`; None if the inner instance has no such steps."""
+        return self._instance.native if isinstance(self._instance, StepsNatively) else None
+
+    @property
+    def stage(self) -> int:
+        """See `StepsNatively`; `IN_PYTHON` if the inner instance has no such steps."""
+        return self._instance.stage if isinstance(self._instance, StepsNatively) else Stage.IN_PYTHON
+
+    def finish(self, step: int, outcome: int) -> None:
+        """See `StepsNatively`; only called if there is `native`."""
+        cast("StepsNatively", self._instance).finish(step, outcome)
 
 
 def of_kind(kind: type[Own], state: object) -> Own:

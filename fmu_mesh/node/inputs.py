@@ -8,17 +8,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
-from typing import Literal, cast
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FmuError
 from ..instances.call_guard import Guarded
-from ..instances.contract import Instance, KeepsState, StepsNatively
+from ..instances.contract import Instance, KeepsState
 from ..instances.input_trajectory import Trajectory
-from ..instances.instance_wrapper import AroundInstance
-from ..rings.native import NativeStep, Stage
+from ..instances.instance_wrapper import AroundNativeSteps
 from ..rings.ring import Ring
 from ..simtime import ENDLESS, TimeGrid
 from ..system.plan import InstancePlan
@@ -39,7 +38,7 @@ _AHEAD = 4096
 """Number of steps that inputs are calculated ahead."""
 
 
-class TimedInputs(AroundInstance[Instance]):
+class TimedInputs(AroundNativeSteps):
     """An `Instance` whose inputs and parameters may follow trajectories; all other calls go to the inner instance.
 
     The step from t sets each of these variables to its value at t. A value without a time holds from the next step on.
@@ -104,20 +103,6 @@ class TimedInputs(AroundInstance[Instance]):
                 self._in_row[name][0](0, float(values[step - self.tracks_from]))
         self._instance.do_step(step)
         self._step = step + 1
-
-    @property
-    def native(self) -> NativeStep | None:
-        """See `StepsNatively`: the steps before `python_at`."""
-        return self._instance.native if isinstance(self._instance, StepsNatively) else None
-
-    @property
-    def stage(self) -> int:
-        """See `StepsNatively`."""
-        return self._instance.stage if isinstance(self._instance, StepsNatively) else Stage.IN_PYTHON
-
-    def finish(self, step: int, outcome: int) -> None:
-        """See `StepsNatively`; only called if there is `native`."""
-        cast("StepsNatively", self._instance).finish(step, outcome)
 
     def reached(self, step: int) -> None:
         """Note that ``step`` own steps are done: `do_step` has not taken those without a change."""
