@@ -53,11 +53,13 @@ class PlannedRerun(NamedTuple):
         plan: the plan of the run.
         values: what is set in it, in the order of the points.
         last_point: the point at which it is stopped; None: it runs to its end.
+        first: the result of the first run.
     """
 
     plan: RunPlan
     values: Sequence[SetValue]
     last_point: int | None
+    first: Result
 
     def run(self, **how: Unpack[StartOptions]) -> Result:
         """Run it.
@@ -156,7 +158,7 @@ def planned_rerun(
     _check_models(path, metadata, plan)
     if (version := metadata.versions.get("fmu_mesh")) != __version__:
         on_notice(f"'{path}' was made by fmu_mesh {version}, and this is {__version__}")
-    return PlannedRerun(plan, values, last_point)
+    return PlannedRerun(plan, values, last_point, first)
 
 
 def replay(client: MeshClient, values: Sequence[SetValue], last_point: int | None) -> None:

@@ -55,7 +55,7 @@ def _rerun(arguments: argparse.Namespace) -> int:
         for line in summary(plan, outcome):
             print(line)
         assert outcome.file is not None  # it records what the first run has recorded
-        comparison = Result.read(arguments.result).compare(Result.read(outcome.file))
+        comparison = again.first.compare(Result.read(outcome.file))
         if comparison.equal:
             print(f"every value is that of '{arguments.result}'")
             return 0
