@@ -7,10 +7,28 @@ import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-__all__ = ["fits", "listed", "nearest", "nearest_file", "short_number", "short_path", "shown"]
+__all__ = [
+    "EXPRESSION",
+    "WILDCARDS",
+    "expression_of",
+    "fits",
+    "listed",
+    "nearest",
+    "nearest_file",
+    "short_number",
+    "short_path",
+    "shown",
+]
 
 _LISTED_NAMES = 8
 _SHOWN_CHARACTERS = 60
+
+
+EXPRESSION = "re:"
+"""Begins a pattern of names that is a regular expression."""
+
+WILDCARDS = {"*": ".*", "?": "."}
+"""The signs of other patterns, and what they mean."""
 
 
 def nearest(name: str, names: Iterable[str]) -> str | None:
@@ -80,3 +98,14 @@ def fits(pattern: str, name: str) -> bool:
     Brackets belong to the names of variables, so these are not the patterns of `fnmatch`.
     """
     return re.fullmatch(".*".join(map(re.escape, pattern.split("*"))), name, re.DOTALL) is not None
+
+
+def expression_of(pattern: str) -> re.Pattern[str]:
+    """What a pattern of names matches as a whole: `*` any characters, `?` one; after `re:` it is a regular expression.
+
+    Raises:
+        re.error: it is no regular expression; OverflowError and RecursionError: it is too large.
+    """
+    if pattern.startswith(EXPRESSION):
+        return re.compile(pattern.removeprefix(EXPRESSION), re.DOTALL)
+    return re.compile("".join(WILDCARDS.get(sign) or re.escape(sign) for sign in pattern), re.DOTALL)

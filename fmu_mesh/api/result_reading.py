@@ -17,14 +17,13 @@ from ..errors import ConfigurationError
 from ..recorder.csv_file import CsvFile
 from ..recorder.notes_file import read_notes
 from ..system.recording import Columns, ReadableFormat, result_format
-from ..text import listed, nearest, nearest_file
+from ..text import EXPRESSION, WILDCARDS, expression_of, listed, nearest, nearest_file
 from ..variables.value_types import DTYPES, VariableType, is_float
 
 __all__ = ["Columns", "chosen_names", "read_csv", "read_result", "require_readable"]
 
 _TIME = "time"
 _FLAGS: Final = {"true": True, "false": False}
-_WILD: Final = {"*": ".*", "?": "."}
 _FIELD = re.compile(rb'"((?:[^"]|"")*)"|([^,]*)')
 
 
@@ -215,14 +214,11 @@ def chosen_names(path: Path | str, names: Sequence[str], wanted: Sequence[str]) 
 
 def _matching(pattern: str, names: Sequence[str]) -> list[str]:
     """The names that a pattern means, or the elements of an array."""
-    if pattern.startswith("re:"):
+    if pattern.startswith(EXPRESSION) or any(sign in pattern for sign in WILDCARDS):
         try:
-            matches = re.compile(pattern.removeprefix("re:")).fullmatch
-        except re.error as error:
+            matches = expression_of(pattern).fullmatch
+        except (re.error, OverflowError, RecursionError) as error:
             raise ConfigurationError(f"'{pattern}' is no regular expression: {error}.") from error
-    elif "*" in pattern or "?" in pattern:
-        parts = (_WILD.get(character, re.escape(character)) for character in pattern)
-        matches = re.compile("".join(parts), re.DOTALL).fullmatch
     else:
         matches = re.compile(re.escape(pattern) + r"\[[0-9]+(,[0-9]+)*\]").fullmatch
     return [name for name in names if matches(name)]

@@ -17,7 +17,7 @@ from ..config.findings import Findings
 from ..config.loading import LoadedConfig
 from ..config.mesh import RecordConfig
 from ..simtime import TimeGrid, steps_between
-from ..text import listed, nearest, short_number, shown
+from ..text import EXPRESSION, WILDCARDS, expression_of, listed, nearest, short_number, shown
 from ..variables.model_description import Causality, Variable
 from ..variables.value_types import element_name, is_text, split_element
 from .connections import Variables, resolve_variable
@@ -34,9 +34,6 @@ _PREFIXES: dict[str, tuple[Causality, ...]] = {
 """What a pattern with one of these words and a colon before it matches."""
 
 _WORDS = {"out": "output", "in": "input", "local": "local variable", "param": "parameter"}
-
-_EXPRESSION = "re:"
-_WILDCARDS = {"*": ".*", "?": "."}
 
 
 class RecordPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -251,8 +248,8 @@ def _is_pattern(reference: str, variables: Variables) -> bool:
     if name in (variables.get(instance) or ()):
         return False
     word, colon, _ = reference.partition(":")
-    is_marked = bool(colon) and (word in _PREFIXES or f"{word}:" == _EXPRESSION)
-    return is_marked or any(sign in reference for sign in _WILDCARDS)
+    is_marked = bool(colon) and (word in _PREFIXES or f"{word}:" == EXPRESSION)
+    return is_marked or any(sign in reference for sign in WILDCARDS)
 
 
 def _parts(reference: str) -> tuple[str, str]:
@@ -264,13 +261,10 @@ def _parts(reference: str) -> tuple[str, str]:
 def _pattern(reference: str, place: str, findings: Findings) -> _Pattern | None:
     """The pattern that a text is; None after a finding."""
     word, text = _parts(reference)
-    if not text.startswith(_EXPRESSION):
-        written = "".join(_WILDCARDS.get(sign) or re.escape(sign) for sign in text)
-        return _Pattern(re.compile(written, re.DOTALL), _PREFIXES[word])
     try:
-        return _Pattern(re.compile(text.removeprefix(_EXPRESSION), re.DOTALL), _PREFIXES[word])
+        return _Pattern(expression_of(text), _PREFIXES[word])
     except (re.error, OverflowError, RecursionError) as error:
-        findings.add(place, f"{shown(reference)} ({error})", f"a regular expression of Python after `{_EXPRESSION}`")
+        findings.add(place, f"{shown(reference)} ({error})", f"a regular expression of Python after `{EXPRESSION}`")
         return None
 
 
@@ -305,5 +299,5 @@ def _nothing_matches(reference: str, pattern: _Pattern, place: str, variables: V
     elif others:
         findings.add(place, found, f"a pattern for {_WORDS[others[0]]}s, as it matches some", f"{others[0]}:{text}")
     else:
-        near = nearest(re.sub(r"[*?]", "", text.removeprefix(_EXPRESSION)), names)
+        near = nearest(re.sub(r"[*?]", "", text.removeprefix(EXPRESSION)), names)
         findings.add(place, found, f"a pattern for one of {listed(names)}", near)
