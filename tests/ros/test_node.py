@@ -649,6 +649,38 @@ def test_while_an_fmu_hangs_the_node_answers_and_its_end_is_bounded_and_clean(
     assert list(temporary.iterdir()) == []
 
 
+HANGING_ROS = """
+import sys, threading
+import rclpy
+from fmu_mesh.ros.node import entry
+
+entry._END_S = 0.5
+rclpy.try_shutdown = threading.Event().wait
+threading.Timer(1.0, rclpy.shutdown).start()
+sys.exit(entry.main(["--ros-args", "-p", "fmu_path:=" + sys.argv[1], "-p", "autostart:=true"]))
+"""
+
+
+def test_a_middleware_that_does_not_shut_down_ends_with_a_message_and_the_code_of_the_node(
+    ros: Ros, tmp_path: Path
+) -> None:
+    environment = {**os.environ, **ros.environment, "TMPDIR": str(tmp_path)}
+
+    done = subprocess.run(
+        [sys.executable, "-c", HANGING_ROS, GAIN],
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=DEADLINE_S,
+    )
+
+    assert "fmu_mesh.ros.node: ROS was not shut down within 0.5 s; the process ends without it" in done.stderr
+    assert "in wait" in done.stderr  # the call that hangs, for a report
+    assert done.returncode == 0
+    assert list(tmp_path.glob("fmu*")) == []
+
+
 def test_a_misspelt_parameter_is_told_with_the_nearest_right_one(ros: Ros, said: Said) -> None:
     node = ros.fmu(fmu_path=PENDULUM, update_perid=0.1, l=2.0)
 

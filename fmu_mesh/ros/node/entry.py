@@ -5,6 +5,7 @@ With the parameter `fmu_path` the node runs an FMU; with `config` it is the gate
 
 from __future__ import annotations
 
+import faulthandler
 import os
 import signal
 import sys
@@ -12,7 +13,7 @@ import threading
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
-from ...errors import ConfigurationError, FmuMeshError, Interrupted
+from ...errors import ConfigurationError, FmuError, FmuMeshError, Interrupted
 from .autostart import Autostart
 from .fmu_node import FmuNode
 from .gateway_node import GatewayNode
@@ -174,16 +175,40 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # A second Ctrl-C ends the process at once, without a traceback.
         signal.signal(signal.SIGINT, lambda *_: os._exit(Interrupted.exit_code))
         managed: Managed = node.managed
-        # Neither an FMU that hangs nor the shutdown of the middleware may keep this process alive.
-        end = threading.Timer(_END_S, os._exit, (3,))
-        end.daemon = True
-        end.start()
-        returned = managed.close()
-        node.destroy_node()
-        rclpy.try_shutdown()
-    exit_code = managed.failure.exit_code if managed.failure is not None else 0
+        with _Deadline(f"the node was not closed within {_END_S:g} s", FmuError.exit_code):
+            returned = managed.close()
+        exit_code = managed.failure.exit_code if managed.failure is not None else 0 if returned else FmuError.exit_code
+        # All that is the node's own is closed: nothing is lost if the middleware does not end.
+        with _Deadline(f"ROS was not shut down within {_END_S:g} s", exit_code):
+            node.destroy_node()
+            rclpy.try_shutdown()
     if not returned:
         # Python waits at its end for the thread that is still inside the FMU.
-        os._exit(exit_code or 3)
-    end.cancel()
+        os._exit(exit_code)
     return exit_code
+
+
+class _Deadline:
+    """Ends the process if what is inside takes longer than `_END_S`; says so, and what every thread does.
+
+    Args:
+        what: has not happened then.
+        exit_code: of the process then.
+    """
+
+    def __init__(self, what: str, exit_code: int) -> None:
+        self._what = what
+        self._exit_code = exit_code
+        self._timer = threading.Timer(_END_S, self._end)
+        self._timer.daemon = True
+
+    def __enter__(self) -> None:
+        self._timer.start()
+
+    def __exit__(self, *_: object) -> None:
+        self._timer.cancel()
+
+    def _end(self) -> None:
+        print(f"fmu_mesh.ros.node: {self._what}; the process ends without it", file=sys.stderr)  # noqa: T201 as above
+        faulthandler.dump_traceback()
+        os._exit(self._exit_code)
