@@ -7,12 +7,15 @@ import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+from .errors import ConfigurationError
+
 __all__ = [
     "EXPRESSION",
     "WILDCARDS",
     "expression_of",
-    "fits",
+    "is_pattern",
     "listed",
+    "matching",
     "nearest",
     "nearest_file",
     "short_number",
@@ -92,20 +95,39 @@ def short_path(path: str | Path) -> str:
         return str(path)
 
 
-def fits(pattern: str, name: str) -> bool:
-    """Whether ``name`` is the pattern, in which only `*` is special and stands for any characters.
+def is_pattern(text: str) -> bool:
+    """Whether a text has a sign of a pattern of names; the name of a variable may have one too."""
+    return text.startswith(EXPRESSION) or any(sign in text for sign in WILDCARDS)
 
-    Brackets belong to the names of variables, so these are not the patterns of `fnmatch`.
+
+def matching(text: str, names: Sequence[str]) -> list[str]:
+    """The names that a text means: the one that it is, or else all that it matches as a pattern.
+
+    Raises:
+        ConfigurationError: it is no regular expression.
     """
-    return re.fullmatch(".*".join(map(re.escape, pattern.split("*"))), name, re.DOTALL) is not None
+    if text in names:
+        return [text]
+    if not is_pattern(text):
+        return []
+    try:
+        matches = expression_of(text).fullmatch
+    except ValueError as error:
+        raise ConfigurationError(f"'{text}' is no regular expression: {error}.") from error
+    return [name for name in names if matches(name)]
 
 
 def expression_of(pattern: str) -> re.Pattern[str]:
     """What a pattern of names matches as a whole: `*` any characters, `?` one; after `re:` it is a regular expression.
 
+    Brackets belong to the names of variables, so these are not the patterns of `fnmatch`.
+
     Raises:
-        re.error: it is no regular expression; OverflowError and RecursionError: it is too large.
+        ValueError: it is no regular expression, or one that is too large.
     """
     if pattern.startswith(EXPRESSION):
-        return re.compile(pattern.removeprefix(EXPRESSION), re.DOTALL)
+        try:
+            return re.compile(pattern.removeprefix(EXPRESSION), re.DOTALL)
+        except (re.error, OverflowError, RecursionError) as error:
+            raise ValueError(str(error)) from error
     return re.compile("".join(WILDCARDS.get(sign) or re.escape(sign) for sign in pattern), re.DOTALL)

@@ -15,7 +15,7 @@ from ..config.instance_sections import KIND
 from ..errors import CallRefused, LoadFailed, UnknownName
 from ..instances.fmi import read_description, sha256_of
 from ..instances.registry import KINDS, describe
-from ..text import fits, listed, nearest, nearest_file, short_number, shown
+from ..text import listed, matching, nearest, nearest_file, short_number, shown
 from ..variables.model_description import Causality, Kind, ModelDescription, Variable
 from .tables import pairs
 
@@ -78,7 +78,8 @@ class Inspection(msgspec.Struct, frozen=True, omit_defaults=False):
 
         Args:
             width: in columns.
-            variables: names, with `*` for any characters; if given, only these variables are shown.
+            variables: names, or patterns of names (`*`: any characters; `?`: one; `re:...`: a regular expression); if
+                given, only these variables are shown.
             everything: whether all variables are listed.
 
         Raises:
@@ -86,7 +87,7 @@ class Inspection(msgspec.Struct, frozen=True, omit_defaults=False):
         """
         names = [variable.name for variable in self.description.variables]
         for pattern in variables:
-            if not any(fits(pattern, name) for name in names):
+            if not matching(pattern, names):
                 near = nearest(pattern, names)
                 hint = f"Did you mean '{near}'?" if near else None
                 raise UnknownName(f"'{self.file}' has no variable '{pattern}'", hint=hint)
@@ -161,7 +162,9 @@ def with_way_out(error: LoadFailed, path: Path) -> LoadFailed:
 
 def _page(inspection: Inspection, width: int, patterns: Sequence[str], *, everything: bool) -> list[str]:
     description = inspection.description
-    chosen = [v for v in description.variables if not patterns or any(fits(pattern, v.name) for pattern in patterns)]
+    names = [variable.name for variable in description.variables]
+    wanted = {name for pattern in patterns for name in matching(pattern, names)}
+    chosen = [variable for variable in description.variables if not patterns or variable.name in wanted]
     lines = [] if patterns else [*_facts(inspection, width), *_problems(inspection, width)]
     for causality, title in _CAUSALITIES:
         members = [variable for variable in chosen if variable.causality == causality]

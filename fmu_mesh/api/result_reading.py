@@ -17,7 +17,7 @@ from ..errors import ConfigurationError
 from ..recorder.csv_file import CsvFile
 from ..recorder.notes_file import read_notes
 from ..system.recording import Columns, ReadableFormat, result_format
-from ..text import EXPRESSION, WILDCARDS, expression_of, listed, nearest, nearest_file
+from ..text import listed, matching, nearest, nearest_file
 from ..variables.value_types import DTYPES, VariableType, is_float
 
 __all__ = ["Columns", "chosen_names", "read_csv", "read_result", "require_readable"]
@@ -202,7 +202,7 @@ def chosen_names(path: Path | str, names: Sequence[str], wanted: Sequence[str]) 
     found: dict[str, None] = {}
     unknown = []
     for text in wanted:
-        own = [text] if text in names else _matching(text, names)
+        own = matching(text, names) or _elements(text, names)
         found.update(dict.fromkeys(own))
         unknown += [text] if not own else []
     if unknown:
@@ -212,15 +212,9 @@ def chosen_names(path: Path | str, names: Sequence[str], wanted: Sequence[str]) 
     return [*found] or names
 
 
-def _matching(pattern: str, names: Sequence[str]) -> list[str]:
-    """The names that a pattern means, or the elements of an array."""
-    if pattern.startswith(EXPRESSION) or any(sign in pattern for sign in WILDCARDS):
-        try:
-            matches = expression_of(pattern).fullmatch
-        except (re.error, OverflowError, RecursionError) as error:
-            raise ConfigurationError(f"'{pattern}' is no regular expression: {error}.") from error
-    else:
-        matches = re.compile(re.escape(pattern) + r"\[[0-9]+(,[0-9]+)*\]").fullmatch
+def _elements(array: str, names: Sequence[str]) -> list[str]:
+    """The columns of the elements of an array."""
+    matches = re.compile(re.escape(array) + r"\[[0-9]+(,[0-9]+)*\]").fullmatch
     return [name for name in names if matches(name)]
 
 

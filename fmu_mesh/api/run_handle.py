@@ -36,7 +36,7 @@ from ..wire.views import (
 )
 from .notebook_progress import NotebookProgress
 from .run_ways import TIMEOUT_S, ended_by_keyboard, follow, reach
-from .samples import Sample, Watch, sample_of, targets_of
+from .samples import Sample, Watch, sample_of, target_of, targets_of
 
 if TYPE_CHECKING:  # whoever attaches to a mesh needs nothing that plans or starts one
     from ..ros.bags.bag import Bag
@@ -181,7 +181,7 @@ class Run:
     def variables(self) -> dict[str, VariableView]:
         """All variables of the mesh by `instance.variable`."""
         client = self._running()
-        return {f"{target.instance}.{target.variable.name}": target.variable for target in client.targets("*.*")}
+        return {target.name: target.variable for target in client.targets("*")}
 
     # --- values
 
@@ -192,12 +192,14 @@ class Run:
             A number, truth value, text or bytes; an array as a numpy array, which belongs to the caller.
 
         Raises:
-            UnknownName: there is no such variable; suggests the nearest one.
+            UnknownName: there is no such variable (suggests the nearest one), or a pattern means several.
         """
+        if len(self._targets.get(name, ())) != 1:
+            self._targets[name] = [target_of(self._running(), name)]
         return self.samples(name)[0].value
 
     def samples(self, *names: str) -> list[Sample]:
-        """The current values of several variables, each with its point; `*` in a name stands for any characters."""
+        """The current values of several variables, each with its point; patterns mean all that they match."""
         client = self._running()
         for name in names:
             self._targets[name] = self._targets.get(name) or targets_of(client, name)
@@ -220,12 +222,12 @@ class Run:
         """
         client = self._running()
         try:
-            return client.set(targets_of(client, name)[0], value, at)
+            return client.set(target_of(client, name), value, at)
         except ConfigurationError as error:
             raise CallRefused(error.message, hint=error.hint) from error
 
     def watch(self, *names: str) -> Watch:
-        """Every value of variables from now on, until the mesh ends; `*` in a name stands for any characters.
+        """Every value of variables from now on, until the mesh ends; patterns mean all that they match.
 
         A reader that falls far behind loses the newest values; the points tell which.
 

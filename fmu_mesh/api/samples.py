@@ -14,7 +14,7 @@ from ..wire.client.mesh_client import MeshClient
 from ..wire.client.readings import Reading, Target
 from ..wire.views import VariableView
 
-__all__ = ["Sample", "Watch", "sample_of", "targets_of"]
+__all__ = ["Sample", "Watch", "sample_of", "target_of", "targets_of"]
 
 
 class Sample(NamedTuple):
@@ -77,13 +77,25 @@ class Watch(Iterator[Sample]):
 
 
 def targets_of(client: MeshClient, name: str) -> list[Target]:
-    """The variables with a name; `*` in it stands for any characters.
+    """The variables that a name or a pattern means (`*`: any characters, `?`: one, `re:...`: a regular expression).
 
     Raises:
         UnknownName: there is none.
     """
     try:
         return client.targets(name)
+    except ConfigurationError as error:
+        raise UnknownName(error.message, hint=error.hint) from error
+
+
+def target_of(client: MeshClient, name: str) -> Target:
+    """The one variable that a name or a pattern means.
+
+    Raises:
+        UnknownName: there is none, or there are several.
+    """
+    try:
+        return client.target(name)
     except ConfigurationError as error:
         raise UnknownName(error.message, hint=error.hint) from error
 

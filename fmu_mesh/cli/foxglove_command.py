@@ -23,7 +23,7 @@ def _add_foxglove(parser: CommandParser) -> None:
         nargs="+",
         default=[],
         metavar="INSTANCE.VARIABLE",
-        help="offer only these (`*`: any characters); default: all outputs",
+        help="offer only these, or patterns; default: all outputs",
     )
     parser.add_argument("--host", default=_HOST, metavar="ADDRESS", help=f"the address to listen at ({_HOST})")
     parser.add_argument(

@@ -27,7 +27,7 @@ def _add_inspect(parser: CommandParser) -> None:
         "variables",
         nargs="*",
         metavar="VARIABLE",
-        help="show only these variables; * stands for any characters",
+        help="show only these variables, or patterns, such as 'x*'",
     )
     parser.add_argument(
         "--all", action="store_true", help=f"show all variables instead of {SHOWN_VARIABLES} of each causality"

@@ -37,7 +37,10 @@ from .output.pages import (
 
 __all__ = ["PARSERS"]
 
-_REFERENCE = "`instance.variable` or `MESH/instance.variable` (`*`: any characters), or a key (with wildcards of Zenoh)"
+_REFERENCE = (
+    "`instance.variable` or `MESH/instance.variable`, or a pattern of them (`*` any characters, `?` one, `re:` a "
+    "regular expression); or a key (with wildcards of Zenoh)"
+)
 _WHICH = "a mesh or an instance: NAME, MESH/INSTANCE, or its key"
 
 Run = Callable[[argparse.Namespace, Meshes], int]

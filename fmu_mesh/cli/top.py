@@ -56,7 +56,7 @@ def _add_top(parser: CommandParser) -> None:
         nargs="+",
         default=[],
         metavar="INSTANCE.VARIABLE",
-        help="also show the course of these variables (`*`: any characters)",
+        help="also show the course of these variables (or patterns, such as 'arm*.x')",
     )
     add_json(parser, "JSON, one object per look")
     parser.set_defaults(run_command=_top)

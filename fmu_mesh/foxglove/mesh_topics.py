@@ -102,7 +102,7 @@ def settable(infos: Iterable[InstanceInfo], targets: Iterable[Target]) -> dict[s
     """
     connected = {connection.target for info in infos for connection in info.connections}
     connected |= {element[0] for name in connected if (element := split_element(name)) is not None}
-    names = {f"{target.instance}.{target.variable.name}": target for target in targets}
+    names = {target.name: target for target in targets}
     return {name: target for name, target in names.items() if name not in connected and _is_open(target.variable)}
 
 
@@ -116,10 +116,7 @@ def topics_by_instance(
             element = split_element(connection.source)
             for source in (connection.source, *([element[0]] if element is not None else ())):
                 readers.setdefault(source, {})[name] = None
-    return {
-        topic_of(target): (target.instance, tuple(readers.get(f"{target.instance}.{target.variable.name}", ())))
-        for target in targets
-    }
+    return {topic_of(target): (target.instance, tuple(readers.get(target.name, ()))) for target in targets}
 
 
 def _is_open(view: VariableView) -> bool:

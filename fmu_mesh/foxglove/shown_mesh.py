@@ -40,7 +40,7 @@ class ShownMesh:
     Args:
         client: the way into the mesh.
         server: where it is shown.
-        patterns: what is offered, as names with `*`; none: all outputs.
+        patterns: what is offered, as names or patterns of names; none: all outputs.
         read_only: whether clients cannot set anything.
 
     Raises:
@@ -55,7 +55,7 @@ class ShownMesh:
         self._grid = TimeGrid(self._info.start_time, self._info.step_size, ENDLESS)
         self._shift_ns = max(0, -nanoseconds(self._info.start_time))
         self._infos = {name: client.instance_info(name) for name in self._info.instances}
-        everything = client.targets("*.*")
+        everything = client.targets("*")
         chosen = [target for pattern in patterns for target in client.targets(pattern)]
         offered = chosen if patterns else [target for target in everything if target.variable.causality == "output"]
         self._targets = {topic_of(target): target for target in offered}

@@ -17,7 +17,7 @@ from ..config.findings import Findings
 from ..config.loading import LoadedConfig
 from ..config.mesh import RecordConfig
 from ..simtime import TimeGrid, steps_between
-from ..text import EXPRESSION, WILDCARDS, expression_of, listed, nearest, short_number, shown
+from ..text import EXPRESSION, expression_of, is_pattern, listed, nearest, short_number, shown
 from ..variables.model_description import Causality, Variable
 from ..variables.value_types import element_name, is_text, split_element
 from .connections import Variables, resolve_variable
@@ -248,8 +248,7 @@ def _is_pattern(reference: str, variables: Variables) -> bool:
     if name in (variables.get(instance) or ()):
         return False
     word, colon, _ = reference.partition(":")
-    is_marked = bool(colon) and (word in _PREFIXES or f"{word}:" == EXPRESSION)
-    return is_marked or any(sign in reference for sign in WILDCARDS)
+    return is_pattern(reference) or (bool(colon) and word in _PREFIXES)
 
 
 def _parts(reference: str) -> tuple[str, str]:
@@ -263,7 +262,7 @@ def _pattern(reference: str, place: str, findings: Findings) -> _Pattern | None:
     word, text = _parts(reference)
     try:
         return _Pattern(expression_of(text), _PREFIXES[word])
-    except (re.error, OverflowError, RecursionError) as error:
+    except ValueError as error:
         findings.add(place, f"{shown(reference)} ({error})", f"a regular expression of Python after `{EXPRESSION}`")
         return None
 

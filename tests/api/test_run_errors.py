@@ -144,6 +144,10 @@ def test_what_cannot_be_set_says_why() -> None:
             run.set("gain.u", "much")
         with pytest.raises(fmu_mesh.UnknownName, match=r"Did you mean 'gain'\?"):
             run.get("gian.y")
+        assert len(run.samples("gain.*")) > 1
+        for use in (run.get, lambda name: run.set(name, 1.0)):
+            with pytest.raises(fmu_mesh.UnknownName, match=r"'gain\.\*' means \d+ variables: gain\.u"):
+                use("gain.*")
 
 
 def test_a_wait_has_an_end() -> None:

@@ -247,6 +247,23 @@ def test_get_takes_names_keys_and_wildcards(call: Call) -> None:
     assert all(reading["time"] == reading["point"] * 0.01 for reading in readings)
 
 
+@pytest.mark.parametrize(
+    ("pattern", "names"),
+    [
+        ("gain.*", ["gain.u", "gain.y", "gain.k"]),
+        ("*n.y", ["gain.y"]),
+        ("????.y", ["gain.y", "free.y"]),
+        ("pendulum.der(?)", ["pendulum.der(a)"]),
+        ("looked_at/re:(gain|free)[.][uy]", ["gain.u", "gain.y", "free.u", "free.y"]),
+    ],
+)
+def test_a_pattern_means_here_what_it_means_in_a_record(call: Call, pattern: str, names: list[str]) -> None:
+    lines = call("get", "--json", pattern)[1].splitlines()
+
+    found = [f"{reading['instance']}.{reading['variable']}" for reading in map(json.loads, lines)]
+    assert sorted(found) == sorted(names)
+
+
 def test_a_short_key_names_the_mesh_in_front(call: Call) -> None:
     def key_of(reference: str) -> str:
         key: str = json.loads(call("get", "--json", reference)[1])["key"]
@@ -327,6 +344,9 @@ def test_what_cannot_be_set_is_refused_with_the_reason(call: Call, name: str, va
         (("get", "pendulum.der(b)"), "instance 'pendulum' has no variable 'der(b)'. Did you mean 'der(a)'?"),
         (("get", f"{ROOT}/gain/out/z"), f"no variable has the key '{ROOT}/gain/out/z'. Did you mean"),
         (("get", "gain"), "'gain' names no variable. Write 'gain.VARIABLE', or 'gain.*' for all."),
+        (("get", "*.z"), "mesh 'looked_at' has no variable '*.z'. There are: "),
+        (("get", "re:(gain"), "'re:(gain' is no regular expression: missing ), unterminated subpattern at position 0."),
+        (("set", "free.*", "1.0"), "'free.*' means 3 variables: "),
         (("get", "fmu_mesh/other/a/out/y"), "no mesh 'fmu_mesh/other/a/out/y' is running."),
         (("get", f"{ROOT}//y"), f"'{ROOT}//y' is no key expression"),
         (("pause", "loked_at"), "no mesh 'loked_at' is running. Did you mean 'looked_at'?"),

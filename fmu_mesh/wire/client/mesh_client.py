@@ -25,7 +25,7 @@ import numpy as np
 import zenoh
 
 from ...errors import ConfigurationError, DeadlineExceeded, MeshLost, MessageRefused
-from ...text import fits, listed, nearest, shown
+from ...text import is_pattern, listed, matching, nearest, shown
 from ..keys import Keys
 from ..messages import decode_json
 from ..session import Question, answer_of, answers, reason_of
@@ -146,7 +146,8 @@ class MeshClient:
     def targets(self, reference: str) -> list[Target]:
         """The variables that a reference means: `instance.variable`, `mesh/instance.variable`, or a key.
 
-        All may have wildcards: in the short forms `*` means any characters; a key has the wildcards of Zenoh.
+        All may be patterns: in the short forms `*` means any characters, `?` one, and `re:` begins a regular
+        expression; a key has the wildcards of Zenoh.
         """
         reference = self._within(reference)
         if not is_key(reference, self.keys):
@@ -168,7 +169,7 @@ class MeshClient:
         """The one variable that a reference means."""
         found = self.targets(reference)
         if len(found) > 1:
-            names = listed([f"{target.instance}.{target.variable.name}" for target in found])
+            names = listed([target.name for target in found])
             raise ConfigurationError(f"'{reference}' means {len(found)} variables: {names}.")
         return found[0]
 
@@ -258,23 +259,22 @@ class MeshClient:
     def _targets_by_name(self, reference: str) -> list[Target]:
         instance, _, name = reference.partition(".")
         names = self.info().instances
-        if not name:
-            if not any(fits(instance, candidate) for candidate in names):
-                instance = "INSTANCE"
+        if not name and not is_pattern(reference):
+            known = instance if instance in names else "INSTANCE"
             raise ConfigurationError(
-                f"'{reference}' names no variable.", hint=f"Write '{instance}.VARIABLE', or '{instance}.*' for all."
+                f"'{reference}' names no variable.", hint=f"Write '{known}.VARIABLE', or '{known}.*' for all."
             )
-        instances = [candidate for candidate in names if fits(instance, candidate)]
-        if not instances:
-            raise self._unknown_instance(instance)
-        found = [target for candidate in instances for target in self._variables(candidate)]
-        matching = [target for target in found if fits(name, target.variable.name)]
-        if not matching:
-            where = (
-                f"instance '{instances[0]}' has" if len(instances) == 1 else f"the instances {listed(instances)} have"
-            )
-            raise _unknown(f"{where} no variable '{name}'", name, [target.variable.name for target in found])
-        return matching
+        if instance not in names and not is_pattern(reference):
+            raise self._unknown_instance(instance, names)
+        instances = [instance] if instance in names else names
+        found = {target.name: target for each in instances for target in self._variables(each)}
+        meant = [found[full_name] for full_name in matching(reference, [*found])]
+        if not meant and instance in names:
+            own = [target.variable.name for target in found.values()]
+            raise _unknown(f"instance '{instance}' has no variable '{name}'", name, own)
+        if not meant:
+            raise _unknown(f"mesh '{self.keys.mesh}' has no variable '{reference}'", reference, [*found])
+        return meant
 
     def _variables(self, instance: str) -> list[Target]:
         root = self.keys.instance(instance)

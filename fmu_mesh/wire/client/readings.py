@@ -30,6 +30,11 @@ class Target(msgspec.Struct, frozen=True):
     key: str
     variable: VariableView
 
+    @property
+    def name(self) -> str:
+        """`instance.variable`."""
+        return f"{self.instance}.{self.variable.name}"
+
 
 class Reading(msgspec.Struct, frozen=True, omit_defaults=True):
     """One value that was received, with its communication point and the time of that point in s."""
