@@ -6,9 +6,12 @@ import argparse
 from functools import partial
 from pathlib import Path
 
+import msgspec
+
 from ..api.rerunning import planned_rerun
 from ..api.result import Result
 from ..api.run_handle import Run
+from ..errors import FmuMeshError
 from .arguments import CommandParser, Parsers, add_json
 from .output.display import Display, summary, teller, warn
 from .output.reports import RunReporter
@@ -16,8 +19,6 @@ from .run_options import add_options
 from .running import add_output, interrupted_by_signals, show_event
 
 __all__ = ["PARSERS"]
-
-_DIFFERENT = 1
 
 
 def _add_rerun(parser: CommandParser) -> None:
@@ -56,11 +57,13 @@ def _rerun(arguments: argparse.Namespace) -> int:
             print(line)
         assert outcome.file is not None  # it records what the first run has recorded
         comparison = again.first.compare(Result.read(outcome.file))
-        if comparison.equal:
-            print(f"every value is that of '{arguments.result}'")
-            return 0
-        print(comparison.text)
-    return _DIFFERENT
+        if not comparison.equal:
+            print(comparison.text)
+            raise FmuMeshError(f"the values are not those of '{arguments.result}'.")
+        # It was to end where the first run has ended, which may have been stopped.
+        reporter.event(msgspec.structs.replace(outcome, state="done"))
+        print(f"every value is that of '{arguments.result}'")
+    return 0
 
 
 PARSERS: Parsers = {"rerun": _add_rerun}

@@ -219,6 +219,44 @@ def test_the_command_runs_a_result_again(place: Place, folder: Path) -> None:
     assert "is the result itself" in place.run("rerun", "first.csv", "--output", "first.csv").errors
 
 
+def test_the_command_says_done_where_a_stopped_run_is_repeated(place: Place, folder: Path) -> None:
+    with steered(folder).start(paused=True) as run:
+        run.step(7)
+        run.stop()
+        run.wait(DEADLINE_S)
+
+    done = place.run("rerun", "first.csv", "--json")
+
+    assert done.wait() == 0, done.errors
+    report = json.loads(done.output)
+    assert (report["state"], report["exit_code"], report["point"]) == ("done", 0, 7)
+
+
+UNREPEATABLE = """
+import os
+import fmu_mesh
+
+@fmu_mesh.component(y=fmu_mesh.Output())
+def draw(time):
+    return float(int.from_bytes(os.urandom(6), "big"))
+"""
+
+
+def test_the_command_fails_if_the_values_are_others(place: Place, folder: Path) -> None:
+    Path("draw.py").write_text(UNREPEATABLE, encoding="utf-8")
+    instances = {"dice": {"python": "draw.py:draw"}}
+    config = write_config(folder, instances=instances, connections=(), stop_time=0.01)
+    fmu_mesh.load(config).run()
+
+    done = place.run("rerun", "pair.csv", "--json", "--allow-code")
+
+    assert done.wait() == 1, done.errors
+    report = json.loads(done.output)
+    assert (report["state"], report["exit_code"]) == ("failed", 1)
+    assert report["error"]["message"] == "the values are not those of 'pair.csv'."
+    assert "dice.y" in done.errors
+
+
 def test_a_run_with_a_scenario_is_run_again_unless_a_file_of_it_has_changed(folder: Path) -> None:
     Path("drive.csv").write_text("time,u\n0.0,1.0\n0.5,2.0\n", encoding="utf-8")
     Path("drive.yaml").write_text("values: {gain.u: {file: drive.csv, column: u}}\n", encoding="utf-8")
