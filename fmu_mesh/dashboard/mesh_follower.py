@@ -24,7 +24,7 @@ from ..errors import FmuMeshError, MeshLost
 from ..variables.value_types import element_names
 from ..wire.views import InstanceInfo, InstanceStatus, LogLine, MeshInfo, MeshStatus, VariableView
 from .curve import BoundedCurve, CurveChange
-from .result_tail import ResultTail
+from .csv_tail import CsvTail
 
 __all__ = ["MOST_CURVES", "Catalogue", "CurveQuestion", "MeshFollower", "MeshView"]
 
@@ -330,8 +330,8 @@ class _ResultSource:
 
     def __init__(self, path: Path | None) -> None:
         self._path = path
-        self._new: ResultTail | None = None
-        self._old: ResultTail | None = None
+        self._new: CsvTail | None = None
+        self._old: CsvTail | None = None
         self._filling: dict[str, BoundedCurve] = {}
         self._filled: dict[str, BoundedCurve] = {}
 
@@ -351,7 +351,7 @@ class _ResultSource:
             self.close()
             forget()
         if self._new is None:
-            if self._path is None or (new := ResultTail.open(self._path)) is None:
+            if self._path is None or (new := CsvTail.open(self._path)) is None:
                 return
             self._new = new
             new.skip()
@@ -360,7 +360,7 @@ class _ResultSource:
             self._new.skip()
         _feed(self._new, curves)
         added = {name: curve for name, curve in curves.items() if self._filled.get(name) is not curve}
-        if added and self._old is None and (old := ResultTail.open(self._new.path)) is not None:
+        if added and self._old is None and (old := CsvTail.open(self._new.path)) is not None:
             self._old, self._filling = old, added
             self._filled = {name: curve for name, curve in self._filled.items() if name in curves} | added
         if self._old is not None and _feed(self._old, self._filling, _OLD_PIECES):
@@ -390,7 +390,7 @@ class _ResultSource:
         self._filled = {}
 
 
-def _feed(tail: ResultTail, curves: Mapping[str, BoundedCurve], pieces: int = _PIECES) -> bool:
+def _feed(tail: CsvTail, curves: Mapping[str, BoundedCurve], pieces: int = _PIECES) -> bool:
     """Add some rows to curves; True at the end of the file."""
     for _ in range(pieces):
         rows = tail.read(list(curves))

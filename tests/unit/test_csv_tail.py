@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fmu_mesh.dashboard.result_tail import ResultTail
+from fmu_mesh.dashboard.csv_tail import CsvTail
 
 HEADING = b'time,a.x,"a.der(x,2)",a.flag\n'
 
@@ -24,8 +24,8 @@ def _add(path: Path, data: bytes) -> None:
         file.write(data)
 
 
-def _opened(path: Path) -> ResultTail:
-    tail = ResultTail.open(path)
+def _opened(path: Path) -> CsvTail:
+    tail = CsvTail.open(path)
     assert tail is not None
     return tail
 
@@ -91,5 +91,5 @@ def test_what_is_no_result_file_is_not_read(tmp_path: Path, content: bytes) -> N
     path = tmp_path / "other.csv"
     path.write_bytes(content)
 
-    assert ResultTail.open(path) is None
-    assert ResultTail.open(tmp_path / "missing.csv") is None
+    assert CsvTail.open(path) is None
+    assert CsvTail.open(tmp_path / "missing.csv") is None

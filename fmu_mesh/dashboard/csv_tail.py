@@ -15,7 +15,7 @@ from typing import Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["ResultTail"]
+__all__ = ["CsvTail"]
 
 _PIECE: Final = 1 << 20
 """Bytes that are read at once: the memory of one look."""
@@ -24,7 +24,7 @@ _FLAGS: Final = {b"true": 1.0, b"false": 0.0}
 Table = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
-class ResultTail:
+class CsvTail:
     """The rows of a growing file in pieces.
 
     Args:
