@@ -24,7 +24,7 @@ from ..errors import FmuMeshError, MeshLost
 from ..variables.value_types import element_names
 from ..wire.views import InstanceInfo, InstanceStatus, LogLine, MeshInfo, MeshStatus, VariableView
 from .curve import BoundedCurve, CurveChange
-from .csv_tail import CsvTail
+from .result_source import ResultSource
 
 __all__ = ["MOST_CURVES", "Catalogue", "CurveQuestion", "MeshFollower", "MeshView"]
 
@@ -36,11 +36,6 @@ _AGAIN_S: Final = 1.0
 _ASKED_S: Final = 10.0
 """A value that is in no result file is asked for this long after the last page has shown it."""
 _LOG_LINES: Final = 500
-_PIECES: Final = 8
-_OLD_PIECES: Final = 2
-"""Of older rows fewer are read at once, so that new ones are not late."""
-_FAR_BEHIND: Final = 64 << 20
-"""Bytes of a result file that the dashboard reads late; beyond it, it leaves rows out."""
 
 
 class Catalogue(NamedTuple):
@@ -274,7 +269,7 @@ class MeshFollower:
 
     def _sample(self, run: Run, info: MeshInfo, ended: threading.Event) -> None:
         path = Path(info.result_file) if info.result_file is not None and info.host == socket.gethostname() else None
-        source = _ResultSource(path if path is not None and path.suffix == ".csv" else None)
+        source = ResultSource(path)
         try:
             while not (self._closing.is_set() or self._next_run.is_set()):
                 over = ended.is_set()
@@ -319,87 +314,6 @@ class MeshFollower:
                     curve.add(np.array([sample.time]), np.array([value]))
             if self._closing.is_set():
                 return
-
-
-class _ResultSource:
-    """Feeds curves from a result file: new rows as they come, and for a new curve the older ones, piece by piece.
-
-    Args:
-        path: the file; None: there is none that can be read here.
-    """
-
-    def __init__(self, path: Path | None) -> None:
-        self._path = path
-        self._new: CsvTail | None = None
-        self._old: CsvTail | None = None
-        self._filling: dict[str, BoundedCurve] = {}
-        self._filled: dict[str, BoundedCurve] = {}
-
-    @property
-    def names(self) -> Sequence[str]:
-        """The variables in the file."""
-        return self._new.names if self._new is not None else ()
-
-    def read(self, held: Callable[[], Mapping[str, BoundedCurve]], forget: Callable[[], None]) -> None:
-        """Read some megabytes, so that this returns soon.
-
-        Args:
-            held: gives the curves.
-            forget: called when the file is another one than before.
-        """
-        if self._new is not None and self._new.replaced:
-            self.close()
-            forget()
-        if self._new is None:
-            if self._path is None or (new := CsvTail.open(self._path)) is None:
-                return
-            self._new = new
-            new.skip()
-        curves = {name: curve for name, curve in held().items() if name in self._new.names}
-        if self._new.behind > _FAR_BEHIND or not curves:
-            self._new.skip()
-        _feed(self._new, curves)
-        added = {name: curve for name, curve in curves.items() if self._filled.get(name) is not curve}
-        if added and self._old is None and (old := CsvTail.open(self._new.path)) is not None:
-            self._old, self._filling = old, added
-            self._filled = {name: curve for name, curve in self._filled.items() if name in curves} | added
-        if self._old is not None and _feed(self._old, self._filling, _OLD_PIECES):
-            self._old.close()
-            self._old = None
-
-    @property
-    def replaced(self) -> bool:
-        """Whether another file has its name by now."""
-        return self._new is None or self._new.replaced
-
-    def read_all(self, held: Callable[[], Mapping[str, BoundedCurve]]) -> None:
-        """Read to the end of a file that nobody writes any more."""
-        self.read(held, lambda: None)
-        if self._new is not None:
-            while not _feed(self._new, {n: c for n, c in held().items() if n in self._new.names}):
-                pass
-        while self._old is not None and not _feed(self._old, self._filling):
-            pass
-
-    def close(self) -> None:
-        """Close the files."""
-        for tail in (self._new, self._old):
-            if tail is not None:
-                tail.close()
-        self._new = self._old = None
-        self._filled = {}
-
-
-def _feed(tail: CsvTail, curves: Mapping[str, BoundedCurve], pieces: int = _PIECES) -> bool:
-    """Add some rows to curves; True at the end of the file."""
-    for _ in range(pieces):
-        rows = tail.read(list(curves))
-        if rows is None:
-            return True
-        times, values = rows
-        for curve, column in zip(curves.values(), values, strict=True):
-            curve.add(times, column)
-    return False
 
 
 def _catalogue_of(mesh: str, infos: Mapping[str, InstanceInfo]) -> Catalogue:

@@ -1,0 +1,203 @@
+"""Follows the Parquet file of a run: the batches of the stream beside it while it grows, and its row groups afterwards.
+
+Only the columns that are asked for are read from the disk. This module needs pyarrow, which is optional.
+"""
+
+from __future__ import annotations
+
+import mmap
+import os
+from collections.abc import Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any, BinaryIO, Final, Self, TypeVar
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet
+from numpy.typing import NDArray
+
+__all__ = ["ParquetTail"]
+
+_TIME: Final = "time"
+
+
+class ParquetTail:
+    """The rows of a result, batch by batch.
+
+    Args:
+        path: the result file.
+        batches: of the stream, or of the file itself.
+
+    Attributes:
+        path: the result file.
+        names: the columns of numbers without `time`.
+    """
+
+    def __init__(self, path: Path, batches: _Stream | _Groups) -> None:
+        columns = [field for field in batches.schema if field.name != _TIME]
+        self.path = path
+        self.names: Sequence[str] = [
+            field.name for field in columns if not (pa.types.is_string(field.type) or pa.types.is_binary(field.type))
+        ]
+        self._batches = batches
+
+    @classmethod
+    def open(cls, path: Path, growing_file: Path) -> Self | None:
+        """Open a result file, or the stream that becomes it; None if there is none that this process can read."""
+        # As long as there is a stream, what is at `path` is of a run before.
+        batches = _opened(_Stream, growing_file) if growing_file.exists() else _opened(_Groups, path)
+        return cls(path, batches) if batches is not None else None
+
+    @property
+    def replaced(self) -> bool:
+        """Whether the file is gone, or that of another run; a stream that has become the file is not."""
+        return not (self._batches.is_there or (self._batches.is_over and self.path.exists()))
+
+    @property
+    def behind(self) -> int:
+        """Bytes that were not read yet."""
+        return self._batches.behind
+
+    def skip(self) -> None:
+        """Go on with the rows that are written from now on."""
+        self._batches.skip()
+
+    def read(self, columns: Sequence[str]) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+        """The rows of the next batch; None if there is no new one.
+
+        Returns:
+            The times in s, shape `(rows,)`, and the values, shape `(columns, rows)`.
+        """
+        is_over = self._batches.is_over  # asked before the last batch is
+        batch = self._batches.next([_TIME, *columns])
+        if batch is None:
+            if is_over and (file := _opened(_Groups, self.path)) is not None:
+                file.skip()  # all of it was in the stream
+                self._batches.close()
+                self._batches = file
+            return None
+        table = np.array([batch.column(name).to_numpy(zero_copy_only=False) for name in (_TIME, *columns)], float)
+        return table[0], table[1:]
+
+    def close(self) -> None:
+        """Close the file."""
+        self._batches.close()
+
+
+class _File:
+    """An open file that may lose its name; `close` closes it.
+
+    Args:
+        path: the file.
+        file: it, open.
+    """
+
+    def __init__(self, path: Path, file: BinaryIO) -> None:
+        self._path = path
+        self._file = file
+
+    @property
+    def is_there(self) -> bool:
+        """Whether the file still has its name."""
+        try:
+            return os.path.samestat(os.fstat(self._file.fileno()), self._path.stat())
+        except OSError:
+            return False
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+
+class _Stream(_File):
+    """The batches of a stream that another process writes.
+
+    Attributes:
+        schema: of the stream.
+    """
+
+    def __init__(self, path: Path, file: BinaryIO) -> None:
+        super().__init__(path, file)
+        self._content: Any = None
+        self._at = 0
+        heading = self._message()
+        if heading is None:
+            raise OSError(f"'{path}' has only begun")
+        self.schema = pa.ipc.read_schema(heading)
+
+    @property
+    def is_over(self) -> bool:
+        """Whether the run has ended: then the stream is removed."""
+        return not self._path.exists()
+
+    @property
+    def behind(self) -> int:
+        return os.fstat(self._file.fileno()).st_size - self._at
+
+    def skip(self) -> None:
+        while self._message() is not None:
+            pass
+
+    def next(self, columns: Sequence[str]) -> Any:  # noqa: ANN401, ARG002  pyarrow has no types; all columns are there
+        message = self._message()
+        return None if message is None else pa.ipc.read_record_batch(message, self.schema)
+
+    def _message(self) -> Any:  # noqa: ANN401  pyarrow has no types
+        """The next message in the memory of the file; None if it is not complete."""
+        size = os.fstat(self._file.fileno()).st_size
+        if self._at < size and (self._content is None or len(self._content) < size):
+            self._content = pa.py_buffer(mmap.mmap(self._file.fileno(), size, access=mmap.ACCESS_READ))
+        if self._at >= size:
+            return None
+        source = pa.BufferReader(self._content)
+        source.seek(self._at)
+        try:
+            message = pa.ipc.read_message(source)
+        except (EOFError, pa.ArrowException, OSError):
+            return None
+        self._at = source.tell()
+        return message
+
+
+class _Groups(_File):
+    """The rows of a complete Parquet file.
+
+    Attributes:
+        schema: of the file.
+    """
+
+    is_over = False
+
+    def __init__(self, path: Path, file: BinaryIO) -> None:
+        super().__init__(path, file)
+        self._content = pyarrow.parquet.ParquetFile(self._file)
+        self._group = 0
+        self.schema = self._content.schema_arrow
+
+    @property
+    def behind(self) -> int:
+        return 0  # the rest is read only for a new curve, and all of it
+
+    def skip(self) -> None:
+        self._group = self._content.num_row_groups
+
+    def next(self, columns: Sequence[str]) -> Any:  # noqa: ANN401  pyarrow has no types
+        if self._group == self._content.num_row_groups:
+            return None
+        self._group += 1
+        return self._content.read_row_group(self._group - 1, columns=list(columns))
+
+
+_Batches = TypeVar("_Batches", _Stream, _Groups)
+
+
+def _opened(kind: type[_Batches], path: Path) -> _Batches | None:
+    """A file; None if there is none, or it is not complete enough to be read."""
+    with ExitStack() as stack:
+        try:
+            opened = kind(path, stack.enter_context(path.open("rb")))
+        except (OSError, pa.ArrowException):
+            return None
+        stack.pop_all()
+    return opened
