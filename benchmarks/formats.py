@@ -4,9 +4,10 @@ python -m benchmarks.formats                                       1,000 variabl
 python -m benchmarks.formats --variables 100 --points 100000       a small one
 python -m benchmarks.formats --formats csv parquet --cpu 1         only these, on one processor
 
-Every line is measured in a process of its own. Only the calls of the writer count, not the making of the values. HDF5
-is not a format of fmu_mesh; it is written with h5py, one dataset per variable in chunks of 16384 values. An MCAP has a
-message for each value, so it gets fewer points; its line says how many, and is not scaled.
+Every number is measured in a process of its own, which may take nine tenths of the memory that is free. Only the calls
+of the writer count, not the making of the values. HDF5 is not a format of fmu_mesh; it is written with h5py, one
+dataset per variable in chunks of 16384 values. An MCAP has a message for each value, so it gets fewer points; its line
+says how many, and is not scaled.
 """
 
 from __future__ import annotations
@@ -168,16 +169,22 @@ def _peak_mb() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
-def _in_child(*arguments: str) -> dict[str, float]:
+def _in_child(*arguments: str) -> dict[str, float] | None:
+    """What a process of its own has measured; None if its memory was not enough."""
     command = [sys.executable, "-m", "benchmarks.formats", "--child", *arguments]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=_TIMEOUT_S, check=False)
     if done.returncode:
+        if "memory" in done.stderr.lower():
+            return None
         raise SystemExit(done.stderr)
     answer: dict[str, float] = json.loads(done.stdout)
     return answer
 
 
 def _child(what: str, format_: str, path: str, variables: str, points: str) -> dict[str, float]:
+    fields = (line.split() for line in Path("/proc/meminfo").read_text(encoding="ascii").splitlines())
+    free = next(int(field[1]) * 1024 for field in fields if field[0] == "MemAvailable:")
+    resource.setrlimit(resource.RLIMIT_DATA, (free * 9 // 10, -1))
     if what == "write":
         return _write(format_, Path(path), int(variables), int(points))
     return _read(format_, Path(path), what)
@@ -188,6 +195,7 @@ def _line(format_: str, folder: Path, variables: int, points: int) -> str:
     path = folder / f"table{_FORMATS[format_]}"
     arguments = (format_, str(path), str(variables), str(points))
     written = _in_child("write", *arguments)
+    assert written is not None  # it writes block by block
     reads = [_in_child(what, *arguments) for what in _READS]
     for file in folder.iterdir():
         file.unlink()
@@ -200,7 +208,7 @@ def _line(format_: str, folder: Path, variables: int, points: int) -> str:
         f"{values / written['write'] / 1e6:.1f}",
         f"{written['end']:.2f} s",
         f"{written['memory']:.0f} MB",
-        *(f"{read['seconds']:.2f} s, {read['memory']:.0f} MB" for read in reads),
+        *(f"{read['seconds']:.2f} s, {read['memory']:.0f} MB" if read else "out of memory" for read in reads),
     ]
     return f"| {' | '.join(cells)} |"
 
