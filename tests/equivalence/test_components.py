@@ -575,6 +575,23 @@ def test_this_python_by_its_name_is_no_other_python(place: Place) -> None:
     both(place, written(place.folder, {"lag": part("Lag", interpreter=sys.executable)}))
 
 
+def test_inputs_that_a_component_has_in_another_python_are_recorded_as_in_this_one(
+    place: Place, other_python: Path
+) -> None:
+    (place.folder / "parts.py").write_text(PARTS, encoding="utf-8")
+    found = []
+    for python in (sys.executable, str(other_python)):
+        instances = {"source": part("Source"), "lag": part("Lag", interpreter=python)}
+        record = {"file": "m.csv", "variables": ["*", "in:*"]}
+        config = written(place.folder, instances, ["source.y -> lag.u"], record=record)
+        done = place.run("launch", config, "--no-progress")
+        assert done.wait() == 0, done.errors
+        found.append((place.folder / "m.csv").read_bytes())
+
+    assert found[0] == found[1]
+    assert found[0].startswith(b"time,source.y,lag.y,lag.u\n")
+
+
 def test_a_node_that_is_started_by_hand_in_the_wrong_python_says_how_to_start_it(
     place: Place, other_python: Path
 ) -> None:
