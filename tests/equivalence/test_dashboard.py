@@ -146,29 +146,41 @@ def test_history_begins_at_the_start_also_for_a_dashboard_that_comes_later(place
 
 
 def test_history_of_a_parquet_file_begins_at_the_start_and_stays_after_its_end(place: Place) -> None:
-    file = place.folder / "pair.parquet"
-    config = write_config(place.folder, stop_time=3600.0, simulation=PACED, record={"file": "pair.parquet"})
+    # Of values that only grow, the first and the last one are also the smallest and the largest of their intervals.
+    ramps = {name: {"fmu": "Integrator", "start_values": {"u": rate}} for name, rate in (("slow", 0.1), ("fast", 2.0))}
+    config = write_config(
+        place.folder,
+        instances=ramps,
+        connections=(),
+        stop_time=3600.0,
+        simulation=PACED,
+        record={"file": "pair.parquet"},
+    )
+    stream = place.folder / "pair.parquet.arrows"
     place.start("launch", config, "--no-progress")
-    stream = file.with_name("pair.parquet.arrows")
     wait_until(lambda: stream.exists() and stream.stat().st_size > 20_000, "some batches")
 
     dashboard = Dashboard(place)
-    curve = _reached(dashboard)["pendulum.a"]
+
+    def from_the_start(name: str) -> dict[str, list[float]] | None:
+        found = dashboard.curves(KEY, **{name.replace(".", "__"): 0}).get(name)
+        return found if found and _first_time(found) == 0.0 else None
+
+    early = wait_until(lambda: from_the_start("slow.y"), "the history from the start")
     place.run("stop", "pair")
     wait_until(lambda: not place.processes("master"), "the end of the mesh")
-    result = fmu_mesh.Result.read(file)
+    result = fmu_mesh.Result.read(place.folder / "pair.parquet")
 
     def at_the_end(name: str) -> dict[str, list[float]] | None:
-        found = dashboard.curves(KEY, **{name.replace(".", "__"): 0}).get(name)
-        return found if found and max(found["th"], default=0.0) == result.times[-1] else None
+        found = from_the_start(name)
+        return found if found and found["th"][-1] == result.times[-1] else None
 
-    for name in ("pendulum.a", "delay.y"):  # the second one was chosen after the end
-        whole = wait_until(lambda name=name: at_the_end(name), f"all of {name}")  # type: ignore[misc]  # mypy #12557
+    whole = wait_until(lambda: at_the_end("slow.y"), "all of it")
+    late = wait_until(lambda: at_the_end("fast.y"), "a curve that was chosen after the end")
+    for name, change in (("slow.y", early), ("slow.y", whole), ("fast.y", late)):
         rows = dict(zip(result.times.tolist(), result[name].tolist(), strict=True))
-        assert _first_time(whole) == 0.0
-        for change in (whole, curve if name == "pendulum.a" else whole):
-            assert all(rows[time] == value for time, value in zip(change["tl"], change["l"], strict=True))
-            assert all(rows[time] == value for time, value in zip(change["th"], change["h"], strict=True))
+        assert all(rows[time] == value for time, value in zip(change["tl"], change["l"], strict=True))
+        assert all(rows[time] == value for time, value in zip(change["th"], change["h"], strict=True))
 
 
 def test_values_that_are_not_recorded_are_asked_for(place: Place) -> None:
