@@ -145,7 +145,7 @@ def _read(format_: str, path: Path, what: str) -> dict[str, float]:
     one = what.endswith("one column")
     frame_of: dict[str, Callable[[], Any]] = {
         "csv": lambda: pd.read_csv(path, usecols=["time", "model.y1"] if one else None),
-        "parquet": lambda: pd.read_parquet(path, columns=["time", "model.y1"] if one else None),
+        "parquet": lambda: pd.read_parquet(path, columns=["time", "model.y1"] if one else None, memory_map=True),
         "mcap": lambda: fmu_mesh.Result.read(path).to_pandas().reset_index(),
     }
     before = _peak_mb()

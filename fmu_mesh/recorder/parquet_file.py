@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import io
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final, Self
@@ -137,19 +137,21 @@ class ParquetFile:
         try:
             if stream.is_file() and not path.exists():
                 with _Stream(stream) as batches:
-                    table = pa.Table.from_batches(list(batches), batches.schema)
-                    metadata = with_notes(decoded(table.schema), batches.notes)
+                    rows = sum(batch.num_rows for batch in batches)
+                with _Stream(stream) as batches:
+                    schema = batches.schema
+                    columns = _columns_of(path, schema, rows, batches)
+                    metadata = with_notes(decoded(schema), batches.notes)
             else:
                 with path.open("rb") as file:
                     content = parquet_module().ParquetFile(file)
-                    table = content.read()
+                    schema = content.schema_arrow
+                    groups = map(content.read_row_group, range(content.num_row_groups))
+                    columns = _columns_of(path, schema, content.metadata.num_rows, groups)
                     metadata = decoded(content.metadata)
         except (pa.ArrowException, msgspec.DecodeError) as error:
             raise _no_result(path, str(error)) from error
-        if not table.column_names or table.column_names[0] != _TIME or not pa.types.is_float64(table.schema[0].type):
-            raise _no_result(path, f"its first column is not '{_TIME}' in float64")
-        columns = {name: _array(column) for name, column in zip(table.column_names, table.columns, strict=True)}
-        units = {f.name: f.metadata[_UNIT].decode() for f in table.schema if f.metadata and _UNIT in f.metadata}
+        units = {f.name: f.metadata[_UNIT].decode() for f in schema if f.metadata and _UNIT in f.metadata}
         return Columns(columns.pop(_TIME), columns, units, metadata)
 
     def write(self, times: NDArray[np.float64], columns: Sequence[NDArray[Any]]) -> None:
@@ -359,12 +361,31 @@ def _arrow_array(values: NDArray[Any], type_: Any) -> Any:  # noqa: ANN401  pyar
     return pa.Array.from_buffers(type_, len(values), [None, *map(pa.py_buffer, buffers)], null_count=0)
 
 
+def _columns_of(path: Path, schema: Any, rows: int, tables: Iterable[Any]) -> dict[str, NDArray[Any]]:  # noqa: ANN401  pyarrow has no types
+    """The columns as numpy has them; besides these, only one table is in memory at a time."""
+    pa = pyarrow_module()
+    if not schema.names or schema.names[0] != _TIME or not pa.types.is_float64(schema[0].type):
+        raise _no_result(path, f"its first column is not '{_TIME}' in float64")
+    columns = {field.name: np.empty(rows, _array(pa.array([], field.type)).dtype) for field in schema}
+    done = 0
+    for table in tables:
+        block = slice(done, min(done + table.num_rows, rows))  # a stream may have grown meanwhile
+        done = block.stop
+        for name, column in zip(schema.names, table.columns, strict=True):
+            part = _array(column)[: block.stop - block.start]
+            if part.dtype != columns[name].dtype:  # it has nulls, as the files of other programs may
+                columns[name] = columns[name].astype(np.result_type(columns[name], part))
+            columns[name][block] = part
+    return columns
+
+
 def _array(column: Any) -> NDArray[Any]:  # noqa: ANN401  pyarrow has no types
-    """A column as numpy has it, of its own memory; `object` for texts and bytes."""
+    """A column as numpy has it; `object` for texts and bytes."""
     pa = pyarrow_module()
     if pa.types.is_string(column.type) or pa.types.is_binary(column.type):
         return np.array([*column.to_pylist(), None], object)[:-1]  # never an array of more dimensions
-    return np.array(column.to_numpy())
+    array: NDArray[Any] = column.to_numpy(zero_copy_only=False)
+    return array
 
 
 def _no_result(path: Path, why: str) -> ConfigurationError:

@@ -13,6 +13,7 @@ import msgspec
 import numpy as np
 import pandas as pd
 import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from mcap.reader import make_reader
 from numpy.typing import NDArray
@@ -326,6 +327,25 @@ def test_pandas_and_pyarrow_read_a_parquet_file_with_its_types_and_units(tmp_pat
     assert schema.field("it.Enumeration").metadata[b"type"] == b"Enumeration"
     assert msgspec.json.decode(about[b"fmu_mesh"]) == METADATA
     assert fmu_mesh.Result.read(path).units["it.Float64"] == "rad"
+
+
+def test_a_file_of_another_program_may_have_nulls_and_a_name_twice(tmp_path: Path) -> None:
+    path = tmp_path / "other.parquet"
+    columns = {
+        "time": pa.array([0.0, 1.0, 2.0, 3.0]),
+        "whole": pa.array([1, 2, None, 4]),
+        "flag": pa.array([True, None, False, True]),
+        "x": pa.array([1.0, 2.0, 3.0, None]),
+    }
+    names = [*columns, "x"]
+    table = pa.Table.from_arrays([*columns.values(), pa.array([5.0, 6.0, 7.0, 8.0])], names=names)
+    pq.write_table(table, path, row_group_size=2)
+
+    result = fmu_mesh.Result.read(path)
+
+    assert np.array_equal(result["whole"], [1, 2, np.nan, 4], equal_nan=True)
+    assert result["flag"].tolist() == [True, None, False, True]
+    assert result["x"].tolist() == [5.0, 6.0, 7.0, 8.0]
 
 
 def test_row_groups_are_bounded_and_small_batches_become_large_ones(
