@@ -47,6 +47,23 @@ _OTHER_ARROW = re.compile(r"\s*(?:-+>|=+>|→|⟶|~>|>)\s*")
 _SHORT_FORM = "'instance.output -> instance.input', or {from: instance.output, to: instance.input}"
 
 
+class Origin(NamedTuple):
+    """Where a value was written that another file than the configuration gives.
+
+    Attributes:
+        file: the file as messages name it.
+        line: counted from 1.
+        text: the element in words, such as `Parameter 'k'`.
+    """
+
+    file: str
+    line: int
+    text: str
+
+    def __str__(self) -> str:
+        return f"{self.text} ({self.file}:{self.line})"
+
+
 class PlainConfig(NamedTuple):
     """The values of a configuration, not yet checked.
 
@@ -56,6 +73,9 @@ class PlainConfig(NamedTuple):
         lines: line numbers, counted from 1, by path in the file; empty without a file.
         findings: what is wrong with the text, such as a key that stands there twice.
         overrides: the option that replaced a value, by path in the file.
+        origins: where a value was written, by path in the file, if that is another file.
+        warnings: findings that do not prevent a run.
+        needed: what an option has to give because the file cannot say it: the option, by path in the file.
     """
 
     data: Plain
@@ -63,6 +83,9 @@ class PlainConfig(NamedTuple):
     lines: dict[str, int] = {}
     findings: tuple[Finding, ...] = ()
     overrides: dict[str, str] = {}
+    origins: dict[str, Origin] = {}
+    warnings: tuple[Finding, ...] = ()
+    needed: dict[str, str] = {}
 
 
 class LoadedConfig(msgspec.Struct, frozen=True):
