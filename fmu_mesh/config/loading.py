@@ -219,7 +219,7 @@ def read_scenario(loaded: LoadedConfig) -> ScenarioSource | None:
 
 def examine_data(plain: PlainConfig, overrides: Sequence[str], kinds: Kinds) -> tuple[LoadedConfig, Findings]:
     """As `examine`, for values that were read before, or that a program has made."""
-    data, path, lines, first, replaced = plain
+    data, path, lines, first, replaced = plain[:5]
     replaced = dict(replaced)
     findings = Findings(str(path), lines, replaced, first)
     sections = kinds.own()

@@ -8,6 +8,8 @@ from __future__ import annotations
 import re
 from typing import Final, NamedTuple
 
+import msgspec
+
 __all__ = ["GRAMMAR", "NAMESPACES", "PATTERNS", "TYPES", "Attribute", "Rule"]
 
 NAMESPACES: Final = {
@@ -80,7 +82,7 @@ class Attribute(NamedTuple):
         return f"a list of {_IN_WORDS[self.type].removeprefix('a ')}s" if self.is_list else _IN_WORDS[self.type]
 
 
-class Rule(NamedTuple):
+class Rule(msgspec.Struct, frozen=True):
     """One element.
 
     Attributes:

@@ -242,7 +242,7 @@ def _kind(tag: str) -> str:
 
 def _in_words(element: Any) -> str:  # noqa: ANN401  lxml ships no types
     """An element and the named ones around it: `Connector 'u' of Component 'gain'`."""
-    words = []
+    words: list[str] = []
     while element is not None and len(words) < 2:
         local = etree.QName(element).localname
         name = next((f"'{element.get(key)}'" for key in _SHOWN_ATTRIBUTES if element.get(key)), None)
