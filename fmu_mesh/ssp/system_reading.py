@@ -140,7 +140,7 @@ class _Configuration:
         )
 
     def _describe(self, path: tuple[str, ...]) -> ModelDescription | None:
-        """The model description of a component; None if it cannot be read, for which the plan of a run has a finding."""
+        """The model description of a component; None if it cannot be read: then the plan has a finding."""
         component = self._components[path]
         if not component.source:
             return None
