@@ -33,6 +33,7 @@ class PlannedConnection(msgspec.Struct, frozen=True):
 
     Attributes:
         map: what the input gets instead of a value, items by their names; other values stay as they are.
+        initial_only: whether it gives a parameter its value in the initialization, and has no part in the steps.
     """
 
     source: str = msgspec.field(name="from")
@@ -43,6 +44,7 @@ class PlannedConnection(msgspec.Struct, frozen=True):
     units: str
     closes_cycle: bool
     map: dict[str, str] = {}
+    initial_only: bool = False
 
 
 class PlannedRecord(msgspec.Struct, frozen=True):
@@ -127,6 +129,7 @@ def plan_view(plan: Plan) -> PlanView:
             c.units,
             str(c) in closing,
             map_words(c.map, c.source, c.target),
+            c.initial_only,
         )
         for c in plan.connections
     ]
