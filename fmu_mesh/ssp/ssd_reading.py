@@ -276,7 +276,8 @@ class _Reader:
             if found is None:
                 return None
             entries = parameter_mapping(found, self._problems)
-        parameters: ParameterSet = parameter_set(values, self._problems)
+        inside = () if element.get("source") else (file.units, file.enumerations)
+        parameters: ParameterSet = parameter_set(values, self._problems, *inside)
         return Binding(parameters, element.place, element.get("prefix") or "", entries)
 
     def _referred(  # noqa: PLR0913, PLR0917  what a reference consists of

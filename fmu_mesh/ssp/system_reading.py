@@ -169,7 +169,9 @@ class _Configuration:
             if applied is not None:
                 description = self._describe(path)
                 target = description.variable_of(variable) if description is not None else None
-                of_components.setdefault(path, {})[variable] = changed(applied, value.change, target)
+                given = changed(applied, value.change, target, path, self._problems)
+                if given is not None:
+                    of_components.setdefault(path, {})[variable] = given
         for connection in connections:
             path, variable = connection.target
             bound = of_components.get(path, {}).pop(variable, None)
