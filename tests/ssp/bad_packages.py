@@ -239,7 +239,7 @@ CONNECTIONS = (
         one_more(SECOND_SOURCE),
         at=SECOND_SOURCE,
         element="Connection 'pendulum.a - delay.x' of System 'root'",
-        words=("a second source for 'delay.x'", "'pendulum.a', after 'inner.y'", "in line 76"),
+        words=("a second source for 'delay.x'", "'pendulum.a', after 'inner.y'", "in line 65"),
     ),
     fault(
         "an output of an element to another",
@@ -790,7 +790,7 @@ BINDINGS = (
     ),
     fault(
         "an SSM of another version",
-        ('version="1.0"', 'version="1.1"'),
+        ('ParameterMapping version="1.0"', 'ParameterMapping version="1.1"'),
         file=NAMES,
         at="xmlns:ssm=",
         element="ParameterMapping",
