@@ -246,7 +246,10 @@ CONNECTIONS = (
         one_more(OUT_OUT),
         at=OUT_OUT,
         element="Connection 'pendulum.a - inner.y' of System 'root'",
-        words=("'pendulum.a' (output of an element) and 'inner.y' (output of an element)", "a source and a destination"),
+        words=(
+            "'pendulum.a' (output of an element) and 'inner.y' (output of an element)",
+            "a source and a destination",
+        ),
     ),
     fault(
         "an input of an element to another",
@@ -287,7 +290,10 @@ CONNECTIONS = (
     fault(
         "units of other dimensions",
         (DELAY_X, DELAY_X.replace("<ssc:Real/>", '<ssc:Real unit="m"/>')),
-        (INTO_DELAY, INTO_DELAY.replace('startElement="inner" startConnector="y"', 'startElement="pendulum" startConnector="a"')),
+        (
+            INTO_DELAY,
+            INTO_DELAY.replace('startElement="inner" startConnector="y"', 'startElement="pendulum" startConnector="a"'),
+        ),
         at='startElement="pendulum" startConnector="a" endElement="delay"',
         element="Connection 'pendulum.a - delay.x' of System 'root'",
         words=("'pendulum.a' in 'rad'", "'delay.x' in 'm'", "units of one dimension", 'suppressUnitConversion="true"'),
@@ -375,7 +381,10 @@ ELEMENTS = (
     ),
     fault(
         "two elements of one name",
-        ('<ssd:System name="inner">', '<ssd:Component name="pendulum" source="resources/Gain.fmu"/>\n<ssd:System name="inner">'),
+        (
+            '<ssd:System name="inner">',
+            '<ssd:Component name="pendulum" source="resources/Gain.fmu"/>\n<ssd:System name="inner">',
+        ),
         at='<ssd:Component name="pendulum" source="resources/Gain.fmu"/>',
         element="Component 'pendulum' of System 'root'",
         words=("a second element 'pendulum', first in line 18",),
@@ -424,7 +433,10 @@ ELEMENTS = (
     ),
     fault(
         "a reference to a signal dictionary",
-        (ELEMENTS_END, ELEMENTS_END.replace("\n", '\n<ssd:SignalDictionaryReference name="bus" dictionary="signals"/>\n')),
+        (
+            ELEMENTS_END,
+            ELEMENTS_END.replace("\n", '\n<ssd:SignalDictionaryReference name="bus" dictionary="signals"/>\n'),
+        ),
         at="SignalDictionaryReference",
         element="SignalDictionaryReference 'bus' of System 'root'",
         words=("a reference to a signal dictionary", "connections between the connectors themselves"),
@@ -438,7 +450,12 @@ ELEMENTS = (
     ),
     fault(
         "an id that no system has",
-        (DELAY, DELAY.replace('source="resources/TransportDelay.fmu"', 'type="application/x-ssp-definition" source="#pump"')),
+        (
+            DELAY,
+            DELAY.replace(
+                'source="resources/TransportDelay.fmu"', 'type="application/x-ssp-definition" source="#pump"'
+            ),
+        ),
         at='source="#pump"',
         element="Component 'delay' of System 'root'",
         words=("the source '#pump'", "the id of a System in SystemStructure.ssd"),
@@ -458,8 +475,16 @@ SOURCES = tuple(
         ("a path out of the package, coded", "resources/%2E%2E/../../Gain.fmu", ("which leads out of the package",)),
         ("an absolute path", "/etc/Gain.fmu", ("the source '/etc/Gain.fmu', which leads out of the package",)),
         ("a backslash", "resources\\Gain.fmu", ("which leads out of the package",)),
-        ("an FMU that is not there", "resources/Gian.fmu", ("no such file 'resources/Gian.fmu'", "'resources/Gain.fmu'?")),
-        ("an FMU behind proxyfmu", "proxyfmu://localhost?file=Gain.fmu", ("scheme 'proxyfmu'", "a path inside the package")),
+        (
+            "an FMU that is not there",
+            "resources/Gian.fmu",
+            ("no such file 'resources/Gian.fmu'", "'resources/Gain.fmu'?"),
+        ),
+        (
+            "an FMU behind proxyfmu",
+            "proxyfmu://localhost?file=Gain.fmu",
+            ("scheme 'proxyfmu'", "a path inside the package"),
+        ),
         ("an FMU behind http", "http://example.com/Gain.fmu", ("the scheme 'http'", "a path inside the package")),
         ("a file URI", "file:///tmp/Gain.fmu", ("the scheme 'file'", "a path inside the package")),
         ("a URI of a drive", "C:/models/Gain.fmu", ("C:/models/Gain.fmu", "a path inside the package")),
@@ -517,7 +542,10 @@ EXPERIMENT = (
 XML = (
     fault(
         "a root in another namespace",
-        ("http://ssp-standard.org/SSP1/SystemStructureDescription", "http://www.pmsf.net/xsd/SystemStructureDescriptionDraft"),
+        (
+            "http://ssp-standard.org/SSP1/SystemStructureDescription",
+            "http://www.pmsf.net/xsd/SystemStructureDescriptionDraft",
+        ),
         at="xmlns:ssm=",
         element="SystemStructureDescription",
         words=("SystemStructureDescriptionDraft", "'http://ssp-standard.org/SSP1/SystemStructureDescription'"),
@@ -595,7 +623,10 @@ XML = (
     ),
     fault(
         "two lists of bindings",
-        ("</ssd:ParameterBindings>\n    <ssd:Elements>", "</ssd:ParameterBindings>\n<ssd:ParameterBindings/>\n<ssd:Elements>"),
+        (
+            "</ssd:ParameterBindings>\n    <ssd:Elements>",
+            "</ssd:ParameterBindings>\n<ssd:ParameterBindings/>\n<ssd:Elements>",
+        ),
         at="<ssd:ParameterBindings/>",
         element="ParameterBindings of System 'root'",
         words=("a second ParameterBindings in System 'root'", "one at most"),
@@ -609,7 +640,10 @@ XML = (
     ),
     fault(
         "a document type",
-        ('<ssd:SystemStructureDescription name', '<!DOCTYPE ssd [<!ENTITY a "aaaa">]>\n<ssd:SystemStructureDescription name'),
+        (
+            "<ssd:SystemStructureDescription name",
+            '<!DOCTYPE ssd [<!ENTITY a "aaaa">]>\n<ssd:SystemStructureDescription name',
+        ),
         at="<!DOCTYPE",
         element="",
         words=("a document type", "expand without limit"),
@@ -638,7 +672,10 @@ XML = (
     ),
     fault(
         "two units of one name",
-        ('<ssc:Unit name="m"><ssc:BaseUnit m="1"/></ssc:Unit>', '<ssc:Unit name="rad"><ssc:BaseUnit m="1"/></ssc:Unit>'),
+        (
+            '<ssc:Unit name="m"><ssc:BaseUnit m="1"/></ssc:Unit>',
+            '<ssc:Unit name="rad"><ssc:BaseUnit m="1"/></ssc:Unit>',
+        ),
         at='<ssc:Unit name="rad"><ssc:BaseUnit m="1"/></ssc:Unit>',
         element="Unit 'rad'",
         words=("a second unit 'rad'",),
@@ -726,7 +763,10 @@ BINDINGS = (
     ),
     fault(
         "an SSV in another namespace",
-        ("http://ssp-standard.org/SSP1/SystemStructureParameterValues", "http://www.pmsf.net/xsd/SystemStructureParameterValuesDraft"),
+        (
+            "http://ssp-standard.org/SSP1/SystemStructureParameterValues",
+            "http://www.pmsf.net/xsd/SystemStructureParameterValuesDraft",
+        ),
         file=VALUES,
         at="xmlns:ssv=",
         element="ParameterSet",
