@@ -362,7 +362,7 @@ class _Reader:
                 found = f"a second {what} '{one.name}', first in line {first[one.name].place.line}"
                 self._problems.add(one.place, found, "names of their own inside a system")
             first.setdefault(one.name, one)
-        return [*first.values()]
+        return list(first.values())
 
     def _too_deep(self, place: Place) -> None:
         found = f"more than {_MAXIMUM_DEPTH} systems inside one another"
