@@ -27,7 +27,6 @@ from .structure import (
     ConnectorKind,
     Enumeration,
     ParameterMapping,
-    ParameterSet,
     Place,
     Structure,
     StructureConnection,
@@ -308,6 +307,10 @@ class _Reader:
         values = self._referred(element, inline, "ssv:ParameterSet", _SET, file, component)
         if values is None:
             return None
+        if element.get("source"):
+            parameters = parameter_set(values, self._problems)
+        else:  # a set inside this file
+            parameters = parameter_set(values, self._problems, file.units, file.enumerations)
         mapping = element.child("ssd:ParameterMapping")
         entries: ParameterMapping | None = None
         if mapping is not None:
@@ -315,7 +318,6 @@ class _Reader:
             if found is None:
                 return None
             entries = parameter_mapping(found, self._problems)
-        parameters: ParameterSet = parameter_set(values, self._problems)
         return Binding(parameters, element.place, element.get("prefix") or "", entries)
 
     def _referred(  # noqa: PLR0913, PLR0917  what a reference consists of

@@ -69,7 +69,7 @@ def connection(start: str, end: str, *inside: str, **attributes: object) -> str:
     return element("ssd:Connection", *inside, **ends, **attributes)
 
 
-def component(  # noqa: PLR0913  what a component consists of
+def component(
     name: str,
     source: str,
     *connectors: str,
@@ -90,7 +90,7 @@ def component(  # noqa: PLR0913  what a component consists of
     )
 
 
-def system(  # noqa: PLR0913  what a system consists of
+def system(
     name: str,
     *elements: str,
     connectors: Iterable[str] = (),
@@ -112,7 +112,7 @@ def system(  # noqa: PLR0913  what a system consists of
     )
 
 
-def description(  # noqa: PLR0913  what a description consists of
+def description(
     root: str,
     *,
     name: str = "own",
