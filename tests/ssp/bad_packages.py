@@ -500,6 +500,7 @@ EXPERIMENT = (
         at='stopTime="one"',
         element="DefaultExperiment",
         words=("stopTime 'one'", "a number"),
+        count=2,  # and an option could give it
     ),
     fault(
         "a stop time before the start time",
@@ -786,8 +787,8 @@ BINDINGS = (
         (FACTOR, FACTOR.replace("1.5", "1,5")),
         file=VALUES,
         at="1,5",
-        element="Parameter 'factor'",
-        words=("'1,5'", "number"),
+        element="Real of Parameter 'factor'",
+        words=("the value '1,5'", "a number such as 2.5"),
     ),
     fault(
         "an SSV with a parameter twice",
