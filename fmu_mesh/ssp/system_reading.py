@@ -252,6 +252,9 @@ class _Configuration:
             written["ignore_units"] = True
         if connection.change.mapping:
             written["map"] = dict(connection.change.mapping)
+        if connection.change.place is not None:
+            for key in ("factor", "offset", "map"):
+                self._place(f"connections[{number}].{key}", connection.change.place)
         return written
 
     def _place(self, path: str, place: Place) -> None:
