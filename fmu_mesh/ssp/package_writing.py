@@ -1,0 +1,127 @@
+"""Writing a package: a ZIP archive that has the same bytes whenever it has the same content.
+
+Owns times, permissions, order and compression of the entries, and that a failed export leaves nothing behind. What is
+in the files is not its business.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import stat
+import zipfile
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryFile
+from typing import IO, Final, NamedTuple
+
+from .. import files
+from ..errors import ConfigurationError
+from ..instances.fmi.archive.archive import content_of
+
+__all__ = ["PackageEntry", "resource_names", "write_package"]
+
+_TIME: Final = (1980, 1, 1, 0, 0, 0)
+"""The earliest time that an archive can have."""
+
+_CHUNK: Final = 2**20
+_UNSAFE: Final = re.compile(r"[^A-Za-z0-9_.-]")
+"""Characters that would have to be escaped in the URI of a source (RFC 3986, 2.3), which not every tool undoes."""
+
+
+class PackageEntry(NamedTuple):
+    """One file of a package.
+
+    Attributes:
+        name: its path in the package.
+        content: its bytes; or the path of an FMU, which may be an unpacked one.
+    """
+
+    name: str
+    content: bytes | Path
+
+
+def write_package(path: Path, entries: Iterable[PackageEntry]) -> None:
+    """Write a package; one that is there stays as it is until the new one is complete.
+
+    Raises:
+        ConfigurationError: it cannot be written, or an FMU cannot be read.
+    """
+    try:
+        with files.replaced(path) as draft, zipfile.ZipFile(draft, "w") as package:
+            for entry in entries:
+                _add(package, entry)
+    except OSError as error:
+        at = f" ('{error.filename}')" if error.filename and Path(error.filename) != path else ""
+        raise ConfigurationError(f"'{path}' cannot be written: {error.strerror or error}{at}") from error
+
+
+def resource_names(models: Iterable[Path]) -> dict[Path, str]:
+    """The name in the package of each FMU: as its own, and unique; FMUs with equal content share one file.
+
+    Names that differ in upper and lower case only would be one file on some systems.
+
+    Raises:
+        OSError: an FMU cannot be read.
+    """
+    names: dict[Path, str] = {}
+    by_content: dict[str, str] = {}
+    taken: set[str] = set()
+    for path in models:
+        content = content_of(path)
+        if content not in by_content:
+            stem = _UNSAFE.sub("_", path.name.removesuffix(".fmu")) or "model"
+            name, number = f"{stem}.fmu", 1
+            while name.casefold() in taken:
+                number += 1
+                name = f"{stem}_{number}.fmu"
+            taken.add(name.casefold())
+            by_content[content] = f"resources/{name}"
+        names[path] = by_content[content]
+    return names
+
+
+def _add(package: zipfile.ZipFile, entry: PackageEntry) -> None:
+    """Add one file. FMUs are archives themselves, so they are not compressed again."""
+    if isinstance(entry.content, bytes):
+        with package.open(_info(entry.name, len(entry.content), zipfile.ZIP_DEFLATED), "w") as target:
+            target.write(entry.content)
+        return
+    with _fmu_file(entry.content) as source:
+        size = source.seek(0, os.SEEK_END)
+        source.seek(0)
+        with package.open(_info(entry.name, size, zipfile.ZIP_STORED), "w") as target:
+            shutil.copyfileobj(source, target, _CHUNK)
+
+
+def _info(name: str, size: int, compression: int, *, executable: bool = False) -> zipfile.ZipInfo:
+    info = zipfile.ZipInfo(name, _TIME)
+    info.compress_type = compression
+    info.create_system = 3  # Unix, on every system
+    info.external_attr = (stat.S_IFREG | (0o755 if executable else 0o644)) << 16
+    info.file_size = size
+    return info
+
+
+@contextmanager
+def _fmu_file(path: Path) -> Iterator[IO[bytes]]:
+    """The archive of an FMU, open for reading; an unpacked FMU is packed."""
+    if not files.is_folder(path):
+        with path.open("rb") as file:
+            yield file
+        return
+    with TemporaryFile() as packed:
+        with zipfile.ZipFile(packed, "w") as archive:
+            for own in sorted(path.rglob("*"), key=lambda file: file.relative_to(path).as_posix()):
+                if own.is_file():
+                    _pack(archive, own, own.relative_to(path).as_posix())
+        yield packed
+
+
+def _pack(archive: zipfile.ZipFile, file: Path, name: str) -> None:
+    status = file.stat()
+    info = _info(name, status.st_size, zipfile.ZIP_DEFLATED, executable=bool(status.st_mode & stat.S_IXUSR))
+    with file.open("rb") as source, archive.open(info, "w") as target:
+        shutil.copyfileobj(source, target, _CHUNK)

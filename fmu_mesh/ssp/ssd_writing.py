@@ -1,0 +1,342 @@
+"""From a mesh to the XML of a system structure description, of SSP 1.0 or 2.0.
+
+Owns which elements and attributes stand for what, and what a version cannot say. Which files go into the package is
+`exporting`, and what no version can say is `own_annotation`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, Final, Literal
+
+import msgspec
+from lxml import etree
+
+from ..config.findings import Findings
+from ..config.mesh import ConnectionConfig
+from ..instances.fmi.fmu_kind import FmuConfig
+from ..system.system import Connection, ResolvedSystem
+from ..variables.model_description import ModelDescription, Value, Variable
+from ..variables.units import BaseUnit
+from ..variables.value_conversion import to_value
+from ..variables.value_types import flattened
+from .grammar import NAMESPACES
+from .own_annotation import ANNOTATION_ELEMENT, ANNOTATION_TYPE
+
+__all__ = ["SspVersion", "is_xml_text", "ssd_of"]
+
+SspVersion = Literal["1.0", "2.0"]
+
+XmlNode = Any
+"""An element of lxml, which ships no types."""
+
+_KINDS_OF_1: Final = ("input", "output", "parameter", "calculatedParameter")
+_KINDS: Final = (*_KINDS_OF_1, "structuralParameter")
+"""The connectors that are written even if nothing uses them."""
+
+_TYPES_OF_1: Final = {
+    "Float64": "Real",
+    "Int32": "Integer",
+    "Boolean": "Boolean",
+    "String": "String",
+    "Enumeration": "Enumeration",
+    "Binary": "Binary",
+}
+"""The names in SSP 1.0 of the types that it has."""
+
+_IMPLEMENTATIONS: Final = {"co_simulation": "CoSimulation", "model_exchange": "ModelExchange"}
+_INT_32: Final = range(-(2**31), 2**31)
+_SOURCES_OF_PARAMETERS: Final = ("constant", "calculatedParameter")
+
+
+class ElementNames(msgspec.Struct, frozen=True):
+    """The names of the elements.
+
+    Attributes:
+        elements: the name of the component, by instance.
+        sources: the path of the FMU in the package, by instance.
+    """
+
+    elements: Mapping[str, str]
+    sources: Mapping[str, str]
+
+
+def ssd_of(
+    system: ResolvedSystem, names: ElementNames, version: SspVersion, annotation: str, findings: Findings
+) -> bytes:
+    """The bytes of a system structure description.
+
+    Args:
+        system: the mesh; all of its instances are FMUs.
+        names: how the components are called, and where their FMUs are.
+        version: the version of SSP.
+        annotation: the text of our annotation.
+        findings: gets what this version, or no version, can say. Then the bytes are useless.
+    """
+    return _Writer(system, names, version, findings).document(annotation)
+
+
+def is_xml_text(text: str) -> bool:
+    """Whether XML can hold a text: it has no place for most control characters (XML 1.0, 2.2)."""
+    return all(
+        character in "\t\n\r" or " " <= character < "\ud800" or "\ue000" <= character < "\ufffe" or character > "\uffff"
+        for character in text
+    )
+
+
+class _Writer:
+    """Writes one document; units and enumerations are collected on the way."""
+
+    def __init__(
+        self, system: ResolvedSystem, names: ElementNames, version: SspVersion, findings: Findings
+    ) -> None:
+        self._system = system
+        self._names = names
+        self._version: SspVersion = version
+        self._findings = findings
+        self._units: dict[str, BaseUnit] = {}
+        self._enumerations: dict[tuple[tuple[str, int], ...], str] = {}
+
+    def document(self, annotation: str) -> bytes:
+        config = self._system.config
+        root = etree.Element(
+            _tag("ssd:SystemStructureDescription"),
+            {"version": self._version, "name": config.mesh, "generationTool": "fmu_mesh"},
+            nsmap={prefix: NAMESPACES[prefix] for prefix in ("ssd", "ssc", "ssv")},
+        )
+        own = _child(root, "ssd:System", name=config.mesh)
+        elements = _child(own, "ssd:Elements")
+        for name in self._system.instances:
+            self._component(elements, name)
+        if self._system.connections:
+            connections = _child(own, "ssd:Connections")
+            for connection in self._system.connections:
+                self._connection(connections, connection)
+        entry = _child(_child(own, "ssd:Annotations"), "ssc:Annotation", type=ANNOTATION_TYPE)
+        namespace = etree.QName(ANNOTATION_ELEMENT).namespace
+        etree.SubElement(entry, ANNOTATION_ELEMENT, nsmap={None: namespace}).text = annotation
+        self._definitions(root)
+        experiment = {"startTime": _number(config.simulation.start_time)}
+        if config.simulation.stop_time is not None:
+            experiment["stopTime"] = _number(config.simulation.stop_time)
+        _child(root, "ssd:DefaultExperiment", **experiment)
+        etree.indent(root)
+        return bytes(etree.tostring(root, encoding="UTF-8", xml_declaration=True)) + b"\n"
+
+    # --- components
+
+    def _component(self, parent: XmlNode, name: str) -> None:
+        section = self._system.config.instances[name]
+        description = self._system.instances[name].description
+        component = _child(parent, "ssd:Component", name=self._names.elements[name], source=self._names.sources[name])
+        if isinstance(section, FmuConfig) and section.kind in _IMPLEMENTATIONS:
+            component.set("implementation", _IMPLEMENTATIONS[section.kind])
+        connected = self._connected(name)
+        shown = [variable for variable in description.variables if self._has_connector(variable, section.start_values)]
+        connectors = [
+            variable
+            for variable in description.variables
+            if variable.name in connected or (variable in shown and self._is_known(variable))
+        ]
+        if connectors:
+            parent = _child(component, "ssd:Connectors")
+            for variable in connectors:
+                self._connector(parent, variable, description)
+        values = {key: description.variable(key) for key in section.start_values}
+        written = [(variable, section.start_values[key]) for key, variable in values.items() if variable is not None]
+        if written:
+            self._binding(component, name, written)
+
+    def _connected(self, name: str) -> set[str]:
+        """The variables of an instance that are ends of connections."""
+        sources = {one.source.name for one in self._system.connections if one.source_instance == name}
+        return sources | {one.target.name for one in self._system.connections if one.target_instance == name}
+
+    def _has_connector(self, variable: Variable, start_values: Mapping[str, Any]) -> bool:
+        return variable.causality in _KINDS or (variable.name in start_values and variable.causality != "independent")
+
+    def _is_known(self, variable: Variable) -> bool:
+        """Whether this version of SSP has the kind and the type of a variable."""
+        if self._version == "2.0":
+            return True
+        return variable.causality in _KINDS_OF_1 and not variable.shape and variable.type in _TYPES_OF_1
+
+    def _type(self, variable: Variable) -> str:
+        """The name of a type: of the FMU's own version, where this version of SSP has it."""
+        if self._version == "1.0":
+            return _TYPES_OF_1.get(variable.type, variable.type)
+        return variable.declared_type or variable.type
+
+    def _connector(self, parent: XmlNode, variable: Variable, description: ModelDescription) -> None:
+        connector = _child(parent, "ssd:Connector", name=variable.name, kind=variable.causality)
+        attributes: dict[str, str] = {}
+        if variable.type in ("Float64", "Float32") and (unit := self._unit(variable)) is not None:
+            attributes["unit"] = unit
+        if variable.type == "Enumeration":
+            enumeration = self._enumeration(variable, description)
+            if enumeration is None:
+                return  # the type of the FMU's variable counts
+            attributes["name"] = enumeration
+        _child(connector, f"ssc:{self._type(variable)}", **attributes)
+        self._dimensions(connector, variable)
+
+    def _dimensions(self, parent: XmlNode, variable: Variable) -> None:
+        for dimension, size in zip(variable.dimensions, variable.shape, strict=True):
+            if isinstance(dimension, str) and parent.tag == _tag("ssd:Connector"):
+                _child(parent, "ssc:Dimension", sizeConnector=dimension)
+            else:
+                _child(parent, "ssc:Dimension", size=str(size))
+
+    # --- start values
+
+    def _binding(self, component: XmlNode, name: str, written: Sequence[tuple[Variable, Any]]) -> None:
+        binding = _child(_child(component, "ssd:ParameterBindings"), "ssd:ParameterBinding")
+        values = _child(binding, "ssd:ParameterValues")
+        own = _child(values, "ssv:ParameterSet", version=self._version, name=self._names.elements[name])
+        parameters = _child(own, "ssv:Parameters")
+        units: dict[str, BaseUnit] = {}
+        for variable, plain in written:
+            place = f"instances.{name}.start_values.{variable.name}"
+            if self._version == "1.0" and (variable.shape or variable.type not in _TYPES_OF_1):
+                self._needs_2(place, f"a start value of type {variable.type_name} for '{variable.name}'")
+                continue
+            value = to_value(plain, variable)
+            texts = [_text_of(element, variable) for element in flattened(value, len(variable.shape))]
+            if not all(is_xml_text(text) for text in texts):
+                found = f"a control character in the start value of '{variable.name}'"
+                self._findings.add(place, found, "text without control characters: XML has no place for them")
+                continue
+            parameter = _child(parameters, "ssv:Parameter", name=variable.name)
+            self._value(parameter, variable, texts)
+            if variable.type in ("Float64", "Float32") and (unit := self._unit(variable)) is not None:
+                parameter[0].set("unit", unit)
+                units[unit] = self._units[unit]
+            self._dimensions(parameter, variable)
+        if units:
+            _units(_child(own, "ssv:Units"), units)
+
+    def _value(self, parameter: XmlNode, variable: Variable, texts: Sequence[str]) -> None:
+        type_ = self._type(variable)
+        if variable.type == "Enumeration" and not variable.items:
+            type_ = "Integer"  # there are no names of items
+        node = _child(parameter, f"ssv:{type_}")
+        if not variable.shape:
+            node.set("value", texts[0])
+        elif type_ in ("String", "Enumeration", "Binary"):
+            for text in texts:
+                _child(node, "ssv:Value", value=text)
+        else:
+            node.set("value", " ".join(texts))
+
+    # --- connections
+
+    def _connection(self, parent: XmlNode, connection: Connection) -> None:
+        index = int(connection.path.removeprefix("connections[").rstrip("]"))
+        config = self._system.config.connections[index]
+        self._check_ends(connection)
+        attributes = {
+            "startElement": self._names.elements[connection.source_instance],
+            "startConnector": connection.source.name,
+            "startIndices": " ".join(str(number + 1) for number in connection.source_index),
+            "endElement": self._names.elements[connection.target_instance],
+            "endConnector": connection.target.name,
+            "endIndices": " ".join(str(number + 1) for number in connection.target_index),
+            "suppressUnitConversion": "true" if config.ignore_units else "",
+        }
+        node = _child(parent, "ssd:Connection", **{name: text for name, text in attributes.items() if text})
+        self._transformation(node, connection, config)
+
+    def _transformation(self, node: XmlNode, connection: Connection, config: ConnectionConfig) -> None:
+        if (config.factor, config.offset) != (1.0, 0.0):
+            numbers = {"factor": _number(config.factor), "offset": _number(config.offset)}
+            _child(node, "ssc:LinearTransformation", **numbers)
+
+    def _check_ends(self, connection: Connection) -> None:
+        source, target = connection.source, connection.target
+        if target.causality != "input" and source.causality not in _SOURCES_OF_PARAMETERS:
+            found = f"{connection}, from {source.role} to {target.role}"
+            expected = "a start value for it: SSP has such connections from calculated parameters only"
+            self._findings.add(connection.path, found, expected)
+        if self._version == "2.0":
+            return
+        for variable, index in ((source, connection.source_index), (target, connection.target_index)):
+            if index:
+                self._needs_2(connection.path, f"{connection}, which connects an element of an array")
+            elif not self._is_known(variable):
+                what = variable.causality if variable.causality not in _KINDS_OF_1 else f"type {variable.type_name}"
+                self._needs_2(connection.path, f"{connection}, where '{variable.name}' is of {what}")
+
+    def _needs_2(self, path: str, found: str) -> None:
+        self._findings.add(path, found, 'SSP 2.0, as with `version="2.0"` or `--version 2.0`')
+
+    # --- definitions
+
+    def _unit(self, variable: Variable) -> str | None:
+        """The name of a variable's unit in the document; None if the FMU's counts.
+
+        That is where the FMU does not define it, or where another FMU has another definition of this name.
+        """
+        name, base = variable.unit, variable.base_unit
+        if name is None or base is None or not base.usable:
+            return None
+        return name if self._units.setdefault(name, base) == base else None
+
+    def _enumeration(self, variable: Variable, description: ModelDescription) -> str | None:
+        """The name of an enumeration in the document; None if it cannot be defined there."""
+        if not variable.items or not all(number in _INT_32 for _, number in variable.items):
+            return None
+        if variable.items not in self._enumerations:
+            wanted, names = f"{description.model_name}.{variable.name}", {*self._enumerations.values()}
+            name, number = wanted, 1
+            while name in names:
+                number += 1
+                name = f"{wanted} {number}"
+            self._enumerations[variable.items] = name
+        return self._enumerations[variable.items]
+
+    def _definitions(self, root: XmlNode) -> None:
+        if self._enumerations:
+            parent = _child(root, "ssd:Enumerations")
+            for items, name in self._enumerations.items():
+                enumeration = _child(parent, "ssc:Enumeration", name=name)
+                for item, number in items:
+                    _child(enumeration, "ssc:Item", name=item, value=str(number))
+        if self._units:
+            _units(_child(root, "ssd:Units"), self._units)
+
+
+def _units(parent: XmlNode, units: Mapping[str, BaseUnit]) -> None:
+    for name, base in sorted(units.items()):
+        fields = {key: value for key, value in msgspec.structs.asdict(base).items() if value != getattr(BaseUnit(), key)}
+        texts = {key: str(value) if isinstance(value, int) else _number(value) for key, value in fields.items()}
+        _child(_child(parent, "ssc:Unit", name=name), "ssc:BaseUnit", **texts)
+
+
+def _text_of(value: Value, variable: Variable) -> str:
+    """A scalar value as an attribute of a parameter set has it."""
+    match value:
+        case bool():
+            return "true" if value else "false"
+        case float():
+            return _number(value)
+        case bytes():
+            return value.hex().upper()
+    names = {number: item for item, number in variable.items}
+    return names.get(value, str(value)) if variable.type == "Enumeration" else str(value)
+
+
+def _number(value: float) -> str:
+    """A number as xs:double, which gives back the same one."""
+    if math.isfinite(value):
+        return repr(float(value))
+    return "NaN" if math.isnan(value) else "INF" if value > 0.0 else "-INF"
+
+
+def _tag(name: str) -> str:
+    prefix, _, local = name.partition(":")
+    return f"{{{NAMESPACES[prefix]}}}{local}"
+
+
+def _child(parent: XmlNode, name: str, /, **attributes: str) -> XmlNode:
+    return etree.SubElement(parent, _tag(name), attributes)
