@@ -219,9 +219,9 @@ def read_scenario(loaded: LoadedConfig) -> ScenarioSource | None:
 
 def examine_data(plain: PlainConfig, overrides: Sequence[str], kinds: Kinds) -> tuple[LoadedConfig, Findings]:
     """As `examine`, for values that were read before, or that a program has made."""
-    data, path, lines, first, replaced = plain[:5]
-    replaced = dict(replaced)
-    findings = Findings(str(path), lines, replaced, first)
+    data, path, lines = plain.data, plain.file, plain.lines
+    replaced = dict(plain.overrides)
+    findings = Findings(str(path), lines, replaced, plain.findings)
     sections = kinds.own()
     if isinstance(data, dict):
         data = _with_long_connections(data, findings)

@@ -239,8 +239,13 @@ def _user(uid: int) -> str:
 
 def _expected(section: InstanceSection, path: Path) -> str:
     """In words, what the file of a model should be, where the one at ``path`` is not."""
-    elsewhere = not files.exists(path) and files.exists(Path(section.path))
+    elsewhere = not _leads_somewhere(path) and _leads_somewhere(Path(section.path))
     return expected_model(section) + ("; paths are relative to the configuration file" if elsewhere else "")
+
+
+def _leads_somewhere(path: Path) -> bool:
+    """Whether there is something at the path, or an archive that it leads into."""
+    return files.exists(path) or files.archive_on_the_way(path) is not None
 
 
 def _similar(path: Path) -> str | None:

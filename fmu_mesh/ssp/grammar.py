@@ -324,7 +324,7 @@ GRAMMAR: Final[dict[str, Rule]] = {
     # --- parameter mappings
     "ssm:ParameterMapping": Rule(_TOP, {"ssm:MappingEntry": True, **_META, "ssm:Annotations": False}),
     "ssm:MappingEntry": Rule(
-        {**_SELF, "source": _name, "target": _name, "suppressUnitConversion": _boolean},
+        {**_SELF, "source": _needed, "target": _name, "suppressUnitConversion": _boolean},
         {**_TRANSFORMATIONS, "ssm:Annotations": False},
     ),
     "ssm:Annotations": Rule({}, {"ssc:Annotation": True}),
