@@ -11,6 +11,7 @@ from ..system.plan import Plan
 from ..system.records import RecordPlan
 from ..system.series_files import course_of
 from ..system.system import Connection, SystemInstance
+from ..system.value_map import map_text
 from ..text import listed, short_number, short_path, shown
 from ..variables.model_description import Variable
 from ..variables.value_conversion import to_plain
@@ -146,7 +147,9 @@ def _scenario(plan: Plan) -> list[str]:
 
 
 def _arithmetic(c: Connection) -> str:
-    """The formula of a connection; empty if it copies the value."""
+    """The formula of a connection, or its map; empty if it copies the value."""
+    if c.map:
+        return f"map {map_text(c.map, c.source, c.target)}"
     if (c.factor, c.offset) == (1.0, 0.0):
         return ""
     product = f"{short_number(c.factor)} * {c.source_name}" if c.factor != 1.0 else c.source_name

@@ -11,6 +11,7 @@ from ..system.plan import Plan
 from ..system.schedule import Schedule
 from ..system.series_files import course_of
 from ..system.system import SystemInstance
+from ..system.value_map import map_words
 from ..variables.value_conversion import to_plain
 from ..variables.value_types import PlainValue
 
@@ -28,7 +29,11 @@ class PlannedInstance(msgspec.Struct, frozen=True):
 
 
 class PlannedConnection(msgspec.Struct, frozen=True):
-    """One connection: the input is factor * output + offset, ``delay`` points later."""
+    """One connection: the input is factor * output + offset, ``delay`` points later.
+
+    Attributes:
+        map: what the input gets instead of a value, items by their names; other values stay as they are.
+    """
 
     source: str = msgspec.field(name="from")
     target: str = msgspec.field(name="to")
@@ -37,6 +42,7 @@ class PlannedConnection(msgspec.Struct, frozen=True):
     offset: float
     units: str
     closes_cycle: bool
+    map: dict[str, str] = {}
 
 
 class PlannedRecord(msgspec.Struct, frozen=True):
@@ -120,6 +126,7 @@ def plan_view(plan: Plan) -> PlanView:
             c.offset,
             c.units,
             str(c) in closing,
+            map_words(c.map, c.source, c.target),
         )
         for c in plan.connections
     ]

@@ -16,7 +16,7 @@ from .grammar import PATTERNS
 from .problems import Problems
 from .structure import Annotation
 
-__all__ = ["OPEN_MODELICA", "OPEN_SIMULATION_PLATFORM", "base_step_size", "step_size_hint"]
+__all__ = ["OPEN_MODELICA", "OPEN_SIMULATION_PLATFORM", "base_step_size", "common_solvers", "step_size_hint"]
 
 OPEN_MODELICA: Final = "org.openmodelica"
 OPEN_SIMULATION_PLATFORM: Final = "com.opensimulationplatform"
@@ -43,6 +43,15 @@ def base_step_size(annotations: Iterable[Annotation], problems: Problems) -> tup
                 annotation.place, f"{element} with {attribute} '{found.get(attribute)}'", "a step size > 0 in s"
             )
     return None
+
+
+def common_solvers(annotations: Iterable[Annotation]) -> Iterator[tuple[str, Annotation]]:
+    """The solvers that OMSimulator is to use for all FMUs of a system together, and their annotations."""
+    for annotation in annotations:
+        if annotation.type == OPEN_MODELICA:
+            for local in ("VariableStepSolver", "FixedStepSolver"):
+                for _found in _elements(annotation, local):
+                    yield local, annotation
 
 
 def step_size_hint(annotations: Iterable[Annotation], problems: Problems) -> tuple[float, Annotation] | None:

@@ -221,13 +221,13 @@ class _Flattening:
         description = self._describe(path)
         if description is None:
             return
+        missing = [one.name for one in component.connectors if description.variable_of(one.name) is None]
+        if missing:  # one that is connected is a finding
+            found = f"connectors for variables that {component.source} does not have: {listed(missing)}"
+            self._problems.warn(component.place, found)
         for connector in component.connectors:
             variable = description.variable_of(connector.name)
             if variable is None:
-                names = [one.name for one in description.variables]
-                found = f"a connector for '{connector.name}', which the FMU does not have"
-                near = nearest(connector.name, names)
-                self._problems.add(connector.place, found, f"one of the variables of {component.source}", near)
                 continue
             has = _kind_of(variable)
             old = description.fmi_version.startswith("1.") and connector.kind not in ("input", "output")
@@ -309,6 +309,11 @@ class _Flattening:
         elif connector is None:
             names = [one.name for one in component.connectors]
             found = f"the unknown connector '{name}' of '{component.name}'"
+            self._problems.add(connection.place, found, f"one of {listed(names)}", nearest(name, names))
+            return None
+        elif description is not None and variable is None:
+            names = [one.name for one in description.variables]
+            found = f"the variable '{name}', which the FMU of '{component.name}' does not have"
             self._problems.add(connection.place, found, f"one of {listed(names)}", nearest(name, names))
             return None
         kind = connector.kind if connector is not None else None

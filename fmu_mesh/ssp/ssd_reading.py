@@ -242,8 +242,8 @@ class _Reader:
             start_connector=element.text("startConnector"),
             end_connector=element.text("endConnector"),
             place=element.place,
-            start_element=element.get("startElement"),
-            end_element=element.get("endElement"),
+            start_element=element.get("startElement") or None,  # OMSimulator writes an empty one
+            end_element=element.get("endElement") or None,
             start_index=element.numbers("startIndices"),
             end_index=element.numbers("endIndices"),
             suppress_unit_conversion=element.boolean("suppressUnitConversion"),

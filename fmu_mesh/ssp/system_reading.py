@@ -18,14 +18,14 @@ from ..instances.fmi.archive.archive import Terms
 from ..instances.fmi.archive.reading import read_description
 from ..text import listed, nearest
 from ..variables.model_description import ModelDescription
-from .annotations import OPEN_MODELICA, OPEN_SIMULATION_PLATFORM, base_step_size, step_size_hint
+from .annotations import OPEN_MODELICA, OPEN_SIMULATION_PLATFORM, base_step_size, common_solvers, step_size_hint
 from .flattening import FlatConnection, FlatValue, flatten
 from .naming import instance_name, mesh_name
 from .package import DEFAULT, Package
 from .parameters import AppliedValue, changed, resolve_parameters
 from .problems import Problems
 from .ssd_reading import annotations_of, read_structure
-from .structure import Annotation, Component, Place, Structure, components_of
+from .structure import Annotation, Component, Place, Structure, StructureSystem, components_of
 
 __all__ = ["NEEDED", "read_system"]
 
@@ -128,7 +128,7 @@ class _Configuration:
         if self._package.is_archive:  # beside the archive, and not in it
             data["record"] = {"file": "../results/{mesh}.csv"}
         self._place("", self._structure.place)
-        self._unknown_annotations()
+        self._note_annotations(system, simulation.get("step_size"))
         return PlainConfig(
             data,
             self._file,
@@ -259,11 +259,23 @@ class _Configuration:
         elif path:
             self._origins[path] = Origin(place.file, place.line, place.element)
 
-    def _unknown_annotations(self) -> None:
-        """Note which annotations have no effect."""
-        seen: dict[str, Annotation] = {}
-        for annotation in annotations_of(self._structure):
+    def _note_annotations(self, system: StructureSystem, step_size: Plain) -> None:
+        """Note which annotations of a system, and of those in it, have no effect."""
+        annotations = annotations_of(self._structure) if system is self._structure.system else system.annotations
+        own = base_step_size(system.annotations, Problems())
+        if own is not None and own[0] != step_size:
+            found = f"a step size of {own[0]:g} s for the system '{system.name}'"
+            self._problems.warn(own[1].place, found, "that of the root system, which all its instances have")
+        for solver, annotation in common_solvers(annotations):
+            found = f"the {solver} of the system '{system.name}', which is not used"
+            self._problems.warn(annotation.place, found, "one solver per model-exchange FMU, see `solver`")
+        unknown: dict[str, Annotation] = {}
+        for element in system.elements:
+            annotations += element.annotations if isinstance(element, Component) else ()
+            if isinstance(element, StructureSystem):
+                self._note_annotations(element, step_size)
+        for annotation in annotations:
             if annotation.type not in _KNOWN:
-                seen.setdefault(annotation.type, annotation)
-        for type_, annotation in seen.items():
+                unknown.setdefault(annotation.type, annotation)
+        for type_, annotation in unknown.items():
             self._problems.warn(annotation.place, f"the annotation '{type_}' is not known, and has no effect")
