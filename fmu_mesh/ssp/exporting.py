@@ -7,26 +7,24 @@ and files of that package (`kept_package`); any other one gets a new description
 from __future__ import annotations
 
 import posixpath
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import msgspec
-
 from ..config.findings import Findings
 from ..config.loading import PlainConfig, read_file
+from ..config.mesh import Config
 from ..errors import ConfigurationError, Finding
-from ..files import exists, is_file
-from ..instances.fmi.fmu_kind import FmuConfig
+from ..files import archive_on_the_way, is_file
 from ..system.system import ResolvedSystem
+from ..text import nearest_file
+from .naming import element_path, instance_name, mesh_name
 from .own_annotation import written
+from .package import DEFAULT
 from .package_writing import PackageEntry, resource_names, write_package
-from .ssd_writing import ElementNames, SspVersion, ssd_of
+from .ssd_writing import ElementNames, SspVersion, is_xml_text, ssd_of
 
-__all__ = ["MAIN_DOCUMENT", "export"]
-
-MAIN_DOCUMENT = "SystemStructure.ssd"
-"""The description that a package is read by, unless another one is chosen (SSP 2.0, 3.1)."""
+__all__ = ["export"]
 
 
 def export(
@@ -53,44 +51,103 @@ def export(
     return ()
 
 
-def _write_new(
-    plain: PlainConfig, resolve: Callable[[], ResolvedSystem], path: Path, version: SspVersion
-) -> None:
-    findings = Findings(str(plain.file), plain.lines)
+def _write_new(plain: PlainConfig, resolve: Callable[[], ResolvedSystem], path: Path, version: SspVersion) -> None:
+    """Write a package with a new description."""
+    findings = Findings(str(plain.file), plain.lines, plain.overrides)
     data = _with_scenario(plain, findings)
     _check_kinds(data, findings)
     _check_files(data, findings)
     findings.raise_any()
     system = resolve()
     models = {name: Path(instance.fmu) for name, instance in system.instances.items()}
-    try:
-        resources = resource_names(models.values())
-    except OSError as error:
-        raise ConfigurationError(f"'{error.filename}' cannot be read: {error.strerror}") from error
-    elements, changed = _element_names(list(models))
+    resources = resource_names(models.values())
+    elements, changed = _element_names([*models])
     names = ElementNames(elements, {name: resources[model] for name, model in models.items()})
-    simulation = system.config.simulation
-    described: dict[str, Any] = {
-        "mesh": _default_name(system.config.mesh),
-        "simulation": {"start_time": simulation.start_time},
-    }
-    if simulation.stop_time is not None:
-        described["simulation"]["stop_time"] = simulation.stop_time
-    annotation = written(data, described, names=changed, moved=_from_package(plain.file))
+    annotation = written(data, _described(system.config), names=changed, moved=_to_package(plain.file))
     document = ssd_of(system, names, version, annotation, findings)
     findings.raise_any()
-    files = {resource: model for model, resource in reversed(resources.items())}
-    entries = [PackageEntry(MAIN_DOCUMENT, document)]
-    entries += [PackageEntry(resource, files[resource]) for resource in dict.fromkeys(resources.values())]
-    write_package(path, entries)
+    models_of = {resource: model for model, resource in reversed(resources.items())}
+    entries = [PackageEntry(resource, models_of[resource]) for resource in dict.fromkeys(resources.values())]
+    write_package(path, [PackageEntry(DEFAULT, document), *entries])
+
+
+def _described(config: Config) -> dict[str, Any]:
+    """What a new description says in its own words about what the annotation could also say."""
+    simulation = config.simulation
+    times = {"start_time": simulation.start_time, "stop_time": simulation.stop_time}
+    given = {key: value for key, value in times.items() if value is not None}
+    return {"mesh": mesh_name(config.mesh), "simulation": given}
+
+
+def _element_names(instances: Sequence[str]) -> tuple[dict[str, str], dict[str, str]]:
+    """The name of each element, and the instances whose names do not follow from that, by the name that would.
+
+    An instance that was read from a package gets the name of its element again, such as `DP Controller`. One whose name
+    stands for systems around an element, such as `left-motor`, keeps it as the name of its element.
+    """
+    elements: dict[str, str] = {}
+    for name in instances:
+        try:
+            path = element_path(name)
+        except (ValueError, OverflowError):
+            continue  # a number in it is no code point
+        if len(path) == 1 and path[0] and is_xml_text(path[0]) and instance_name(path) == name:
+            elements[name] = path[0]
+    taken = {*elements.values()}
+    for name in instances:
+        if name not in elements:
+            elements[name] = name
+            while elements[name] in taken:
+                elements[name] += "_"
+            taken.add(elements[name])
+    defaults = {name: instance_name((elements[name],)) for name in instances}
+    return elements, {default: name for name, default in defaults.items() if default != name}
+
+
+def _with_scenario(plain: PlainConfig, findings: Findings) -> dict[str, Any]:
+    """The values of the configuration with the scenario that it may name a file of."""
+    data = plain.data
+    if not isinstance(data, dict) or not isinstance(data.get("instances"), dict):
+        findings.add("", "no mapping with instances", "a configuration")
+        findings.raise_any()
+    assert isinstance(data, dict)  # see above
+    scenario = data.get("scenario")
+    if not isinstance(scenario, str):
+        return data
+    file = plain.file.parent / scenario
+    if not is_file(file):
+        findings.add("scenario", f"no such file '{scenario}'", "a file with values and events", nearest_file(file))
+        return data
+    return {**data, "scenario": read_file(file).data}
 
 
 def _check_kinds(data: Mapping[str, Any], findings: Findings) -> None:
     """Add a finding for every instance that is no FMU."""
-    keys = {*msgspec.structs.fields(FmuConfig)}
-    del keys
     for name, section in data["instances"].items():
-        if isinstance(section, dict) and "fmu" not in section:
-            kind = next(iter(section), "nothing")
-            found = f"'{name}', which is no FMU but of the kind '{kind}'"
-            findings.add(f"instances.{name}", found, "FMUs only: SSP has no components of other kinds")
+        if isinstance(section, dict) and section and "fmu" not in section:
+            found = f"'{name}', which is no FMU but has the key '{next(iter(section))}'"
+            expected = "only FMUs: SSP has no components of other kinds. Export the mesh without it"
+            findings.add(f"instances.{name}", found, expected)
+
+
+def _check_files(data: Mapping[str, Any], findings: Findings) -> None:
+    """Add a finding for every file that cannot go into a package."""
+    scenario = data.get("scenario")
+    values = scenario.get("values") if isinstance(scenario, dict) else None
+    for name, entry in (values or {}).items():
+        if isinstance(entry, dict) and entry.get("file") is not None:
+            found = f"values from the file '{entry['file']}', which has no place in a package"
+            findings.add(f"scenario.values.{name}", found, "`times` and `values`, or no entry for this variable")
+    zenoh = data.get("zenoh")
+    if isinstance(zenoh, dict) and zenoh.get("config") is not None:
+        found = f"the file '{zenoh['config']}', which has no place in a package"
+        findings.add("zenoh.config", found, "the keys of the section `zenoh`, such as `connect`")
+
+
+def _to_package(file: Path) -> Callable[[str], str]:
+    """From the path of a result file for the folder of ``file`` to one for the folder of the package around it."""
+    package = archive_on_the_way(file)
+    if package is None:
+        return lambda path: path
+    folder = file.parent.relative_to(package.parent).as_posix()
+    return lambda path: posixpath.normpath(posixpath.join(folder, path))

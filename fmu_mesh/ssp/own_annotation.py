@@ -19,11 +19,19 @@ import posixpath
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any, Final, NamedTuple
 
-from ..config.yaml_text import Plain
 from ..errors import Finding
 from ..text import listed
 
-__all__ = ["ANNOTATION_ELEMENT", "ANNOTATION_TYPE", "AnnotationRefused", "Merged", "merged", "names_in", "without", "written"]
+__all__ = [
+    "ANNOTATION_ELEMENT",
+    "ANNOTATION_TYPE",
+    "AnnotationRefused",
+    "Merged",
+    "merged",
+    "names_in",
+    "without",
+    "written",
+]
 
 ANNOTATION_TYPE: Final = "io.github.fmu-mesh"
 """The type of our annotation. It is one of the root system."""
@@ -230,9 +238,7 @@ def _mapping(content: Mapping[str, Any], key: str) -> dict[str, Any]:
     return section
 
 
-def _renamed(
-    data: Mapping[str, Any], names: Mapping[str, str], file: str, warnings: list[Finding]
-) -> dict[str, Any]:
+def _renamed(data: Mapping[str, Any], names: Mapping[str, str], file: str, warnings: list[Finding]) -> dict[str, Any]:
     """A copy of ``data`` with other names of its instances; a name that another instance has is not given twice."""
     instances = data.get("instances", {})
     given: dict[str, str] = {}
@@ -297,9 +303,7 @@ def _own_connections(
             yield {"from": connection["from"], "to": connection["to"], **kept}
 
 
-def _merge_connections(
-    made: dict[str, Any], content: Mapping[str, Any], file: str, warnings: list[Finding]
-) -> None:
+def _merge_connections(made: dict[str, Any], content: Mapping[str, Any], file: str, warnings: list[Finding]) -> None:
     entries = content.get("connections", [])
     if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
         raise AnnotationRefused("no list of mappings in 'connections'", "a list of mappings")

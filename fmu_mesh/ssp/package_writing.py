@@ -18,8 +18,10 @@ from tempfile import TemporaryFile
 from typing import IO, Final, NamedTuple
 
 from .. import files
-from ..errors import ConfigurationError
+from ..config.mesh import LimitsConfig
+from ..errors import ConfigurationError, LoadFailed
 from ..instances.fmi.archive.archive import content_of
+from ..instances.fmi.archive.inner_files import inner_file
 
 __all__ = ["PackageEntry", "resource_names", "write_package"]
 
@@ -53,6 +55,8 @@ def write_package(path: Path, entries: Iterable[PackageEntry]) -> None:
         with files.replaced(path) as draft, zipfile.ZipFile(draft, "w") as package:
             for entry in entries:
                 _add(package, entry)
+    except LoadFailed as error:
+        raise ConfigurationError(error.message, hint=error.hint) from error
     except OSError as error:
         at = f" ('{error.filename}')" if error.filename and Path(error.filename) != path else ""
         raise ConfigurationError(f"'{path}' cannot be written: {error.strerror or error}{at}") from error
@@ -64,13 +68,18 @@ def resource_names(models: Iterable[Path]) -> dict[Path, str]:
     Names that differ in upper and lower case only would be one file on some systems.
 
     Raises:
-        OSError: an FMU cannot be read.
+        ConfigurationError: an FMU cannot be read.
     """
     names: dict[Path, str] = {}
     by_content: dict[str, str] = {}
     taken: set[str] = set()
     for path in models:
-        content = content_of(path)
+        try:
+            content = content_of(path)
+        except LoadFailed as error:
+            raise ConfigurationError(error.message, hint=error.hint) from error
+        except OSError as error:
+            raise ConfigurationError(f"'{path}' cannot be read: {error.strerror}") from error
         if content not in by_content:
             stem = _UNSAFE.sub("_", path.name.removesuffix(".fmu")) or "model"
             name, number = f"{stem}.fmu", 1
@@ -107,9 +116,10 @@ def _info(name: str, size: int, compression: int, *, executable: bool = False) -
 
 @contextmanager
 def _fmu_file(path: Path) -> Iterator[IO[bytes]]:
-    """The archive of an FMU, open for reading; an unpacked FMU is packed."""
+    """The archive of an FMU, open for reading, also from inside another archive; an unpacked FMU is packed."""
     if not files.is_folder(path):
-        with path.open("rb") as file:
+        outer = files.archive_on_the_way(path)
+        with path.open("rb") if outer is None else inner_file(path, outer, LimitsConfig()).file as file:
             yield file
         return
     with TemporaryFile() as packed:

@@ -24,7 +24,7 @@ from ..variables.value_types import flattened
 from .grammar import NAMESPACES
 from .own_annotation import ANNOTATION_ELEMENT, ANNOTATION_TYPE
 
-__all__ = ["SspVersion", "is_xml_text", "ssd_of"]
+__all__ = ["ElementNames", "SspVersion", "annotations_element", "is_xml_text", "ssd_of"]
 
 SspVersion = Literal["1.0", "2.0"]
 
@@ -63,7 +63,7 @@ class ElementNames(msgspec.Struct, frozen=True):
 
 
 def ssd_of(
-    system: ResolvedSystem, names: ElementNames, version: SspVersion, annotation: str, findings: Findings
+    system: ResolvedSystem, names: ElementNames, version: SspVersion, annotation: str | None, findings: Findings
 ) -> bytes:
     """The bytes of a system structure description.
 
@@ -71,10 +71,19 @@ def ssd_of(
         system: the mesh; all of its instances are FMUs.
         names: how the components are called, and where their FMUs are.
         version: the version of SSP.
-        annotation: the text of our annotation.
+        annotation: the text of our annotation; None: there is none.
         findings: gets what this version, or no version, can say. Then the bytes are useless.
     """
     return _Writer(system, names, version, findings).document(annotation)
+
+
+def annotations_element(text: str) -> XmlNode:
+    """The element `ssd:Annotations` of a root system, with our annotation and no other."""
+    parent = etree.Element(_tag("ssd:Annotations"), nsmap={prefix: NAMESPACES[prefix] for prefix in ("ssd", "ssc")})
+    entry = _child(parent, "ssc:Annotation", type=ANNOTATION_TYPE)
+    namespace = etree.QName(ANNOTATION_ELEMENT).namespace
+    etree.SubElement(entry, ANNOTATION_ELEMENT, nsmap={None: namespace}).text = text
+    return parent
 
 
 def is_xml_text(text: str) -> bool:
@@ -88,9 +97,7 @@ def is_xml_text(text: str) -> bool:
 class _Writer:
     """Writes one document; units and enumerations are collected on the way."""
 
-    def __init__(
-        self, system: ResolvedSystem, names: ElementNames, version: SspVersion, findings: Findings
-    ) -> None:
+    def __init__(self, system: ResolvedSystem, names: ElementNames, version: SspVersion, findings: Findings) -> None:
         self._system = system
         self._names = names
         self._version: SspVersion = version
@@ -98,7 +105,7 @@ class _Writer:
         self._units: dict[str, BaseUnit] = {}
         self._enumerations: dict[tuple[tuple[str, int], ...], str] = {}
 
-    def document(self, annotation: str) -> bytes:
+    def document(self, annotation: str | None) -> bytes:
         config = self._system.config
         root = etree.Element(
             _tag("ssd:SystemStructureDescription"),
@@ -113,9 +120,8 @@ class _Writer:
             connections = _child(own, "ssd:Connections")
             for connection in self._system.connections:
                 self._connection(connections, connection)
-        entry = _child(_child(own, "ssd:Annotations"), "ssc:Annotation", type=ANNOTATION_TYPE)
-        namespace = etree.QName(ANNOTATION_ELEMENT).namespace
-        etree.SubElement(entry, ANNOTATION_ELEMENT, nsmap={None: namespace}).text = annotation
+        if annotation is not None:
+            own.append(annotations_element(annotation))
         self._definitions(root)
         experiment = {"startTime": _number(config.simulation.start_time)}
         if config.simulation.stop_time is not None:
@@ -133,20 +139,18 @@ class _Writer:
         if isinstance(section, FmuConfig) and section.kind in _IMPLEMENTATIONS:
             component.set("implementation", _IMPLEMENTATIONS[section.kind])
         connected = self._connected(name)
-        shown = [variable for variable in description.variables if self._has_connector(variable, section.start_values)]
         connectors = [
             variable
             for variable in description.variables
-            if variable.name in connected or (variable in shown and self._is_known(variable))
+            if variable.name in connected or self._has_connector(variable, section.start_values)
         ]
         if connectors:
             parent = _child(component, "ssd:Connectors")
             for variable in connectors:
                 self._connector(parent, variable, description)
-        values = {key: description.variable(key) for key in section.start_values}
-        written = [(variable, section.start_values[key]) for key, variable in values.items() if variable is not None]
-        if written:
-            self._binding(component, name, written)
+        variables = {variable.name: variable for variable in description.variables}
+        if section.start_values:
+            self._binding(component, name, [(variables[key], value) for key, value in section.start_values.items()])
 
     def _connected(self, name: str) -> set[str]:
         """The variables of an instance that are ends of connections."""
@@ -154,7 +158,8 @@ class _Writer:
         return sources | {one.target.name for one in self._system.connections if one.target_instance == name}
 
     def _has_connector(self, variable: Variable, start_values: Mapping[str, Any]) -> bool:
-        return variable.causality in _KINDS or (variable.name in start_values and variable.causality != "independent")
+        """Whether an unconnected variable is shown to other tools: it can be connected or set, and has a type."""
+        return (variable.causality in _KINDS or variable.name in start_values) and self._is_known(variable)
 
     def _is_known(self, variable: Variable) -> bool:
         """Whether this version of SSP has the kind and the type of a variable."""
@@ -245,12 +250,7 @@ class _Writer:
             "suppressUnitConversion": "true" if config.ignore_units else "",
         }
         node = _child(parent, "ssd:Connection", **{name: text for name, text in attributes.items() if text})
-        self._transformation(node, connection, config)
-
-    def _transformation(self, node: XmlNode, connection: Connection, config: ConnectionConfig) -> None:
-        if (config.factor, config.offset) != (1.0, 0.0):
-            numbers = {"factor": _number(config.factor), "offset": _number(config.offset)}
-            _child(node, "ssc:LinearTransformation", **numbers)
+        _transformation(node, config)
 
     def _check_ends(self, connection: Connection) -> None:
         source, target = connection.source, connection.target
@@ -306,9 +306,16 @@ class _Writer:
             _units(_child(root, "ssd:Units"), self._units)
 
 
+def _transformation(node: XmlNode, config: ConnectionConfig) -> None:
+    if (config.factor, config.offset) != (1.0, 0.0):
+        _child(node, "ssc:LinearTransformation", factor=_number(config.factor), offset=_number(config.offset))
+
+
 def _units(parent: XmlNode, units: Mapping[str, BaseUnit]) -> None:
     for name, base in sorted(units.items()):
-        fields = {key: value for key, value in msgspec.structs.asdict(base).items() if value != getattr(BaseUnit(), key)}
+        fields = {
+            key: value for key, value in msgspec.structs.asdict(base).items() if value != getattr(BaseUnit(), key)
+        }
         texts = {key: str(value) if isinstance(value, int) else _number(value) for key, value in fields.items()}
         _child(_child(parent, "ssc:Unit", name=name), "ssc:BaseUnit", **texts)
 
@@ -322,8 +329,9 @@ def _text_of(value: Value, variable: Variable) -> str:
             return _number(value)
         case bytes():
             return value.hex().upper()
-    names = {number: item for item, number in variable.items}
-    return names.get(value, str(value)) if variable.type == "Enumeration" else str(value)
+        case int() if variable.type == "Enumeration":
+            return next((item for item, number in variable.items if number == value), str(value))
+    return str(value)
 
 
 def _number(value: float) -> str:
