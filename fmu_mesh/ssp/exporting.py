@@ -6,25 +6,32 @@ and files of that package (`kept_package`); any other one gets a new description
 
 from __future__ import annotations
 
+import json
 import posixpath
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from ..config.findings import Findings
 from ..config.loading import PlainConfig, read_file
 from ..config.mesh import Config
-from ..errors import ConfigurationError, Finding
-from ..files import archive_on_the_way, is_file
+from ..errors import ConfigurationError, Finding, LoadFailed
+from ..files import archive_on_the_way, is_file, is_folder
 from ..system.system import ResolvedSystem
 from ..text import nearest_file
+from .document_changes import own_annotation_in, with_own_annotation
+from .kept_package import KeptPackage, kept_package
 from .naming import element_path, instance_name, mesh_name
-from .own_annotation import written
+from .own_annotation import names_in, without, written
 from .package import DEFAULT
 from .package_writing import PackageEntry, resource_names, write_package
 from .ssd_writing import ElementNames, SspVersion, is_xml_text, ssd_of
+from .system_reading import read_system
 
 __all__ = ["export"]
+
+_OF_CONNECTIONS: Final = ("from", "to", "factor", "offset", "ignore_units", "map")
+"""The keys of a connection that SSP can say."""
 
 
 def export(
@@ -47,12 +54,69 @@ def export(
     """
     if path.suffix.lower() != ".ssp":
         raise ConfigurationError(f"'{path}' is no name of a package", hint="Let it end in '.ssp'.")
-    _write_new(plain, resolve, path, version or "1.0")
+    kept = kept_package(plain)
+    if kept is not None and version in (None, kept.version) and _is_unchanged(plain, original := _read_again(kept)):
+        return _write_copy(plain, original, kept, path)
+    units = _write_new(plain, resolve, path, version or "1.0")
+    return kept.lost(units) if kept is not None else ()
+
+
+def _read_again(kept: KeptPackage) -> PlainConfig:
+    """The configuration of a package as it is on the disk.
+
+    Raises:
+        ConfigurationError: it is wrong; has all findings.
+    """
+    original = read_system(kept.root / kept.name) if is_folder(kept.root) else read_system(kept.root, kept.name)
+    Findings(kept.shown, first=original.findings).raise_any()
+    return original
+
+
+def _is_unchanged(plain: PlainConfig, original: PlainConfig) -> bool:
+    """Whether a configuration has the instances, start values and connections of a package, in their order."""
+    return json.dumps(_content(plain.data)) == json.dumps(_content(original.data))
+
+
+def _content(data: Any) -> list[Any]:  # noqa: ANN401  values of a file
+    """What a configuration says that SSP can say."""
+    instances = [
+        (name, section.get("fmu"), section.get("kind", "auto"), section.get("start_values") or {})
+        for name, section in data.get("instances", {}).items()
+    ]
+    connections = [
+        {key: value for key, value in one.items() if key in _OF_CONNECTIONS} if isinstance(one, dict) else one
+        for one in data.get("connections", ())
+    ]
+    return [instances, connections]
+
+
+def _write_copy(plain: PlainConfig, original: PlainConfig, kept: KeptPackage, path: Path) -> tuple[Finding, ...]:
+    """Write a copy of the package with an annotation of ours that says the rest."""
+    findings = Findings(str(plain.file), plain.lines, plain.overrides)
+    data = _with_scenario(plain, findings)
+    _check_files(data, findings)
+    findings.raise_any()
+    described: Mapping[str, Any] = original.data if isinstance(original.data, dict) else {}
+    names: dict[str, str] = {}
+    before = own_annotation_in(kept.document)
+    if before is not None:
+        described, names = without(described, before), names_in(before)
+    annotation = written(data, described, names=names, moved=_to_package(plain.file))
+    document = kept.document if annotation == before else with_own_annotation(kept.document, annotation)
+    try:
+        with kept.copied(document) as entries:
+            write_package(path, entries)
+            names_of_files = [entry.name for entry in entries]
+    except LoadFailed as error:
+        raise ConfigurationError(error.message, hint=error.hint) from error
+    if kept.name in names_of_files and kept.name != DEFAULT:
+        found = f"'{kept.name}' is not the default description of the package"
+        return (Finding(str(path), "", found, f"`--ssd {kept.name}` to run it"),)
     return ()
 
 
-def _write_new(plain: PlainConfig, resolve: Callable[[], ResolvedSystem], path: Path, version: SspVersion) -> None:
-    """Write a package with a new description."""
+def _write_new(plain: PlainConfig, resolve: Callable[[], ResolvedSystem], path: Path, version: SspVersion) -> set[str]:
+    """Write a package with a new description; returns the names of its units."""
     findings = Findings(str(plain.file), plain.lines, plain.overrides)
     data = _with_scenario(plain, findings)
     _check_kinds(data, findings)
@@ -63,12 +127,14 @@ def _write_new(plain: PlainConfig, resolve: Callable[[], ResolvedSystem], path: 
     resources = resource_names(models.values())
     elements, changed = _element_names([*models])
     names = ElementNames(elements, {name: resources[model] for name, model in models.items()})
+    data = {**data, "simulation": {"algorithm": system.config.simulation.algorithm, **data["simulation"]}}
     annotation = written(data, _described(system.config), names=changed, moved=_to_package(plain.file))
     document = ssd_of(system, names, version, annotation, findings)
     findings.raise_any()
     models_of = {resource: model for model, resource in reversed(resources.items())}
     entries = [PackageEntry(resource, models_of[resource]) for resource in dict.fromkeys(resources.values())]
-    write_package(path, [PackageEntry(DEFAULT, document), *entries])
+    write_package(path, [PackageEntry(DEFAULT, document.xml), *entries])
+    return document.units
 
 
 def _described(config: Config) -> dict[str, Any]:

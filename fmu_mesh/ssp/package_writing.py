@@ -11,8 +11,10 @@ import re
 import shutil
 import stat
 import zipfile
+import zlib
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from io import BytesIO
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import IO, Final, NamedTuple
@@ -23,14 +25,24 @@ from ..errors import ConfigurationError, LoadFailed
 from ..instances.fmi.archive.archive import content_of
 from ..instances.fmi.archive.inner_files import inner_file
 
-__all__ = ["PackageEntry", "resource_names", "write_package"]
+__all__ = ["ArchiveEntry", "PackageEntry", "resource_names", "write_package"]
 
 _TIME: Final = (1980, 1, 1, 0, 0, 0)
 """The earliest time that an archive can have."""
 
+_ARCHIVES: Final = (".fmu", ".ssp")
+"""Files that are archives themselves, and are not compressed again."""
+
 _CHUNK: Final = 2**20
 _UNSAFE: Final = re.compile(r"[^A-Za-z0-9_.-]")
 """Characters that would have to be escaped in the URI of a source (RFC 3986, 2.3), which not every tool undoes."""
+
+
+class ArchiveEntry(NamedTuple):
+    """A file in an archive that is open."""
+
+    archive: zipfile.ZipFile
+    entry: zipfile.ZipInfo
 
 
 class PackageEntry(NamedTuple):
@@ -38,11 +50,11 @@ class PackageEntry(NamedTuple):
 
     Attributes:
         name: its path in the package.
-        content: its bytes; or the path of an FMU, which may be an unpacked one.
+        content: its bytes, or where it is. The path of a folder is that of an unpacked FMU, which is packed.
     """
 
     name: str
-    content: bytes | Path
+    content: bytes | Path | ArchiveEntry
 
 
 def write_package(path: Path, entries: Iterable[PackageEntry]) -> None:
@@ -57,6 +69,8 @@ def write_package(path: Path, entries: Iterable[PackageEntry]) -> None:
                 _add(package, entry)
     except LoadFailed as error:
         raise ConfigurationError(error.message, hint=error.hint) from error
+    except (zipfile.BadZipFile, zlib.error, EOFError) as error:
+        raise ConfigurationError(f"'{path}' cannot be written, because a file for it is damaged: {error}") from error
     except OSError as error:
         at = f" ('{error.filename}')" if error.filename and Path(error.filename) != path else ""
         raise ConfigurationError(f"'{path}' cannot be written: {error.strerror or error}{at}") from error
@@ -93,15 +107,14 @@ def resource_names(models: Iterable[Path]) -> dict[Path, str]:
 
 
 def _add(package: zipfile.ZipFile, entry: PackageEntry) -> None:
-    """Add one file. FMUs are archives themselves, so they are not compressed again."""
-    if isinstance(entry.content, bytes):
-        with package.open(_info(entry.name, len(entry.content), zipfile.ZIP_DEFLATED), "w") as target:
-            target.write(entry.content)
-        return
-    with _fmu_file(entry.content) as source:
-        size = source.seek(0, os.SEEK_END)
-        source.seek(0)
-        with package.open(_info(entry.name, size, zipfile.ZIP_STORED), "w") as target:
+    with _opened(entry.content) as source:
+        if isinstance(entry.content, ArchiveEntry):
+            size, stored = entry.content.entry.file_size, entry.content.entry.compress_type == zipfile.ZIP_STORED
+        else:
+            size, stored = source.seek(0, os.SEEK_END), entry.name.lower().endswith(_ARCHIVES)
+            source.seek(0)
+        info = _info(entry.name, size, zipfile.ZIP_STORED if stored else zipfile.ZIP_DEFLATED)
+        with package.open(info, "w") as target:
             shutil.copyfileobj(source, target, _CHUNK)
 
 
@@ -115,13 +128,26 @@ def _info(name: str, size: int, compression: int, *, executable: bool = False) -
 
 
 @contextmanager
-def _fmu_file(path: Path) -> Iterator[IO[bytes]]:
-    """The archive of an FMU, open for reading, also from inside another archive; an unpacked FMU is packed."""
-    if not files.is_folder(path):
-        outer = files.archive_on_the_way(path)
-        with path.open("rb") if outer is None else inner_file(path, outer, LimitsConfig()).file as file:
-            yield file
-        return
+def _opened(content: bytes | Path | ArchiveEntry) -> Iterator[IO[bytes]]:
+    """What a file of the package is to contain, open for reading."""
+    match content:
+        case bytes():
+            yield BytesIO(content)
+        case ArchiveEntry():
+            with content.archive.open(content.entry) as file:
+                yield file
+        case _ if files.is_folder(content):
+            with _packed(content) as file:
+                yield file
+        case _:
+            outer = files.archive_on_the_way(content)
+            with content.open("rb") if outer is None else inner_file(content, outer, LimitsConfig()).file as file:
+                yield file
+
+
+@contextmanager
+def _packed(path: Path) -> Iterator[IO[bytes]]:
+    """The archive of an unpacked FMU."""
     with TemporaryFile() as packed:
         with zipfile.ZipFile(packed, "w") as archive:
             for own in sorted(path.rglob("*"), key=lambda file: file.relative_to(path).as_posix()):

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, NamedTuple
 
 import msgspec
 from lxml import etree
@@ -62,19 +62,31 @@ class ElementNames(msgspec.Struct, frozen=True):
     sources: Mapping[str, str]
 
 
+class NewDocument(NamedTuple):
+    """A system structure description.
+
+    Attributes:
+        units: the names of the units that it defines.
+    """
+
+    xml: bytes
+    units: set[str]
+
+
 def ssd_of(
     system: ResolvedSystem, names: ElementNames, version: SspVersion, annotation: str | None, findings: Findings
-) -> bytes:
-    """The bytes of a system structure description.
+) -> NewDocument:
+    """A system structure description.
 
     Args:
         system: the mesh; all of its instances are FMUs.
         names: how the components are called, and where their FMUs are.
         version: the version of SSP.
         annotation: the text of our annotation; None: there is none.
-        findings: gets what this version, or no version, can say. Then the bytes are useless.
+        findings: gets what this version, or no version, can say. Then the document is useless.
     """
-    return _Writer(system, names, version, findings).document(annotation)
+    writer = _Writer(system, names, version, findings)
+    return NewDocument(writer.document(annotation), writer.units)
 
 
 def annotations_element(text: str) -> XmlNode:
@@ -104,6 +116,11 @@ class _Writer:
         self._findings = findings
         self._units: dict[str, BaseUnit] = {}
         self._enumerations: dict[tuple[tuple[str, int], ...], str] = {}
+
+    @property
+    def units(self) -> set[str]:
+        """The names of the units that the document defines."""
+        return {*self._units}
 
     def document(self, annotation: str | None) -> bytes:
         config = self._system.config
