@@ -338,15 +338,15 @@ class Mesh:
 
         Args:
             path: the file, which ends in `.ssp`; an older one is replaced.
-            version: of SSP; None: that of the package that the mesh was loaded from, otherwise 1.0. Arrays and the types
+            version: of SSP; None: that of the package that the mesh was loaded from, otherwise 1.0. Arrays and types
                 of FMI 3.0 need 2.0.
 
         Returns:
             What the package that the mesh was loaded from has, and this one has not.
 
         Raises:
-            ConfigurationError: the mesh is wrong, SSP cannot say something, or a file cannot be read or written; carries
-                all findings. No file is left behind.
+            ConfigurationError: the mesh is wrong, SSP cannot say something, or a file cannot be read or written;
+                carries all findings. No file is left behind.
         """
         from ..ssp.exporting import export  # noqa: PLC0415  only this needs it
 

@@ -1,7 +1,8 @@
 """A system structure description of another tool with our annotation: every other byte of it stays as it is.
 
 Owns where the annotation stands in the text of a document. A parser tells only the places; the text itself is never
-written anew, so prefixes, comments and blanks of the tool are kept. Documents are those that `ssd_reading` has accepted.
+written anew, so prefixes, comments and blanks of the tool are kept. It is for documents that `ssd_reading` has
+accepted.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from lxml import etree
 
 from .grammar import NAMESPACES
 from .own_annotation import ANNOTATION_TYPE
-from .ssd_writing import annotations_element
+from .xml_writing import annotations_element
 
 __all__ = ["own_annotation_in", "with_own_annotation"]
 
@@ -58,7 +59,7 @@ def with_own_annotation(document: bytes, text: str | None) -> bytes:
         for span in reversed(places.own):
             changed = _without(changed, span)
         return changed
-    entry = etree.tostring(element[0], encoding="ASCII", xml_declaration=False)
+    entry: bytes = etree.tostring(element[0], encoding="ASCII", xml_declaration=False)
     if places.own:
         for span in reversed(places.own[1:]):
             changed = _without(changed, span)
@@ -67,7 +68,7 @@ def with_own_annotation(document: bytes, text: str | None) -> bytes:
     if places.annotations is not None and places.annotations.inner_end != places.annotations.end:
         at = places.annotations.inner_end
         return document[:at] + entry + document[at:]
-    whole = etree.tostring(element, encoding="ASCII", xml_declaration=False)
+    whole: bytes = etree.tostring(element, encoding="ASCII", xml_declaration=False)
     if places.annotations is not None:
         return document[: places.annotations.start] + whole + document[places.annotations.end :]
     if places.system is None or places.system.inner_end == places.system.end:

@@ -25,8 +25,8 @@ from .naming import element_path, instance_name, mesh_name
 from .own_annotation import names_in, without, written
 from .package import DEFAULT
 from .package_writing import PackageEntry, resource_names, write_package
-from .ssd_writing import ElementNames, SspVersion, is_xml_text, ssd_of
-from .system_reading import read_system
+from .ssd_writing import ElementNames, SspVersion, ssd_of
+from .xml_writing import is_xml_text
 
 __all__ = ["export"]
 
@@ -67,6 +67,8 @@ def _read_again(kept: KeptPackage) -> PlainConfig:
     Raises:
         ConfigurationError: it is wrong; has all findings.
     """
+    from .system_reading import read_system
+
     original = read_system(kept.root / kept.name) if is_folder(kept.root) else read_system(kept.root, kept.name)
     Findings(kept.shown, first=original.findings).raise_any()
     return original

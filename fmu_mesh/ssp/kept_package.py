@@ -161,16 +161,12 @@ def _kind_of(element: Any, kept_units: set[str]) -> str | None:  # noqa: ANN401 
     name, own = etree.QName(element).localname, element.get("name")
     around = element.getparent()
     parent = etree.QName(around).localname if around is not None else None
-    if name == "System" and parent != "SystemStructureDescription":
-        return "nested systems"
-    if name == "Component" and "x-ssp" in (element.get("type") or ""):
-        return "nested systems"
-    if name == "Connectors" and parent == "System":
-        return "lists of connectors of systems"
-    if name == "Annotation" and element.get("type") != ANNOTATION_TYPE:
-        return f"annotations '{element.get('type')}'"
-    if name == "Unit" and own not in kept_units:
-        return f"the unit '{own}', which no FMU defines"
-    if name == "GraphicalElements" or name.endswith("Geometry"):
-        return "elements with geometry"
-    return _LOST.get(name)
+    special = {
+        "nested systems": (name == "System" and parent != "SystemStructureDescription")
+        or (name == "Component" and "x-ssp" in (element.get("type") or "")),
+        "lists of connectors of systems": name == "Connectors" and parent == "System",
+        f"annotations '{element.get('type')}'": name == "Annotation" and element.get("type") != ANNOTATION_TYPE,
+        f"the unit '{own}', which no FMU defines": name == "Unit" and own not in kept_units,
+        "elements with geometry": name == "GraphicalElements" or name.endswith("Geometry"),
+    }
+    return next((what for what, applies in special.items() if applies), _LOST.get(name))

@@ -6,7 +6,6 @@ Owns which elements and attributes stand for what, and what a version cannot say
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any, Final, Literal, NamedTuple
 
@@ -17,19 +16,17 @@ from ..config.findings import Findings
 from ..config.mesh import ConnectionConfig
 from ..instances.fmi.fmu_kind import FmuConfig
 from ..system.system import Connection, ResolvedSystem
+from ..system.value_map import map_words
 from ..variables.model_description import ModelDescription, Value, Variable
 from ..variables.units import BaseUnit
 from ..variables.value_conversion import to_value
 from ..variables.value_types import flattened
 from .grammar import NAMESPACES
-from .own_annotation import ANNOTATION_ELEMENT, ANNOTATION_TYPE
+from .xml_writing import XmlNode, annotations_element, child, is_xml_text, number_text, tag_of, write_units
 
-__all__ = ["ElementNames", "SspVersion", "annotations_element", "is_xml_text", "ssd_of"]
+__all__ = ["ElementNames", "NewDocument", "SspVersion", "ssd_of"]
 
 SspVersion = Literal["1.0", "2.0"]
-
-XmlNode = Any
-"""An element of lxml, which ships no types."""
 
 _KINDS_OF_1: Final = ("input", "output", "parameter", "calculatedParameter")
 _KINDS: Final = (*_KINDS_OF_1, "structuralParameter")
@@ -89,23 +86,6 @@ def ssd_of(
     return NewDocument(writer.document(annotation), writer.units)
 
 
-def annotations_element(text: str) -> XmlNode:
-    """The element `ssd:Annotations` of a root system, with our annotation and no other."""
-    parent = etree.Element(_tag("ssd:Annotations"), nsmap={prefix: NAMESPACES[prefix] for prefix in ("ssd", "ssc")})
-    entry = _child(parent, "ssc:Annotation", type=ANNOTATION_TYPE)
-    namespace = etree.QName(ANNOTATION_ELEMENT).namespace
-    etree.SubElement(entry, ANNOTATION_ELEMENT, nsmap={None: namespace}).text = text
-    return parent
-
-
-def is_xml_text(text: str) -> bool:
-    """Whether XML can hold a text: it has no place for most control characters (XML 1.0, 2.2)."""
-    return all(
-        character in "\t\n\r" or " " <= character < "\ud800" or "\ue000" <= character < "\ufffe" or character > "\uffff"
-        for character in text
-    )
-
-
 class _Writer:
     """Writes one document; units and enumerations are collected on the way."""
 
@@ -125,25 +105,25 @@ class _Writer:
     def document(self, annotation: str | None) -> bytes:
         config = self._system.config
         root = etree.Element(
-            _tag("ssd:SystemStructureDescription"),
+            tag_of("ssd:SystemStructureDescription"),
             {"version": self._version, "name": config.mesh, "generationTool": "fmu_mesh"},
             nsmap={prefix: NAMESPACES[prefix] for prefix in ("ssd", "ssc", "ssv")},
         )
-        own = _child(root, "ssd:System", name=config.mesh)
-        elements = _child(own, "ssd:Elements")
+        own = child(root, "ssd:System", name=config.mesh)
+        elements = child(own, "ssd:Elements")
         for name in self._system.instances:
             self._component(elements, name)
         if self._system.connections:
-            connections = _child(own, "ssd:Connections")
+            connections = child(own, "ssd:Connections")
             for connection in self._system.connections:
                 self._connection(connections, connection)
         if annotation is not None:
             own.append(annotations_element(annotation))
         self._definitions(root)
-        experiment = {"startTime": _number(config.simulation.start_time)}
+        experiment = {"startTime": number_text(config.simulation.start_time)}
         if config.simulation.stop_time is not None:
-            experiment["stopTime"] = _number(config.simulation.stop_time)
-        _child(root, "ssd:DefaultExperiment", **experiment)
+            experiment["stopTime"] = number_text(config.simulation.stop_time)
+        child(root, "ssd:DefaultExperiment", **experiment)
         etree.indent(root)
         return bytes(etree.tostring(root, encoding="UTF-8", xml_declaration=True)) + b"\n"
 
@@ -152,7 +132,7 @@ class _Writer:
     def _component(self, parent: XmlNode, name: str) -> None:
         section = self._system.config.instances[name]
         description = self._system.instances[name].description
-        component = _child(parent, "ssd:Component", name=self._names.elements[name], source=self._names.sources[name])
+        component = child(parent, "ssd:Component", name=self._names.elements[name], source=self._names.sources[name])
         if isinstance(section, FmuConfig) and section.kind in _IMPLEMENTATIONS:
             component.set("implementation", _IMPLEMENTATIONS[section.kind])
         connected = self._connected(name)
@@ -162,7 +142,7 @@ class _Writer:
             if variable.name in connected or self._has_connector(variable, section.start_values)
         ]
         if connectors:
-            parent = _child(component, "ssd:Connectors")
+            parent = child(component, "ssd:Connectors")
             for variable in connectors:
                 self._connector(parent, variable, description)
         variables = {variable.name: variable for variable in description.variables}
@@ -191,7 +171,7 @@ class _Writer:
         return variable.declared_type or variable.type
 
     def _connector(self, parent: XmlNode, variable: Variable, description: ModelDescription) -> None:
-        connector = _child(parent, "ssd:Connector", name=variable.name, kind=variable.causality)
+        connector = child(parent, "ssd:Connector", name=variable.name, kind=variable.causality)
         attributes: dict[str, str] = {}
         if variable.type in ("Float64", "Float32") and (unit := self._unit(variable)) is not None:
             attributes["unit"] = unit
@@ -200,23 +180,23 @@ class _Writer:
             if enumeration is None:
                 return  # the type of the FMU's variable counts
             attributes["name"] = enumeration
-        _child(connector, f"ssc:{self._type(variable)}", **attributes)
+        child(connector, f"ssc:{self._type(variable)}", **attributes)
         self._dimensions(connector, variable)
 
     def _dimensions(self, parent: XmlNode, variable: Variable) -> None:
         for dimension, size in zip(variable.dimensions, variable.shape, strict=True):
-            if isinstance(dimension, str) and parent.tag == _tag("ssd:Connector"):
-                _child(parent, "ssc:Dimension", sizeConnector=dimension)
+            if isinstance(dimension, str) and parent.tag == tag_of("ssd:Connector"):
+                child(parent, "ssc:Dimension", sizeConnector=dimension)
             else:
-                _child(parent, "ssc:Dimension", size=str(size))
+                child(parent, "ssc:Dimension", size=str(size))
 
     # --- start values
 
     def _binding(self, component: XmlNode, name: str, written: Sequence[tuple[Variable, Any]]) -> None:
-        binding = _child(_child(component, "ssd:ParameterBindings"), "ssd:ParameterBinding")
-        values = _child(binding, "ssd:ParameterValues")
-        own = _child(values, "ssv:ParameterSet", version=self._version, name=self._names.elements[name])
-        parameters = _child(own, "ssv:Parameters")
+        binding = child(child(component, "ssd:ParameterBindings"), "ssd:ParameterBinding")
+        values = child(binding, "ssd:ParameterValues")
+        own = child(values, "ssv:ParameterSet", version=self._version, name=self._names.elements[name])
+        parameters = child(own, "ssv:Parameters")
         units: dict[str, BaseUnit] = {}
         for variable, plain in written:
             place = f"instances.{name}.start_values.{variable.name}"
@@ -229,25 +209,25 @@ class _Writer:
                 found = f"a control character in the start value of '{variable.name}'"
                 self._findings.add(place, found, "text without control characters: XML has no place for them")
                 continue
-            parameter = _child(parameters, "ssv:Parameter", name=variable.name)
+            parameter = child(parameters, "ssv:Parameter", name=variable.name)
             self._value(parameter, variable, texts)
             if variable.type in ("Float64", "Float32") and (unit := self._unit(variable)) is not None:
                 parameter[0].set("unit", unit)
                 units[unit] = self._units[unit]
             self._dimensions(parameter, variable)
         if units:
-            _units(_child(own, "ssv:Units"), units)
+            write_units(child(own, "ssv:Units"), units)
 
     def _value(self, parameter: XmlNode, variable: Variable, texts: Sequence[str]) -> None:
         type_ = self._type(variable)
         if variable.type == "Enumeration" and not variable.items:
             type_ = "Integer"  # there are no names of items
-        node = _child(parameter, f"ssv:{type_}")
+        node = child(parameter, f"ssv:{type_}")
         if not variable.shape:
             node.set("value", texts[0])
         elif type_ in ("String", "Enumeration", "Binary"):
             for text in texts:
-                _child(node, "ssv:Value", value=text)
+                child(node, "ssv:Value", value=text)
         else:
             node.set("value", " ".join(texts))
 
@@ -266,8 +246,31 @@ class _Writer:
             "endIndices": " ".join(str(number + 1) for number in connection.target_index),
             "suppressUnitConversion": "true" if config.ignore_units else "",
         }
-        node = _child(parent, "ssd:Connection", **{name: text for name, text in attributes.items() if text})
-        _transformation(node, config)
+        node = child(parent, "ssd:Connection", **{name: text for name, text in attributes.items() if text})
+        self._transformation(node, connection, config)
+
+    def _transformation(self, node: XmlNode, connection: Connection, config: ConnectionConfig) -> None:
+        if (config.factor, config.offset) != (1.0, 0.0):
+            child(
+                node, "ssc:LinearTransformation", factor=number_text(config.factor), offset=number_text(config.offset)
+            )
+        if not connection.map:
+            return
+        source, target = connection.source, connection.target
+        kind = _map_kind(source, target)
+        place = f"{connection.path}.map"
+        if kind is None:
+            expected = "two ends of type Boolean, or none: SSP has no other maps of Boolean"
+            self._findings.add(place, f"a map from {source.type_name} to {target.type_name}", expected)
+            return
+        pairs = {str(have): str(want) for have, want in connection.map}
+        if kind != "Integer":
+            pairs = map_words(connection.map, source, target)
+        elif self._version == "1.0" and not all(number in _INT_32 for pair in connection.map for number in pair):
+            self._needs_2(place, "a number of more than 32 bits")
+        parent = child(node, f"ssc:{kind}MappingTransformation")
+        for have, want in pairs.items():
+            child(parent, "ssc:MapEntry", source=have, target=want)
 
     def _check_ends(self, connection: Connection) -> None:
         source, target = connection.source, connection.target
@@ -314,27 +317,23 @@ class _Writer:
 
     def _definitions(self, root: XmlNode) -> None:
         if self._enumerations:
-            parent = _child(root, "ssd:Enumerations")
+            parent = child(root, "ssd:Enumerations")
             for items, name in self._enumerations.items():
-                enumeration = _child(parent, "ssc:Enumeration", name=name)
+                enumeration = child(parent, "ssc:Enumeration", name=name)
                 for item, number in items:
-                    _child(enumeration, "ssc:Item", name=item, value=str(number))
+                    child(enumeration, "ssc:Item", name=item, value=str(number))
         if self._units:
-            _units(_child(root, "ssd:Units"), self._units)
+            write_units(child(root, "ssd:Units"), self._units)
 
 
-def _transformation(node: XmlNode, config: ConnectionConfig) -> None:
-    if (config.factor, config.offset) != (1.0, 0.0):
-        _child(node, "ssc:LinearTransformation", factor=_number(config.factor), offset=_number(config.offset))
-
-
-def _units(parent: XmlNode, units: Mapping[str, BaseUnit]) -> None:
-    for name, base in sorted(units.items()):
-        fields = {
-            key: value for key, value in msgspec.structs.asdict(base).items() if value != getattr(BaseUnit(), key)
-        }
-        texts = {key: str(value) if isinstance(value, int) else _number(value) for key, value in fields.items()}
-        _child(_child(parent, "ssc:Unit", name=name), "ssc:BaseUnit", **texts)
+def _map_kind(source: Variable, target: Variable) -> str | None:
+    """Which of the mappings of SSP a map is; None if it is none of them."""
+    types = {source.type, target.type}
+    if types == {"Boolean"}:
+        return "Boolean"
+    if types == {"Enumeration"} and source.items and target.items:
+        return "Enumeration"
+    return "Integer" if "Boolean" not in types else None
 
 
 def _text_of(value: Value, variable: Variable) -> str:
@@ -343,25 +342,9 @@ def _text_of(value: Value, variable: Variable) -> str:
         case bool():
             return "true" if value else "false"
         case float():
-            return _number(value)
+            return number_text(value)
         case bytes():
             return value.hex().upper()
         case int() if variable.type == "Enumeration":
             return next((item for item, number in variable.items if number == value), str(value))
     return str(value)
-
-
-def _number(value: float) -> str:
-    """A number as xs:double, which gives back the same one."""
-    if math.isfinite(value):
-        return repr(float(value))
-    return "NaN" if math.isnan(value) else "INF" if value > 0.0 else "-INF"
-
-
-def _tag(name: str) -> str:
-    prefix, _, local = name.partition(":")
-    return f"{{{NAMESPACES[prefix]}}}{local}"
-
-
-def _child(parent: XmlNode, name: str, /, **attributes: str) -> XmlNode:
-    return etree.SubElement(parent, _tag(name), attributes)
