@@ -28,7 +28,7 @@ from ..system.scenario import Scenario
 from ..system.system import build
 from ..text import nearest_file
 from ..variables.model_description import ModelDescription
-from .options import Options, with_config_values, with_options
+from .options import Options, with_config_values, with_needed, with_options
 from .results import check_results
 from .run_plan import RunPlan
 
@@ -110,7 +110,8 @@ def plan_run(
     Raises:
         ConfigurationError: the configuration or an FMU is wrong; carries all findings.
     """
-    loaded, findings = examine_data(with_config_values(read_file(path), options.config_values), options.start_values)
+    plain = with_needed(with_config_values(read_file(path), options.config_values), options)
+    loaded, findings = examine_data(plain, options.start_values)
     return planned(loaded, findings, options, tell)
 
 

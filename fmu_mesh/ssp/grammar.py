@@ -317,13 +317,14 @@ GRAMMAR: Final[dict[str, Rule]] = {
         choice=tuple(_VALUE_TYPES),
     ),
     **_value_types(),
-    "ssv:Value": Rule(anything=True, since="2.0"),
+    "ssv:Value": Rule({"value": _needed}, since="2.0"),
     "ssv:Enumerations": Rule({}, {"ssc:Enumeration": True}),
     "ssv:Units": Rule({}, {"ssc:Unit": True}),
     "ssv:Annotations": Rule({}, {"ssc:Annotation": True}),
     # --- parameter mappings
     "ssm:ParameterMapping": Rule(_TOP, {"ssm:MappingEntry": True, **_META, "ssm:Annotations": False}),
     "ssm:MappingEntry": Rule(
+        # Tools write entries without a source for parameters that they do not map.
         {**_SELF, "source": _needed, "target": _name, "suppressUnitConversion": _boolean},
         {**_TRANSFORMATIONS, "ssm:Annotations": False},
     ),

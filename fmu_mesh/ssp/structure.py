@@ -103,7 +103,7 @@ class Connector(msgspec.Struct, frozen=True):
 
 
 class MapEntry(msgspec.Struct, frozen=True):
-    """One entry of a mapping of values; both as written, such as `true`, `3` or the name of an item."""
+    """One entry of a mapping of values: both are `true` or `false`, a whole number as `3`, or the name of an item."""
 
     source: str
     target: str
@@ -150,7 +150,7 @@ class Parameter(msgspec.Struct, frozen=True):
 
     Attributes:
         type: the name of the type's element, such as Real or Int32.
-        values: as written: one for a scalar; for an array all elements, row by row.
+        values: as written: one for a scalar; for an array all elements, row by row. Empty: there is a finding.
         unit: None if it is not given: no conversion takes place.
         dimensions: the sizes of an array; empty for a scalar, or if the file does not say.
     """

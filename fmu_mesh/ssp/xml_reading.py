@@ -24,6 +24,7 @@ __all__ = ["XmlElement", "read_xml"]
 _SHOWN_ATTRIBUTES: Final = ("name", "source", "type")
 _PREFIXES: Final = {namespace: prefix for prefix, namespace in NAMESPACES.items()}
 _VERSIONS: Final = ("1.0", "2.0")
+_INLINE: Final = ("ssv:ParameterSet", "ssm:ParameterMapping", "ssb:SignalDictionary")
 _UNBOUND: Final = re.compile(r"Namespace prefix (\S+)(?: for \S+)? on (\S+) is not defined")
 _DOCUMENT_TYPE: Final = re.compile(rb"<!DOCTYPE")
 
@@ -78,7 +79,9 @@ class XmlElement:
         """The children with one of these tags, in their order; all of them if no tag is given."""
         for child in self._element:
             if isinstance(child.tag, str) and (not tags or _name_of(child) in tags):
-                yield XmlElement(child, self._file, self.version)
+                # A parameter set or a mapping inside a description has a version of its own.
+                own = child.get("version") if _name_of(child) in _INLINE else None
+                yield XmlElement(child, self._file, (own or self.version).strip())
 
     def child(self, *tags: str) -> XmlElement | None:
         """The first child with one of these tags; None if there is none."""
