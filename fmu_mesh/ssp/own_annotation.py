@@ -16,10 +16,9 @@ from __future__ import annotations
 
 import json
 import posixpath
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
-from ..errors import Finding
 from ..text import listed
 
 __all__ = [
@@ -93,11 +92,13 @@ class Merged(NamedTuple):
 
     Attributes:
         data: the values of the configuration.
-        warnings: what the annotation says about things that are gone.
+        paths: what the annotation says of it, such as `simulation.step_size`.
+        gone: what the annotation says about instances and connections that there are not.
     """
 
     data: dict[str, Any]
-    warnings: list[Finding]
+    paths: list[str]
+    gone: list[str]
 
 
 def written(
@@ -157,54 +158,59 @@ def names_in(text: str) -> dict[str, str]:
     Raises:
         AnnotationRefused: the text is no annotation of ours.
     """
-    names = _parsed(text).get("names", {})
+    names = _mapping(_parsed(text), "names")
     if not all(isinstance(name, str) for name in names.values()):
-        raise AnnotationRefused("a name that is no text in 'names'", "the name of an instance")
+        raise AnnotationRefused("a name in 'names' that is no text", "the name of an instance")
     return dict(names)
 
 
-def merged(
-    data: Mapping[str, Any],
-    text: str,
-    *,
-    moved: Callable[[str], str] = lambda path: path,
-    file: str = "",
-) -> Merged:
+def chosen_names(defaults: Sequence[str], text: str) -> dict[str, str]:
+    """The name of each instance, by the name that follows from its element.
+
+    Args:
+        defaults: the names that follow from the elements of the description.
+        text: the text of the annotation.
+
+    Raises:
+        AnnotationRefused: the text is no annotation of ours, or gives one name to two instances.
+    """
+    wanted = names_in(text)
+    chosen = {default: wanted.get(default, default) for default in defaults}
+    first: dict[str, str] = {}
+    for default, name in chosen.items():
+        if name in first:
+            found = f"the name '{name}' of the elements '{first[name]}' and '{default}'"
+            raise AnnotationRefused(found, "a name of its own for each of them")
+        first[name] = default
+    return chosen
+
+
+def merged(data: Mapping[str, Any], text: str, *, moved: Callable[[str], str] = lambda path: path) -> Merged:
     """A configuration of a description with what its annotation says.
 
     Args:
-        data: what the description itself says: a mapping as in a configuration file, with long connections. It is not
-            changed.
+        data: what the description itself says: a mapping as in a configuration file, with long connections, and with
+            the names that `chosen_names` gives. It is not changed.
         text: the text of the annotation.
         moved: from the path of a result file for the folder of the package to one for the folder of the configuration.
-        file: the file that warnings name.
 
     Raises:
         AnnotationRefused: the text is no annotation of ours.
     """
     content = _parsed(text)
-    warnings: list[Finding] = []
-    made = _renamed(data, names_in(text), file, warnings)
+    simulation = _mapping(content, "simulation")
+    made = {**data, "simulation": {**data.get("simulation", {}), **simulation}}
+    result = Merged(made, [f"simulation.{key}" for key in simulation], [])
     if "mesh" in content:
         made["mesh"] = content["mesh"]
-    made["simulation"] = {**made.get("simulation", {}), **_mapping(content, "simulation")}
-    for name, section in _mapping(content, "instances").items():
-        if not isinstance(section, dict):
-            raise AnnotationRefused(f"no mapping for the instance '{name}'", "a mapping")
-        for key in section:
-            if key not in _INSTANCE_KEYS:
-                raise AnnotationRefused(f"the key '{key}' of '{name}'", f"one of {listed(_INSTANCE_KEYS)}")
-        if name in made["instances"]:
-            made["instances"][name] = {**made["instances"][name], **section}
-        else:
-            warnings.append(_gone(file, f"instances.{name}", f"the instance '{name}'", section))
-    _merge_connections(made, content, file, warnings)
+        result.paths.append("mesh")
+    _merge_instances(content, result)
+    _merge_connections(content, result)
     for key in _SECTIONS:
         if key in content:
-            made[key] = content[key]
-    if "record" in content:
-        made["record"] = _with_files(content["record"], moved)
-    return Merged(made, warnings)
+            made[key] = _with_files(content[key], moved) if key == "record" else content[key]
+            result.paths.append(key)
+    return result
 
 
 def _parsed(text: str) -> dict[str, Any]:
@@ -236,33 +242,6 @@ def _mapping(content: Mapping[str, Any], key: str) -> dict[str, Any]:
     if not isinstance(section, dict):
         raise AnnotationRefused(f"no mapping in '{key}'", "a mapping")
     return section
-
-
-def _renamed(data: Mapping[str, Any], names: Mapping[str, str], file: str, warnings: list[Finding]) -> dict[str, Any]:
-    """A copy of ``data`` with other names of its instances; a name that another instance has is not given twice."""
-    instances = data.get("instances", {})
-    given: dict[str, str] = {}
-    taken = {name for name in instances if name not in names}
-    for old, new in names.items():
-        if old not in instances:
-            continue
-        if new in taken:
-            found = f"the name '{new}' of the annotation, which another element has"
-            warnings.append(Finding(file, f"instances.{old}", found, ""))
-        else:
-            given[old] = new
-        taken.add(given.get(old, old))
-    connections = [
-        {**connection, "from": _end(connection["from"], given), "to": _end(connection["to"], given)}
-        for connection in data.get("connections", ())
-    ]
-    renamed = {given.get(name, name): dict(section) for name, section in instances.items()}
-    return {**data, "instances": renamed, **({"connections": connections} if "connections" in data else {})}
-
-
-def _end(reference: str, names: Mapping[str, str]) -> str:
-    instance, dot, variable = reference.partition(".")
-    return f"{names.get(instance, instance)}{dot}{variable}"
 
 
 def _without(section: Mapping[str, Any], keys: Mapping[str, Any]) -> dict[str, Any]:
@@ -303,27 +282,43 @@ def _own_connections(
             yield {"from": connection["from"], "to": connection["to"], **kept}
 
 
-def _merge_connections(made: dict[str, Any], content: Mapping[str, Any], file: str, warnings: list[Finding]) -> None:
+def _merge_instances(content: Mapping[str, Any], result: Merged) -> None:
+    instances = {name: dict(section) for name, section in result.data.get("instances", {}).items()}
+    result.data["instances"] = instances
+    for name, section in _mapping(content, "instances").items():
+        if not isinstance(section, dict):
+            raise AnnotationRefused(f"no mapping for the instance '{name}'", "a mapping")
+        for key in section:
+            if key not in _INSTANCE_KEYS:
+                raise AnnotationRefused(f"the key '{key}' of '{name}'", f"one of {listed(_INSTANCE_KEYS)}")
+        if name in instances:
+            instances[name] |= section
+            result.paths.extend(f"instances.{name}.{key}" for key in section)
+        else:
+            result.gone.append(f"the instance '{name}', which the annotation has {listed([*section])} for")
+
+
+def _merge_connections(content: Mapping[str, Any], result: Merged) -> None:
     entries = content.get("connections", [])
     if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
         raise AnnotationRefused("no list of mappings in 'connections'", "a list of mappings")
-    connections = {(one["from"], one["to"]): one for one in made.get("connections", ())}
+    if not entries:
+        return
+    connections = [dict(one) for one in result.data.get("connections", ())]
+    result.data["connections"] = connections
+    numbers = {_ends(one): number for number, one in enumerate(connections)}
     for entry in entries:
         keys = {key: value for key, value in entry.items() if key not in ("from", "to")}
         for key in keys:
             if key not in _CONNECTION_KEYS:
                 raise AnnotationRefused(f"the key '{key}' of a connection", f"one of {listed(_CONNECTION_KEYS)}")
-        found = connections.get((entry.get("from"), entry.get("to")))
-        if found is not None:
-            found.update(keys)
+        ends = entry.get("from"), entry.get("to")
+        number = numbers.get(ends) if all(isinstance(end, str) for end in ends) else None
+        if number is not None:
+            connections[number] |= keys
+            result.paths.extend(f"connections[{number}].{key}" for key in keys)
         else:
-            ends = f"{entry.get('from')} -> {entry.get('to')}"
-            warnings.append(_gone(file, "connections", f"the connection {ends}", keys))
-
-
-def _gone(file: str, path: str, what: str, keys: Mapping[str, Any]) -> Finding:
-    """The warning about something that another program has removed from the description."""
-    return Finding(file, path, f"{what} is gone, so {listed(list(keys))} of it has no effect", "")
+            result.gone.append(f"the connection {ends[0]} -> {ends[1]}, which the annotation has {listed([*keys])} for")
 
 
 def _with_files(record: Any, moved: Callable[[str], str]) -> Any:  # noqa: ANN401  a section as in a file

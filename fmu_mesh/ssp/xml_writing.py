@@ -30,15 +30,18 @@ def number_text(value: float) -> str:
 
 
 def tag_of(name: str) -> str:
+    """The name of an element with its namespace, from a name with the usual prefix: `ssd:System`."""
     prefix, _, local = name.partition(":")
     return f"{{{NAMESPACES[prefix]}}}{local}"
 
 
 def child(parent: XmlNode, name: str, /, **attributes: str) -> XmlNode:
+    """Add an element to another one; ``name`` has the usual prefix."""
     return etree.SubElement(parent, tag_of(name), attributes)
 
 
 def write_units(parent: XmlNode, units: Mapping[str, BaseUnit]) -> None:
+    """Add the definitions of units to the element `Units` of a document."""
     for name, base in sorted(units.items()):
         fields = {
             key: value for key, value in msgspec.structs.asdict(base).items() if value != getattr(BaseUnit(), key)
