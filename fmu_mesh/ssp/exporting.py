@@ -26,6 +26,7 @@ from .own_annotation import names_in, without, written
 from .package import DEFAULT
 from .package_writing import PackageEntry, resource_names, write_package
 from .ssd_writing import ElementNames, SspVersion, ssd_of
+from .system_reading import read_system
 from .xml_writing import is_xml_text
 
 __all__ = ["export"]
@@ -67,8 +68,6 @@ def _read_again(kept: KeptPackage) -> PlainConfig:
     Raises:
         ConfigurationError: it is wrong; has all findings.
     """
-    from .system_reading import read_system
-
     original = read_system(kept.root / kept.name) if is_folder(kept.root) else read_system(kept.root, kept.name)
     Findings(kept.shown, first=original.findings).raise_any()
     return original

@@ -132,6 +132,9 @@ class _Configuration:
         }
         if self._package.is_archive:  # beside the archive, and not in it
             data["record"] = {"file": "../results/{mesh}.csv"}
+        data = self._with_annotation(data)
+        times = data["simulation"]
+        assert isinstance(times, dict)  # `merged` adds to a mapping
         self._place("", self._structure.place)
         self._note_annotations(system, simulation.get("step_size"))
         return PlainConfig(
@@ -271,7 +274,8 @@ class _Configuration:
     def _connection(self, number: int, connection: FlatConnection) -> dict[str, Plain]:
         """A connection as a configuration has it."""
         self._place(f"connections[{number}]", connection.place)
-        ends = [f"{self._names[instance_name(path)]}.{variable}" for path, variable in (connection.source, connection.target)]
+        both = connection.source, connection.target
+        ends = [f"{self._names[instance_name(path)]}.{variable}" for path, variable in both]
         written: dict[str, Plain] = {"from": ends[0], "to": ends[1]}
         linear = connection.change.linear
         if linear.factor != 1.0:
