@@ -316,7 +316,7 @@ class _Flattening:
             found = f"the variable '{name}', which the FMU of '{component.name}' does not have"
             self._problems.add(connection.place, found, f"one of {listed(names)}", nearest(name, names))
             return None
-        kind = connector.kind if connector is not None else None
+        kind: str | None = connector.kind if connector is not None else None
         if kind in (None, "unspecified") and variable is not None:
             kind = _kind_of(variable)
         unit = connector.unit if connector is not None else None

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import posixpath
 from collections.abc import Iterable
-from typing import Final, NamedTuple, cast
+from typing import Final, Literal, NamedTuple, cast
 
 from msgspec.structs import replace
 
@@ -44,6 +44,10 @@ _PACKAGE: Final = "application/x-ssp-package"
 _SET: Final = "application/x-ssp-parameter-set"
 _MAPPING: Final = "application/x-ssp-parameter-mapping"
 _MODELICA: Final = "text/x-modelica"
+_IMPLEMENTATIONS: Final[dict[str, Literal["any", "CoSimulation", "ModelExchange"]]] = {
+    "CoSimulation": "CoSimulation",
+    "ModelExchange": "ModelExchange",
+}
 _MAXIMUM_DEPTH: Final = 32
 """Most systems inside one another; a system that contains itself ends here."""
 
@@ -157,18 +161,17 @@ class _Reader:
         if type_ != _FMU:
             return self._nested(element, file, source, depth)
         name = self._package.named_by(source, file.folder, element.place, self._problems)
-        implementation = element.get("implementation") or "any"
+        implementation = element.get("implementation")
         if implementation == "ScheduledExecution":
             expected = "CoSimulation or ModelExchange"
             self._problems.add(element.place, f"the implementation '{implementation}'", expected)
-            implementation = "any"
         self._not_verified(element)
         return [
             Component(
                 name=element.text("name"),
                 source=name or "",
                 place=element.place,
-                implementation=implementation if implementation in ("any", "CoSimulation", "ModelExchange") else "any",
+                implementation=_IMPLEMENTATIONS.get(implementation or "", "any"),
                 connectors=self._connectors(element, file),
                 bindings=self._bindings(element, file, name),
                 annotations=element.annotations(),

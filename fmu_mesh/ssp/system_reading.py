@@ -18,7 +18,7 @@ from ..errors import ConfigurationError, LoadFailed
 from ..instances.fmi.archive.archive import Terms
 from ..instances.fmi.archive.reading import read_description
 from ..text import listed, nearest
-from ..variables.model_description import ModelDescription
+from ..variables.model_description import Kind, ModelDescription
 from .annotations import OPEN_MODELICA, OPEN_SIMULATION_PLATFORM, base_step_size, common_solvers, step_size_hint
 from .flattening import FlatConnection, FlatValue, flatten
 from .naming import instance_name, mesh_name
@@ -38,7 +38,7 @@ NEEDED: Final = {
 }
 """What a run needs and a package may not say, with the option that does."""
 
-_KINDS: Final[Mapping[str, Literal["co_simulation", "model_exchange"]]] = {
+_KINDS: Final[Mapping[str, Kind]] = {
     "CoSimulation": "co_simulation",
     "ModelExchange": "model_exchange",
 }
@@ -181,7 +181,7 @@ class _Configuration:
             return None
         key = component.source, component.implementation
         if key not in self._descriptions:
-            kind = _KINDS.get(component.implementation, "auto")
+            kind: Literal["auto"] | Kind = _KINDS.get(component.implementation, "auto")
             try:
                 path_of_fmu = self._package.root / component.source
                 found = read_description(path_of_fmu, Terms(LimitsConfig()), kind, to_run=False)
