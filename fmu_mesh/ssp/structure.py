@@ -209,11 +209,13 @@ class Annotation(msgspec.Struct, frozen=True):
     Attributes:
         type: its namespace, such as `org.openmodelica`.
         xml: the XML of its content.
+        text: the text of the first element inside it, without those in that element; empty if there is none.
     """
 
     type: str
     xml: bytes
     place: Place
+    text: str = ""
 
 
 class Component(msgspec.Struct, frozen=True):
