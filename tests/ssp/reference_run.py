@@ -13,7 +13,7 @@ import argparse
 import csv
 import math
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from ctypes import byref, c_double, c_int, c_void_p
 from pathlib import Path
@@ -396,7 +396,15 @@ class _Fmi1(_Running):
 
     def get(self, name: str) -> Value:
         self.leave_initialization()
-        return super().get(name)
+        return self._signed(name, super().get(name))
+
+    def set(self, name: str, value: Value) -> None:
+        super().set(name, self._signed(name, value))
+
+    def _signed(self, name: str, value: Value) -> Value:
+        if name not in self.of.negated or isinstance(value, str):
+            return value
+        return not value if isinstance(value, bool) else -value
 
 
 class _Fmi2(_Running):
@@ -549,11 +557,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
         if step_size is None or stop_time is None:
             parser.error("the system has no step size or no stop time: --step-size, --stop-time")
         outputs, rows = run_system(system, step_size=step_size, stop_time=stop_time, algorithm=given.algorithm)
-    write: Callable[[Value], str] = lambda value: repr(value) if isinstance(value, float) else str(value)  # noqa: E731
     with given.rows.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(["time", *(f"{name_of(path)}.{name}" for path, name in outputs)])
-        writer.writerows([write(value) for value in row] for row in rows)
+        writer.writerows([_written(value) for value in row] for row in rows)
+
+
+def _written(value: Value) -> str:
+    """A value as in the result files of the package."""
+    return str(value).lower() if isinstance(value, bool) else repr(value) if isinstance(value, float) else str(value)
 
 
 if __name__ == "__main__":

@@ -106,15 +106,24 @@ class Fmu:
         return {unit.name: _fmu_unit(unit) for unit in self.description.unitDefinitions}
 
     @cached_property
+    def negated(self) -> set[str]:
+        """The variables of FMI 1.0 whose value is that of another one with the other sign."""
+        return {v.attrib["name"] for v in self._written() if v.get("alias") == "negatedAlias"}
+
+    @cached_property
     def direct_dependencies(self) -> dict[str, list[str]]:
         """What the outputs of an FMU of FMI 1.0 depend on, where it says so."""
-        with zipfile.ZipFile(self.file) as archive:
-            root = ET.fromstring(archive.read("modelDescription.xml"))  # noqa: S314  as `_Reader`
         return {
             variable.attrib["name"]: [name.text or "" for name in direct.iterfind("Name")]
-            for variable in root.iterfind("ModelVariables/ScalarVariable")
+            for variable in self._written()
             if (direct := variable.find("DirectDependency")) is not None
         }
+
+    def _written(self) -> list[ET.Element]:
+        """The variables of FMI 1.0 with what FMPy does not read."""
+        with zipfile.ZipFile(self.file) as archive:
+            root = ET.fromstring(archive.read("modelDescription.xml"))  # noqa: S314  as `_Reader`
+        return root.findall("ModelVariables/ScalarVariable")
 
     def unit_of(self, name: str) -> Unit | None:
         """The unit of a variable; None if it has none."""
