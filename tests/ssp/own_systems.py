@@ -271,6 +271,31 @@ def _units() -> OwnSystem:
     )
 
 
+def _chain() -> OwnSystem:
+    """What FMPy can run, too: outputs that are 0 at the start, and connections from start to end."""
+    outer = _system(
+        "outer",
+        _component("gain", "Gain", _WIRED),
+        _wire("u", ("gain", "u")),
+        _wire(("gain", "y"), "y"),
+        connectors="u:input y:output",
+    )
+    return OwnSystem(
+        _system(
+            "root",
+            _component("source", "DriveProfile", "linearVelocity:output")
+            + outer
+            + _component("sum", "Adder", "u1:input u2:input y:output")
+            + _component("tank", "Integrator", _WIRED),
+            _wire(("source", "linearVelocity"), ("outer", "u")),
+            _wire(("outer", "y"), ("sum", "u1")),
+            _wire(("source", "linearVelocity"), ("sum", "u2")),
+            _wire(("sum", "y"), ("tank", "u")),
+        ),
+        ("DriveProfile", "Gain", "Adder", "Integrator"),
+    )
+
+
 def _parameters() -> OwnSystem:
     """Bindings of three levels, inline and in files, with prefixes, mappings and units."""
     inner = _system(
@@ -398,6 +423,7 @@ SYSTEMS: Mapping[str, Callable[[], OwnSystem]] = {
     "cycle a": lambda: _cycle(last="a"),
     "cycle b": lambda: _cycle(last="b"),
     "cycle c": lambda: _cycle(last="c"),
+    "chain": _chain,
     "units": _units,
     "parameters": _parameters,
     "connected parameters": _connected_parameters,
