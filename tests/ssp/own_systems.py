@@ -397,6 +397,68 @@ def _types() -> OwnSystem:
     )
 
 
+def _dc_motor() -> OwnSystem:
+    """A DC motor of two models for model exchange, its source and load beside them, and units of the files only."""
+    motor = _system(
+        "SuT",
+        _component(
+            "rotor",
+            "Rotor2",
+            "M_A:input:Real:unit=N.m M_B:input:Real:unit=N.m w:output:Real:unit=rad/s J:parameter d:parameter",
+            _binding(_set("J=0.002", "d=0.001")),
+            implementation="ModelExchange",
+        )
+        + _component(
+            "winding",
+            "Winding2",
+            "U:input:Real:unit=V w:input:Real:unit=rad/s I:output:Real:unit=A M:output:Real:unit=N.m "
+            "R:parameter:Real:unit=Ohm L:parameter k:parameter",
+            _binding("winding.ssv"),
+            implementation="ModelExchange",
+        ),
+        _wire(("rotor", "w"), "w"),
+        _wire("M_load", ("rotor", "M_B")),
+        _wire("U", ("winding", "U")),
+        _wire(("rotor", "M_A"), ("winding", "M")),
+        _wire(("winding", "w"), ("rotor", "w")),
+        _wire(("winding", "I"), "I"),
+        connectors="U:input:Real:unit=V M_load:input:Real:unit=N.m w:output:Real:unit=rad/s I:output:Real:unit=A",
+    )
+    return OwnSystem(
+        _system(
+            "motor",
+            motor
+            + _component("voltage", "Gain", "y:output:Real:unit=V", _binding(_set("u=12.0")))
+            + _component("load", "Gain", "y:output:Real:unit=N.m", _binding(_set("u=-0.5"))),
+            _wire(("SuT", "w"), "w"),
+            _wire(("voltage", "y"), ("SuT", "U")),
+            _wire(("SuT", "M_load"), ("load", "y")),
+            _wire("U", ("voltage", "y")),
+            connectors="w:output U:output:Real",
+        ),
+        ("Rotor2", "Winding2", "Gain"),
+        files={
+            "winding.ssv": _set(
+                "R=500.0 mOhm", "L=0.001", "k=0.1", units=_unit("mOhm", **_OHM, factor=0.001), version="2.0"
+            )
+        },
+        more=f"<ssd:Units>{_MOTOR_UNITS}</ssd:Units>\n",
+        version="2.0",
+        step_size=0.001,
+        stop_time=3.0,
+    )
+
+
+_OHM = {"kg": 1, "m": 2, "s": -3, "A": -2}
+_MOTOR_UNITS = (
+    _unit("V", kg=1, m=2, s=-3, A=-1)
+    + _unit("N.m", kg=1, m=2, s=-2)
+    + _unit("rad/s", rad=1, s=-1)
+    + _unit("A", A=1)
+    + _unit("Ohm", **_OHM)
+)
+
+
 def _versions() -> OwnSystem:
     """FMI 1.0, 2.0 and 3.0, co-simulation and model exchange, in a system of SSP 2.0."""
     return OwnSystem(
@@ -429,4 +491,5 @@ SYSTEMS: Mapping[str, Callable[[], OwnSystem]] = {
     "connected parameters": _connected_parameters,
     "types": _types,
     "versions": _versions,
+    "dc motor": _dc_motor,
 }
