@@ -22,7 +22,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from io import BufferedReader, FileIO
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import IO, TYPE_CHECKING, NamedTuple, cast
 
 from .errors import ConfigurationError
 
@@ -32,22 +32,30 @@ if TYPE_CHECKING:
 __all__ = [
     "Kept",
     "OwnFile",
+    "archive_on_the_way",
     "exists",
     "is_file",
     "is_folder",
+    "known_sha256",
     "open_alone",
+    "remember_sha256",
     "replaced",
     "sha256_of",
     "sha256_of_open",
     "unwritable",
+    "version_at",
+    "version_of",
 ]
+
+FileVersion = tuple[int, int, int, int]
+"""What changes if a file changes."""
 
 _DRAFT = ".starting"
 _TRIES = 10
 """Attempts to open a file that other processes rename or remove at the same time."""
 
-_hashes: dict[tuple[int, ...], str] = {}
-"""The SHA-256 of files that this process has read."""
+_hashes: dict[tuple[FileVersion, str], str] = {}
+"""The SHA-256 of files that this process has read, and of files inside archives."""
 
 
 class Kept(NamedTuple):
@@ -128,21 +136,55 @@ def replaced(path: Path) -> Iterator[Path]:
         draft.unlink(missing_ok=True)
 
 
+def archive_on_the_way(path: Path) -> Path | None:
+    """The file that a path leads into, such as `system.ssp` for `system.ssp/resources/a.fmu`.
+
+    None if something is at the path itself, or if no part of it is a file.
+    """
+    return None if exists(path) else next((parent for parent in path.parents if is_file(parent)), None)
+
+
 def sha256_of(path: Path) -> str:
     """The SHA-256 of a file in hexadecimal digits; it is calculated once per process, unless the file changes."""
-    if (known := _hashes.get(_version(path.stat()))) is not None:
+    if (known := known_sha256(version_at(path))) is not None:
         return known
     with path.open("rb") as file:
         return sha256_of_open(file)
 
 
-def sha256_of_open(file: BufferedReader, *, again: bool = False) -> str:
+def sha256_of_open(file: IO[bytes], *, again: bool = False) -> str:
     """As `sha256_of`, for a file that is open; ``again``: read it even if its hash is known. Moves its position."""
-    version = _version(os.fstat(file.fileno()))
-    if again or version not in _hashes:
+    version = version_of(file)
+    known = None if again else known_sha256(version)
+    if known is None:
         file.seek(0)
-        _hashes[version] = hashlib.file_digest(file, "sha256").hexdigest()
-    return _hashes[version]
+        known = hashlib.file_digest(cast("BufferedReader", file), "sha256").hexdigest()
+        remember_sha256(version, "", known)
+    return known
+
+
+def version_at(path: Path) -> FileVersion:
+    """What changes if the file at a path changes.
+
+    Raises:
+        OSError: it cannot be examined.
+    """
+    return _version(path.stat())
+
+
+def version_of(file: IO[bytes]) -> FileVersion:
+    """As `version_at`, for a file that is open."""
+    return _version(os.fstat(file.fileno()))
+
+
+def known_sha256(version: FileVersion, inside: str = "") -> str | None:
+    """The SHA-256 of a file, or of the file at the path ``inside`` of it, if this process has calculated it."""
+    return _hashes.get((version, inside))
+
+
+def remember_sha256(version: FileVersion, inside: str, sha256: str) -> None:
+    """Remember the SHA-256 of a file, or of the file at the path ``inside`` of it."""
+    _hashes[version, inside] = sha256
 
 
 class OwnFile(FileIO):
@@ -189,8 +231,7 @@ class OwnFile(FileIO):
         self.truncate(0)
 
 
-def _version(status: os.stat_result) -> tuple[int, ...]:
-    """What changes if a file changes."""
+def _version(status: os.stat_result) -> FileVersion:
     return status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns
 
 

@@ -42,8 +42,8 @@ class GraphVariable(msgspec.Struct, frozen=True):
     """One connection of an edge: the input is factor * output + offset.
 
     Attributes:
-        source: the output; ``target``: the input.
-        source_unit: the unit of the output; empty without one. ``target_unit`` likewise.
+        source: the output; ``target``: the input. ``source_unit``, ``target_unit``: their units; empty without one.
+        map: what the input gets instead of a value, such as `0 -> 2, 1 -> 5`; empty without a map.
     """
 
     source: str
@@ -52,6 +52,7 @@ class GraphVariable(msgspec.Struct, frozen=True):
     target_unit: str = ""
     factor: float = 1.0
     offset: float = 0.0
+    map: str = ""
 
     @property
     def unit_text(self) -> str:
@@ -424,7 +425,8 @@ def _wired(names: Sequence[str], edges: Sequence[GraphEdge]) -> tuple[list[_Port
 def _tip(edge: GraphEdge, variable: GraphVariable) -> str:
     unit = f" ({variable.unit_text})" if variable.unit_text else ""
     closing = ", closes a cycle" if edge.closes_cycle else ""
-    return f"{edge.source}.{variable.source} -> {edge.target}.{variable.target}{unit}, delay {edge.delay}{closing}"
+    end = closing + (f", map {variable.map}" if variable.map else "")
+    return f"{edge.source}.{variable.source} -> {edge.target}.{variable.target}{unit}, delay {edge.delay}{end}"
 
 
 def _port_text(name: str, unit: str) -> str:

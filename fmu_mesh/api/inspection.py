@@ -13,7 +13,7 @@ import msgspec
 from .. import files
 from ..config.instance_sections import KIND
 from ..errors import CallRefused, LoadFailed, UnknownName
-from ..instances.fmi import read_description, sha256_of
+from ..instances.fmi import read_description, sha256_of, size_of
 from ..instances.registry import KINDS, describe
 from ..text import listed, matching, nearest, nearest_file, short_number, shown
 from ..variables.model_description import Causality, Kind, ModelDescription, Variable
@@ -136,11 +136,10 @@ def inspect(path: str | Path, *, kind: str | None = None) -> Inspection:
                 reasons = (str(error),)
     except LoadFailed as error:
         raise with_way_out(error, file) from error
-    is_archive = not files.is_folder(file)
     return Inspection(
         file=str(path),
         sha256=sha256_of(file),
-        bytes=file.stat().st_size if is_archive else None,
+        bytes=size_of(file),
         runs_here=not reasons,
         problems=(*reasons, *description.problems),
         description=description,

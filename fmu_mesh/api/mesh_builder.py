@@ -18,7 +18,7 @@ from ..errors import CallRefused, ConfigurationError, FmuError, LoadFailed
 from ..instances.configuration import examine_data
 from ..instances.python.importing import being_imported, component_section
 from ..instances.registry import KINDS, check_engines
-from ..run.options import with_config_values
+from ..run.options import with_config_values, with_needed
 from ..run.preparing import KnownModels, planned
 from ..run.run_plan import RunPlan
 from ..text import listed, shown
@@ -367,7 +367,7 @@ class Mesh:
             raise ConfigurationError(f"mesh '{self.name}' would run while '{place}' is imported", hint=hint)
         chosen = options_of(options)
         values = with_scenario(self._plain._replace(file=self._shown_file), options)
-        data = with_config_values(values, chosen.config_values)
+        data = with_needed(with_config_values(values, chosen.config_values), chosen)
         loaded, findings = examine_data(data, chosen.start_values)
         return planned(loaded, findings, chosen, options.get("on_notice", log.info), self._known)
 

@@ -53,12 +53,12 @@ class Check(msgspec.Struct, frozen=True):
     @property
     def plan(self) -> PlanView | None:
         """What would run, as plain values; None if the configuration is wrong."""
-        return plan_view(self.run.plan) if self.run is not None else None
+        return plan_view(self.run.plan, self.run.loaded) if self.run is not None else None
 
     @property
     def page(self) -> str:
         """What would run, as text; empty if the configuration is wrong."""
-        return "\n".join(plan_page(self.run.plan)) if self.run is not None else ""
+        return "\n".join(plan_page(self.run.plan, self.run.loaded)) if self.run is not None else ""
 
     def require(self) -> RunPlan:
         """The plan of the run.

@@ -178,11 +178,22 @@ def plain(value: Any) -> Any:  # noqa: ANN401  whatever a program gives
         case np.ndarray() | np.generic():
             return value.tolist()
         case Mapping():
-            return {key: plain(inner) for key, inner in value.items()}
+            return {_key(key): plain(inner) for key, inner in value.items()}
         case list() | tuple():
             return [plain(inner) for inner in value]
         case _:
             return value
+
+
+def _key(key: Any) -> Any:  # noqa: ANN401  whatever a program gives
+    """A key as a file has it: text. Those of a `map` are numbers in a program."""
+    match key:
+        case bool():
+            return "true" if key else "false"
+        case int() | np.integer():
+            return str(key)
+        case _:
+            return key
 
 
 def _memory_file() -> Path:

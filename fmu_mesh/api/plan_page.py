@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from ..config.findings import Origin
+from ..config.loading import LoadedConfig
 from ..rings.library import library_missed, why_no_library
 from ..system.grouping import automatic_nodes
 from ..system.initialization_plan import Loop
@@ -11,21 +13,28 @@ from ..system.plan import Plan
 from ..system.records import RecordPlan
 from ..system.series_files import course_of
 from ..system.system import Connection, SystemInstance
+from ..system.value_map import map_text
 from ..text import listed, short_number, short_path, shown
 from ..variables.model_description import Variable
 from ..variables.value_conversion import to_plain
 from .tables import pairs, table
 
-__all__ = ["plan_page", "slower_than_it_could_be"]
+__all__ = ["plan_page", "slower_than_it_could_be", "start_value_origin"]
 
 _PROBLEM_CHARACTERS = 100
 
 
-def plan_page(plan: Plan) -> list[str]:
-    """The plan as lines of text, the same on every terminal and in every pipe."""
+def plan_page(plan: Plan, loaded: LoadedConfig | None = None) -> list[str]:
+    """The plan as lines of text, the same on every terminal and in every pipe.
+
+    Args:
+        plan: what would run.
+        loaded: its configuration, which says where start values come from.
+    """
     sections = [
         ("", _head(plan)),
         ("Instances", _instances(plan)),
+        ("Start values", _start_values(plan, loaded)),
         ("Connections", _connections(plan)),
         ("Execution order within one point", _order(plan)),
         ("Groups", _groups(plan)),
@@ -73,7 +82,6 @@ def _instances(plan: Plan) -> list[str]:
             _model(plan, instance),
             f"step {short_number(instance.step_points * plan.grid.step_size)} s",
             "a process of its own" if instance.node == instance.name else f"group {instance.node}",
-            _start_values(instance),
         ]
         for instance in plan.system.instances.values()
     ]
@@ -86,11 +94,26 @@ def _model(plan: Plan, instance: SystemInstance) -> str:
     return f"{Path(instance.fmu).name or instance.description.model_name} ({summary})"
 
 
-def _start_values(instance: SystemInstance) -> str:
-    return ", ".join(
-        f"{name} = {shown(value)}{_unit(instance.description.variable(name))}"
+def _start_values(plan: Plan, loaded: LoadedConfig | None) -> list[str]:
+    """Each start value with its unit, and where it was written."""
+    rows = [
+        [
+            f"{instance.name}.{name}",
+            f"= {shown(value)}{_unit(instance.description.variable(name))}",
+            str(start_value_origin(loaded, instance, name)) if loaded is not None else "",
+        ]
+        for instance in plan.system.instances.values()
         for name, value in instance.start_values.items()
-    )
+    ]
+    return table(rows, indent=2)
+
+
+def start_value_origin(loaded: LoadedConfig, instance: SystemInstance, variable: str) -> Origin:
+    """Where a start value comes from: a line of a file, as short as a person would write its path, or an option."""
+    is_own = variable in loaded.config.instances[instance.name].start_values  # the scenario has none of these
+    path = f"instances.{instance.name}.start_values.{variable}"
+    origin = loaded.origin(path) if is_own else loaded.scenario_origin
+    return origin._replace(file=short_path(origin.file)) if origin.file else origin
 
 
 def _connections(plan: Plan) -> list[str]:
@@ -146,7 +169,9 @@ def _scenario(plan: Plan) -> list[str]:
 
 
 def _arithmetic(c: Connection) -> str:
-    """The formula of a connection; empty if it copies the value."""
+    """The formula of a connection, or its map; empty if it copies the value."""
+    if c.map:
+        return f"map {map_text(c.map, c.source, c.target)}"
     if (c.factor, c.offset) == (1.0, 0.0):
         return ""
     product = f"{short_number(c.factor)} * {c.source_name}" if c.factor != 1.0 else c.source_name

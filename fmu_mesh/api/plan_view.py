@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import msgspec
 
+from ..config.loading import LoadedConfig
 from ..config.mesh import SimulationConfig
 from ..errors import Finding
 from ..rings.library import why_no_library
@@ -11,24 +12,39 @@ from ..system.plan import Plan
 from ..system.schedule import Schedule
 from ..system.series_files import course_of
 from ..system.system import SystemInstance
+from ..system.value_map import map_words
 from ..variables.value_conversion import to_plain
 from ..variables.value_types import PlainValue
+from .plan_page import start_value_origin
 
 __all__ = ["PlanView", "plan_view"]
 
 
+class PlannedOrigin(msgspec.Struct, frozen=True):
+    """Where a value was written: a line of a file, or an option; ``text`` has the option, or the element in words."""
+
+    file: str | None
+    line: int | None
+    text: str
+
+
 class PlannedInstance(msgspec.Struct, frozen=True):
-    """One instance: its model, step size in s, node (process), and start values."""
+    """One instance: its model, step size in s, node (process), and start values with their origins."""
 
     name: str
     model: str
     step_size: float
     node: str
     start_values: dict[str, PlainValue]
+    origins: dict[str, PlannedOrigin]
 
 
 class PlannedConnection(msgspec.Struct, frozen=True):
-    """One connection: the input is factor * output + offset, ``delay`` points later."""
+    """One connection: the input is factor * output + offset, ``delay`` points later.
+
+    Attributes:
+        map: what the input gets instead of a value, items by their names; other values stay as they are.
+    """
 
     source: str = msgspec.field(name="from")
     target: str = msgspec.field(name="to")
@@ -37,6 +53,7 @@ class PlannedConnection(msgspec.Struct, frozen=True):
     offset: float
     units: str
     closes_cycle: bool
+    map: dict[str, str] = {}
 
 
 class PlannedRecord(msgspec.Struct, frozen=True):
@@ -96,8 +113,8 @@ class PlanView(msgspec.Struct, frozen=True):
     library: str | None
 
 
-def plan_view(plan: Plan) -> PlanView:
-    """The plan as plain values."""
+def plan_view(plan: Plan, loaded: LoadedConfig) -> PlanView:
+    """The plan as plain values; its configuration says where start values come from."""
     system, grid = plan.system, plan.grid
     closing = {str(connection) for connection in plan.closing}
     connected = {(c.target_instance, c.target.name) for c in plan.connections}
@@ -108,6 +125,7 @@ def plan_view(plan: Plan) -> PlanView:
             own.step_points * grid.step_size,
             own.node,
             {name: to_plain(value) for name, value in own.start_values.items()},
+            {name: _origin(loaded, own, name) for name in own.start_values},
         )
         for own in system.instances.values()
     ]
@@ -120,6 +138,7 @@ def plan_view(plan: Plan) -> PlanView:
             c.offset,
             c.units,
             str(c) in closing,
+            map_words(c.map, c.source, c.target),
         )
         for c in plan.connections
     ]
@@ -151,6 +170,11 @@ def plan_view(plan: Plan) -> PlanView:
         warnings=system.warnings,
         library=why_no_library(),
     )
+
+
+def _origin(loaded: LoadedConfig, instance: SystemInstance, variable: str) -> PlannedOrigin:
+    origin = start_value_origin(loaded, instance, variable)
+    return PlannedOrigin(origin.file or None, origin.line, origin.text)
 
 
 def _scheduled(plan: Plan, instance: SystemInstance, schedule: Schedule) -> PlannedSchedule:

@@ -14,6 +14,7 @@ import msgspec
 from msgspec.structs import replace
 
 from ..system.graph import strongly_connected, topological_order
+from ..system.value_map import map_text
 from .graph_drawing import GraphEdge, GraphNode, GraphVariable, drawing_of
 from .graph_layout import going_back
 from .graph_pictures import figure_of_drawing, svg_of_drawing
@@ -149,7 +150,7 @@ class SystemGraph(msgspec.Struct, frozen=True):
                 variable.source,
                 f"{edge.target}.{variable.target}",
                 shortened(variable.unit_text, 14),
-                "closes a cycle" if edge.closes_cycle else "delay 1" if edge.delay else "",
+                _remark(edge, variable),
             )
             for edge in self.edges
             if edge.source == node.instance
@@ -168,7 +169,15 @@ def graph_of_plan(plan: Plan) -> SystemGraph:
     connections = [
         (
             (c.source_instance, c.target_instance, c.delay or 0),
-            GraphVariable(c.source_name, c.target_name, c.source.unit or "", c.target.unit or "", c.factor, c.offset),
+            GraphVariable(
+                c.source_name,
+                c.target_name,
+                c.source.unit or "",
+                c.target.unit or "",
+                c.factor,
+                c.offset,
+                map_text(c.map, c.source, c.target),
+            ),
         )
         for c in plan.connections
     ]
@@ -185,7 +194,8 @@ def graph_of_infos(mesh: str, infos: Sequence[InstanceInfo]) -> SystemGraph:
             source, _, output = c.source.partition(".")
             target, _, input_ = c.target.partition(".")
             both = [units.get(end, units.get(end.partition("[")[0], "")) for end in (c.source, c.target)]
-            variable = GraphVariable(output, input_, both[0], both[1], c.factor, c.offset)
+            mapped = ", ".join(f"{have} -> {want}" for have, want in c.map)
+            variable = GraphVariable(output, input_, both[0], both[1], c.factor, c.offset, mapped)
             connections.append(((source, target, c.delay), variable))
     return graph_of(mesh, nodes, connections)
 
@@ -240,6 +250,11 @@ def _live(node: GraphNode, status: InstanceStatus | None, before: InstanceStatus
         points_per_second=(status.point - start[0]) / wall_s if wall_s > 0.0 else 0.0,
         wait=min((status.wait_time - start[2]) / wall_s, 1.0) if wall_s > 0.0 else 0.0,
     )
+
+
+def _remark(edge: GraphEdge, variable: GraphVariable) -> str:
+    delay = "closes a cycle" if edge.closes_cycle else "delay 1" if edge.delay else ""
+    return ", ".join(filter(None, [delay, "map" if variable.map else ""]))
 
 
 def _count(number: int, what: str) -> str:

@@ -1,15 +1,40 @@
-"""A collection of findings about one configuration file.
+"""A collection of findings about one configuration.
 
-Owns how a path in the file (`connections[2].to`) becomes a line number. Does not know what is checked.
+Owns how a path in the configuration (`connections[2].to`) becomes a file and a line number, or the option that has
+replaced the value. Does not know what is checked.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from types import MappingProxyType
+from typing import NamedTuple
 
 from fmu_mesh.errors import ConfigurationError, Finding
 
-__all__ = ["Findings", "locate"]
+__all__ = ["Findings", "Origin", "located"]
+
+
+class Origin(NamedTuple):
+    """Where a value was written.
+
+    Example:
+        >>> print(Origin("start.ssv", 12, "Parameter 'k'"))
+        Parameter 'k' (start.ssv:12)
+
+    Attributes:
+        file: the file as messages name it; empty for an option.
+        line: counted from 1; None if it is not known.
+        text: the element in words, such as `Parameter 'k'`, or the option; empty if the line says it.
+    """
+
+    file: str
+    line: int | None
+    text: str = ""
+
+    def __str__(self) -> str:
+        place = f"{self.file}:{self.line}" if self.line is not None else self.file
+        return f"{self.text} ({place})" if self.text and place else self.text or place
 
 
 class Findings:
@@ -26,6 +51,7 @@ class Findings:
         lines: line numbers, counted from 1, by path in the file.
         replaced: the options that replace a value of the file, by path in the file.
         first: findings that there are already.
+        origins: where parts of the configuration were written that other files give, by path.
     """
 
     def __init__(
@@ -34,10 +60,12 @@ class Findings:
         lines: Mapping[str, int] | None = None,
         replaced: Mapping[str, str] | None = None,
         first: Sequence[Finding] = (),
+        origins: Mapping[str, Origin] = MappingProxyType({}),
     ) -> None:
         self._file = file
         self._lines = lines if lines is not None else {}
         self._replaced = replaced if replaced is not None else {}
+        self._origins = origins
         self._items: list[Finding] = [*first]
         self._places: set[str] = {finding.path for finding in first}
         self._settled: frozenset[str] = frozenset()
@@ -47,9 +75,12 @@ class Findings:
         if any(_same_place(path, settled) for settled in self._settled):
             return
         self._places.add(path)
-        option = self._option(path)
-        line = None if option is not None or path.startswith("--") else locate(self._lines, path)
-        self._items.append(Finding(self._file, option or path, found, expected, suggestion, line))
+        if path.startswith("--"):
+            origin = Origin("", None, path)
+        else:
+            origin = located(path, self._file, self._lines, self._replaced, self._origins)
+        place, file = (path, origin.file) if origin.file else (origin.text, self._file)
+        self._items.append(Finding(file, place, found, expected, suggestion, origin.line))
 
     def merge(self, findings: Iterable[Finding]) -> None:
         """Add earlier findings. Later ones at, inside or around their places are ignored as consequences."""
@@ -67,11 +98,7 @@ class Findings:
 
     def line(self, path: str) -> int | None:
         """The line of ``path``, or of the innermost part of the file around it that has one."""
-        return locate(self._lines, path)
-
-    def _option(self, path: str) -> str | None:
-        """The option that replaced the value at ``path``, or a part of the file around it, such as a whole section."""
-        return self._replaced.get(max((own for own in self._replaced if _is_inside(path, own)), key=len, default=""))
+        return located(path, self._file, self._lines, {}, self._origins).line
 
     def __len__(self) -> int:
         return len(self._items)
@@ -80,24 +107,50 @@ class Findings:
         return iter(self._items)
 
     def raise_any(self) -> None:
-        """Raise one error with all findings in the order of their lines; do nothing if there are none.
+        """Raise one error with all findings in the order of files and lines; do nothing if there are none.
 
         Raises:
             ConfigurationError: there is at least one finding.
         """
         if self._items:
-            by_line = sorted(self._items, key=lambda finding: (finding.line is None, finding.line or 0))
+            files = list(dict.fromkeys([self._file, *(finding.file for finding in self._items)]))
+            by_line = sorted(self._items, key=lambda one: (files.index(one.file), one.line is None, one.line or 0))
             text = f"{self._file}: {len(by_line)} problems" if len(by_line) > 1 else str(by_line[0])
             raise ConfigurationError(text, findings=tuple(by_line))
 
 
-def locate(lines: Mapping[str, int], path: str) -> int | None:
-    """The line of ``path``, or of the innermost part around it that has one; None if there is none."""
-    while path:
-        if path in lines:
-            return lines[path]
+def located(
+    path: str,
+    file: str,
+    lines: Mapping[str, int],
+    replaced: Mapping[str, str],
+    origins: Mapping[str, Origin],
+) -> Origin:
+    """Where the value at ``path`` of a configuration was written, or the innermost part around it that is known.
+
+    Example:
+        >>> lines, options = {"": 1, "instances": 3}, {"instances.gain.start_values.k": "--set gain.k=2"}
+        >>> print(located("instances.gain.fmu", "mesh.yaml", lines, options, {}))
+        mesh.yaml:3
+        >>> print(located("instances.gain.start_values.k", "mesh.yaml", lines, options, {}))
+        --set gain.k=2
+
+    Args:
+        path: of the value.
+        file: the file of the configuration.
+        lines: line numbers in this file by path.
+        replaced: options by the path of the value that they replaced; nothing in a file says more.
+        origins: the places in other files by path.
+    """
+    option = replaced.get(max((own for own in replaced if _is_inside(path, own)), key=len, default=""))
+    if option is not None:
+        return Origin("", None, option)
+    while True:
+        if path in origins:
+            return origins[path]
+        if path in lines or not path:
+            return Origin(file, lines.get(path))
         path = path[: max(path.rfind("."), path.rfind("["), 0)]
-    return lines.get("")
 
 
 def _same_place(path: str, other: str) -> bool:

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import msgspec
 from msgspec import inspect, structs
 
-from fmu_mesh.config.findings import Findings, locate
+from fmu_mesh.config.findings import Findings, Origin, located
 from fmu_mesh.config.instance_sections import KIND, InstanceSection, Kinds, keys_of
 from fmu_mesh.config.mesh import Config, config_type
 from fmu_mesh.config.partial import partial_configuration
@@ -29,6 +29,7 @@ from fmu_mesh.text import listed, nearest, nearest_file, shown
 __all__ = [
     "MAXIMUM_BYTES",
     "LoadedConfig",
+    "Origin",
     "PlainConfig",
     "examine",
     "examine_data",
@@ -56,6 +57,9 @@ class PlainConfig(NamedTuple):
         lines: line numbers, counted from 1, by path in the file; empty without a file.
         findings: what is wrong with the text, such as a key that stands there twice.
         overrides: the option that replaced a value, by path in the file.
+        origins: where a value was written, by path in the file, if that is another file.
+        warnings: findings that do not prevent a run.
+        needed: what an option has to give because the file cannot say it: the option, by path in the file.
     """
 
     data: Plain
@@ -63,6 +67,9 @@ class PlainConfig(NamedTuple):
     lines: dict[str, int] = {}
     findings: tuple[Finding, ...] = ()
     overrides: dict[str, str] = {}
+    origins: dict[str, Origin] = {}
+    warnings: tuple[Finding, ...] = ()
+    needed: dict[str, str] = {}
 
 
 class LoadedConfig(msgspec.Struct, frozen=True):
@@ -73,24 +80,39 @@ class LoadedConfig(msgspec.Struct, frozen=True):
         file: the file as the user named it.
         lines: line numbers, counted from 1, by path in the file.
         overrides: the option (`--set pendulum.l=2`) that replaced a value, by path in the file.
+        origins: where a value was written, by path in the file, if that is another file.
+        warnings: findings of the file that do not prevent a run.
     """
 
     config: Config
     file: Path
     lines: dict[str, int] = {}
     overrides: dict[str, str] = {}
+    origins: dict[str, Origin] = {}
+    warnings: tuple[Finding, ...] = ()
 
     def findings(self) -> Findings:
         """An empty collection of findings about this file."""
-        return Findings(str(self.file), self.lines, self.overrides)
+        return Findings(str(self.file), self.lines, self.overrides, origins=self.origins)
 
     def locate(self, path: str) -> int | None:
         """The line of ``path``, or of the innermost part of the file around it that has one."""
-        return locate(self.lines, path)
+        return self.origin(path).line
+
+    def origin(self, path: str) -> Origin:
+        """Where the value at ``path`` comes from: a file and a line of it, or an option."""
+        return located(path, str(self.file), self.lines, self.overrides, self.origins)
+
+    @property
+    def scenario_origin(self) -> Origin:
+        """Where the scenario was written."""
+        scenario = self.config.scenario
+        return Origin(scenario, None, "scenario") if isinstance(scenario, str) else self.origin("scenario")
 
     def finding(self, path: str, found: str, expected: str, suggestion: str | None = None) -> Finding:
-        """A finding with the line of ``path``."""
-        return Finding(str(self.file), path, found, expected, suggestion, self.locate(path))
+        """A finding with the file and the line of ``path``."""
+        origin = self.origin(path)
+        return Finding(origin.file or str(self.file), path, found, expected, suggestion, origin.line)
 
     def resolve(self, relative: str) -> Path:
         """The absolute path for a path in the file, which is relative to the folder of the file.
@@ -196,9 +218,9 @@ def read_scenario(loaded: LoadedConfig) -> ScenarioSource | None:
 
 def examine_data(plain: PlainConfig, overrides: Sequence[str], kinds: Kinds) -> tuple[LoadedConfig, Findings]:
     """As `examine`, for values that were read before, or that a program has made."""
-    data, path, lines, first, replaced = plain
-    replaced = dict(replaced)
-    findings = Findings(str(path), lines, replaced, first)
+    data, path, lines = plain.data, plain.file, plain.lines
+    replaced = dict(plain.overrides)
+    findings = Findings(str(path), lines, replaced, plain.findings, plain.origins)
     sections = kinds.own()
     if isinstance(data, dict):
         data = _with_long_connections(data, findings)
@@ -210,7 +232,8 @@ def examine_data(plain: PlainConfig, overrides: Sequence[str], kinds: Kinds) -> 
         findings.raise_any()
     assert config is not None  # without a finding there is a configuration
     # The kinds have done their part: from here on, a configuration is a plain `Config`, in every process.
-    return LoadedConfig(Config(**structs.asdict(config)), path, lines, replaced), findings
+    loaded = LoadedConfig(Config(**structs.asdict(config)), path, lines, replaced, plain.origins, plain.warnings)
+    return loaded, findings
 
 
 @lru_cache(maxsize=8)

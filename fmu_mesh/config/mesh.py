@@ -157,6 +157,14 @@ class ConnectionConfig(Base, frozen=True, kw_only=True):
     ignore_units: Annotated[bool, Meta(description="true: neither convert nor compare the units of the two ends.")] = (
         False
     )
+    map: Annotated[
+        dict[str, bool | int | str],
+        Meta(
+            description="Values of the output and what the input gets instead, such as {off: idle, on: running}; a "
+            "value without an entry stays as it is. For Boolean, integer types and Enumeration (name or number).",
+            examples=[{"0": 2, "1": 5}],
+        ),
+    ] = {}
     extrapolation: Annotated[
         Literal["hold", "linear"],
         Meta(

@@ -154,8 +154,8 @@ def _check_struct(value: dict[str, Plain], kind: inspect.StructType, path: str, 
         meant.add(suggestion)
         findings.add(place, "an unknown key" if key else "an empty key", f"one of {listed(list(fields))}", suggestion)
     for name in absent:
-        if fields[name].required and name not in meant:
-            place = f"{path}.{name}" if path else name
+        place = f"{path}.{name}" if path else name
+        if fields[name].required and name not in meant and place not in findings.places:
             findings.add(place, "missing", describe(fields[name].type))
 
 

@@ -329,9 +329,16 @@ def instance_info(plan: NodePlan, runner: Runner) -> InstanceInfo:
             if (kind := kind_of(v)) is not None
         ),
         connections=tuple(
-            ConnectionView(f"{feed.source}.{source}", f"{runner.name}.{target}", feed.delay, factor, offset)
+            ConnectionView(
+                f"{feed.source}.{own.source}",
+                f"{runner.name}.{own.target}",
+                feed.delay,
+                own.factor,
+                own.offset,
+                own.map,
+            )
             for feed in runner.plan.feeds
-            for source, target, factor, offset in feed.columns
+            for own in feed.columns
         ),
         node=plan.node,
         pid=os.getpid(),

@@ -11,10 +11,11 @@ import time
 from collections.abc import Callable, Collection, Sequence
 
 from ..errors import DeadlineExceeded, InitializationFailed
-from ..rings.array_elements import element_of, merged, scaled
-from ..rings.transfer import Narrowing
+from ..rings.array_elements import element_of, merged
+from ..rings.value_change import ValueChange
 from ..simtime import ENDLESS
 from ..system.algebraic_loop import FixedPoint
+from ..system.feeds import FeedColumn
 from ..system.initialization_plan import Loop
 from ..system.layout import Column
 from ..system.plan import Link, NodePlan
@@ -113,7 +114,10 @@ class Initialization:
                 self._set_inputs(runner, loop.first, point, level)
                 self._send(runner, level, self._get_outputs(runner, names, sweep), loop, sweep)
             consistent = point.update(
-                [scaled(self._element(t.source, t.output, sweep), t.factor, t.offset) for t in loop.tears]
+                [
+                    ValueChange.of_tear(tear).of(self._element(tear.source, tear.output, sweep), InitializationFailed)
+                    for tear in loop.tears
+                ]
             )
             if consistent:
                 self._known |= {(*key, None): self._value(*key, sweep) for key in members & self._levels.keys()}
@@ -135,7 +139,7 @@ class Initialization:
         values: dict[str, Value] = {}
         for feed in runner.plan.feeds:
             for column in feed.columns:
-                source, target, _, _ = column
+                source, target = column.source, column.target
                 level, key = self._levels[feed.source, self._column(feed.source, source).name], (runner.name, target)
                 if point is not None and key in point.assumed:
                     values[target] = point.assumed[key]
@@ -146,13 +150,11 @@ class Initialization:
         if values:
             runner.instance.set_values(merged(values, runner.plan.inputs, runner.instance.get_values))
 
-    def _moved(
-        self, instance: str, column: tuple[str, str, float, float], runner: Runner, sweep: int | None = None
-    ) -> Value:
+    def _moved(self, instance: str, column: FeedColumn, runner: Runner, sweep: int | None = None) -> Value:
         """The initial value that a connection from ``instance`` gives its input."""
-        source, target, factor, offset = column
-        ends = Narrowing(f"{instance}.{source}", runner.name, target, runner.plan.inputs.column(target).type)
-        return ends.checked(scaled(self._element(instance, source, sweep), factor, offset), InitializationFailed)
+        input_type = runner.plan.inputs.column(column.target).type
+        change = ValueChange.of_column(instance, runner.name, input_type, column)
+        return change.of(self._element(instance, column.source, sweep), InitializationFailed)
 
     def _column(self, instance: str, name: str) -> Column:
         """The column of an output, or of the array that ``name`` is an element of."""

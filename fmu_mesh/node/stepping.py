@@ -95,7 +95,7 @@ class Runner:
 
         Between two steps, the row of the last one stays as it is: what was set since then belongs to the next row.
         """
-        connected = [target for source in self.sources for _, target, _, _ in source.transfer.columns]
+        connected = [own.target for source in self.sources for own in source.transfer.columns]
         fill_unconnected(self.inputs, connected, self.instance.get_values)
         outputs = (self.outputs,) if self.watched is None else (self.outputs, self.watched)
         slot = self.step & self.outputs.mask

@@ -69,6 +69,18 @@ typedef struct { /* the rows of one source, for one delay */
   int64_t known;  /* the counter when it was last read */
 } Gate;
 
+typedef struct { /* a value of the source, and what the target gets instead; large: see as_integer */
+  int64_t from, to;
+  int32_t from_large, to_large;
+} Entry;
+
+typedef struct { /* the map of a connection, and the items of its input; both in ascending order */
+  const Entry *entries;
+  const int64_t *items;
+  int64_t n_entries;
+  int64_t n_items; /* 0: the input can be each number of its type */
+} Lookup;
+
 /* Values that are copied. A base is a row, or 0: then the offset is an address. */
 typedef struct {
   int64_t from_base;
@@ -78,10 +90,11 @@ typedef struct {
   int64_t count;
   int32_t from_type;
   int32_t to_type;
-  int32_t scaled;
+  int32_t change;
   int32_t negated; /* an alias of FMI 1.0 with the opposite sign */
   double factor;
   double offset;
+  const Lookup *lookup;
 } Move;
 
 typedef struct { /* a getter or a setter */
@@ -118,6 +131,7 @@ enum { WAITING, SETTING, STEPPING, GETTING, IN_PYTHON, STEPPED };        /* Memb
 enum { FIXED, OUTPUT, WATCHED, FIRST_GATE, MAX_GATES = 4096 };           /* bases */
 enum { WARNING = 1, OUT_OF_RANGE = 100, STAGE_BITS = 24 };               /* statuses */
 enum { F64, F32, I8, U8, I16, U16, I32, U32, I64, U64, TRUTH };          /* types */
+enum { UNCHANGED, SCALED, LOOKED_UP };                                   /* Move.change */
 
 typedef struct {
   Gate *gates;
@@ -389,11 +403,40 @@ static inline void put_double(char *to, int type, double v) {
 
 static const int SIZES[] = {8, 4, 1, 1, 2, 2, 4, 4, 8, 8, 1};
 
-/* Copy values, with factor and offset (one rounding each) and types. Returns 0, or OUT_OF_RANGE. */
+/* Replace an integer by that of its entry, if it has one. Returns whether the input can be the result. */
+static int look_up(const Lookup *lookup, int64_t *value, int *large) {
+  int64_t low = 0, high = lookup->n_entries;
+  while (low < high) {
+    const int64_t middle = low + (high - low) / 2;
+    const Entry *entry = &lookup->entries[middle];
+    if (entry->from == *value && entry->from_large == *large) {
+      *value = entry->to;
+      *large = entry->to_large;
+      break;
+    }
+    if (entry->from_large < *large || (entry->from_large == *large && entry->from < *value))
+      low = middle + 1;
+    else
+      high = middle;
+  }
+  if (lookup->n_items == 0) return 1;
+  if (*large) return 0;
+  for (low = 0, high = lookup->n_items; low < high;) {
+    const int64_t middle = low + (high - low) / 2, item = lookup->items[middle];
+    if (item == *value) return 1;
+    if (item < *value)
+      low = middle + 1;
+    else
+      high = middle;
+  }
+  return 0;
+}
+
+/* Copy values, with factor and offset (one rounding each) or a map, and types. Returns 0, or OUT_OF_RANGE. */
 static int move_values(const Move *move, const char *from, char *to) {
   const int from_type = move->from_type, to_type = move->to_type;
   const int64_t from_size = SIZES[from_type], to_size = SIZES[to_type];
-  if (from_type == to_type && !move->scaled && !move->negated) {
+  if (from_type == to_type && move->change == UNCHANGED && !move->negated) {
     if (move->count == 1 && from_size == 8)
       memcpy(to, from, 8);
     else
@@ -401,15 +444,16 @@ static int move_values(const Move *move, const char *from, char *to) {
     return 0;
   }
   for (int64_t i = 0; i < move->count; i++, from += from_size, to += to_size) {
-    if (move->scaled || from_type <= F32 || to_type <= F32) {
+    if (move->change == SCALED || from_type <= F32 || to_type <= F32) {
       double value = as_double(from, from_type);
-      if (move->scaled) value = value * move->factor + move->offset;
+      if (move->change == SCALED) value = value * move->factor + move->offset;
       if (move->negated) value = -value;
       put_double(to, to_type, value);
       continue;
     }
     int large;
     int64_t value = as_integer(from, from_type, &large);
+    if (move->change == LOOKED_UP && !look_up(move->lookup, &value, &large)) return OUT_OF_RANGE;
     if (move->negated) {
       if (to_type == TRUTH || from_type == TRUTH)
         value = value == 0;
@@ -840,7 +884,7 @@ PUBLIC void node_attended(Node *node) { atomic_store(&node->attention, 0); }
 PUBLIC int64_t structure_sizes(int64_t *sizes) {
   const int64_t own[] = {sizeof(Place), sizeof(Gate), sizeof(Move), sizeof(Call), sizeof(Output),
                          sizeof(Member), sizeof(Unit), sizeof(Peer), sizeof(Node), sizeof(Wish), sizeof(Said),
-                         sizeof(Track)};
+                         sizeof(Track), sizeof(Entry), sizeof(Lookup)};
   memcpy(sizes, own, sizeof own);
   return sizeof own / sizeof own[0];
 }

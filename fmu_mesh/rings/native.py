@@ -7,7 +7,7 @@ library is missing, and then nothing else of this module may be used.
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from ctypes import CFUNCTYPE, POINTER, PYFUNCTYPE, Structure, c_bool, c_double, c_int32, c_int64, c_uint32, c_void_p
 from enum import IntEnum
 from typing import Any, Final, NamedTuple
@@ -22,7 +22,10 @@ __all__ = [
     "STAGE_BITS",
     "BurstEnd",
     "Call",
+    "Change",
+    "Entry",
     "Gate",
+    "Lookup",
     "MemberTable",
     "Move",
     "NativeStep",
@@ -43,6 +46,7 @@ __all__ = [
 
 NEVER: Final = 2**63 - 1
 STAGE_BITS: Final = 24
+_LARGEST: Final = 2**63 - 1
 OUT_OF_RANGE: Final = 100
 """The status of a call where a value does not fit into the type of the model."""
 
@@ -74,6 +78,14 @@ class RowBase(IntEnum):
     OUTPUT = 1
     WATCHED = 2
     FIRST_GATE = 3
+
+
+class Change(IntEnum):
+    """What a `Move` makes of a value."""
+
+    UNCHANGED = 0
+    SCALED = 1
+    LOOKED_UP = 2
 
 
 class BurstEnd(IntEnum):
@@ -125,8 +137,28 @@ class Gate(Structure):
     )
 
 
+class Entry(Structure):
+    """A value of a source, and what its target gets instead; ``large`` adds 2**64 to a negative number."""
+
+    _fields_ = (("from_", c_int64), ("to", c_int64), ("from_large", c_int32), ("to_large", c_int32))
+
+
+class Lookup(Structure):
+    """The map of a connection, and the numbers that its input can be; without items all of its type."""
+
+    _fields_ = (("entries", POINTER(Entry)), ("items", POINTER(c_int64)), ("n_entries", c_int64), ("n_items", c_int64))
+
+    @classmethod
+    def of(cls, mapping: Mapping[int, int], items: Iterable[int]) -> Lookup:
+        """The table for a map and the numbers of items; it keeps what it points to."""
+        pairs = sorted(mapping.items())
+        entries = [Entry(_signed(have), _signed(want), have > _LARGEST, want > _LARGEST) for have, want in pairs]
+        numbers = sorted({*items})
+        return cls(table(Entry, entries), table(c_int64, numbers), len(entries), len(numbers))
+
+
 class Move(Structure):
-    """Values that are copied from one base to another, with factor, offset and type."""
+    """Values that are copied from one base to another, with factor, offset and type, or with a map."""
 
     _fields_ = (
         ("from_base", c_int64),
@@ -136,10 +168,11 @@ class Move(Structure):
         ("count", c_int64),
         ("from_type", c_int32),
         ("to_type", c_int32),
-        ("scaled", c_int32),
+        ("change", c_int32),
         ("negated", c_int32),
         ("factor", c_double),
         ("offset", c_double),
+        ("lookup", c_void_p),
     )
 
 
@@ -343,6 +376,11 @@ def table(kind: Any, items: Sequence[Any]) -> Any:  # noqa: ANN401 ctypes has no
     return (kind * max(len(items), 1))(*items)
 
 
+def _signed(number: int) -> int:
+    """The number with the same 64 bits that `int64_t` has."""
+    return number - 2**64 if number > _LARGEST else number
+
+
 _STRUCTURES: Final = (
     Participant,
     Gate,
@@ -356,6 +394,8 @@ _STRUCTURES: Final = (
     Wish,
     Said,
     Track,
+    Entry,
+    Lookup,
 )
 
 

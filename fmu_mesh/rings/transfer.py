@@ -1,4 +1,4 @@
-"""Moving values from a row of a source into the row of inputs of a target, with factor and offset of a connection.
+"""Moving values from a row of a source into the row of inputs of a target, with factor and offset, or the map.
 
 Which row a step reads is `fmu_mesh.system.coupling_rule`. The burst moves numbers by tables (`moves`); the same moves
 in Python are `step`, which is also the only way for text.
@@ -6,67 +6,23 @@ in Python are `step`, which is also the only way for text.
 
 from __future__ import annotations
 
+import ctypes
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FmuError, StepFailed
 from ..system.coupling_rule import CouplingRule
-from ..system.plan import Feed
-from ..variables.value_types import INTEGERS, Value, VariableType, is_text
-from .native import NUMBER_TYPES, Move, RowBase
+from ..system.feeds import Feed, FeedColumn
+from ..variables.value_types import is_text
+from .native import NUMBER_TYPES, Change, Lookup, Move, RowBase
 from .ring import Ring
+from .value_change import ValueChange
 
-__all__ = ["Narrowing", "Transfer"]
+__all__ = ["Transfer"]
 
 Index = slice | NDArray[np.intp]
-
-
-class Narrowing(NamedTuple):
-    """The two ends of a connection whose input may be unable to take a number of its output.
-
-    An Enumeration may be connected to an integer that can be each of its items; a model may put out other numbers.
-
-    Attributes:
-        source: the output, as `instance.variable`.
-        target: the instance of the input.
-        variable: the input.
-        input_type: its type.
-    """
-
-    source: str
-    target: str
-    variable: str
-    input_type: VariableType
-
-    @staticmethod
-    def is_between(source: VariableType, target: VariableType) -> bool:
-        """Whether an input of type ``target`` cannot be each number that an output of type ``source`` can be."""
-        if source not in INTEGERS or target not in INTEGERS:
-            return False
-        have, want = INTEGERS[source], INTEGERS[target]
-        return have[0] not in want or have[-1] not in want
-
-    def checked(self, value: Value, kind: type[FmuError] = StepFailed) -> Value:
-        """``value``, which may be an array; an error of ``kind`` if the input cannot be this number.
-
-        Example:
-            >>> Narrowing("engine.gear", "clutch", "gear", "Int8").checked([1, 300])
-            Traceback (most recent call last):
-            fmu_mesh.errors.StepFailed: instance clutch.gear: 'engine.gear' is 300, which is out of the range of Int8...
-        """
-        if isinstance(value, list):
-            return [self.checked(element, kind) for element in value]
-        if self.input_type in INTEGERS and value not in INTEGERS[self.input_type]:
-            raise kind(
-                f"'{self.source}' is {value!r}, which is out of the range of {self.input_type}",
-                instance=self.target,
-                variable=self.variable,
-                hint="Its model declares no such item.",
-            )
-        return value
 
 
 class Transfer:
@@ -101,15 +57,26 @@ class Transfer:
         self.source = source
         self.rule = CouplingRule(feed.delay, source_points, target_points)
         self.columns = [
-            column for column in feed.columns if text is None or is_text(inputs.layout.column(column[1]).type) == text
+            column
+            for column in feed.columns
+            if text is None or is_text(inputs.layout.column(column.target).type) == text
         ]
         self._inputs = inputs
-        self._copies = _copies(self.columns, source, inputs)
-        self._narrowings = [
-            (have, Narrowing(f"{feed.source}.{have}", target, want, inputs.layout.column(want).type))
-            for have, want, _, _ in self.columns
-            if Narrowing.is_between(source.layout.column(have).type, inputs.layout.column(want).type)
+        self._changes = [
+            ValueChange.of_column(feed.source, target, inputs.layout.column(column.target).type, column)
+            for column in self.columns
         ]
+        self._copies = _copies(self.columns, self._changes, source, inputs)
+        self._checked = [
+            (column.source, change)
+            for column, change in zip(self.columns, self._changes, strict=True)
+            if change.is_checked(source.layout.column(column.source).type)
+        ]
+        self._lookups = {
+            column: Lookup.of(dict(column.map), [number for _, number in column.items])
+            for column in self.columns
+            if column.map or column.items
+        }
 
     def step(self, step: int) -> None:
         """Move the values for own step ``step`` of the target.
@@ -117,7 +84,7 @@ class Transfer:
         Raises:
             StepFailed: see `check_range`.
         """
-        if self._narrowings:
+        if self._checked:
             self.check_range(step)
         slot = self.rule.row_for(step) & self.source.mask
         for copy in self._copies:
@@ -130,8 +97,8 @@ class Transfer:
             StepFailed: an input cannot be the number that its output is.
         """
         row = self.rule.row_for(step)
-        for source_name, narrowing in self._narrowings:
-            narrowing.checked(self.source.value(row, source_name))
+        for source_name, change in self._checked:
+            change.of(self.source.value(row, source_name))
 
     def step_text(self, step: int) -> None:
         """As `step`, for the columns with text."""
@@ -148,8 +115,9 @@ class Transfer:
     def moves(self, base: int) -> list[Move]:
         """The moves of the numbers, from the row ``base`` of the burst."""
         moves = []
-        for source_name, target_name, factor, offset in self.columns:
-            have, want = self.source.layout.place(source_name), self._inputs.layout.place(target_name)
+        for column in self.columns:
+            have, want = self.source.layout.place(column.source), self._inputs.layout.place(column.target)
+            lookup = self._lookups.get(column)
             from_type = self.source.layout.parts[have.part].type
             to_type = self._inputs.layout.parts[want.part].type
             if is_text(from_type):
@@ -163,9 +131,10 @@ class Transfer:
                     count=want.size,
                     from_type=NUMBER_TYPES[from_type],
                     to_type=NUMBER_TYPES[to_type],
-                    scaled=(factor, offset) != (1.0, 0.0),
-                    factor=factor,
-                    offset=offset,
+                    change=Change.LOOKED_UP if lookup is not None else _change_of(column),
+                    factor=column.factor,
+                    offset=column.offset,
+                    lookup=ctypes.addressof(lookup) if lookup is not None else None,
                 )
             )
         return moves
@@ -174,20 +143,29 @@ class Transfer:
 class _Copy:
     """Columns of one part of the source rows for columns of one part of the row of inputs."""
 
-    def __init__(
-        self, source_part: int, source_columns: Index, part: NDArray[Any], columns: Index, scale: tuple[Any, Any] | None
+    def __init__(  # noqa: PLR0913, PLR0917  places of both ends, and what happens between them
+        self,
+        source_part: int,
+        source_columns: Index,
+        part: NDArray[Any],
+        columns: Index,
+        scale: tuple[Any, Any] | None,
+        change: ValueChange | None,
     ) -> None:
         self.source_part = source_part
         self.source_columns = source_columns
         self.part = part
         self.columns = columns
         self.scale = scale
+        self.change = change
 
     def convert(self, values: NDArray[Any]) -> NDArray[Any]:
         """``values * factor + offset`` in Float64, with one rounding each; for a Float32 the result is rounded again.
 
         The assignment that follows converts between types; `check` refuses connections that would lose something.
         """
+        if self.change is not None:
+            return np.array([self.change.of(value) for value in values.tolist()], self.part.dtype)
         if self.scale is None:
             return values
         factor, offset = self.scale
@@ -198,22 +176,28 @@ class _Copy:
         return scaled
 
 
-def _copies(columns: Sequence[tuple[str, str, float, float]], source: Ring, inputs: Ring) -> list[_Copy]:
-    """Group the columns by part of source and target, and by whether they are scaled.
+def _change_of(column: FeedColumn) -> Change:
+    return Change.UNCHANGED if (column.factor, column.offset) == (1.0, 0.0) else Change.SCALED
+
+
+def _copies(columns: Sequence[FeedColumn], changes: Sequence[ValueChange], source: Ring, inputs: Ring) -> list[_Copy]:
+    """Group the columns by part of source and target, and by whether they are scaled; a column with a map is alone.
 
     An unscaled column is not multiplied by 1.0, so it keeps every bit, also of a NaN.
     """
-    groups: dict[tuple[int, int, bool], list[tuple[int, int, float, float]]] = {}
-    for source_name, target_name, factor, offset in columns:
-        have, want = source.layout.place(source_name), inputs.layout.place(target_name)
-        scaled = (factor, offset) != (1.0, 0.0)
-        group = groups.setdefault((have.part, want.part, scaled), [])
-        group += [(have.first + place, want.first + place, factor, offset) for place in range(want.size)]
+    groups: dict[tuple[int, int, Change, int], list[tuple[int, int, float, float]]] = {}
+    for number, column in enumerate(columns):
+        have, want = source.layout.place(column.source), inputs.layout.place(column.target)
+        key = (Change.LOOKED_UP, number) if column.map else (_change_of(column), -1)
+        group = groups.setdefault((have.part, want.part, *key), [])
+        places = range(want.size)
+        group += [(have.first + place, want.first + place, column.factor, column.offset) for place in places]
     copies = []
-    for (source_part, target_part, scaled), items in groups.items():
-        scale = (np.array([c[2] for c in items]), np.array([c[3] for c in items])) if scaled else None
+    for (source_part, target_part, kind, number), items in groups.items():
+        scale = (np.array([c[2] for c in items]), np.array([c[3] for c in items])) if kind == Change.SCALED else None
         sources, targets = _index([c[0] for c in items]), _index([c[1] for c in items])
-        copies.append(_Copy(source_part, sources, inputs.parts[target_part], targets, scale))
+        change = changes[number] if number >= 0 else None
+        copies.append(_Copy(source_part, sources, inputs.parts[target_part], targets, scale, change))
     return copies
 
 

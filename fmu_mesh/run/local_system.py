@@ -19,10 +19,9 @@ from ..instances.call_guard import Guarded, doing, floating_point_changed, resto
 from ..instances.contract import LogMessage, Opening, Showing
 from ..rings.array_elements import element_of, scaled
 from ..rings.ring import Ring, Rows
-from ..rings.transfer import Narrowing
+from ..rings.value_change import ValueChange
 from ..simtime import TimeGrid
 from ..system.algebraic_loop import FixedPoint
-from ..system.connections import Connection
 from ..system.coupling_rule import CouplingRule
 from ..system.initialization_plan import Loop, Tear
 from ..system.layout import Layout
@@ -206,7 +205,8 @@ class LocalSystem:
 
     def _brought(self, tear: Tear, known: dict[tuple[str, str], Value]) -> Value:
         c = next(c for c in self._plan.connections if (c.target_instance, c.target_name) == (tear.target, tear.input))
-        return scaled(_at(known[c.source_instance, c.source.name], c.source_index), c.factor, c.offset)
+        value = _at(known[c.source_instance, c.source.name], c.source_index)
+        return ValueChange.of_tear(tear).of(value, InitializationFailed)
 
 
 class _SavedMember(NamedTuple):
@@ -260,8 +260,8 @@ class _Member:
             if own in assumed:
                 value = assumed[own]
             elif key in known and c.target_name not in self.settled:
-                value = scaled(_at(known[key], c.source_index), c.factor, c.offset)
-                value = _ends_of(c).checked(value, InitializationFailed)
+                value = _at(known[key], c.source_index)
+                value = ValueChange.of_connection(c).of(value, InitializationFailed)
             else:
                 continue
             if not c.target_index:
@@ -287,11 +287,12 @@ class _Member:
         for c in self.connections:
             read, points = members[c.source_instance].reader(c.source_name)
             lead = CouplingRule(c.delay or 0, points, self._points).lead
+            own = ValueChange.of_connection(c)
             change: Callable[[Value], Value] | None = None
             if (c.factor, c.offset) != (1.0, 0.0):
                 change = partial(scaled, factor=c.factor, offset=c.offset)
-            elif Narrowing.is_between(c.source.type, c.target.type):
-                change = _ends_of(c).checked
+            elif c.map or own.is_checked(c.source.type):
+                change = own.of
             self._feeds.append(_Feed(read, points, lead, change, self._inputs.writer(c.target_name)))
 
     def reader(self, variable: str) -> tuple[Callable[[int], Value], int]:
@@ -411,10 +412,6 @@ def opening_of(
 
 def _instance_plan(plan: Plan, name: str) -> InstancePlan:
     return plan.nodes[plan.node_of(name)].instance(name)
-
-
-def _ends_of(c: Connection) -> Narrowing:
-    return Narrowing(f"{c.source_instance}.{c.source_name}", c.target_instance, c.target_name, c.target.type)
 
 
 def _at(value: Value, index: tuple[int, ...]) -> Value:

@@ -25,9 +25,11 @@ from ..instances.contract import Showing
 from ..recorder.arrays_file import ENDING
 from ..text import listed, nearest
 
-__all__ = ["Flag", "OptionField", "Options", "option_fields", "with_config_values", "with_options"]
+__all__ = ["Flag", "OptionField", "Options", "option_fields", "with_config_values", "with_needed", "with_options"]
 
 _SECTIONS: dict[str, type[Base]] = {"simulation": SimulationConfig, "record": RecordConfig, "zenoh": ZenohConfig}
+_NEEDED = ("step_size", "stop_time", "algorithm")
+"""The options that may give what a file leaves out."""
 
 
 class Flag(NamedTuple):
@@ -173,6 +175,40 @@ def with_config_values(plain: PlainConfig, config_values: Sequence[str]) -> Plai
     return plain._replace(data=data, findings=(*plain.findings, *findings), overrides=overrides)
 
 
+def with_needed(plain: PlainConfig, options: Options) -> PlainConfig:
+    """The values of a configuration with the times and the algorithm that only the options give.
+
+    A key that the file cannot have, and that no option gives either, becomes a finding.
+
+    Example:
+        >>> from pathlib import Path
+        >>> plain = PlainConfig({"mesh": "m"}, Path("m.ssp"), needed={"simulation.step_size": "`--step-size S`"})
+        >>> with_needed(plain, Options(step_size=0.1)).data
+        {'mesh': 'm', 'simulation': {'step_size': 0.1}}
+        >>> print(*with_needed(plain, Options()).findings)
+        m.ssp: simulation.step_size: the package gives none; expected `--step-size S`
+    """
+    data, overrides = plain.data, dict(plain.overrides)
+    for name in _NEEDED:
+        setting, value = option_fields()[name], getattr(options, name)
+        key = setting.flag.key
+        if key is not None and value is not None and _is_absent(data, key):
+            data = _replaced(data, key.split("."), value)
+            overrides[key] = _as_option(setting, value)
+    findings = Findings(str(plain.file), plain.lines, overrides, plain.findings, plain.origins)
+    for key, option in plain.needed.items():
+        if _is_absent(data, key):
+            findings.add(key, "the package gives none", option)
+    return plain._replace(data=data, findings=tuple(findings), overrides=overrides)
+
+
+def _is_absent(data: Plain, key: str) -> bool:
+    """Whether a key of a section is not there; false if the section is no mapping, which is another error."""
+    section, _, name = key.partition(".")
+    inner = data.get(section, {}) if isinstance(data, dict) else None
+    return isinstance(inner, dict) and name not in inner
+
+
 def _obstacle(data: Plain, keys: Sequence[str]) -> tuple[str, str, str | None] | None:
     """Why a key cannot be replaced: what was found, what was expected, and the nearest name."""
     for depth, key in enumerate(keys):
@@ -212,9 +248,10 @@ def with_options(loaded: LoadedConfig, options: Options, findings: Findings | No
             continue
         section, _, key = flag.key.partition(".")
         place = f"{next(iter(config.records), section)}.{key}" if section == "record" else flag.key
-        if place in overrides and findings is not None:
+        option = _as_option(setting, value)
+        if overrides.get(place, option) != option and findings is not None:
             findings.add(place, f"replaced by {flag.name} as well", "one of the two options")
-        overrides[place] = f"{flag.name} {_written(value)}"
+        overrides[place] = option
         plain = list(value) if setting.repeatable else str(value.absolute()) if isinstance(value, Path) else value
         if section == "record":
             config = replace(config, record=_with_output(config, str(plain)))
@@ -222,7 +259,8 @@ def with_options(loaded: LoadedConfig, options: Options, findings: Findings | No
             config = replace(config, **{section: replace(getattr(config, section), **{key: plain})})
         if findings is not None:
             wrong = Findings(str(loaded.file), loaded.lines, overrides)
-            check(plain, _type_of(section, key), place, wrong)
+            if place not in findings.places:  # the value of a key that the file does not have is checked with the file
+                check(plain, _type_of(section, key), place, wrong)
             findings.merge(wrong)
     return replace(loaded, config=config, overrides=overrides)
 
@@ -252,6 +290,11 @@ def _description(key: str) -> str:
     hint = get_type_hints(_SECTIONS[section], include_extras=True)[name]
     text: str = next(meta.description for meta in hint.__metadata__)
     return f"{text[0].lower()}{text[1:]}".partition("; null:")[0].removesuffix(".")
+
+
+def _as_option(setting: OptionField, value: object) -> str:
+    """An option as it is written on the command line."""
+    return f"{setting.flag.name} {_written(value)}"
 
 
 def _written(value: object) -> str:

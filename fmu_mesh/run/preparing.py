@@ -28,7 +28,7 @@ from ..system.scenario import Scenario
 from ..system.system import build
 from ..text import nearest_file
 from ..variables.model_description import ModelDescription
-from .options import Options, with_config_values, with_options
+from .options import Options, with_config_values, with_needed, with_options
 from .results import check_results
 from .run_plan import RunPlan
 
@@ -110,7 +110,8 @@ def plan_run(
     Raises:
         ConfigurationError: the configuration or an FMU is wrong; carries all findings.
     """
-    loaded, findings = examine_data(with_config_values(read_file(path), options.config_values), options.start_values)
+    plain = with_needed(with_config_values(read_file(path), options.config_values), options)
+    loaded, findings = examine_data(plain, options.start_values)
     return planned(loaded, findings, options, tell)
 
 
@@ -239,8 +240,13 @@ def _user(uid: int) -> str:
 
 def _expected(section: InstanceSection, path: Path) -> str:
     """In words, what the file of a model should be, where the one at ``path`` is not."""
-    elsewhere = not files.exists(path) and files.exists(Path(section.path))
+    elsewhere = not _leads_somewhere(path) and _leads_somewhere(Path(section.path))
     return expected_model(section) + ("; paths are relative to the configuration file" if elsewhere else "")
+
+
+def _leads_somewhere(path: Path) -> bool:
+    """Whether there is something at the path, or an archive that it leads into."""
+    return files.exists(path) or files.archive_on_the_way(path) is not None
 
 
 def _similar(path: Path) -> str | None:

@@ -14,10 +14,20 @@ from msgspec.structs import replace
 
 from fmu_mesh.config.findings import Findings
 from fmu_mesh.config.mesh import ConnectionConfig
+from fmu_mesh.system.value_map import checked_items, resolve_map
 from fmu_mesh.text import listed, nearest
 from fmu_mesh.variables.model_description import ModelDescription, Variable
 from fmu_mesh.variables.units import Linear, conversion
-from fmu_mesh.variables.value_types import FMI2_TYPES, TYPES, VariableType, element_name, is_float, split_element, takes
+from fmu_mesh.variables.value_types import (
+    FMI2_TYPES,
+    INTEGERS,
+    TYPES,
+    VariableType,
+    element_name,
+    is_float,
+    split_element,
+    takes,
+)
 
 __all__ = ["Connection", "Variables", "resolve_connections", "resolve_variable", "unit_warnings"]
 
@@ -32,6 +42,8 @@ class Connection(msgspec.Struct, frozen=True):
         factor: of the unit conversion and the file together; ``offset`` likewise.
         source_index: the element of the source array that is connected, counted from 0; empty for all of it.
         target_index: as ``source_index``, for the target.
+        map: what the target gets instead of a value of the source, as numbers; other values stay as they are.
+        items: the items of the target, if a value may be none of them.
         delay: 0, 1, or None where the algorithm decides.
         path: its place in the configuration file, such as `connections[2]`.
         units: the unit conversion in words; empty if there is none.
@@ -50,6 +62,8 @@ class Connection(msgspec.Struct, frozen=True):
     source_index: tuple[int, ...] = ()
     target_index: tuple[int, ...] = ()
     units: str = ""
+    map: tuple[tuple[int, int], ...] = ()
+    items: tuple[tuple[str, int], ...] = ()
 
     @property
     def source_name(self) -> str:
@@ -97,7 +111,8 @@ def resolve_connections(
         if _causality_is_right(connection, variables, findings):
             _check_types(connection, findings)
             _check_delay(connection, findings)
-            connections.append(_with_units(connection, config, findings))
+            connection = _with_units(connection, config, findings)
+            connections.append(_with_map(connection, config, findings))
     return tuple(connections)
 
 
@@ -195,6 +210,16 @@ def _with_units(connection: Connection, config: ConnectionConfig, findings: Find
     return replace(connection, factor=both.factor, offset=both.offset, units=units)
 
 
+def _with_map(connection: Connection, config: ConnectionConfig, findings: Findings) -> Connection:
+    """The connection with the entries of its `map`, and with the items that its values must be."""
+    source, target, path = connection.source, connection.target, f"{connection.path}.map"
+    pairs = resolve_map(config.map, source, target, path, findings) if config.map else ()
+    if config.map and (config.factor, config.offset) != (1.0, 0.0):
+        found = f"a map and factor {config.factor:g} and offset {config.offset:g} on {connection}"
+        findings.add(path, found, "a map, or factor and offset")
+    return replace(connection, map=pairs, items=checked_items(source, target, pairs))
+
+
 def _ends(connection: Connection) -> tuple[tuple[str, Variable], tuple[str, Variable]]:
     return (connection.source_instance, connection.source), (connection.target_instance, connection.target)
 
@@ -267,7 +292,7 @@ def _check_types(connection: Connection, findings: Findings) -> None:
     source, target = connection.source, connection.target
     items = tuple(number for _, number in source.items)
     have, want = _end(source, connection.source_index), _end(target, connection.target_index)
-    if not takes(target.type, source.type, items):
+    if not _fits(target.type, source.type, items):
         accepted = [_name_of(type_, target) for type_ in _sources_for(target.type, source)]
         found = f"{connection} connects {_a(have)} to {_a(want)}"
         findings.add(connection.path, found, f"a source of type {' or '.join(dict.fromkeys(accepted))}")
@@ -281,10 +306,15 @@ def _check_types(connection: Connection, findings: Findings) -> None:
         findings.add(connection.path, f"{conversion} for {name}", "factor and offset on Real inputs only")
 
 
+def _fits(target: VariableType, source: VariableType, items: tuple[int, ...] = ()) -> bool:
+    """Whether a connection is allowed: an integer for an Enumeration is checked in the run, value by value."""
+    return takes(target, source, items) or (target == "Enumeration" and source in INTEGERS)
+
+
 def _sources_for(target: VariableType, source: Variable) -> list[VariableType]:
     """The types that an input of this type accepts, its own first, of those in the FMI version of the source."""
     known = TYPES if source.declared_type is None else FMI2_TYPES.values()
-    return [target, *(type_ for type_ in known if type_ != target and takes(target, type_))]
+    return [target, *(type_ for type_ in known if type_ != target and _fits(target, type_))]
 
 
 def _name_of(type_: VariableType, like: Variable) -> str:

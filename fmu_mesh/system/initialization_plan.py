@@ -32,6 +32,7 @@ class Tear(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         type: the type of the input, or of the element.
         shape: the sizes of its dimensions.
         start: the first assumed value: the start value of the input.
+        map: see `Connection`; ``items`` likewise.
     """
 
     source: str
@@ -43,6 +44,8 @@ class Tear(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     type: VariableType
     start: PlainValue
     shape: tuple[int, ...] = ()
+    map: tuple[tuple[int, int], ...] = ()
+    items: tuple[tuple[str, int], ...] = ()
 
     def __str__(self) -> str:
         return f"{self.source}.{self.output} -> {self.target}.{self.input}"
@@ -151,6 +154,8 @@ def _tear(system: ResolvedSystem, connection: Connection) -> Tear:
         type=variable.type,
         start=to_plain(start),
         shape=() if connection.target_index else variable.shape,
+        map=connection.map,
+        items=connection.items,
     )
 
 

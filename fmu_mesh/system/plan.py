@@ -18,6 +18,7 @@ from ..simtime import TimeGrid
 from ..variables.value_conversion import to_plain
 from ..variables.value_types import PlainValue
 from .digest import digest_of
+from .feeds import Feed, feeds_of
 from .graph import cycle_through, feedback_edges, is_cycle, strongly_connected, topological_order
 from .initialization_plan import InitializationPlan, Loop, plan_initialization
 from .layout import Layout, row_bytes, rows_for
@@ -29,18 +30,6 @@ from .system import Connection, ResolvedSystem, SystemInstance
 from .window import batch_of, recorder_window, window_of
 
 __all__ = ["MASTER", "RECORDER", "Feed", "InstancePlan", "Link", "NodePlan", "Plan", "make_plan"]
-
-
-class Feed(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """All connections from one instance to another that have the same delay.
-
-    Attributes:
-        columns: (source, target, factor, offset) of each connection; an end is a variable, or an element as `y[2]`.
-    """
-
-    source: str
-    delay: int
-    columns: tuple[tuple[str, str, float, float], ...]
 
 
 class InstancePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -377,11 +366,6 @@ def _output_layouts(plan: Plan) -> dict[str, Layout]:
 
 def _instance_plan(plan: Plan, instance: SystemInstance, outputs: Layout) -> InstancePlan:
     incoming = [c for c in plan.connections if c.target_instance == instance.name]
-    feeds: dict[tuple[str, int], list[tuple[str, str, float, float]]] = {}
-    for c in incoming:
-        feeds.setdefault((c.source_instance, c.delay or 0), []).append(
-            (c.source_name, c.target_name, c.factor, c.offset)
-        )
     connected = {c.target.name for c in incoming}
     levels = plan.initialization.levels
     return InstancePlan(
@@ -391,7 +375,7 @@ def _instance_plan(plan: Plan, instance: SystemInstance, outputs: Layout) -> Ins
         step_points=instance.step_points,
         outputs=outputs,
         inputs=Layout.of(v for v in instance.description.variables if v.name in connected),
-        feeds=tuple(Feed(source=s, delay=d, columns=tuple(columns)) for (s, d), columns in sorted(feeds.items())),
+        feeds=feeds_of(incoming),
         initialization={variable: level for (owner, variable), level in levels.items() if owner == instance.name},
         section=placed(plan.system.config.instances[instance.name]),
         linear_inputs=linear_inputs(plan.connections, instance.name),

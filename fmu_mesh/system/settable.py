@@ -25,7 +25,7 @@ def check_settable(plan: InstancePlan, variable: Variable) -> None:
         source = next(
             feed.source
             for feed in plan.feeds
-            if variable.name in {layout.column(target).name for _, target, _, _ in feed.columns}
+            if variable.name in {layout.column(own.target).name for own in feed.columns}
         )
     why = why_not_settable(variable, source)
     if why is not None:

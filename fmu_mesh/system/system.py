@@ -155,7 +155,8 @@ def build(
     warnings.merge(prescribed.warnings)
     _needed_tools(config, descriptions, warnings)
     ending_warnings(loaded, records, warnings)
-    return ResolvedSystem(config, grid, instances, connections, records, tuple(warnings), prescribed.files)
+    all_warnings = (*loaded.warnings, *warnings)
+    return ResolvedSystem(config, grid, instances, connections, records, all_warnings, prescribed.files)
 
 
 def _prescribed(  # noqa: PLR0913, PLR0917  what a scenario refers to

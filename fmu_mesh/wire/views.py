@@ -57,13 +57,14 @@ class VariableView(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 class ConnectionView(msgspec.Struct, frozen=True):
-    """One connection in `info`."""
+    """One connection in `info`; ``map``: what the input gets instead of a value, both as numbers."""
 
     source: str = msgspec.field(name="from")
     target: str = msgspec.field(name="to")
     delay: int
     factor: float = 1.0
     offset: float = 0.0
+    map: tuple[tuple[int, int], ...] = ()
 
 
 class InstanceInfo(msgspec.Struct, frozen=True):

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from fmu_mesh.config.findings import locate
+from fmu_mesh.config.findings import located
 from fmu_mesh.config.loading import LoadedConfig, examine_data, read_text
 from fmu_mesh.config.mesh import MAX_WINDOW, Config, ConnectionConfig, SimulationConfig
 from fmu_mesh.config.yaml_text import resolve
@@ -210,7 +210,7 @@ def test_the_nearest_name_is_one_of_the_names(name: str, names: list[str]) -> No
 @relaxed
 @given(st.dictionaries(st.text(alphabet="ab.[]0"), st.integers(1)), st.text(alphabet="ab.[]0"))
 def test_every_place_has_the_line_of_a_place_around_it(lines: dict[str, int], path: str) -> None:
-    line = locate(lines, path)
+    line = located(path, "", lines, {}, {}).line
     around = [place for place in lines if path.startswith(place)]
     assert line is None if not around or line is None else line in [lines[place] for place in around]
 

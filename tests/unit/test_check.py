@@ -54,11 +54,16 @@ Window      16 points
 Speed       2 times real time
 
 Instances
-  pendulum  DampedPendulum.fmu (FMI 2.0)  step 0.01 s  a process of its own  a = 1.3 rad
+  pendulum  DampedPendulum.fmu (FMI 2.0)  step 0.01 s  a process of its own
   sum       Adder.fmu (FMI 2.0)           step 0.01 s  a process of its own
-  loop      Gain.fmu (FMI 2.0)            step 0.02 s  a process of its own  k = -0.5
+  loop      Gain.fmu (FMI 2.0)            step 0.02 s  a process of its own
   inner     Gain.fmu (FMI 2.0)            step 0.01 s  group pair
-  outer     Integrator.fmu (FMI 2.0)      step 0.01 s  group pair            u = 0.25
+  outer     Integrator.fmu (FMI 2.0)      step 0.01 s  group pair
+
+Start values
+  pendulum.a  = 1.3 rad  mesh.yaml:4
+  loop.k      = -0.5     mesh.yaml:6
+  outer.u     = 0.25     mesh.yaml:8
 
 Connections
   pendulum.a -> sum.u1  delay 0  value at the end of the step    u1 = 57.3 * a - 1                  not converted: sum.u1 has no unit
@@ -177,7 +182,7 @@ def test_options_change_the_plan(tmp_path: Path, capsys: pytest.CaptureFixture[s
 
     page = capsys.readouterr().out
     assert "Window      8 points\n" in page
-    assert "  b  Gain.fmu (FMI 2.0)  step 0.5 s  a process of its own  k = 4.5\n" in page
+    assert "Start values\n  b.k  = 4.5  --set b.k=4.5\n" in page
 
 
 def test_what_is_odd_but_can_run_is_a_warning(tmp_path: Path) -> None:

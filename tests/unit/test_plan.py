@@ -7,6 +7,7 @@ from itertools import pairwise
 import pytest
 
 from fmu_mesh.errors import ConfigurationError
+from fmu_mesh.system.feeds import FeedColumn
 from fmu_mesh.system.layout import rows_for
 from fmu_mesh.system.plan import RECORDER, Plan, make_plan
 from fmu_mesh.system.window import recorder_window
@@ -91,8 +92,8 @@ def test_connections_with_other_delays_are_other_feeds() -> None:
 
     [target] = plan.nodes["b"].instances
     assert [(feed.source, feed.delay, feed.columns) for feed in target.feeds] == [
-        ("a", 0, (("point", "a", 1.0, 0.0),)),
-        ("c", 1, (("point", "c", 1.0, 0.0),)),
+        ("a", 0, (FeedColumn("point", "a"),)),
+        ("c", 1, (FeedColumn("point", "c"),)),
     ]
 
 

@@ -272,8 +272,8 @@ CONNECTIONS = [
      "expected a source of type Real or Integer")),
     ("pendulum.count -> delay.b", ("[0]: pendulum.count -> delay.b connects an Integer to a Boolean; "
      "expected a source of type Boolean")),
-    ("pendulum.count -> delay.e", ("[0]: pendulum.count -> delay.e connects an Integer to an Enumeration; "
-     "expected a source of type Enumeration")),
+    ("pendulum.flag -> delay.e", ("[0]: pendulum.flag -> delay.e connects a Boolean to an Enumeration; "
+     "expected a source of type Enumeration or Integer")),
     ("pendulum.name -> delay.x", ("[0]: pendulum.name -> delay.x connects a String to a Real; "
      "expected a source of type Real or Integer")),
     ("{from: pendulum.count, to: delay.i, factor: 2}", ("[0]: factor 2 and offset 0 for the Integer 'i'; "

@@ -15,8 +15,8 @@ from fmu_mesh.rings.native import OUT_OF_RANGE, STAGE_BITS, MemberTable, Move, R
 from fmu_mesh.rings.ring import Ring
 from fmu_mesh.rings.transfer import Transfer
 from fmu_mesh.system.coupling_rule import CouplingRule
+from fmu_mesh.system.feeds import Feed, FeedColumn
 from fmu_mesh.system.layout import Layout
-from fmu_mesh.system.plan import Feed
 from fmu_mesh.variables.value_types import INTEGERS, Value, VariableType, element_names, is_float, takes
 
 needs_library = pytest.mark.skipif(native.library is None, reason="the library with the burst is not built here")
@@ -41,7 +41,7 @@ def transfer(
     *,
     text: bool | None = None,
 ) -> Transfer:
-    feed = Feed("source", delay, columns)
+    feed = Feed("source", delay, tuple(FeedColumn(*column) for column in columns))
     points = {"source_points": source_points, "target_points": target_points}
     return Transfer(feed, source, inputs, target="target", **points, text=text)
 
@@ -120,7 +120,7 @@ def test_text_is_moved_without_the_numbers() -> None:
 def test_numbers_and_text_can_come_from_different_rings(text: bool | None, names: list[str]) -> None:  # noqa: FBT001 a parameter of a test
     moved = transfer(filled(1), Ring(INPUTS, 1), columns=(*PLAIN, ("s", "t", 1.0, 0.0)), text=text)
 
-    assert [source for source, _, _, _ in moved.columns] == names
+    assert [source for source, *_ in moved.columns] == names
     assert moved.has_text == ("s" in names)
 
 

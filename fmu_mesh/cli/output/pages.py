@@ -121,7 +121,7 @@ def instance_info(info: InstanceInfo) -> list[str]:
                 ),
             ),
             ("node", f"{info.node}, process {info.pid} on {info.host}"),
-            ("fed by", ", ".join(f"{c.source} -> {c.target}" for c in info.connections)),
+            ("fed by", ", ".join(f"{c.source} -> {c.target}{' (map)' if c.map else ''}" for c in info.connections)),
             ("clocks", ", ".join(map(str, info.clocks))),
             ("problems", "; ".join(info.problems)),
         ]

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from ..contract import LogMessage
-    from .archive.archive import Terms, content_of, sha256_of
+    from .archive.archive import Terms, content_of, sha256_of, size_of
     from .archive.reading import read_description
     from .archive.sources import describe
     from .co_simulation.fmi1 import Fmi1Instance
@@ -30,6 +30,7 @@ __all__ = [
     "open_instance",
     "read_description",
     "sha256_of",
+    "size_of",
     "stepped",
 ]
 
@@ -45,6 +46,7 @@ _MODULES = {
     "open_instance": ".opening",
     "read_description": ".archive.reading",
     "sha256_of": ".archive.archive",
+    "size_of": ".archive.archive",
     "stepped": ".opening",
 }
 

@@ -1,39 +1,32 @@
-"""The files of an FMU: a ZIP archive from any source, or a folder that somebody has unpacked.
+"""The files of an FMU: a ZIP archive from any source, also inside another one, or a folder that somebody has unpacked.
 
-Owns the protection against hostile archives, and the private folder that an instance uses. That folder has the layout
-of the FMU and can always be removed: if the FMU is a folder, it holds copies of the binaries and links to all other
-files. It lies below a folder that is passed in, so that it is removed even if the process that used it was killed.
-Does not know what the files mean; see `fmu_mesh.instances.fmi.archive.examining`.
+Owns the private folder that an instance uses. That folder has the layout of the FMU and can always be removed: if the
+FMU is a folder, it holds copies of the binaries and links to all other files. It lies below a folder that is passed in,
+so that it is removed even if the process that used it was killed. The protection against hostile archives is in
+`archive_entries`; what the files mean, in `fmu_mesh.instances.fmi.archive.examining`.
 """
 
 from __future__ import annotations
 
 import hashlib
-import lzma
 import os
 import shutil
-import stat
 import tempfile
-import zipfile
-import zlib
 from collections.abc import Iterator
 from contextlib import ExitStack, closing, contextmanager
-from pathlib import Path, PurePosixPath
-from typing import Final, Protocol
+from pathlib import Path
+from typing import IO, Protocol
 
 import msgspec
 
 from .... import files
 from ....config.mesh import LimitsConfig
 from ....errors import LoadFailed
+from .archive_entries import LIMITS_HINT, checked_archive, entry_name, reading, write_entry
+from .inner_files import inner_file, inner_sha256, inner_size
 
-__all__ = ["Contents", "OpenFmu", "Terms", "content_of", "opened", "sha256_of", "unpacked"]
+__all__ = ["Contents", "OpenFmu", "Terms", "content_of", "opened", "sha256_of", "size_of", "unpacked"]
 
-_HARMLESS_BYTES: Final = 64 * 2**20
-"""An archive with fewer unpacked bytes is not a ZIP bomb, whatever its compression ratio is."""
-
-_CHUNK: Final = 2**20
-_ENCRYPTED: Final = 0x1
 _XML_FILES: tuple[str, ...] = ("modelDescription.xml", "sources/buildDescription.xml")
 
 
@@ -86,6 +79,10 @@ class OpenFmu(Protocol):
         """The names of its files and its descriptions; nothing is unpacked."""
         ...
 
+    def read(self, name: str) -> bytes:
+        """The content of one of its files, which must not be larger than a description (`limits.description_bytes`)."""
+        ...
+
     def content_sha256(self) -> str:
         """Calculate the SHA-256 of the archive, or of the names and contents of all files of a folder."""
         ...
@@ -111,7 +108,19 @@ def opened(path: Path, terms: Terms = Terms()) -> Iterator[OpenFmu]:  # noqa: B0
 
 def sha256_of(path: Path) -> str | None:
     """The SHA-256 of an archive in hexadecimal digits; None for a folder."""
-    return None if files.is_folder(path) else files.sha256_of(path)
+    return None if files.is_folder(path) else content_of(path)
+
+
+def size_of(path: Path) -> int | None:
+    """The size of an archive in bytes; None for a folder.
+
+    Raises:
+        OSError, LoadFailed: it cannot be read.
+    """
+    if files.is_folder(path):
+        return None
+    outer = files.archive_on_the_way(path)
+    return path.stat().st_size if outer is None else inner_size(path, outer)
 
 
 def content_of(path: Path) -> str:
@@ -119,9 +128,11 @@ def content_of(path: Path) -> str:
 
     Raises:
         OSError: it cannot be read.
+        LoadFailed: the archive in which it lies cannot be used.
     """
     if not files.is_folder(path):
-        return files.sha256_of(path)
+        outer = files.archive_on_the_way(path)
+        return files.sha256_of(path) if outer is None else inner_sha256(path, outer)
     digest = hashlib.sha256()
     for name in sorted(_names_in(path)):
         digest.update(f"{files.sha256_of(path / name)} {name}\0".encode(errors="surrogateescape"))
@@ -164,56 +175,48 @@ class _Archive:
         # Bytes that have to be the right ones are read; it does not matter what the file was before.
         self._verifies = terms.sha256 is not None or terms.content is not None
         self._digest: str | None = None
-        with ExitStack() as stack, _reading(path):
-            self._file = stack.enter_context(path.open("rb"))
+        with ExitStack() as stack, reading(path):
+            if (outer := files.archive_on_the_way(path)) is None:
+                self._file: IO[bytes] = stack.enter_context(path.open("rb"))
+            else:
+                copy = inner_file(path, outer, terms.limits)
+                self._file, self._digest = stack.enter_context(copy.file), copy.sha256
             if terms.sha256 is not None:
                 _verify(path, self._sha256(), terms.sha256.lower())
-            self._zip = stack.enter_context(zipfile.ZipFile(self._file))
-            _check(path, self._zip, terms.limits)
+            self._zip = stack.enter_context(checked_archive(path, self._file, terms.limits))
             self._open = stack.pop_all()
 
     def close(self) -> None:
         self._open.close()
 
     def contents(self) -> Contents:
-        entries = {_name(entry): entry for entry in self._zip.infolist() if not entry.is_dir()}
+        entries = {entry_name(entry): entry for entry in self._zip.infolist() if not entry.is_dir()}
         present = [name for name in _XML_FILES if name in entries]
         _refuse_large_description(self.path, {name: entries[name].file_size for name in present}, self._limits)
-        with _reading(self.path):
+        with reading(self.path):
             return Contents(frozenset(entries), {name: self._zip.read(entries[name]) for name in present})
 
+    def read(self, name: str) -> bytes:
+        entry = next((one for one in self._zip.infolist() if entry_name(one) == name and not one.is_dir()), None)
+        if entry is None:
+            raise _no_file(self.path, name)
+        _refuse_large_description(self.path, {name: entry.file_size}, self._limits)
+        with reading(self.path):
+            return self._zip.read(entry)
+
     def content_sha256(self) -> str:
-        with _reading(self.path):
+        with reading(self.path):
             return self._sha256()
 
     def unpack_into(self, folder: Path) -> None:
-        with _reading(self.path):
+        with reading(self.path):
             for entry in self._zip.infolist():
-                _write(self._zip, entry, folder)
+                write_entry(self._zip, entry, folder)
 
     def _sha256(self) -> str:
         if self._digest is None:
             self._digest = files.sha256_of_open(self._file, again=self._verifies)
         return self._digest
-
-
-@contextmanager
-def _reading(path: Path) -> Iterator[None]:
-    """Convert what can go wrong while an archive is read to `LoadFailed`."""
-    try:
-        yield
-    except FileNotFoundError as error:
-        raise LoadFailed(f"'{path}' does not exist.") from error
-    except zipfile.BadZipFile as error:
-        is_zip = files.is_file(path) and zipfile.is_zipfile(path)
-        what = f"is a damaged ZIP archive: {error}" if is_zip else "is no ZIP archive, so it is no FMU."
-        raise LoadFailed(f"'{path}' {what}") from error
-    except (zlib.error, lzma.LZMAError, EOFError) as error:
-        raise LoadFailed(f"'{path}' is a damaged ZIP archive: {error}") from error
-    except OSError as error:
-        raise LoadFailed(f"'{path}' cannot be read: {error.strerror or error}.") from error
-    except (RuntimeError, ValueError) as error:  # `zipfile` raises them for entries that it cannot read
-        raise LoadFailed(f"'{path}' cannot be extracted: {error}") from error
 
 
 def _verify(path: Path, found: str, expected: str) -> None:
@@ -224,79 +227,17 @@ def _verify(path: Path, found: str, expected: str) -> None:
         )
 
 
-def _check(path: Path, archive: zipfile.ZipFile, limits: LimitsConfig) -> None:
-    """Check that all entries of an archive may be unpacked.
-
-    Raises:
-        LoadFailed: an entry exceeds a limit or would be written outside the folder.
-    """
-    entries = archive.infolist()
-    hint = "If you trust it, raise `limits` in the configuration."
-    if len(entries) > limits.entries:
-        raise LoadFailed(f"'{path}' has {len(entries)} entries; the limit is {limits.entries}.", hint=hint)
-    names: set[str] = set()
-    for entry in entries:
-        _check_entry(path, entry)
-        name = _name(entry)
-        if name in names and not entry.is_dir():
-            raise LoadFailed(f"'{path}' has two entries with one name: '{name}'.")
-        names.add(name)
-    unpacked = sum(entry.file_size for entry in entries)
-    if unpacked > limits.unpacked_bytes:
-        text = f"'{path}' has {unpacked} bytes when it is unpacked; the limit is {limits.unpacked_bytes}."
-        raise LoadFailed(text, hint=hint)
-    packed = max(1, sum(entry.compress_size for entry in entries))
-    if unpacked > _HARMLESS_BYTES and unpacked > limits.ratio * packed:
-        text = f"'{path}' is {unpacked / packed:.0f} times as large when it is unpacked; the limit is {limits.ratio:g}."
-        raise LoadFailed(text, hint=hint)
-
-
-def _name(entry: zipfile.ZipInfo) -> str:
-    """The name of an entry without the leading `./` that some tools write."""
-    return str(PurePosixPath(entry.filename))
-
-
-def _check_entry(path: Path, entry: zipfile.ZipInfo) -> None:
-    name = entry.filename
-    relative = PurePosixPath(name)
-    has_drive = any(":" in part for part in relative.parts[:1])
-    has_name = bool(relative.parts) or entry.is_dir()
-    if not has_name or relative.is_absolute() or ".." in relative.parts or has_drive:
-        raise LoadFailed(f"'{path}' has an entry outside its own folder: '{name}'.")
-    if "\\" in name:
-        raise LoadFailed(
-            f"'{path}' has an entry with a backslash in its name: '{name}' (FMI 2.0, 2.3: the separator is '/').",
-            hint="Unpack it with a tool that accepts backslashes, and zip it again.",
-        )
-    kind = stat.S_IFMT(entry.external_attr >> 16)
-    if kind == stat.S_IFLNK:
-        raise LoadFailed(f"'{path}' has a symbolic link inside: '{name}'.")
-    if kind not in (0, stat.S_IFREG, stat.S_IFDIR):
-        raise LoadFailed(f"'{path}' has something inside that is neither a file nor a folder: '{name}'.")
-    if entry.flag_bits & _ENCRYPTED:
-        raise LoadFailed(f"'{path}' is encrypted: '{name}'.")
-
-
-def _write(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, folder: Path) -> None:
-    """Unpack one entry, with permissions for this user only, and never more bytes than the archive declares."""
-    target = folder / PurePosixPath(entry.filename)
-    if entry.is_dir():
-        target.mkdir(parents=True, exist_ok=True)
-        return
-    target.parent.mkdir(parents=True, exist_ok=True)
-    executable = (entry.external_attr >> 16) & stat.S_IXUSR
-    with archive.open(entry) as source, target.open("xb") as file:
-        shutil.copyfileobj(source, file, _CHUNK)  # `ZipExtFile` ends at the declared size
-    target.chmod(0o700 if executable else 0o600)
-
-
 def _refuse_large_description(path: Path, sizes: dict[str, int], limits: LimitsConfig) -> None:
     for name, size in sizes.items():
         if size > limits.description_bytes:
             raise LoadFailed(
                 f"the {name} of '{path}' has {size} bytes; the limit is {limits.description_bytes}.",
-                hint="If you trust it, raise `limits` in the configuration.",
+                hint=LIMITS_HINT,
             )
+
+
+def _no_file(path: Path, name: str) -> LoadFailed:
+    return LoadFailed(f"'{path}' has no file '{name}'.")
 
 
 # --- a folder
@@ -319,6 +260,15 @@ class _Folder:
             sizes = {name: (self.path / name).stat().st_size for name in _XML_FILES if name in names}
             _refuse_large_description(self.path, sizes, self._limits)
             return Contents(names, {name: (self.path / name).read_bytes() for name in sizes})
+        except OSError as error:
+            raise LoadFailed(f"'{self.path}' cannot be read: {error.strerror}.") from error
+
+    def read(self, name: str) -> bytes:
+        try:
+            if name not in _names_in(self.path):
+                raise _no_file(self.path, name)
+            _refuse_large_description(self.path, {name: (self.path / name).stat().st_size}, self._limits)
+            return (self.path / name).read_bytes()
         except OSError as error:
             raise LoadFailed(f"'{self.path}' cannot be read: {error.strerror}.") from error
 

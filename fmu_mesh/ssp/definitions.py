@@ -1,0 +1,204 @@
+"""What a file defines for its other parts (SSP 2.0, 4.3, 4.4): units, enumerations, and transformations of values.
+
+Units and enumerations belong to their file. What a unit of one file is in another one is decided by its base units.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from typing import Final, Literal
+
+from ..text import listed, nearest, shown
+from ..variables.units import BaseUnit
+from ..variables.value_types import INTEGERS
+from .grammar import PATTERNS
+from .problems import Problems
+from .structure import Enumeration, MapEntry, Place, Transformation, Unit
+from .xml_reading import XmlElement
+
+__all__ = ["enumeration_named", "enumerations_of", "transformation_of", "unit_named", "units_of"]
+
+_KINDS: Final[dict[str, Literal["linear", "boolean", "integer", "enumeration"]]] = {
+    "ssc:LinearTransformation": "linear",
+    "ssc:BooleanMappingTransformation": "boolean",
+    "ssc:IntegerMappingTransformation": "integer",
+    "ssc:EnumerationMappingTransformation": "enumeration",
+}
+_BOOLEANS: Final = {"true": "true", "1": "true", "false": "false", "0": "false"}
+
+
+def units_of(root: XmlElement, tag: str, problems: Problems) -> dict[str, Unit]:
+    """The units that a file defines, by name.
+
+    Args:
+        root: the root of the file, or of a parameter set inside another file.
+        tag: of the list in it: `ssd:Units`, `ssv:Units` or `ssb:Units`.
+        problems: where a second unit of one name goes, and a unit into which nothing can be converted; such a unit has
+            no base units.
+    """
+    units: dict[str, Unit] = {}
+    for element in _unique(root, tag, "ssc:Unit", problems):
+        name, base = element.text("name"), element.child("ssc:BaseUnit")
+        units[name] = Unit(name, _base_unit(base, problems) if base is not None else None)
+    return units
+
+
+def unit_named(name: str, units: dict[str, Unit], place: Place, problems: Problems) -> Unit:
+    """The unit that an attribute `unit` names; an empty name is explicitly no unit.
+
+    A unit that the file does not define has no base units. There is one warning for each such name and file, because
+    it is added to ``units``.
+
+    Args:
+        name: the value of the attribute.
+        units: what `units_of` returned for the file.
+        place: the element with the attribute.
+        problems: where the warning goes.
+    """
+    if name and name not in units:
+        near = nearest(name, units)
+        problems.warn(
+            place,
+            f"the unit {shown(name)}, which the file does not define: values in it are not converted",
+            f"one of its Units: {listed(list(units))}{f' (did you mean {shown(near)}?)' if near else ''}",
+        )
+        units[name] = Unit(name)
+    return units[name] if name else Unit("")
+
+
+def enumerations_of(root: XmlElement, tag: str, problems: Problems) -> dict[str, Enumeration]:
+    """The enumerations that a file defines, by name.
+
+    Args:
+        root: the root of the file, or of a parameter set inside another file.
+        tag: of the list in it: `ssd:Enumerations`, `ssv:Enumerations` or `ssb:Enumerations`.
+        problems: where a second enumeration or item of one name goes, and numbers of more than 64 bits.
+    """
+    enumerations: dict[str, Enumeration] = {}
+    for element in _unique(root, tag, "ssc:Enumeration", problems):
+        items: dict[str, int] = {}
+        for item in element.children("ssc:Item"):
+            name, number = item.text("name"), item.integer("value")
+            if name in items:
+                problems.add(item.place, f"a second item {shown(name)}", "one item of each name")
+            elif number not in INTEGERS["Enumeration"]:
+                problems.add(item.place, f"the value {number}", "a whole number of 64 bits")
+            else:
+                items[name] = number
+        enumerations[element.text("name")] = Enumeration(element.text("name"), items)
+    return enumerations
+
+
+def enumeration_named(
+    name: str, enumerations: Mapping[str, Enumeration], place: Place, problems: Problems
+) -> Enumeration | None:
+    """The enumeration that an attribute `name` of a type names; None after a warning if the file does not define it.
+
+    Args:
+        name: the value of the attribute.
+        enumerations: what `enumerations_of` returned for the file.
+        place: the element with the attribute.
+        problems: where the warning goes.
+    """
+    found = enumerations.get(name)
+    if found is None and name:  # without a name there is a finding
+        near = nearest(name, enumerations)
+        problems.warn(
+            place,
+            f"the enumeration {shown(name)}, which the file does not define: the items of the FMU count",
+            f"one of its Enumerations: {listed(list(enumerations))}{f' (did you mean {shown(near)}?)' if near else ''}",
+        )
+    return found
+
+
+def transformation_of(element: XmlElement, problems: Problems) -> Transformation | None:
+    """The transformation of a connection or of an entry of a mapping; None if it has none.
+
+    Entries of a mapping whose values are wrong, and all but the first for one source, are findings and left out.
+
+    Args:
+        element: the `ssd:Connection` or `ssm:MappingEntry`.
+        problems: where mistakes go.
+    """
+    found = [*element.children(*_KINDS)]
+    if not found:
+        return None
+    for second in found[1:]:
+        if second.tag != found[0].tag:  # of the same element, there is a finding
+            problems.add(second.place, "a second transformation", "one at most")
+    kind = _KINDS[found[0].tag]
+    if kind == "linear":
+        return _linear(found[0], problems)
+    return Transformation(kind, found[0].place, entries=tuple(_entries(found[0], kind, problems)))
+
+
+def _unique(root: XmlElement, tag: str, child: str, problems: Problems) -> Iterator[XmlElement]:
+    """The definitions in a list; those with a name that another one has already are findings instead."""
+    lines: dict[str, int] = {}
+    for element in root.inside(tag):
+        name = element.text("name")
+        if element.tag != child or not name:
+            continue  # there is a finding
+        if name in lines:
+            found = f"a second {child.partition(':')[2].lower()} {shown(name)}"
+            problems.add(element.place, found, f"one of this name (first: line {lines[name]})")
+        else:
+            lines[name] = element.place.line
+            yield element
+
+
+def _base_unit(element: XmlElement, problems: Problems) -> BaseUnit | None:
+    """A unit in base units; None after a finding."""
+    unit = BaseUnit(
+        **{name: element.integer(name) for name in ("kg", "m", "s", "A", "K", "mol", "cd", "rad")},
+        factor=element.number("factor", 1.0) or 0.0,
+        offset=element.number("offset", 0.0) or 0.0,
+    )
+    if unit.usable:
+        return unit
+    found = f"factor {unit.factor:g} and offset {unit.offset:g}"
+    problems.add(element.place, found, "a finite factor that is not 0, and a finite offset")
+    return None
+
+
+def _linear(element: XmlElement, problems: Problems) -> Transformation:
+    factor, offset = element.number("factor", 1.0) or 0.0, element.number("offset", 0.0) or 0.0
+    if not (math.isfinite(factor) and math.isfinite(offset)):
+        problems.add(element.place, f"factor {factor:g} and offset {offset:g}", "finite numbers")
+        factor, offset = 1.0, 0.0
+    return Transformation("linear", element.place, factor, offset)
+
+
+def _entries(element: XmlElement, kind: str, problems: Problems) -> Iterator[MapEntry]:
+    lines: dict[str, int] = {}
+    for entry in element.children("ssc:MapEntry"):
+        source, target = (_map_value(entry, side, kind, problems) for side in ("source", "target"))
+        if source is None or target is None:
+            continue
+        if source in lines:
+            found = f"a second entry for the source {shown(source)}"
+            problems.add(entry.place, found, f"one entry for each source (first: line {lines[source]})")
+            continue
+        lines[source] = entry.place.line
+        yield MapEntry(source, target, entry.place)
+
+
+def _map_value(entry: XmlElement, side: str, kind: str, problems: Problems) -> str | None:
+    """One value of an entry in its shortest form: `true` for 1, `3` for +03; None if there is a finding."""
+    text = entry.get(side)
+    if text is None:
+        return None
+    value: str | None = text
+    expected = "the name of an item"
+    match kind:
+        case "boolean":
+            value, expected = _BOOLEANS.get(text.strip()), "true or false"
+        case "integer":
+            value = str(int(text)) if PATTERNS["integer"].fullmatch(text.strip()) else None
+            expected = "a whole number"
+        case _ if not text:
+            value = None
+    if value is None:
+        problems.add(entry.place, f"{side} {shown(text)}", expected)
+    return value

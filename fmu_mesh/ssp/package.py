@@ -1,0 +1,176 @@
+"""The files of a package: an .ssp archive, a folder that somebody has unpacked, or one .ssd and what lies beside it.
+
+Owns how the URIs in a package become paths, and that none leads out of it. The protection against hostile archives is
+that of FMUs (`fmu_mesh.instances.fmi.archive`).
+"""
+
+from __future__ import annotations
+
+import posixpath
+import re
+from contextlib import ExitStack
+from pathlib import Path, PurePosixPath
+from types import TracebackType
+from typing import Final, Self
+from urllib.parse import unquote
+
+from .. import files
+from ..errors import ConfigurationError, LoadFailed
+from ..instances.fmi.archive.archive import OpenFmu, opened
+from ..text import listed, nearest, nearest_file
+from .problems import Problems
+from .structure import Place
+
+__all__ = ["DEFAULT", "Package", "is_package"]
+
+DEFAULT: Final = "SystemStructure.ssd"
+_SCHEME: Final = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):")
+_SUFFIXES: Final = (".ssp", ".ssd")
+
+
+def is_package(path: Path) -> bool:
+    """Whether a path is meant as a package: by its suffix, or as a folder with a SystemStructure.ssd."""
+    return path.suffix.lower() in _SUFFIXES or files.is_file(path / DEFAULT)
+
+
+class Package:
+    """The files of one package, as a context manager.
+
+    Names of files are relative to the package, with `/` between the parts. A name may lead into an archive inside the
+    package, such as `resources/a.fmu/extra/start.ssv`.
+
+    Attributes:
+        root: the archive, or the folder.
+        given: the .ssd that the user named instead of the package; empty if there is none.
+
+    Args:
+        path: what the user named.
+
+    Raises:
+        ConfigurationError: it cannot be read.
+    """
+
+    def __init__(self, path: Path) -> None:
+        is_ssd = path.suffix.lower() == ".ssd" and not files.is_folder(path)
+        self.root = path.parent if is_ssd else path
+        self.given = path.name if is_ssd else ""
+        self._shown = path.parent if is_ssd else path
+        self._open = ExitStack()
+        self._containers: dict[str, OpenFmu] = {}
+        if is_ssd and not files.is_file(path):
+            raise _no_such_file(path)
+        self._container("")
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self._open.close()
+
+    @property
+    def is_archive(self) -> bool:
+        """Whether it is one file."""
+        return not files.is_folder(self.root)
+
+    @property
+    def descriptions(self) -> list[str]:
+        """The names of the system structure descriptions at its root, the default one first."""
+        names = [name for name in self.names() if name.lower().endswith(".ssd") and "/" not in name]
+        return sorted(names, key=lambda name: (name != DEFAULT, name))
+
+    def names(self, container: str = "") -> list[str]:
+        """The names of all files of the package, or of an archive inside it."""
+        return sorted(self._container(container).contents().names)
+
+    def shown(self, name: str) -> str:
+        """A file as messages name it."""
+        return str(self._shown / name)
+
+    def exists(self, name: str) -> bool:
+        """Whether there is a file of this name."""
+        try:
+            return self._owner(name) is not None
+        except ConfigurationError:
+            return False
+
+    def read(self, name: str) -> bytes:
+        """The bytes of a file.
+
+        Raises:
+            ConfigurationError: there is no such file, or it cannot be read.
+        """
+        owner = self._owner(name)
+        if owner is None:
+            near = nearest(name, self.names())
+            hint = f"Did you mean '{near}'?" if near is not None else f"It has {listed(self.names())}."
+            raise ConfigurationError(f"'{self._shown}' has no file '{name}'", hint=hint)
+        try:
+            return self._container(owner[0]).read(owner[1])
+        except LoadFailed as error:
+            raise ConfigurationError(error.message, hint=error.hint) from error
+
+    def named_by(self, uri: str, base: str, place: Place, problems: Problems) -> str | None:
+        """The name of the file that a URI means; None after a finding.
+
+        Args:
+            uri: as the file has it, without a fragment.
+            base: the folder that it is relative to, such as `resources`; empty: the root of the package.
+            place: where it is written.
+            problems: gets URIs with a scheme, absolute ones, those out of the package, and files that do not exist.
+        """
+        expected = "a path inside the package, such as resources/model.fmu"
+        scheme = _SCHEME.match(uri)
+        if scheme is not None:
+            problems.add(place, f"the URI '{uri}' with the scheme '{scheme[1]}'", expected)
+            return None
+        text = unquote(uri)
+        name = posixpath.normpath(posixpath.join(base, text)) if text else ""
+        if not name or name == ".":
+            problems.add(place, f"the source '{uri}', which is this file itself", expected)
+            return None
+        if text.startswith("/") or name.startswith("../") or name == ".." or "\\" in text or "\0" in text:
+            problems.add(place, f"the source '{uri}', which leads out of the package", expected)
+            return None
+        if not self.exists(name):
+            near = nearest(name, self.names())
+            problems.add(place, f"no such file '{name}' in the package", "an existing file", near)
+            return None
+        return name
+
+    def _owner(self, name: str) -> tuple[str, str] | None:
+        """The container that has a file (empty: the package itself), and the name of the file in it."""
+        container, rest = "", name
+        while rest not in self._container(container).contents().names:
+            parts = PurePosixPath(rest).parts
+            inner = next(
+                (
+                    joined
+                    for count in range(1, len(parts))
+                    if (joined := "/".join(parts[:count])) in self._container(container).contents().names
+                ),
+                None,
+            )
+            if inner is None:
+                return None
+            container, rest = posixpath.join(container, inner), rest[len(inner) + 1 :]
+        return container, rest
+
+    def _container(self, name: str) -> OpenFmu:
+        """An archive or a folder with files, opened once."""
+        if name not in self._containers:
+            path = self.root / name if name else self.root
+            if not name and not files.exists(path):
+                raise _no_such_file(path)
+            try:
+                self._containers[name] = self._open.enter_context(opened(path))
+            except LoadFailed as error:
+                text = error.message.replace(", so it is no FMU", "")
+                raise ConfigurationError(text, hint=error.hint) from error
+        return self._containers[name]
+
+
+def _no_such_file(path: Path) -> ConfigurationError:
+    near = nearest_file(path)
+    return ConfigurationError(f"{path}: no such file", hint=f"Did you mean '{near}'?" if near is not None else None)

@@ -1,0 +1,244 @@
+"""From the XML of parameter values and of parameter mappings to Structs (SSP 2.0, 6 and 7).
+
+Owns which texts are values of which type. What the names mean in a system is `parameters`.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import sys
+from collections.abc import Mapping
+from typing import Final
+
+import numpy as np
+
+from ..text import shown
+from ..variables.value_types import INTEGERS, VariableType
+from .definitions import enumeration_named, enumerations_of, transformation_of, unit_named, units_of
+from .grammar import PATTERNS
+from .problems import Problems
+from .structure import Enumeration, MappingEntry, Parameter, ParameterMapping, ParameterSet, Unit
+from .xml_reading import XmlElement
+
+__all__ = ["VARIABLE_TYPES", "number_of", "parameter_mapping", "parameter_set"]
+
+VARIABLE_TYPES: Final[dict[str, VariableType]] = {
+    "Real": "Float64",
+    "Float64": "Float64",
+    "Float32": "Float32",
+    "Integer": "Int32",
+    "Int8": "Int8",
+    "UInt8": "UInt8",
+    "Int16": "Int16",
+    "UInt16": "UInt16",
+    "Int32": "Int32",
+    "UInt32": "UInt32",
+    "Int64": "Int64",
+    "UInt64": "UInt64",
+    "Boolean": "Boolean",
+    "String": "String",
+    "Enumeration": "Enumeration",
+    "Binary": "Binary",
+}
+"""The types of variables by the names of the elements for types (SSP 2.0, 4.4.1)."""
+
+_TYPES: Final = tuple(f"ssv:{name}" for name in VARIABLE_TYPES)
+_WITH_ELEMENTS: Final = ("String", "Enumeration", "Binary")
+_HEX: Final = re.compile(r"([0-9a-fA-F]{2})*")
+_LARGEST: Final = {
+    "Real": sys.float_info.max,
+    "Float64": sys.float_info.max,
+    "Float32": float(np.finfo(np.float32).max),
+}
+
+
+def parameter_set(
+    element: XmlElement,
+    problems: Problems,
+    units: Mapping[str, Unit] = {},
+    enumerations: Mapping[str, Enumeration] = {},
+) -> ParameterSet:
+    """The parameters of an SSV file, or of a set inside a system structure description.
+
+    A parameter whose values are wrong is a finding and has no values.
+
+    Args:
+        element: the `ssv:ParameterSet`.
+        problems: where mistakes go.
+        units: those of the file around it, which a set inside a description may use; its own ones come first.
+        enumerations: as ``units``.
+    """
+    own_units = {**units, **units_of(element, "ssv:Units", problems)}
+    own_enumerations = {**enumerations, **enumerations_of(element, "ssv:Enumerations", problems)}
+    lines: dict[str, int] = {}
+    parameters: list[Parameter] = []
+    for one in element.inside("ssv:Parameters"):
+        name = one.text("name")
+        if one.tag != "ssv:Parameter" or not name:
+            continue  # there is a finding
+        if name in lines:
+            expected = f"one of this name (first: line {lines[name]})"
+            problems.add(one.place, f"a second parameter {shown(name)}", expected)
+            continue
+        lines[name] = one.place.line
+        parameter = _parameter(one, own_units, own_enumerations, problems)
+        if parameter is not None:
+            parameters.append(parameter)
+    return ParameterSet(element.text("name"), tuple(parameters), element.place)
+
+
+def parameter_mapping(element: XmlElement, problems: Problems) -> ParameterMapping:
+    """The entries of an SSM file, or of a mapping inside a system structure description.
+
+    Entries with an empty source are left out, because they map nothing.
+
+    Args:
+        element: the `ssm:ParameterMapping`.
+        problems: where two entries with one target go, and wrong transformations.
+    """
+    lines: dict[str, int] = {}
+    entries: list[MappingEntry] = []
+    without: list[XmlElement] = []
+    for one in element.children("ssm:MappingEntry"):
+        source, target = one.get("source"), one.text("target")
+        if source is None or not target:
+            continue  # there is a finding
+        if not source:
+            without.append(one)
+            continue
+        if target in lines:
+            found = f"a second entry for the target {shown(target)}"
+            problems.add(one.place, found, f"one entry for each target (first: line {lines[target]})")
+            continue
+        lines[target] = one.place.line
+        suppressed = one.boolean("suppressUnitConversion")
+        entries.append(MappingEntry(source, target, one.place, suppressed, transformation_of(one, problems)))
+    if without:
+        several = f"{len(without)} entries with an empty source, which map nothing"
+        found = several if len(without) > 1 else "an entry with an empty source, which maps nothing"
+        problems.warn(without[0].place, found)
+    return ParameterMapping(tuple(entries), element.place)
+
+
+def number_of(text: str) -> float:
+    """The value of a text that is an xs:double, exactly as Python reads the same digits.
+
+    Example:
+        >>> number_of("1e-3"), number_of("-INF")
+        (0.001, -inf)
+    """
+    return float(text.replace("INF", "inf"))
+
+
+def _parameter(
+    element: XmlElement, units: dict[str, Unit], enumerations: Mapping[str, Enumeration], problems: Problems
+) -> Parameter | None:
+    """One parameter; None if it has no type."""
+    types = [*element.children(*_TYPES)]
+    if not types:
+        return None
+    for second in types[1:]:
+        if second.tag != types[0].tag:  # of the same element, there is a finding
+            problems.add(second.place, f"a second type {_local(second)}", "one type")
+    type_ = types[0]
+    kind, unit, enumeration = _local(type_), type_.get("unit"), type_.get("name")
+    dimensions, fits = _dimensions(element, problems)
+    values = _values(type_, problems)
+    if len(values) > 1 and fits and not dimensions:
+        found = "several values without a Dimension: they are taken as an array of the size that the variable has"
+        problems.warn(type_.place, found, '<ssc:Dimension size="..."/> for each dimension (SSP 2.0, 6.2)')
+    if dimensions and fits and values and math.prod(dimensions) != len(values):
+        sizes = " x ".join(map(str, dimensions))
+        found = f"{len(values)} value{'s' if len(values) > 1 else ''} for the dimensions {sizes}"
+        problems.add(type_.place, found, f"{math.prod(dimensions)} values, row by row")
+        fits = False
+    return Parameter(
+        element.text("name"),
+        kind,
+        values if fits else (),
+        element.place,
+        unit_named(unit, units, type_.place, problems) if unit is not None else None,
+        enumeration_named(enumeration, enumerations, type_.place, problems)
+        if kind == "Enumeration" and enumeration is not None
+        else None,
+        dimensions,
+    )
+
+
+def _dimensions(element: XmlElement, problems: Problems) -> tuple[tuple[int, ...], bool]:
+    """The sizes of an array, and whether all of them are known: a parameter has fixed sizes only (SSP 2.0, 4.4.3)."""
+    sizes: list[int] = []
+    fits = True
+    for dimension in element.children("ssc:Dimension"):
+        if dimension.get("sizeConnector") is not None:
+            problems.add(dimension.place, "the attribute 'sizeConnector' for a parameter", "size, a whole number")
+            fits = False
+        elif dimension.get("size") is None:
+            problems.add(dimension.place, "no attribute 'size'", "a whole number")
+            fits = False
+        sizes.append(dimension.integer("size"))
+    return tuple(sizes), fits
+
+
+def _values(element: XmlElement, problems: Problems) -> tuple[str, ...]:
+    """The values of a type's element, as written; empty after a finding."""
+    kind, text = _local(element), element.get("value")
+    inside = [*element.children("ssv:Value")] if kind in _WITH_ELEMENTS else []
+    if text is not None and inside:
+        problems.add(element.place, "the attribute 'value' and elements Value", "only one of them")
+        return ()
+    if kind in _WITH_ELEMENTS:
+        texts = [text] if text is not None else [one.text("value") for one in inside]
+        if not texts:
+            problems.add(element.place, "no value", "the attribute 'value', or elements Value")
+    else:
+        texts = (text or "").split()
+        if text is not None and not texts:
+            problems.add(element.place, "no value", _EXPECTED[kind])
+    wrong = next((one for one in texts if not _is_value(one, kind)), None)
+    if wrong is None:
+        return tuple(texts)
+    problems.add(element.place, f"the value {shown(wrong)}", _EXPECTED[kind])
+    return ()
+
+
+def _is_value(text: str, kind: str) -> bool:
+    """Whether a text is a value of a type."""
+    match kind:
+        case "Real" | "Float64" | "Float32":
+            return _is_number(text, kind)
+        case "Boolean":
+            return bool(PATTERNS["boolean"].fullmatch(text))
+        case "Binary":
+            return bool(_HEX.fullmatch(text.strip()))
+        case "Enumeration" | "String":
+            return bool(text) or kind == "String"
+        case _:
+            return bool(PATTERNS["integer"].fullmatch(text)) and int(text) in INTEGERS[VARIABLE_TYPES[kind]]
+
+
+def _is_number(text: str, kind: str) -> bool:
+    """Whether a text is a floating-point number of a type; one with digits must not become infinite."""
+    if text in ("INF", "-INF", "NaN"):
+        return True
+    return bool(PATTERNS["number"].fullmatch(text)) and abs(number_of(text)) <= _LARGEST[kind]
+
+
+_EXPECTED: Final = {
+    **{
+        name: f"a whole number from {INTEGERS[type_][0]} to {INTEGERS[type_][-1]}"
+        for name, type_ in VARIABLE_TYPES.items()
+        if type_ in INTEGERS
+    },
+    **{name: f"a number from {-largest!r} to {largest!r}, INF, -INF or NaN" for name, largest in _LARGEST.items()},
+    "Boolean": "true or false",
+    "Enumeration": "the name of an item",
+    "Binary": "an even number of hexadecimal digits",
+    "String": "a text",
+}
+"""What the values of a type are, in words."""
+
+
+def _local(element: XmlElement) -> str:
+    return element.tag.partition(":")[2]

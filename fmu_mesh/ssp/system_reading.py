@@ -1,0 +1,281 @@
+"""From a package to the values of a configuration, as a YAML file gives them.
+
+Owns which description of a package is read, what SSP cannot say and an option has to, and which part of the
+configuration came from which line.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Final, Literal
+
+from ..config.loading import Origin, PlainConfig
+from ..config.mesh import LimitsConfig
+from ..config.yaml_text import Plain
+from ..errors import ConfigurationError, LoadFailed
+from ..instances.fmi.archive.archive import Terms
+from ..instances.fmi.archive.reading import read_description
+from ..text import listed, nearest
+from ..variables.model_description import Kind, ModelDescription
+from .annotations import OPEN_MODELICA, OPEN_SIMULATION_PLATFORM, base_step_size, common_solvers, step_size_hint
+from .flattening import FlatConnection, FlatValue, flatten
+from .naming import instance_name, mesh_name
+from .package import DEFAULT, Package
+from .parameters import AppliedValue, changed, resolve_parameters
+from .problems import Problems
+from .ssd_reading import annotations_of, read_structure
+from .structure import Annotation, Component, Place, Structure, StructureSystem, components_of
+
+__all__ = ["NEEDED", "read_system"]
+
+NEEDED: Final = {
+    "simulation.step_size": "`--step-size S`, the communication step size in s",
+    "simulation.stop_time": "`--stop-time S`, the end of the simulation in s",
+    "simulation.algorithm": "`--algorithm jacobi`, as OMSimulator and libcosim step, or `--algorithm gauss_seidel`",
+}
+"""What a run needs and a package may not say, with the option that does."""
+
+_KINDS: Final[Mapping[str, Kind]] = {
+    "CoSimulation": "co_simulation",
+    "ModelExchange": "model_exchange",
+}
+_KNOWN: Final = {OPEN_MODELICA, OPEN_SIMULATION_PLATFORM}
+
+
+def read_system(path: Path, ssd: str | None = None) -> PlainConfig:
+    """Read a package as the values of a configuration.
+
+    What the configuration means is checked with everything else before a run; so are the findings of the package.
+
+    Args:
+        path: an .ssp file, a folder that was one, or an .ssd file.
+        ssd: which description of the package: the name of its file, or the name that it has; None: the default one.
+
+    Raises:
+        ConfigurationError: there is no such package or description, or it has no system.
+    """
+    problems = Problems()
+    with Package(path) as package:
+        name = _chosen(package, ssd)
+        structure = read_structure(package, name, problems)
+        if structure is None:
+            problems.raise_any(package.shown(name))
+        assert structure is not None  # otherwise there is a finding
+        return _Configuration(package, name, structure, problems).plain()
+
+
+def _chosen(package: Package, ssd: str | None) -> str:
+    """The file of the description that is asked for.
+
+    Raises:
+        ConfigurationError: there is none.
+    """
+    names = package.descriptions
+    if ssd is None:
+        if package.given:
+            return package.given
+        if DEFAULT in names:
+            return DEFAULT
+        inside = next((name for name in package.names() if name.endswith(f"/{DEFAULT}")), None)
+        hint = f"It has '{inside}': zip what is inside that folder." if inside else "Is it a package of SSP?"
+        if names:
+            hint = f"It has {listed(names)}: choose one with `--ssd`."
+        raise ConfigurationError(f"'{package.root}' has no {DEFAULT} at its root", hint=hint)
+    for wanted in (ssd, f"{ssd}.ssd"):
+        if wanted in names:
+            return wanted
+    titles: dict[str, str] = {}
+    for name in names:
+        structure = read_structure(package, name, Problems())
+        if structure is not None:
+            titles.setdefault(structure.name, name)
+    if ssd in titles:
+        return titles[ssd]
+    near = nearest(ssd, [*names, *titles])
+    hint = f"Did you mean '{near}'?" if near is not None else f"It has {listed(names)}."
+    raise ConfigurationError(f"'{package.root}' has no description '{ssd}'", hint=hint)
+
+
+class _Configuration:
+    """The values of a configuration, and where they come from."""
+
+    def __init__(self, package: Package, name: str, structure: Structure, problems: Problems) -> None:
+        self._package = package
+        self._name = name
+        self._structure = structure
+        self._problems = problems
+        self._components = dict(components_of(structure.system))
+        self._descriptions: dict[tuple[str, str], ModelDescription | None] = {}
+        self._file = Path(package.shown(name))
+        self._lines: dict[str, int] = {}
+        self._origins: dict[str, Origin] = {}
+
+    def plain(self) -> PlainConfig:
+        """All of it."""
+        system = self._structure.system
+        parameters = resolve_parameters(system, self._describe, self._problems)
+        units = {node: value.unit for node, value in parameters.of_systems.items() if value.unit is not None}
+        connections, values = flatten(system, self._describe, self._problems, units)
+        self._settle(connections, values, parameters.of_components, parameters.of_systems)
+        simulation = self._simulation()
+        data: dict[str, Plain] = {
+            "mesh": mesh_name(self._structure.name or self._package.root.stem),
+            "simulation": simulation,
+            "instances": self._instances(parameters.of_components, simulation),
+            "connections": [self._connection(number, one) for number, one in enumerate(connections)],
+        }
+        if self._package.is_archive:  # beside the archive, and not in it
+            data["record"] = {"file": "../results/{mesh}.csv"}
+        self._place("", self._structure.place)
+        self._note_annotations(system, simulation.get("step_size"))
+        return PlainConfig(
+            data,
+            self._file,
+            self._lines,
+            tuple(self._problems.findings),
+            origins=self._origins,
+            warnings=tuple(self._problems.warnings),
+            needed={key: option for key, option in NEEDED.items() if key.partition(".")[2] not in simulation},
+        )
+
+    def _describe(self, path: tuple[str, ...]) -> ModelDescription | None:
+        """The model description of a component; None if it cannot be read: then the plan has a finding."""
+        component = self._components[path]
+        if not component.source:
+            return None
+        key = component.source, component.implementation
+        if key not in self._descriptions:
+            kind: Literal["auto"] | Kind = _KINDS.get(component.implementation, "auto")
+            try:
+                path_of_fmu = self._package.root / component.source
+                found = read_description(path_of_fmu, Terms(LimitsConfig()), kind, to_run=False)
+            except LoadFailed:
+                found = None
+            self._descriptions[key] = found
+        return self._descriptions[key]
+
+    def _settle(
+        self,
+        connections: Iterable[FlatConnection],
+        values: Iterable[FlatValue],
+        of_components: dict[tuple[str, ...], dict[str, AppliedValue]],
+        of_systems: Mapping[tuple[tuple[str, ...], str], AppliedValue],
+    ) -> None:
+        """Give components the values of connectors of systems; a connected variable takes that of the connection."""
+        for value in values:
+            applied = of_systems.get(value.connector)
+            path, variable = value.target
+            if applied is not None:
+                description = self._describe(path)
+                target = description.variable_of(variable) if description is not None else None
+                of_components.setdefault(path, {})[variable] = changed(applied, value.change, target)
+        for connection in connections:
+            path, variable = connection.target
+            bound = of_components.get(path, {}).pop(variable, None)
+            if bound is not None and not self._is_input(path, variable):
+                found = f"a value for '{'.'.join((*path, variable))}', which a connection gives its value"
+                self._problems.warn(bound.origin, found)
+            elif bound is not None:
+                of_components[path][variable] = bound  # the value before the first one of the connection
+
+    def _is_input(self, path: tuple[str, ...], name: str) -> bool:
+        description = self._describe(path)
+        variable = description.variable_of(name) if description is not None else None
+        return variable is not None and variable.causality == "input"
+
+    # --- sections
+
+    def _simulation(self) -> dict[str, Plain]:
+        """What the package says about time."""
+        structure, simulation = self._structure, dict[str, Plain]()
+        if structure.start_time is not None:
+            simulation["start_time"] = structure.start_time
+        if structure.stop_time is not None:
+            simulation["stop_time"] = structure.stop_time
+        found = base_step_size(annotations_of(structure), self._problems)
+        if found is not None:
+            step_size, annotation = found
+            simulation |= {"step_size": step_size, "algorithm": "jacobi"}
+            for key in ("step_size", "algorithm"):
+                self._place(f"simulation.{key}", annotation.place)
+        self._place("simulation", structure.place)
+        return simulation
+
+    def _instances(
+        self, values: Mapping[tuple[str, ...], Mapping[str, AppliedValue]], simulation: Mapping[str, Plain]
+    ) -> dict[str, Plain]:
+        instances: dict[str, Plain] = {}
+        for path, component in self._components.items():
+            name = instance_name(path)
+            section: dict[str, Plain] = {"fmu": component.source}
+            place = f"instances.{name}"
+            self._place(place, component.place)
+            if component.implementation in _KINDS:
+                section["kind"] = _KINDS[component.implementation]
+            if (step_size := self._step_size(component, simulation)) is not None:
+                section["step_size"] = step_size
+            applied = values.get(path, {})
+            if applied:
+                section["start_values"] = {variable: one.value for variable, one in applied.items()}
+                for variable, one in applied.items():
+                    text = f"{one.origin.element}{f', {one.how}' if one.how else ''}"
+                    origin = Origin(one.origin.file, one.origin.line, text)
+                    self._origins[f"{place}.start_values.{variable}"] = origin
+            instances[name] = section
+        return instances
+
+    def _step_size(self, component: Component, simulation: Mapping[str, Plain]) -> float | None:
+        """The step size that libcosim is told for a component: the nearest multiple of the base step size."""
+        hint, base = step_size_hint(component.annotations, self._problems), simulation.get("step_size")
+        if hint is None or not isinstance(base, float):
+            return None
+        points = max(1, round(hint[0] / base))
+        if points * base != hint[0]:
+            found = f"the step size {hint[0]:g} s, for which {points * base:.12g} s is taken"
+            self._problems.warn(hint[1].place, found, f"a whole multiple of {base:g} s")
+        return points * base if points > 1 else None
+
+    def _connection(self, number: int, connection: FlatConnection) -> dict[str, Plain]:
+        """A connection as a configuration has it."""
+        self._place(f"connections[{number}]", connection.place)
+        ends = [f"{instance_name(path)}.{variable}" for path, variable in (connection.source, connection.target)]
+        written: dict[str, Plain] = {"from": ends[0], "to": ends[1]}
+        linear = connection.change.linear
+        if linear.factor != 1.0:
+            written["factor"] = linear.factor
+        if linear.offset != 0.0:
+            written["offset"] = linear.offset
+        if connection.change.ignore_units:
+            written["ignore_units"] = True
+        if connection.change.mapping:
+            written["map"] = dict(connection.change.mapping)
+        return written
+
+    def _place(self, path: str, place: Place) -> None:
+        """Note where a part of the configuration is written; in another file than the description, with that file."""
+        if place.file == str(self._file):
+            self._lines[path] = place.line
+        elif path:
+            self._origins[path] = Origin(place.file, place.line, place.element)
+
+    def _note_annotations(self, system: StructureSystem, step_size: Plain) -> None:
+        """Note which annotations of a system, and of those in it, have no effect."""
+        annotations = annotations_of(self._structure) if system is self._structure.system else system.annotations
+        own = base_step_size(system.annotations, Problems())
+        if own is not None and own[0] != step_size:
+            found = f"a step size of {own[0]:g} s for the system '{system.name}'"
+            self._problems.warn(own[1].place, found, "that of the root system, which all its instances have")
+        for solver, annotation in common_solvers(annotations):
+            found = f"the {solver} of the system '{system.name}', which is not used"
+            self._problems.warn(annotation.place, found, "one solver per model-exchange FMU, see `solver`")
+        unknown: dict[str, Annotation] = {}
+        for element in system.elements:
+            annotations += element.annotations if isinstance(element, Component) else ()
+            if isinstance(element, StructureSystem):
+                self._note_annotations(element, step_size)
+        for annotation in annotations:
+            if annotation.type not in _KNOWN:
+                unknown.setdefault(annotation.type, annotation)
+        for type_, annotation in unknown.items():
+            self._problems.warn(annotation.place, f"the annotation '{type_}' is not known, and has no effect")

@@ -1,0 +1,275 @@
+"""From the bytes of one XML file to an element whose names, attributes and values are those of the standard.
+
+Owns the safety of the parser, the namespaces, and the check against `grammar`. What the elements mean is
+`ssd_reading` and `parameter_reading`.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from typing import Any, Final
+
+from lxml import etree
+
+from ..errors import LoadFailed
+from ..instances.fmi.archive.examining import safe_xml
+from ..text import listed, nearest, shown
+from .grammar import GRAMMAR, NAMESPACES, PATTERNS, Attribute, Rule
+from .problems import Problems
+from .structure import Annotation, Place
+
+__all__ = ["XmlElement", "read_xml"]
+
+_SHOWN_ATTRIBUTES: Final = ("name", "source", "type")
+_PREFIXES: Final = {namespace: prefix for prefix, namespace in NAMESPACES.items()}
+_VERSIONS: Final = ("1.0", "2.0")
+_INLINE: Final = ("ssv:ParameterSet", "ssm:ParameterMapping", "ssb:SignalDictionary")
+_UNBOUND: Final = re.compile(r"Namespace prefix (\S+)(?: for \S+)? on (\S+) is not defined")
+_DOCUMENT_TYPE: Final = re.compile(rb"<!DOCTYPE")
+
+
+class XmlElement:
+    """An element of a file that was checked; its attributes have valid values, or there is a finding about them.
+
+    Attributes:
+        tag: with the usual prefix, such as `ssd:System`; a foreign element has its namespace in braces.
+        place: where it is.
+        version: of the file, `1.0` or `2.0`.
+    """
+
+    def __init__(self, element: Any, file: str, version: str) -> None:  # noqa: ANN401  lxml ships no types
+        self._element = element
+        self._file = file
+        self.tag = _name_of(element)
+        self.version = version
+
+    @property
+    def place(self) -> Place:
+        """Its file and line, and its name in words: `Connector 'u' of Component 'gain'`."""
+        return Place(self._file, self._element.sourceline or 0, _in_words(self._element))
+
+    def get(self, name: str) -> str | None:
+        """An attribute as text; None if it is not given."""
+        value: str | None = self._element.get(name)
+        return value
+
+    def text(self, name: str) -> str:
+        """A required attribute; empty where it is missing, for which there is a finding."""
+        return self.get(name) or ""
+
+    def number(self, name: str, default: float | None = None) -> float | None:
+        """A number; ``default`` where it is not given, or is no number."""
+        return _number(self.get(name), default)
+
+    def integer(self, name: str, default: int = 0) -> int:
+        """A whole number; ``default`` where it is not given, or is none."""
+        text = (self.get(name) or "").strip()
+        return int(text) if PATTERNS["integer"].fullmatch(text) else default
+
+    def boolean(self, name: str) -> bool:
+        """A truth value; false where it is not given."""
+        return (self.get(name) or "").strip() in ("true", "1")
+
+    def numbers(self, name: str) -> tuple[int, ...]:
+        """A list of whole numbers, empty where it is not given."""
+        return tuple(int(word) for word in (self.get(name) or "").split() if word.isdigit())
+
+    def children(self, *tags: str) -> Iterator[XmlElement]:
+        """The children with one of these tags, in their order; all of them if no tag is given."""
+        for child in self._element:
+            if isinstance(child.tag, str) and (not tags or _name_of(child) in tags):
+                # A parameter set or a mapping inside a description has a version of its own.
+                own = child.get("version") if _name_of(child) in _INLINE else None
+                yield XmlElement(child, self._file, (own or self.version).strip())
+
+    def child(self, *tags: str) -> XmlElement | None:
+        """The first child with one of these tags; None if there is none."""
+        return next(self.children(*tags), None)
+
+    def inside(self, tag: str) -> Iterator[XmlElement]:
+        """The children of the child with this tag."""
+        child = self.child(tag)
+        return child.children() if child is not None else iter(())
+
+    def annotations(self) -> tuple[Annotation, ...]:
+        """The annotations of this element."""
+        return tuple(
+            Annotation(one.text("type"), b"".join(etree.tostring(child) for child in one._element), one.place)  # noqa: SLF001  of this class
+            for one in self.inside(f"{self.tag.partition(':')[0]}:Annotations")
+        )
+
+    def with_id(self, identifier: str) -> XmlElement | None:
+        """The element of the whole file with this `id`; None if there is none."""
+        for element in self._element.getroottree().iter():
+            if isinstance(element.tag, str) and element.get("id") == identifier:
+                return XmlElement(element, self._file, self.version)
+        return None
+
+    def check(self, problems: Problems) -> None:
+        """Check this element and all that is inside it against the grammar."""
+        rule = GRAMMAR.get(self.tag)
+        if rule is None or rule.anything:
+            return
+        self._check_attributes(rule, problems)
+        counts: dict[str, int] = {}
+        for child in self.children():
+            if child.tag not in rule.children:
+                names = [name.partition(":")[2] for name in rule.children]
+                own = child.tag.rpartition("}")[2].rpartition(":")[2]
+                near = nearest(own, names)
+                namespace = _wrong_namespace(child.tag, near, rule)
+                expected = f"one of {listed(names)}" if names else "nothing inside it"
+                problems.add(child.place, f"the element {namespace or own} in {_kind(self.tag)}", expected, near)
+                continue
+            counts[child.tag] = counts.get(child.tag, 0) + 1
+            if counts[child.tag] > 1 and not rule.children[child.tag]:
+                problems.add(child.place, f"a second {_kind(child.tag)} in {self.place.element}", "one at most")
+            child.check(problems)
+        if rule.choice and not any(tag in counts for tag in rule.choice):
+            names = [tag.partition(":")[2] for tag in rule.choice]
+            problems.add(self.place, "no type", f"one of {listed(names)}")
+        for tag in rule.required:
+            if tag not in counts:
+                problems.add(self.place, f"no {_kind(tag)}", "one")
+
+    def _check_attributes(self, rule: Rule, problems: Problems) -> None:
+        for name, text in self._element.attrib.items():
+            if name.startswith("{"):
+                continue  # of another namespace, such as xsi:schemaLocation
+            attribute = rule.attributes.get(name)
+            if attribute is None:
+                names = [*rule.attributes]
+                expected = f"one of {listed(names)}" if names else "no attributes"
+                problems.add(self.place, f"the attribute '{name}'", expected, nearest(name, names))
+                continue
+            _check_value(self, name, text, attribute, problems)
+            if attribute.since == "2.0" and self.version == "1.0":
+                problems.warn(self.place, f"the attribute '{name}' of SSP 2.0 in a file that says version 1.0")
+        for name, attribute in rule.attributes.items():
+            if attribute.required and self._element.get(name) is None:
+                problems.add(self.place, f"no attribute '{name}'", attribute.expected)
+        if rule.since == "2.0" and self.version == "1.0":
+            problems.warn(self.place, f"{_kind(self.tag)} of SSP 2.0 in a file that says version 1.0")
+
+
+def read_xml(data: bytes, file: str, tag: str, problems: Problems) -> XmlElement | None:
+    """Parse and check one file.
+
+    Args:
+        data: its bytes.
+        file: the file as messages name it.
+        tag: what its root must be, such as `ssd:SystemStructureDescription`.
+        problems: collects what is wrong.
+
+    Returns:
+        The root; None if it is no such file at all, for which there is a finding.
+    """
+    try:
+        root = safe_xml(data, f"'{file}'")
+    except LoadFailed as error:
+        _add_syntax(data, file, error, problems)
+        return None
+    found = XmlElement(root, file, (root.get("version") or "").strip())
+    if found.tag != tag:
+        local = etree.QName(root).localname
+        wanted = tag.partition(":")[2]
+        if local == wanted:
+            namespace = etree.QName(root).namespace
+            text = f"the namespace '{namespace}'" if namespace else "no namespace"
+            problems.add(found.place, f"{wanted} in {text}", f"'{NAMESPACES[tag.partition(':')[0]]}' (SSP 1.0 and 2.0)")
+        else:
+            problems.add(found.place, f"the root element {local}", wanted, wanted if local in _ROOTS else None)
+        return None
+    if found.version and found.version not in _VERSIONS:
+        problems.add(found.place, f"the version {shown(found.version)}", "1.0 or 2.0")
+        return None
+    found.check(problems)
+    return found
+
+
+_ROOTS: Final = ("SystemStructureDescription", "ParameterSet", "ParameterMapping", "SignalDictionary")
+
+
+def _add_syntax(data: bytes, file: str, error: LoadFailed, problems: Problems) -> None:
+    """Add a finding for XML that cannot be parsed, or must not be."""
+    cause = error.__cause__
+    if isinstance(cause, etree.XMLSyntaxError):
+        line = cause.lineno or 1
+        if (unbound := _UNBOUND.search(cause.msg or "")) is not None:
+            found = f"the prefix '{unbound[1]}' of {unbound[1]}:{unbound[2]}, which is bound to no namespace"
+            problems.add(Place(file, line, ""), found, f'xmlns:{unbound[1]}="..." on it or on an element around it')
+        else:
+            problems.add(Place(file, line, ""), f"no well-formed XML: {cause.msg}", "XML 1.0")
+        return
+    match = _DOCUMENT_TYPE.search(data)
+    line = data.count(b"\n", 0, match.start()) + 1 if match is not None else 1
+    found = "a document type, with which XML can expand without limit and read other files"
+    problems.add(Place(file, line, ""), found, "none: no file of SSP has one")
+
+
+def _check_value(element: XmlElement, name: str, text: str, attribute: Attribute, problems: Problems) -> None:
+    words = text.split() if attribute.is_list else [text if attribute.type in ("text", "name") else text.strip()]
+    for word in words:
+        if attribute.words:
+            if word not in attribute.words:
+                near = nearest(word, attribute.words)
+                problems.add(element.place, f"{name} {shown(word)}", attribute.expected, near)
+        elif not PATTERNS[attribute.type].fullmatch(word):
+            problems.add(element.place, f"{name} {shown(word)}", attribute.expected)
+
+
+def _wrong_namespace(tag: str, near: str | None, rule: Rule) -> str | None:
+    """A name with its namespace, where the name without it would be right."""
+    local = tag.rpartition("}")[2].rpartition(":")[2]
+    if near != local or not any(own.partition(":")[2] == local for own in rule.children):
+        return None
+    if tag.startswith("{"):
+        return f"{local} of the namespace '{tag[1:].partition('}')[0]}'"
+    prefix = tag.partition(":")[0]
+    return (
+        f"{local} of the namespace '{NAMESPACES[prefix]}'" if prefix in NAMESPACES else f"{local} without a namespace"
+    )
+
+
+def _name_of(element: Any) -> str:  # noqa: ANN401  lxml ships no types
+    name = etree.QName(element)
+    if name.namespace in _PREFIXES:
+        return f"{_PREFIXES[name.namespace]}:{name.localname}"
+    return str(element.tag)
+
+
+def _kind(tag: str) -> str:
+    return tag.rpartition("}")[2].rpartition(":")[2]
+
+
+def _in_words(element: Any) -> str:  # noqa: ANN401  lxml ships no types
+    """An element and the named ones around it: `Connector 'u' of Component 'gain'`."""
+    words: list[str] = []
+    while element is not None and len(words) < 2:
+        local = etree.QName(element).localname
+        name = next((f"'{element.get(key)}'" for key in _SHOWN_ATTRIBUTES if element.get(key)), None)
+        if local == "Connection":
+            name = f"'{_end(element, 'start')} - {_end(element, 'end')}'"
+        if local == "MappingEntry":
+            name = f"'{element.get('source')} to {element.get('target')}'"
+        if not words:
+            words.append(local if name is None else f"{local} {name}")
+        elif name is not None and local not in _ROOTS:
+            words.append(f"{local} {name}")
+        element = element.getparent()
+    return " of ".join(words)
+
+
+def _end(element: Any, side: str) -> str:  # noqa: ANN401  lxml ships no types
+    """One end of a connection as its attributes have it."""
+    owner, connector = element.get(f"{side}Element"), element.get(f"{side}Connector")
+    return f"{owner}.{connector}" if owner else str(connector)
+
+
+def _number(text: str | None, default: float | None) -> float | None:
+    """The value of an xs:double."""
+    text = (text or "").strip()
+    if not PATTERNS["number"].fullmatch(text):
+        return default
+    return float(text.replace("INF", "inf"))
