@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal, Self, Unpack, cast
 import msgspec
 
 from ..config.instance_sections import KIND
-from ..config.loading import PlainConfig, read_file, read_text
+from ..config.loading import PlainConfig, read_text
 from ..config.mesh import LimitsConfig
 from ..config.yaml_text import written
 from ..errors import CallRefused, ConfigurationError, FmuError, LoadFailed
@@ -21,6 +21,7 @@ from ..instances.registry import KINDS, check_engines
 from ..run.options import with_config_values, with_needed
 from ..run.preparing import KnownModels, planned
 from ..run.run_plan import RunPlan
+from ..ssp.configuration_files import read_configuration
 from ..text import listed, shown
 from .mesh_check import Check
 from .plan_options import PlanOptions, RunOptions, StartOptions, options_of, plain, with_record, with_scenario
@@ -102,9 +103,9 @@ class Mesh:
         return mesh
 
     @classmethod
-    def from_file(cls, path: str | Path) -> Self:
+    def from_file(cls, path: str | Path, *, ssd: str | None = None) -> Self:
         """As `load`."""
-        return cls.from_configuration(read_file(Path(path)))
+        return cls.from_configuration(read_configuration(Path(path), ssd))
 
     @classmethod
     def from_fmu(
@@ -517,16 +518,21 @@ class Mesh:
         return section
 
 
-def load(path: str | Path) -> Mesh:
-    """Read a configuration file.
+def load(path: str | Path, *, ssd: str | None = None) -> Mesh:
+    """Read a configuration: a YAML file, or a package of SSP.
 
     Example:
         >>> import fmu_mesh
         >>> fmu_mesh.load("configs/pendulum_delay.yaml").instances
         ['pendulum', 'delay']
 
+    Args:
+        path: the YAML file; or an .ssp file, the folder of an unpacked one, or an .ssd file.
+        ssd: which system structure description of a package: the name of its file, such as "VarB.ssd", or the name that
+            it has; None: SystemStructure.ssd.
+
     Raises:
         ConfigurationError: the file cannot be read, or is no YAML. What it means is checked by `Mesh.check`, and before
             a run.
     """
-    return Mesh.from_file(path)
+    return Mesh.from_file(path, ssd=ssd)

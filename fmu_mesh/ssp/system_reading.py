@@ -19,7 +19,7 @@ from ..errors import ConfigurationError, LoadFailed
 from ..instances.fmi.archive.archive import Terms
 from ..instances.fmi.archive.reading import read_description
 from ..text import listed, nearest
-from ..variables.model_description import Kind, ModelDescription
+from ..variables.model_description import Kind, ModelDescription, Variable
 from .annotations import OPEN_MODELICA, OPEN_SIMULATION_PLATFORM, base_step_size, common_solvers, step_size_hint
 from .flattening import FlatConnection, FlatValue, flatten
 from .naming import instance_name, mesh_name
@@ -205,7 +205,9 @@ class _Configuration:
             if applied is not None:
                 description = self._describe(path)
                 target = description.variable_of(variable) if description is not None else None
-                of_components.setdefault(path, {})[variable] = changed(applied, value.change, target)
+                given = changed(applied, value.change, target, path, self._problems)
+                if given is not None:
+                    of_components.setdefault(path, {})[variable] = given
         for connection in connections:
             path, variable = connection.target
             bound = of_components.get(path, {}).pop(variable, None)
@@ -291,6 +293,9 @@ class _Configuration:
             target = description.variable_of(name) if description is not None else None
             entries = connection.change.mapping.items()
             written["map"] = {have: _map_value(want, target) for have, want in entries}
+        if connection.change.place is not None:
+            for key in ("factor", "offset", "map"):
+                self._place(f"connections[{number}].{key}", connection.change.place)
         return written
 
     def _place(self, path: str, place: Place) -> None:

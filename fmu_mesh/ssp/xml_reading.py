@@ -109,6 +109,13 @@ class XmlElement:
                 return XmlElement(element, self._file, self.version)
         return None
 
+    def is_inside(self, other: XmlElement) -> bool:
+        """Whether this element is another one, or anywhere inside it."""
+        own: Any = self._element
+        while own is not None and own is not other._element:
+            own = own.getparent()
+        return own is not None
+
     def check(self, problems: Problems) -> None:
         """Check this element and all that is inside it against the grammar."""
         rule = GRAMMAR.get(self.tag)
@@ -267,7 +274,7 @@ def _in_words(element: Any) -> str:  # noqa: ANN401  lxml ships no types
 def _end(element: Any, side: str) -> str:  # noqa: ANN401  lxml ships no types
     """One end of a connection as its attributes have it."""
     owner, connector = element.get(f"{side}Element"), element.get(f"{side}Connector")
-    return f"{owner}.{connector}" if owner else str(connector)
+    return f"{owner}.{connector or '?'}" if owner else connector or "?"
 
 
 def _number(text: str | None, default: float | None) -> float | None:

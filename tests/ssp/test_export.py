@@ -61,12 +61,12 @@ def annotation_of(package: Path) -> dict[str, Any]:
     return content
 
 
-def rows_of(mesh: fmu_mesh.Mesh, file: Path, **options: Any) -> bytes:
+def rows_of(mesh: fmu_mesh.Mesh, file: Path, **options: Any) -> bytes:  # noqa: ANN401  those of a run
     mesh.run(output=str(file), processes=False, **options)
     return file.read_bytes()
 
 
-def assert_equal(mesh: fmu_mesh.Mesh, other: fmu_mesh.Mesh, folder: Path, **options: Any) -> None:
+def assert_equal(mesh: fmu_mesh.Mesh, other: fmu_mesh.Mesh, folder: Path, **options: Any) -> None:  # noqa: ANN401  those of a run
     """Both meshes have one plan, but for the paths of their files, and give one result file."""
     first, second = mesh.plan(**options).plan, other.plan(**options).plan
     assert other.name == mesh.name
