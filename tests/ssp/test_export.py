@@ -128,9 +128,10 @@ def test_what_ssp_cannot_say_is_kept_in_our_annotation(tmp_path: Path) -> None:
         limits={"entries": 1000},
         initialization={"tolerance": 1e-6},
         zenoh={"key_prefix": "lab"},
-        record=[{"file": "a.csv", "every": 2}, {"file": "b.csv", "variables": ["slow.y", "in:fast.*"], "from": 0.7}],
     )
     mesh = fmu_mesh.load(config)
+    mesh.record(file="a.csv", every=2)
+    mesh.record("slow.y", "in:fast.*", file="b.csv", start=0.7, also=True)
     mesh.connect("slow.y", "fast.u", factor=-2.5, offset=1e-3, delay=0)
     mesh.connect("fast.y", "slow.u", delay=1)
 
