@@ -156,6 +156,8 @@ class _Resolution:
         """Give a value to everything that has a name inside an element; return whether there is such a thing."""
         if isinstance(owner, Component):
             return self._note_variable(path, name, candidate)
+        if not owner.is_known:
+            return True  # for which there is a finding
         if path not in self._inside:
             connectors = {connector.name for connector in owner.connectors}
             self._inside[path] = connectors, {element.name: element for element in owner.elements}

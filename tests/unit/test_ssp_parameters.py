@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -168,11 +169,12 @@ def _resolve(folder: Path, root: str) -> tuple[ResolvedParameters, Problems]:
         "</ssd:SystemStructureDescription>"
     )
     (folder / "SystemStructure.ssd").write_text(text)
+    for name in re.findall(r'source="([^"]+\.fmu)"', root):
+        (folder / name).touch()  # what it is, the model description says
     problems = Problems()
     with Package(folder) as package:
         structure = read_structure(package, "SystemStructure.ssd", problems)
     assert structure is not None
-    problems.findings[:] = [one for one in problems.findings if ".fmu" not in one.found]  # there are no FMUs
     return resolve_parameters(structure.system, lambda _path: ALL, problems), problems
 
 
@@ -357,6 +359,15 @@ def test_the_value_of_an_fmu_that_cannot_be_read_is_not_judged() -> None:
 
     assert resolve_parameters(system, lambda _path: None, problems) == ResolvedParameters({}, {})
     assert not problems.findings + problems.warnings
+
+
+def test_the_names_of_an_element_that_cannot_be_read_are_not_judged(tmp_path: Path) -> None:
+    missing = '<ssd:Component name="m" type="x/unknown" source="m.x"/>'
+
+    _, problems = _resolve(tmp_path, _system("root", missing, _binding(_real("m.k", 1))))
+
+    assert "the type 'x/unknown'" in _one(problems.findings)
+    assert not problems.warnings
 
 
 # --- what has no effect
