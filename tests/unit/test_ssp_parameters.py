@@ -169,8 +169,8 @@ def _resolve(folder: Path, root: str) -> tuple[ResolvedParameters, Problems]:
         "</ssd:SystemStructureDescription>"
     )
     (folder / "SystemStructure.ssd").write_text(text)
-    for name in re.findall(r'source="([^"]+\.fmu)"', root):
-        (folder / name).touch()  # what it is, the model description says
+    for name in re.findall(r'source="([^"]+\.fmu)"', text):
+        (folder / name).touch()  # nothing reads it
     problems = Problems()
     with Package(folder) as package:
         structure = read_structure(package, "SystemStructure.ssd", problems)
