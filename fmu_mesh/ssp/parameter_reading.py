@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import re
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Final
 
 import numpy as np
@@ -22,7 +22,7 @@ from .problems import Problems
 from .structure import Enumeration, MappingEntry, Parameter, ParameterMapping, ParameterSet, Unit
 from .xml_reading import XmlElement
 
-__all__ = ["VARIABLE_TYPES", "number_of", "parameter_mapping", "parameter_set"]
+__all__ = ["VARIABLE_TYPES", "number_of", "parameter_mapping", "parameter_set", "refuse_ambiguous"]
 
 VARIABLE_TYPES: Final[dict[str, VariableType]] = {
     "Real": "Float64",
@@ -120,6 +120,21 @@ def parameter_mapping(element: XmlElement, problems: Problems) -> ParameterMappi
         found = several if len(without) > 1 else "an entry with an empty source, which maps nothing"
         problems.warn(without[0].place, found)
     return ParameterMapping(tuple(entries), element.place)
+
+
+def refuse_ambiguous(values: ParameterSet, names: Iterable[str], problems: Problems) -> None:
+    """Add a finding for each of some parameters of which the set has a second one with another value.
+
+    Args:
+        values: the set.
+        names: the parameters that are applied.
+        problems: where the findings go.
+    """
+    for name in names:
+        if name in values.ambiguous:
+            first = next(one.place.line for one in values.parameters if one.name == name)
+            found = f"a second parameter {shown(name)} with another value"
+            problems.add(values.ambiguous[name], found, f"one of this name (first: line {first})")
 
 
 def number_of(text: str) -> float:

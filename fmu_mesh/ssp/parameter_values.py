@@ -24,7 +24,7 @@ from .parameter_reading import VARIABLE_TYPES, number_of
 from .problems import Problems
 from .structure import Connector, MappingEntry, Parameter, Place, Transformation, Unit
 
-__all__ = ["AppliedValue", "Target", "changed", "converted", "target_of_connector", "target_of_variable"]
+__all__ = ["AppliedValue", "ValueTarget", "changed", "converted", "target_of_connector", "target_of_variable"]
 
 
 class AppliedValue(msgspec.Struct, frozen=True):
@@ -50,7 +50,7 @@ class AppliedValue(msgspec.Struct, frozen=True):
     items: dict[str, int] = {}
 
 
-class Target(msgspec.Struct, frozen=True):
+class ValueTarget(msgspec.Struct, frozen=True):
     """What a value is for.
 
     Attributes:
@@ -78,7 +78,7 @@ class _Misfit(Exception):
         self.suggestion = suggestion
 
 
-def target_of_variable(variable: Variable, path: tuple[str, ...], connector: Connector | None = None) -> Target:
+def target_of_variable(variable: Variable, path: tuple[str, ...], connector: Connector | None = None) -> ValueTarget:
     """A variable of an FMU as a target.
 
     Args:
@@ -90,10 +90,10 @@ def target_of_variable(variable: Variable, path: tuple[str, ...], connector: Con
     if unit is None and variable.unit:
         unit = Unit(variable.unit, variable.base_unit)
     words = f"the {variable.type_name} '{variable.name}' of '{'.'.join(path)}'"
-    return Target(words, variable.type, variable.shape, unit, variable.relative_quantity, dict(variable.items))
+    return ValueTarget(words, variable.type, variable.shape, unit, variable.relative_quantity, dict(variable.items))
 
 
-def target_of_connector(connector: Connector, path: tuple[str, ...]) -> Target:
+def target_of_connector(connector: Connector, path: tuple[str, ...]) -> ValueTarget:
     """A connector of a system as a target.
 
     Args:
@@ -105,11 +105,11 @@ def target_of_connector(connector: Connector, path: tuple[str, ...]) -> Target:
     items = connector.enumeration.items if connector.enumeration is not None else {}
     owner = f" of '{'.'.join(path)}'" if path else ""
     words = f"the connector '{connector.name}'{owner}"
-    return Target(words, VARIABLE_TYPES.get(connector.type or ""), shape, connector.unit, items=items)
+    return ValueTarget(words, VARIABLE_TYPES.get(connector.type or ""), shape, connector.unit, items=items)
 
 
 def converted(
-    parameter: Parameter, entry: MappingEntry | None, target: Target, problems: Problems
+    parameter: Parameter, entry: MappingEntry | None, target: ValueTarget, problems: Problems
 ) -> AppliedValue | None:
     """The value of a parameter as one for a target; None after a finding.
 
@@ -161,7 +161,7 @@ def changed(
         path: of the component.
         problems: where a finding goes if the value does not fit.
     """
-    target = Target(f"'{'.'.join(path)}'", None, None)
+    target = ValueTarget(f"'{'.'.join(path)}'", None, None)
     if variable is not None:
         target = target_of_variable(variable, path)
     elements = flattened(value.value, len(value.shape))
@@ -180,7 +180,9 @@ def changed(
 # --- steps
 
 
-def _shape(parameter: Parameter, sizes: tuple[int, ...], target: Target, problems: Problems) -> tuple[int, ...] | None:
+def _shape(
+    parameter: Parameter, sizes: tuple[int, ...], target: ValueTarget, problems: Problems
+) -> tuple[int, ...] | None:
     """The shape that the value gets; None after a finding. An array of unknown dimensions takes those of the target."""
     if target.shape is None or target.shape == sizes:
         return sizes
@@ -196,7 +198,7 @@ def _number_of_values(shape: tuple[int, ...]) -> str:
     return f"{' x '.join(map(str, shape))} values, with a Dimension for each size" if shape else "one value"
 
 
-def _unit_conversion(unit: Unit, parameter: Parameter, target: Target, problems: Problems) -> Linear | None:
+def _unit_conversion(unit: Unit, parameter: Parameter, target: ValueTarget, problems: Problems) -> Linear | None:
     """The conversion from the unit of a parameter to that of the target; None after a finding."""
     want = target.unit
     if want is None or not unit.name or not want.name or unit == want:
@@ -218,7 +220,7 @@ def _unit_conversion(unit: Unit, parameter: Parameter, target: Target, problems:
 
 
 def _transformed(
-    value: AppliedValue, elements: list[Any], transformation: Transformation, target: Target
+    value: AppliedValue, elements: list[Any], transformation: Transformation, target: ValueTarget
 ) -> tuple[AppliedValue, list[Any], str]:
     """A value after the transformation of its mapping (SSP 2.0, 4.4.2), and what was done in words.
 
@@ -274,12 +276,12 @@ def _connected(
     return value, elements, steps
 
 
-def _check_shape(value: AppliedValue, target: Target) -> None:
+def _check_shape(value: AppliedValue, target: ValueTarget) -> None:
     if target.shape is not None and target.shape != value.shape:
         raise _Misfit(_number_of_values(target.shape))
 
 
-def _as_target(value: AppliedValue, elements: list[Any], target: Target, how: str) -> AppliedValue:
+def _as_target(value: AppliedValue, elements: list[Any], target: ValueTarget, how: str) -> AppliedValue:
     """A value with the type and the shape of a target.
 
     Raises:
@@ -289,7 +291,7 @@ def _as_target(value: AppliedValue, elements: list[Any], target: Target, how: st
     return replace(value, value=plain, type=target.type or value.type, how=how, items=target.items or value.items)
 
 
-def _element(element: Any, value: AppliedValue, target: Target) -> Any:  # noqa: ANN401  the type says which
+def _element(element: Any, value: AppliedValue, target: ValueTarget) -> Any:  # noqa: ANN401  the type says which
     """One element as a value of the type of the target, without loss.
 
     Raises:
@@ -316,7 +318,7 @@ def _element(element: Any, value: AppliedValue, target: Target) -> Any:  # noqa:
     return element
 
 
-def _item(element: Any, value: AppliedValue, target: Target) -> str | int:  # noqa: ANN401  the type says which
+def _item(element: Any, value: AppliedValue, target: ValueTarget) -> str | int:  # noqa: ANN401  the type says which
     """An item of an Enumeration by its name, or by its number.
 
     Raises:

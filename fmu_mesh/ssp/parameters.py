@@ -15,9 +15,10 @@ import msgspec
 from ..text import listed, nearest, shown
 from ..variables.model_description import ModelDescription, Value, Variable
 from ..variables.value_conversion import ValueRefused, to_value
+from .parameter_reading import refuse_ambiguous
 from .parameter_values import AppliedValue, changed, converted, target_of_connector, target_of_variable
 from .problems import Problems
-from .structure import Binding, Component, MappingEntry, Parameter, ParameterSet, Place, StructureSystem, components_of
+from .structure import Binding, Component, MappingEntry, Parameter, Place, StructureSystem, components_of
 
 __all__ = ["AppliedValue", "ResolvedParameters", "changed", "resolve_parameters"]
 
@@ -117,7 +118,7 @@ class _Resolution:
                 place = candidate.entry.place if candidate.entry is not None else candidate.parameter.place
                 unmatched.append((name, place))
             else:
-                self._check_unique(candidate.parameter, binding.values)
+                refuse_ambiguous(binding.values, [candidate.parameter.name], self._problems)
         if not unmatched:
             return
         names = list(islice(self._names(owner, path), _COMPARED_NAMES))
@@ -129,13 +130,6 @@ class _Resolution:
         if rest := unmatched[_SHOWN_NAMES:]:
             found = f"{len(rest)} more values for names that {whose} does not have: they have no effect"
             self._problems.warn(rest[0][1], f"{found} ({listed([name for name, _ in rest])})")
-
-    def _check_unique(self, parameter: Parameter, values: ParameterSet) -> None:
-        """Refuse to apply a parameter of which there are two with different values."""
-        second = values.ambiguous.get(parameter.name)
-        if second is not None:
-            found = f"a second parameter {shown(parameter.name)} with another value"
-            self._problems.add(second, found, f"one of this name (first: line {parameter.place.line})")
 
     def _named(self, binding: Binding) -> Iterator[tuple[str, _Candidate]]:
         """The values of a binding by the names that they are applied to: the prefix comes first, then the mapping."""
@@ -156,6 +150,8 @@ class _Resolution:
         """Give a value to everything that has a name inside an element; return whether there is such a thing."""
         if isinstance(owner, Component):
             return self._note_variable(path, name, candidate)
+        if not owner.is_known:
+            return True  # for which there is a finding
         if path not in self._inside:
             connectors = {connector.name for connector in owner.connectors}
             self._inside[path] = connectors, {element.name: element for element in owner.elements}

@@ -17,7 +17,7 @@ from ..text import shown
 from .definitions import enumerations_of, transformation_of, unit_named, units_of
 from .grammar import TYPES
 from .package import DEFAULT, Package
-from .parameter_reading import parameter_mapping, parameter_set
+from .parameter_reading import parameter_mapping, parameter_set, refuse_ambiguous
 from .problems import Problems
 from .structure import (
     Annotation,
@@ -315,7 +315,8 @@ class _Reader:
         entries: ParameterMapping | None = None
         if mapping is not None:
             found = self._referred(mapping, mapping, "ssm:ParameterMapping", _MAPPING, file, component)
-            if found is None:
+            if found is None:  # nobody knows which of the parameters it applies
+                refuse_ambiguous(parameters, parameters.ambiguous, self._problems)
                 return None
             entries = parameter_mapping(found, self._problems)
         return Binding(parameters, element.place, element.get("prefix") or "", entries)

@@ -361,6 +361,15 @@ def test_the_value_of_an_fmu_that_cannot_be_read_is_not_judged() -> None:
     assert not problems.findings + problems.warnings
 
 
+def test_the_names_of_an_element_that_cannot_be_read_are_not_judged(tmp_path: Path) -> None:
+    missing = '<ssd:Component name="m" type="x/unknown" source="m.x"/>'
+
+    _, problems = _resolve(tmp_path, _system("root", missing, _binding(_real("m.k", 1))))
+
+    assert "the type 'x/unknown'" in _one(problems.findings)
+    assert not problems.warnings
+
+
 # --- what has no effect
 
 
