@@ -13,14 +13,12 @@ from msgspec.structs import replace
 
 from ..config.instance_sections import InstanceSection, placed
 from ..config.mesh import InitializationConfig, LimitsConfig, TimeoutsConfig
-from ..errors import ConfigurationError
 from ..simtime import TimeGrid
 from ..variables.value_conversion import to_plain
 from ..variables.value_types import PlainValue
-from .delays import algebraic_loop, with_delays
 from .digest import digest_of
+from .execution_order import execution_order
 from .feeds import Feed, feeds_of
-from .graph import is_cycle, strongly_connected, topological_order
 from .initialization_plan import InitializationPlan, Loop, check_loops, plan_initialization
 from .layout import Layout, row_bytes, rows_for
 from .linear_inputs import LinearInput, linear_inputs
@@ -208,23 +206,14 @@ def make_plan(
     Raises:
         ConfigurationError: a cycle has no delay; names the cycle.
     """
-    connections, closing = with_delays(system)
-    instant = [(c.source_instance, c.target_instance) for c in connections if c.delay == 0]
-    loops = [loop for loop in strongly_connected(system.instances, instant) if is_cycle(loop, instant)]
-    if loops:
-        findings = tuple(algebraic_loop(loop, connections, file) for loop in loops)
-        text = f"{file}: {len(findings)} algebraic loops" if len(findings) > 1 else str(findings[0])
-        raise ConfigurationError(text, findings=findings)
-    edges = [(c.source_instance, c.target_instance) for c in connections if not c.initial_only]
-    order = topological_order(system.instances, instant)
-    cycles = tuple(tuple(part) for part in strongly_connected(system.instances, edges) if is_cycle(part, edges))
+    connections, closing, order, cycles = execution_order(system, file)
     initialization = plan_initialization(system, connections)
     check_loops(initialization, connections, system, file)
     points = window if window is not None else window_of(system)
     plan = Plan(
         system=system,
         connections=connections,
-        order=tuple(order),
+        order=order,
         cycles=cycles,
         closing=closing,
         initialization=initialization,

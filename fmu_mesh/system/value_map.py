@@ -92,8 +92,8 @@ def map_words(pairs: Pairs, source: Variable, target: Variable) -> dict[str, str
 
 
 def map_text(pairs: Pairs, source: Variable, target: Variable) -> str:
-    """The entries for a person: `off -> idle, 5 -> running`."""
-    return ", ".join(f"{have} -> {want}" for have, want in map_words(pairs, source, target).items())
+    """The entries for a person, of many only the first ones: `off -> idle, 5 -> running`."""
+    return listed([f"{have} -> {want}" for have, want in map_words(pairs, source, target).items()], nothing="")
 
 
 def _source_number(word: str, source: Variable, place: str, findings: Findings) -> int | None:

@@ -1,0 +1,82 @@
+"""In which order instances step within one point, and the delay of every connection (docs/architecture.md)."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from msgspec.structs import replace
+
+from ..errors import ConfigurationError, Finding
+from .graph import cycle_through, feedback_edges, is_cycle, strongly_connected, topological_order
+from .system import Connection, ResolvedSystem
+
+__all__ = ["ExecutionOrder", "execution_order"]
+
+
+class ExecutionOrder(NamedTuple):
+    """See `Plan` for its fields."""
+
+    connections: tuple[Connection, ...]
+    closing: tuple[Connection, ...]
+    order: tuple[str, ...]
+    cycles: tuple[tuple[str, ...], ...]
+
+
+def execution_order(system: ResolvedSystem, file: str) -> ExecutionOrder:
+    """The connections with their delays, the order of the instances, and the cycles.
+
+    Args:
+        system: the system.
+        file: name of the configuration file, for errors.
+
+    Raises:
+        ConfigurationError: a cycle has no delay; names the cycle.
+    """
+    connections, closing = _with_delays(system)
+    instant = [(c.source_instance, c.target_instance) for c in connections if c.delay == 0]
+    loops = [loop for loop in strongly_connected(system.instances, instant) if is_cycle(loop, instant)]
+    if loops:
+        findings = tuple(_algebraic_loop(loop, connections, file) for loop in loops)
+        text = f"{file}: {len(findings)} algebraic loops" if len(findings) > 1 else str(findings[0])
+        raise ConfigurationError(text, findings=findings)
+    edges = [(c.source_instance, c.target_instance) for c in connections if not c.initial_only]
+    order = topological_order(system.instances, instant)
+    cycles = tuple(tuple(part) for part in strongly_connected(system.instances, edges) if is_cycle(part, edges))
+    return ExecutionOrder(connections, closing, tuple(order), cycles)
+
+
+def _with_delays(system: ResolvedSystem) -> tuple[tuple[Connection, ...], tuple[Connection, ...]]:
+    """All connections with a delay of 0 or 1, and those that got 1 because they close a cycle.
+
+    A connection to a parameter keeps None: it has no part in the steps.
+    """
+    if system.config.simulation.algorithm == "jacobi":
+        return tuple(
+            replace(c, delay=1) if c.delay is None and not c.initial_only else c for c in system.connections
+        ), ()
+    free = [c for c in system.connections if c.delay != 1 and not c.initial_only]
+    edges = [(c.source_instance, c.target_instance, c.delay is None) for c in free]
+    closing = {id(free[index]) for index in feedback_edges(system.instances, edges)}
+    connections = []
+    for connection in system.connections:
+        delay = connection.delay
+        if delay is None and not connection.initial_only:
+            delay = 1 if id(connection) in closing else 0
+        connections.append(replace(connection, delay=delay))
+    chosen = tuple(new for old, new in zip(system.connections, connections, strict=True) if id(old) in closing)
+    return tuple(connections), chosen
+
+
+def _algebraic_loop(loop: list[str], connections: tuple[Connection, ...], file: str) -> Finding:
+    """The finding for a cycle on which every connection has delay 0."""
+    edges = [(c.source_instance, c.target_instance) for c in connections if c.delay == 0]
+    walk = cycle_through(loop, edges)
+    first = next(
+        c for c in connections if c.delay == 0 and (c.source_instance, c.target_instance) == (walk[0], walk[1])
+    )
+    return Finding(
+        file=file,
+        path=first.path,
+        found=f"an algebraic loop: every connection on the cycle {' -> '.join(walk)} has delay 0",
+        expected="at least one connection with delay 1 (set `delay: 1`, or leave the delays to the algorithm)",
+    )
