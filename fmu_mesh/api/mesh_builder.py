@@ -6,7 +6,7 @@ import logging
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Self, Unpack, cast
+from typing import TYPE_CHECKING, Any, Literal, Self, Unpack, cast
 
 import msgspec
 
@@ -29,6 +29,7 @@ from .rebasing import rebased
 from .run_handle import Run
 
 if TYPE_CHECKING:
+    from ..errors import Finding
     from .open_system import System
     from .repeated_mesh import RepeatedMesh
     from .result import Result
@@ -328,6 +329,34 @@ class Mesh:
             path.write_text(self.to_yaml(path.parent), encoding="utf-8")
         except OSError as error:
             raise ConfigurationError(f"'{path}' cannot be written: {error.strerror}") from error
+
+    def to_ssp(self, path: str | Path, *, version: Literal["1.0", "2.0"] | None = None) -> tuple[Finding, ...]:
+        """Write the mesh as a package of SSP (docs/ssp.md): its FMUs, start values and connections in one file.
+
+        `load` reads it back. What SSP cannot say, such as the step size, is an annotation of the package. A mesh that
+        was loaded from a package, and whose instances and connections are still the same, keeps everything else in it.
+
+        Example:
+            >>> import fmu_mesh
+            >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
+            >>> mesh.to_ssp("pendulum_delay.ssp")
+            ()
+
+        Args:
+            path: the file, which ends in `.ssp`; an older one is replaced.
+            version: of SSP; None: that of the package that the mesh was loaded from, otherwise 1.0. Arrays and types
+                of FMI 3.0 need 2.0.
+
+        Returns:
+            What the package that the mesh was loaded from has, and this one has not.
+
+        Raises:
+            ConfigurationError: the mesh is wrong, SSP cannot say something, or a file cannot be read or written;
+                carries all findings. No file is left behind.
+        """
+        from ..ssp.exporting import export  # noqa: PLC0415  only this needs it
+
+        return export(self._plain, lambda: self.plan().plan.system, Path(path), version)
 
     # --- running
 

@@ -186,7 +186,8 @@ def _shape(parameter: Parameter, sizes: tuple[int, ...], target: Target, problem
         return sizes
     if not parameter.dimensions and math.prod(target.shape) == len(parameter.values):
         return target.shape
-    have = f"an array of {' x '.join(map(str, sizes))} values" if sizes else "one value"
+    several = "s" if math.prod(sizes) != 1 else ""
+    have = f"an array of {' x '.join(map(str, sizes))} value{several}" if sizes else "one value"
     problems.add(parameter.place, f"{have} for {target.words}", _number_of_values(target.shape))
     return None
 
