@@ -11,10 +11,10 @@ from ..config.findings import Findings
 from ..config.loading import PlainConfig
 from ..errors import ConfigurationError, Finding
 from ..run.options import Options, with_needed
-from ..ssp.configuration_files import names_package, read_configuration
-from ..ssp.naming import element_path
+from ..ssp.configuration_files import RESULT_BESIDE_PACKAGE, named_package, read_configuration
 from ..text import short_path
 from .mesh_builder import Mesh
+from .package_inspection import inspect_package
 
 __all__ = ["convert"]
 
@@ -68,7 +68,11 @@ def convert(
     findings.raise_any()
     if suffix == _PACKAGE:
         return mesh.to_ssp(target, version=version)
-    text = "".join(f"# {line}\n" if line else "#\n" for line in _comment(given)) + mesh.to_yaml(target.parent)
+    if isinstance(given.data, dict) and given.data.get("record") == {"file": RESULT_BESIDE_PACKAGE}:
+        del given.data["record"]  # the result file of the new configuration is beside that
+    text = "".join(f"# {line}\n" if line else "#\n" for line in _comment(source, ssd, given)) + mesh.to_yaml(
+        target.parent
+    )
     try:
         with files.replaced(target) as draft:
             draft.write_text(text, encoding="utf-8")
@@ -77,18 +81,19 @@ def convert(
     return given.warnings
 
 
-def _comment(given: PlainConfig) -> Iterator[str]:
+def _comment(source: Path, ssd: str | None, given: PlainConfig) -> Iterator[str]:
     """What the file was made from, which names have changed, and what it has not."""
     yield f"Converted from {_one_line(short_path(given.file))} by fmu-mesh."
-    if not names_package(given.file):
+    if named_package(source, ssd) is None:
         return
-    instances = given.data.get("instances") if isinstance(given.data, dict) else None
-    paths = {name: element_path(name) for name in instances or ()}
-    changed = {name: path for name, path in paths.items() if path != (name,)}
-    if changed:
+    elements = inspect_package(source, ssd=ssd).elements
+    instances = [
+        (own.instance, own.path) for own in elements if own.instance is not None and own.path != (own.instance,)
+    ]
+    if instances:
         yield ""
         yield "Instances, and the elements of the package that they are:"
-        for name, path in changed.items():
+        for name, path in instances:
             yield f"  {name}: {_one_line(' / '.join(path))}"
     if given.warnings:
         yield ""

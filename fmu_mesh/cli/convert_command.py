@@ -8,9 +8,9 @@ from pathlib import Path
 from .. import files
 from ..api.converting import convert
 from ..errors import ConfigurationError
-from .arguments import CommandParser, Parsers, add_quiet
-from .output.display import warn
-from .run_options import add_options, add_ssd, read_options
+from .arguments import CommandParser, Parsers, add_quiet, add_ssd
+from .output.display import say
+from .run_options import add_options, read_options
 
 __all__ = ["PARSERS"]
 
@@ -42,7 +42,7 @@ def _convert(arguments: argparse.Namespace) -> int:
     lost = convert(source, target, ssd=arguments.ssd, version=arguments.version, simulation=given)
     if not arguments.quiet:
         for finding in lost:
-            warn(str(finding))
+            say(f"warning: {finding}")
     print(f"{target}: run it with `fmu-mesh launch {target}`")
     return 0
 
