@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from .api.mesh_builder import Mesh, load
     from .api.mesh_check import Check
     from .api.open_system import System, SystemState
+    from .api.package_inspection import PackageInspection, inspect_package
     from .api.recovering import recover
     from .api.rerunning import rerun
     from .api.result import Result
@@ -70,6 +71,7 @@ __all__ = [
     "Mesh",
     "MeshLost",
     "Output",
+    "PackageInspection",
     "Parameter",
     "ProtocolBroken",
     "Range",
@@ -87,6 +89,7 @@ __all__ = [
     "attach",
     "component",
     "inspect",
+    "inspect_package",
     "load",
     "meshes",
     "recover",
@@ -115,7 +118,9 @@ _PLACES = {
     "SystemState": "api.open_system",
     "attach": "api.attaching",
     "Inspection": "api.inspection",
+    "PackageInspection": "api.package_inspection",
     "inspect": "api.inspection",
+    "inspect_package": "api.package_inspection",
     "meshes": "api.attaching",
     "component": "instances.python.component",
     "Sweep": "sweeps.sweeping",

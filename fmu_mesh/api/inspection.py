@@ -15,6 +15,7 @@ from ..config.instance_sections import KIND
 from ..errors import CallRefused, LoadFailed, UnknownName
 from ..instances.fmi import read_description, sha256_of, size_of
 from ..instances.registry import KINDS, describe
+from ..ssp.configuration_files import names_package
 from ..text import listed, matching, nearest, nearest_file, short_number, shown
 from ..variables.model_description import Causality, Kind, ModelDescription, Variable
 from .tables import pairs
@@ -154,6 +155,8 @@ def with_way_out(error: LoadFailed, path: Path) -> LoadFailed:
     if not files.exists(path):
         near = nearest_file(path)
         return error.instead_of_hint(f"Did you mean '{near}'?") if near is not None else error
+    if names_package(path):
+        return error.instead_of_hint(f"A package of SSP is run by `fmu-mesh launch {path}`.")
     if path.suffix in (".yaml", ".yml"):
         return error.instead_of_hint(f"A configuration is run by `fmu-mesh launch {path}`.")
     return error

@@ -25,6 +25,7 @@ from ..ssp.configuration_files import read_configuration
 from ..text import listed, shown
 from .mesh_check import Check
 from .plan_options import PlanOptions, RunOptions, StartOptions, options_of, plain, with_record, with_scenario
+from .rebasing import rebased
 from .run_handle import Run
 
 if TYPE_CHECKING:
@@ -305,23 +306,27 @@ class Mesh:
             else:
                 self._data[key] = plain(value)
 
-    def to_yaml(self) -> str:
-        """The configuration as the text of a file, for the folder that this mesh looks for files in."""
-        return written(self._data)
+    def to_yaml(self, folder: str | Path | None = None) -> str:
+        """The configuration as the text of a file.
 
-    def save(self, path: str | Path) -> None:
-        """Write the configuration into a file, which `fmu-mesh launch` runs.
+        Args:
+            folder: where the file will be: relative paths are those from there; None: the folder that this mesh looks
+                for files in, so that all paths stay as they are.
 
         Raises:
-            ConfigurationError: the file cannot be written, or lies in another folder than the one that this mesh looks
-                for files in, so that its paths would lead elsewhere.
+            ConfigurationError: too much of the configuration is wrong to know its paths.
+        """
+        return written(self._data if folder is None else rebased(self._plain, Path(folder)))
+
+    def save(self, path: str | Path) -> None:
+        """Write the configuration into a file, which `fmu-mesh launch` runs; its paths lead to the same files.
+
+        Raises:
+            ConfigurationError: the file cannot be written, or too much of the configuration is wrong to know its paths.
         """
         path = Path(path)
-        if path.absolute().parent.resolve() != self._plain.file.absolute().parent.resolve():
-            folder = self._plain.file.absolute().parent
-            raise ConfigurationError(f"'{path}' lies outside '{folder}', to which the paths in it refer")
         try:
-            path.write_text(self.to_yaml(), encoding="utf-8")
+            path.write_text(self.to_yaml(path.parent), encoding="utf-8")
         except OSError as error:
             raise ConfigurationError(f"'{path}' cannot be written: {error.strerror}") from error
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ..config.findings import Origin
+from ..config.findings import ValueOrigin
 from ..config.loading import LoadedConfig
 from ..rings.library import library_missed, why_no_library
 from ..system.grouping import automatic_nodes
@@ -108,7 +108,7 @@ def _start_values(plan: Plan, loaded: LoadedConfig | None) -> list[str]:
     return table(rows, indent=2)
 
 
-def start_value_origin(loaded: LoadedConfig, instance: SystemInstance, variable: str) -> Origin:
+def start_value_origin(loaded: LoadedConfig, instance: SystemInstance, variable: str) -> ValueOrigin:
     """Where a start value comes from: a line of a file, as short as a person would write its path, or an option."""
     is_own = variable in loaded.config.instances[instance.name].start_values  # the scenario has none of these
     path = f"instances.{instance.name}.start_values.{variable}"

@@ -21,6 +21,7 @@ __all__ = [
     "add_json",
     "add_quiet",
     "add_reaching",
+    "add_ssd",
     "count",
     "endpoint",
     "number",
@@ -115,6 +116,12 @@ def add_reaching(parser: argparse.ArgumentParser, timeout_s: float = _TIMEOUT_S)
         metavar="S",
         help=f"deadline of every query in s ({timeout_s:g})",
     )
+
+
+def add_ssd(parser: argparse.ArgumentParser) -> None:
+    """Add `--ssd`."""
+    text = "the description in a package of SSP: its file or its name; default: SystemStructure.ssd"
+    parser.add_argument("--ssd", metavar="NAME", help=text)
 
 
 def number(text: str) -> float:

@@ -16,9 +16,9 @@ from ..api.system_graph import SystemGraph
 from ..errors import ConfigurationError
 from ..files import replaced
 from ..ssp.configuration_files import names_package
-from .arguments import CommandParser, Parsers, add_json, add_quiet, add_reaching
+from .arguments import CommandParser, Parsers, add_json, add_quiet, add_reaching, add_ssd
 from .output.json_output import print_json
-from .run_options import add_options, add_ssd, read_options
+from .run_options import add_options, read_options
 
 __all__ = ["PARSERS"]
 

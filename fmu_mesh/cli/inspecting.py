@@ -1,4 +1,4 @@
-"""`inspect`: the properties of one FMU. Nothing of it is executed."""
+"""`inspect`: the properties of one FMU, or of a package of SSP. Nothing of it is executed."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ import msgspec
 
 from ..api.inspection import SHOWN_VARIABLES, inspect
 from ..errors import ConfigurationError, LoadFailed
-from .arguments import CommandParser, Parsers, add_json
+from ..ssp.configuration_files import named_package
+from .arguments import CommandParser, Parsers, add_json, add_ssd
 from .output.json_output import print_failure
 
 __all__ = ["PARSERS"]
@@ -22,7 +23,8 @@ _WIDE: Final = 120
 
 
 def _add_inspect(parser: CommandParser) -> None:
-    parser.add_argument("fmu", type=Path, metavar="MODEL.fmu", help="the FMU, or the folder of an unpacked one")
+    text = "the FMU, or the folder of an unpacked one; or a package of SSP"
+    parser.add_argument("fmu", type=Path, metavar="MODEL.fmu|PACKAGE", help=text)
     parser.add_argument(
         "variables",
         nargs="*",
@@ -32,11 +34,18 @@ def _add_inspect(parser: CommandParser) -> None:
     parser.add_argument(
         "--all", action="store_true", help=f"show all variables instead of {SHOWN_VARIABLES} of each causality"
     )
+    add_ssd(parser)
     add_json(parser, "print everything as one JSON object")
     parser.set_defaults(run_command=_inspect)
 
 
 def _inspect(arguments: argparse.Namespace) -> int:
+    if named_package(arguments.fmu, arguments.ssd) is not None:
+        return _inspect_package(arguments)
+    if arguments.ssd is not None:
+        raise ConfigurationError(
+            f"--ssd chooses a description of a package of SSP, and '{arguments.fmu}' is no package"
+        )
     try:
         inspection = inspect(arguments.fmu)
     except LoadFailed as error:  # a wrong argument: nothing was going to run
@@ -49,6 +58,25 @@ def _inspect(arguments: argparse.Namespace) -> int:
         return 0
     width = max(_NARROWEST, shutil.get_terminal_size((_WIDE, 0)).columns)
     print(inspection.page(width, arguments.variables, everything=arguments.all))
+    return 0
+
+
+def _inspect_package(arguments: argparse.Namespace) -> int:
+    if arguments.variables:
+        hint = f"Those of an FMU are shown by `fmu-mesh inspect {arguments.fmu}/resources/NAME.fmu`."
+        raise ConfigurationError("a package of SSP has no variables of its own", hint=hint)
+    from ..api.package_inspection import inspect_package  # noqa: PLC0415  it needs more than an FMU does
+
+    try:
+        found = inspect_package(arguments.fmu, ssd=arguments.ssd)
+    except ConfigurationError as error:
+        if arguments.json:
+            print_failure(error)
+        raise
+    if arguments.json:
+        sys.stdout.buffer.write(msgspec.json.format(msgspec.json.encode(found)) + b"\n")
+    else:
+        print(found)
     return 0
 
 

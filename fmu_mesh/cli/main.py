@@ -32,6 +32,7 @@ COMMANDS: Final[Mapping[str, tuple[str, str]]] = {
     "new": ("new_mesh", "write a configuration for FMUs, with suggested connections"),
     "check": ("checking", "check a configuration and show its plan, without running it"),
     "graph": ("graphing", "draw the graph of a configuration or of a running mesh"),
+    "convert": ("convert_command", "convert a package of SSP into a configuration file, or a mesh into a package"),
     "inspect": ("inspecting", "show the properties of an FMU, without running it"),
     "schema": ("checking", "print the JSON Schema of configurations"),
     "ls": ("looking", "list meshes, instances and variables"),

@@ -14,10 +14,10 @@ from ..config.base import Endpoint
 from ..config.mesh import MAX_WINDOW
 from ..errors import ConfigurationError
 from ..run.options import Options, option_fields
-from .arguments import endpoint, number, whole
+from .arguments import add_ssd, endpoint, number, whole
 from .output.display import teller
 
-__all__ = ["add_configuration", "add_options", "add_ssd", "given_options", "read_options"]
+__all__ = ["add_configuration", "add_options", "given_options", "read_options"]
 
 
 def add_configuration(parser: argparse.ArgumentParser) -> None:
@@ -39,12 +39,6 @@ def add_configuration(parser: argparse.ArgumentParser) -> None:
         "connect",
     )
     add_options(parser, "allow_code")
-
-
-def add_ssd(parser: argparse.ArgumentParser) -> None:
-    """Add `--ssd`."""
-    text = "the description in a package of SSP: its file or its name; default: SystemStructure.ssd"
-    parser.add_argument("--ssd", metavar="NAME", help=text)
 
 
 def add_options(

@@ -22,12 +22,12 @@ from ..sweeps.sweep_folder import is_sweep
 from ..sweeps.sweeping import ExecutorSweep, Sweep, SweepPart
 from ..sweeps.variants import Values, read_values
 from ..text import short_path, shown
-from .arguments import CommandParser, Parsers, add_json, count, whole
+from .arguments import CommandParser, Parsers, add_json, add_ssd, count, whole
 from .output.display import say, stdout_as_stderr, teller
 from .output.json_output import Failure, failure_of, print_json
 from .output.progress import SweepProgressLine
 from .output.terminal import error_console
-from .run_options import add_options, add_ssd, read_options
+from .run_options import add_options, read_options
 from .running import add_output, interrupted_by_signals
 
 __all__ = ["PARSERS", "SweepReport"]

@@ -12,14 +12,14 @@ from typing import NamedTuple
 
 from fmu_mesh.errors import ConfigurationError, Finding
 
-__all__ = ["Findings", "Origin", "located"]
+__all__ = ["Findings", "ValueOrigin", "located"]
 
 
-class Origin(NamedTuple):
+class ValueOrigin(NamedTuple):
     """Where a value was written.
 
     Example:
-        >>> print(Origin("start.ssv", 12, "Parameter 'k'"))
+        >>> print(ValueOrigin("start.ssv", 12, "Parameter 'k'"))
         Parameter 'k' (start.ssv:12)
 
     Attributes:
@@ -60,7 +60,7 @@ class Findings:
         lines: Mapping[str, int] | None = None,
         replaced: Mapping[str, str] | None = None,
         first: Sequence[Finding] = (),
-        origins: Mapping[str, Origin] = MappingProxyType({}),
+        origins: Mapping[str, ValueOrigin] = MappingProxyType({}),
     ) -> None:
         self._file = file
         self._lines = lines if lines is not None else {}
@@ -76,7 +76,7 @@ class Findings:
             return
         self._places.add(path)
         if path.startswith("--"):
-            origin = Origin("", None, path)
+            origin = ValueOrigin("", None, path)
         else:
             origin = located(path, self._file, self._lines, self._replaced, self._origins)
         place, file = (path, origin.file) if origin.file else (origin.text, self._file)
@@ -124,8 +124,8 @@ def located(
     file: str,
     lines: Mapping[str, int],
     replaced: Mapping[str, str],
-    origins: Mapping[str, Origin],
-) -> Origin:
+    origins: Mapping[str, ValueOrigin],
+) -> ValueOrigin:
     """Where the value at ``path`` of a configuration was written, or the innermost part around it that is known.
 
     Example:
@@ -144,12 +144,12 @@ def located(
     """
     option = replaced.get(max((own for own in replaced if _is_inside(path, own)), key=len, default=""))
     if option is not None:
-        return Origin("", None, option)
+        return ValueOrigin("", None, option)
     while True:
         if path in origins:
             return origins[path]
         if path in lines or not path:
-            return Origin(file, lines.get(path))
+            return ValueOrigin(file, lines.get(path))
         path = path[: max(path.rfind("."), path.rfind("["), 0)]
 
 

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import msgspec
 from msgspec import inspect, structs
 
-from fmu_mesh.config.findings import Findings, Origin, located
+from fmu_mesh.config.findings import Findings, ValueOrigin, located
 from fmu_mesh.config.instance_sections import KIND, InstanceSection, Kinds, keys_of
 from fmu_mesh.config.mesh import Config, config_type
 from fmu_mesh.config.partial import partial_configuration
@@ -29,8 +29,8 @@ from fmu_mesh.text import listed, nearest, nearest_file, shown
 __all__ = [
     "MAXIMUM_BYTES",
     "LoadedConfig",
-    "Origin",
     "PlainConfig",
+    "ValueOrigin",
     "examine",
     "examine_data",
     "load",
@@ -67,7 +67,7 @@ class PlainConfig(NamedTuple):
     lines: dict[str, int] = {}
     findings: tuple[Finding, ...] = ()
     overrides: dict[str, str] = {}
-    origins: dict[str, Origin] = {}
+    origins: dict[str, ValueOrigin] = {}
     warnings: tuple[Finding, ...] = ()
     needed: dict[str, str] = {}
 
@@ -88,7 +88,7 @@ class LoadedConfig(msgspec.Struct, frozen=True):
     file: Path
     lines: dict[str, int] = {}
     overrides: dict[str, str] = {}
-    origins: dict[str, Origin] = {}
+    origins: dict[str, ValueOrigin] = {}
     warnings: tuple[Finding, ...] = ()
 
     def findings(self) -> Findings:
@@ -99,15 +99,15 @@ class LoadedConfig(msgspec.Struct, frozen=True):
         """The line of ``path``, or of the innermost part of the file around it that has one."""
         return self.origin(path).line
 
-    def origin(self, path: str) -> Origin:
+    def origin(self, path: str) -> ValueOrigin:
         """Where the value at ``path`` comes from: a file and a line of it, or an option."""
         return located(path, str(self.file), self.lines, self.overrides, self.origins)
 
     @property
-    def scenario_origin(self) -> Origin:
+    def scenario_origin(self) -> ValueOrigin:
         """Where the scenario was written."""
         scenario = self.config.scenario
-        return Origin(scenario, None, "scenario") if isinstance(scenario, str) else self.origin("scenario")
+        return ValueOrigin(scenario, None, "scenario") if isinstance(scenario, str) else self.origin("scenario")
 
     def finding(self, path: str, found: str, expected: str, suggestion: str | None = None) -> Finding:
         """A finding with the file and the line of ``path``."""

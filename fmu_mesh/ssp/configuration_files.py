@@ -11,7 +11,10 @@ from ..config.loading import PlainConfig, read_file
 from ..errors import ConfigurationError
 from .package import is_package
 
-__all__ = ["names_package", "read_configuration"]
+__all__ = ["RESULT_BESIDE_PACKAGE", "named_package", "names_package", "read_configuration"]
+
+RESULT_BESIDE_PACKAGE: Final = "../results/{mesh}.csv"
+"""The result file of a package that says none: beside the archive, and not in it."""
 
 _YAML: Final = (".yaml", ".yml", ".json")
 _ARCHIVE: Final = b"PK\x03\x04"
@@ -31,15 +34,25 @@ def read_configuration(path: Path, ssd: str | None = None) -> PlainConfig:
     Raises:
         ConfigurationError: it cannot be read, or it is neither YAML nor a package.
     """
-    if path.suffix.lower() == ".ssd" and (archive := files.archive_on_the_way(path)) is not None and ssd is None:
-        path, ssd = archive, path.relative_to(archive).as_posix()
-    if not names_package(path):
-        if ssd is not None:
-            raise ConfigurationError(f"--ssd chooses a description in a package of SSP, and '{path}' is no package")
-        return read_file(path)
-    from .system_reading import read_system  # noqa: PLC0415  it imports FMPy, which is slow
+    if (package := named_package(path, ssd)) is not None:
+        from .system_reading import read_system  # noqa: PLC0415  it imports FMPy, which is slow
 
-    return read_system(path, ssd)
+        return read_system(*package)
+    if ssd is not None:
+        raise ConfigurationError(f"--ssd chooses a description in a package of SSP, and '{path}' is no package")
+    return read_file(path)
+
+
+def named_package(path: Path, ssd: str | None = None) -> tuple[Path, str | None] | None:
+    """The package that a path names, and which description of it; None if it is no package.
+
+    Example:
+        >>> named_package(Path("configs/pendulum_delay.yaml")) is None
+        True
+    """
+    if path.suffix.lower() == ".ssd" and (archive := files.archive_on_the_way(path)) is not None and ssd is None:
+        return archive, path.relative_to(archive).as_posix()
+    return (path, ssd) if names_package(path) else None
 
 
 def names_package(path: Path) -> bool:

@@ -12,7 +12,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Final, Literal
 
-from ..config.loading import Origin, PlainConfig
+from ..config.loading import PlainConfig, ValueOrigin
 from ..config.mesh import LimitsConfig
 from ..config.yaml_text import Plain
 from ..errors import ConfigurationError, LoadFailed
@@ -21,6 +21,7 @@ from ..instances.fmi.archive.reading import read_description
 from ..text import listed, nearest
 from ..variables.model_description import Kind, ModelDescription, Variable
 from .annotations import OPEN_MODELICA, OPEN_SIMULATION_PLATFORM, base_step_size, common_solvers, step_size_hint
+from .configuration_files import RESULT_BESIDE_PACKAGE
 from .flattening import FlatConnection, FlatValue, flatten
 from .naming import instance_name, mesh_name
 from .own_annotation import ANNOTATION_TYPE, AnnotationRefused, chosen_names, merged
@@ -112,7 +113,7 @@ class _Configuration:
         self._descriptions: dict[tuple[str, str], ModelDescription | None] = {}
         self._file = Path(package.shown(name))
         self._lines: dict[str, int] = {}
-        self._origins: dict[str, Origin] = {}
+        self._origins: dict[str, ValueOrigin] = {}
         own = (one for one in structure.system.annotations if one.type == ANNOTATION_TYPE)
         self._annotation = next(own, None)
         self._names = self._chosen_names()
@@ -131,8 +132,8 @@ class _Configuration:
             "instances": self._instances(parameters.of_components, simulation),
             "connections": [self._connection(number, one) for number, one in enumerate(connections)],
         }
-        if self._package.is_archive:  # beside the archive, and not in it
-            data["record"] = {"file": "../results/{mesh}.csv"}
+        if self._package.is_archive:
+            data["record"] = {"file": RESULT_BESIDE_PACKAGE}
         data = self._with_annotation(data)
         times = data["simulation"]
         assert isinstance(times, dict)  # `merged` adds to a mapping
@@ -258,7 +259,7 @@ class _Configuration:
                 section["start_values"] = {variable: one.value for variable, one in applied.items()}
                 for variable, one in applied.items():
                     text = f"{one.origin.element}{f', {one.how}' if one.how else ''}"
-                    origin = Origin(one.origin.file, one.origin.line, text)
+                    origin = ValueOrigin(one.origin.file, one.origin.line, text)
                     self._origins[f"{place}.start_values.{variable}"] = origin
             instances[name] = section
         return instances
@@ -303,7 +304,7 @@ class _Configuration:
         if place.file == str(self._file):
             self._lines[path] = place.line
         elif path:
-            self._origins[path] = Origin(place.file, place.line, place.element)
+            self._origins[path] = ValueOrigin(place.file, place.line, place.element)
 
     def _note_annotations(self, system: StructureSystem, step_size: Plain) -> None:
         """Note which annotations of a system, and of those in it, have no effect."""

@@ -103,10 +103,24 @@ def test_an_instance_is_added_once_and_says_what_it_is(keys: dict[str, Any], mes
         mesh.add("pendulum", **keys)
 
 
-def test_a_mesh_is_saved_where_its_paths_are_right(folder: Path) -> None:
+def test_a_mesh_that_is_saved_in_another_folder_has_the_same_files(folder: Path) -> None:
     (folder / "other").mkdir()
-    with pytest.raises(fmu_mesh.ConfigurationError, match="to which the paths in it refer"):
-        built().save(folder / "other" / "pair.yaml")
+    mesh = built()
+    mesh.configure(scenario="values.yaml", zenoh={"config": "zenoh.json5"}, ros={"messages": {"a/msg/B": "B.msg"}})
+    mesh.record("pendulum.a", file="a.csv")
+    mesh.record("pendulum.a", file="/dev/null", also=True)
+
+    mesh.save(folder / "other" / "pair.yaml")
+
+    before: Any = mesh.configuration.data
+    after: Any = fmu_mesh.load(folder / "other" / "pair.yaml").configuration.data
+    assert [own["file"] for own in after["record"]] == ["../a.csv", "/dev/null"]
+    assert (after["scenario"], after["zenoh"]["config"]) == ("../values.yaml", "../zenoh.json5")
+    assert after["ros"]["messages"] == {"a/msg/B": "../B.msg"}
+    for name, instance in after["instances"].items():
+        there, here = folder / "other" / instance["fmu"], folder / before["instances"][name]["fmu"]
+        assert there.resolve() == here.resolve()
+    assert fmu_mesh.Mesh.from_yaml(mesh.to_yaml(), folder=folder).to_yaml() == mesh.to_yaml()
 
 
 def test_options_are_checked_as_on_the_command_line() -> None:

@@ -10,7 +10,7 @@ import pytest
 
 import fmu_mesh
 from fmu_mesh.cli.main import main
-from fmu_mesh.config.findings import Findings, Origin
+from fmu_mesh.config.findings import Findings, ValueOrigin
 from fmu_mesh.config.loading import PlainConfig
 from fmu_mesh.errors import ConfigurationError, Finding
 from fmu_mesh.run.options import Options, with_needed
@@ -34,7 +34,7 @@ def package(**parts: Any) -> PlainConfig:  # noqa: ANN401  parts of a configurat
         "record": {"file": None},
     }
     origins = {
-        f"instances.gain.start_values.{name}": Origin("m.ssp/a.ssv", line, f"Parameter '{name}'")
+        f"instances.gain.start_values.{name}": ValueOrigin("m.ssp/a.ssv", line, f"Parameter '{name}'")
         for line, name in enumerate(values, 7)
     }
     lines = {"": 1, "simulation": 2, "instances.gain": 30}
@@ -56,7 +56,7 @@ def test_a_finding_about_a_start_value_has_the_file_and_the_line_in_which_it_was
 
 
 def test_findings_of_several_files_are_in_the_order_of_files_and_lines() -> None:
-    findings = Findings("a.ssd", {"x": 9, "y": 2}, None, (), {"z": Origin("b.ssv", 1)})
+    findings = Findings("a.ssd", {"x": 9, "y": 2}, None, (), {"z": ValueOrigin("b.ssv", 1)})
     for path in ("z", "x", "y"):
         findings.add(path, "wrong", "")
 
@@ -71,7 +71,7 @@ def test_findings_of_several_files_are_in_the_order_of_files_and_lines() -> None
 
 
 def test_the_innermost_place_counts_whichever_file_has_it() -> None:
-    origins = {"instances.a": Origin("inner.ssd", 4)}
+    origins = {"instances.a": ValueOrigin("inner.ssd", 4)}
     findings = Findings("a.ssd", {"instances": 1, "instances.a.fmu": 9}, None, (), origins)
     for path in ("instances.a.fmu", "instances.a.kind", "instances.b"):
         findings.add(path, "wrong", "")

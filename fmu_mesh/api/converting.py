@@ -1,0 +1,107 @@
+"""From one format of a configuration to another: a package of SSP to YAML, and a mesh to a package."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, Final, Literal
+
+from .. import files
+from ..config.findings import Findings
+from ..config.loading import PlainConfig
+from ..errors import ConfigurationError, Finding
+from ..run.options import Options, with_needed
+from ..ssp.configuration_files import RESULT_BESIDE_PACKAGE, named_package, read_configuration
+from ..text import short_path
+from .mesh_builder import Mesh
+from .package_inspection import inspect_package
+
+__all__ = ["convert"]
+
+_YAML: Final = (".yaml", ".yml")
+_PACKAGE: Final = ".ssp"
+
+Version = Literal["1.0", "2.0"]
+
+
+def convert(
+    source: Path,
+    target: Path,
+    *,
+    ssd: str | None = None,
+    version: Version | None = None,
+    simulation: Mapping[str, Any] = {},
+) -> tuple[Finding, ...]:
+    """Write a configuration in another format: the ending of ``target`` chooses YAML or a package of SSP.
+
+    Example:
+        >>> convert(Path("configs/pendulum_delay.yaml"), Path("pendulum.yaml"))
+        ()
+        >>> import fmu_mesh
+        >>> fmu_mesh.load("pendulum.yaml").instances
+        ['pendulum', 'delay']
+
+    Args:
+        source: what `fmu_mesh.load` reads.
+        target: a .yaml, .yml or .ssp file; a file that exists is replaced.
+        ssd: which description of a package.
+        version: of SSP; None: that of the package that is read, or 1.0.
+        simulation: keys of the section `simulation`, in the place of what ``source`` says.
+
+    Returns:
+        What ``source`` says and ``target`` does not.
+
+    Raises:
+        ConfigurationError: ``source`` is wrong, or ``target`` cannot be written; nothing is left of it.
+    """
+    suffix = target.suffix.lower()
+    if suffix not in (*_YAML, _PACKAGE):
+        raise ConfigurationError(f"'{target}' is no format of a configuration", hint="Name it .yaml or .ssp.")
+    if version is not None and suffix != _PACKAGE:
+        raise ConfigurationError(f"--version is that of a package of SSP, and '{target}' is none")
+    given = read_configuration(source, ssd)
+    mesh = Mesh.from_configuration(given)
+    if simulation:
+        mesh.configure(simulation=dict(simulation))
+    needed = with_needed(given, Options())
+    findings = Findings(str(needed.file), first=needed.findings)
+    findings.raise_any()
+    if suffix == _PACKAGE:
+        return mesh.to_ssp(target, version=version)
+    if isinstance(given.data, dict) and given.data.get("record") == {"file": RESULT_BESIDE_PACKAGE}:
+        del given.data["record"]  # the result file of the new configuration is beside that
+    text = "".join(f"# {line}\n" if line else "#\n" for line in _comment(source, ssd, given)) + mesh.to_yaml(
+        target.parent
+    )
+    try:
+        with files.replaced(target) as draft:
+            draft.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise ConfigurationError(f"'{target}' cannot be written: {error.strerror}") from error
+    return given.warnings
+
+
+def _comment(source: Path, ssd: str | None, given: PlainConfig) -> Iterator[str]:
+    """What the file was made from, which names have changed, and what it has not."""
+    yield f"Converted from {_one_line(short_path(given.file))} by fmu-mesh."
+    if named_package(source, ssd) is None:
+        return
+    elements = inspect_package(source, ssd=ssd).elements
+    instances = [
+        (own.instance, own.path) for own in elements if own.instance is not None and own.path != (own.instance,)
+    ]
+    if instances:
+        yield ""
+        yield "Instances, and the elements of the package that they are:"
+        for name, path in instances:
+            yield f"  {name}: {_one_line(' / '.join(path))}"
+    if given.warnings:
+        yield ""
+        yield "What the package says and this file does not, or what may be wrong with it:"
+        for warning in given.warnings:
+            yield f"  {_one_line(str(warning))}"
+
+
+def _one_line(text: str) -> str:
+    """A text of a package as a part of a comment: it must not end the line."""
+    return " ".join(text.split())

@@ -1,0 +1,346 @@
+"""What a package of SSP says: its systems, FMUs, connectors, parameters and annotations. Nothing of it is executed."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Literal
+
+import msgspec
+
+from .. import files
+from ..config.loading import PlainConfig
+from ..errors import ConfigurationError
+from ..ssp.configuration_files import named_package
+from ..ssp.naming import instance_name
+from ..ssp.package import Package
+from ..ssp.problems import Problems
+from ..ssp.ssd_reading import annotations_of, read_structure
+from ..ssp.structure import Annotation, Binding, Component, Element, Structure, StructureSystem
+from ..ssp.system_reading import read_system
+from ..text import short_number
+from .tables import pairs, table
+
+__all__ = ["PackageInspection", "inspect_package"]
+
+
+class PackageVariant(msgspec.Struct, frozen=True):
+    """One description of a package: its file, the name that it has, and the version of SSP."""
+
+    file: str
+    name: str
+    version: str
+
+
+class PackageElement(msgspec.Struct, frozen=True):
+    """A system, or a component with its FMU.
+
+    Attributes:
+        path: the names of the elements from the root system on; empty for the root system.
+        source: the FMU, relative to the package; None for a system.
+        instance: the name of the instance that it becomes; None for a system.
+        implementation: how the FMU is to be used; None for a system.
+        connectors: how many there are of each kind.
+        connections: how many are inside a system.
+    """
+
+    path: tuple[str, ...]
+    kind: Literal["system", "component"]
+    source: str | None
+    instance: str | None
+    implementation: str | None
+    connectors: dict[str, int]
+    connections: int
+    description: str | None
+
+
+class PackageConnector(msgspec.Struct, frozen=True):
+    """A connector of the root system."""
+
+    name: str
+    kind: str | None
+    type: str | None
+    unit: str | None
+
+
+class PackageParameters(msgspec.Struct, frozen=True):
+    """A source of parameter values.
+
+    Attributes:
+        element: path of the element that has the binding.
+        file: where the values are; a description if they are inside of it.
+        line: the line of the parameter set.
+        parameters: how many values it has.
+        prefix: in front of their names.
+        mapping: the file with the mapping; None if all names count as they are.
+    """
+
+    element: tuple[str, ...]
+    file: str
+    line: int
+    parameters: int
+    prefix: str
+    mapping: str | None
+
+
+class PackageInspection(msgspec.Struct, frozen=True, omit_defaults=False):
+    """What `inspect_package` found. As text, it is the page that `fmu-mesh inspect` prints.
+
+    Example:
+        >>> import fmu_mesh
+        >>> _ = fmu_mesh.load("configs/pendulum_delay.yaml").to_ssp("pair.ssp")
+        >>> package = fmu_mesh.inspect_package("pair.ssp")
+        >>> [element.source for element in package.elements if element.kind == "component"]
+        ['resources/DampedPendulum.fmu', 'resources/TransportDelay.fmu']
+        >>> package.problems
+        ()
+
+    Attributes:
+        file: the path as it was given.
+        bytes: size of the package; None for a folder.
+        description: the file of the description that is shown.
+        name: the name of the description.
+        version: the version of SSP.
+        variants: all descriptions of the package; others are chosen by file or name.
+        start_time: of the default experiment in s; None if it has none. ``stop_time`` likewise.
+        step_size: in s, from an annotation; None if no annotation says it.
+        algorithm: from an annotation; None if no annotation says it.
+        needed: what options of a run have to give.
+        elements: in the order of the documents.
+        connectors: those of the root system.
+        connections: how many connections there are between components.
+        parameters: the sources of values.
+        annotations: how many there are of each type.
+        problems: what keeps the package from running, in words with file and line.
+        warnings: what is not supported and has no effect.
+    """
+
+    file: str
+    bytes: int | None
+    description: str
+    name: str
+    version: str
+    variants: tuple[PackageVariant, ...]
+    start_time: float | None
+    stop_time: float | None
+    step_size: float | None
+    algorithm: str | None
+    needed: tuple[str, ...]
+    elements: tuple[PackageElement, ...]
+    connectors: tuple[PackageConnector, ...]
+    connections: int
+    parameters: tuple[PackageParameters, ...]
+    annotations: dict[str, int]
+    problems: tuple[str, ...]
+    warnings: tuple[str, ...]
+
+    @property
+    def page(self) -> str:
+        """The page in lines."""
+        return "\n".join(_page(self))
+
+    def __str__(self) -> str:
+        return self.page
+
+
+def inspect_package(path: str | Path, *, ssd: str | None = None) -> PackageInspection:
+    """Read what a package of SSP says. Nothing of it is run.
+
+    Example:
+        >>> import fmu_mesh
+        >>> _ = fmu_mesh.load("configs/pendulum_delay.yaml").to_ssp("pair.ssp")
+        >>> print(fmu_mesh.inspect_package("pair.ssp"))
+        File         pair.ssp (... bytes)
+        Description  SystemStructure.ssd
+        Name         pendulum_delay
+        ...
+
+    Args:
+        path: an .ssp file, the folder of an unpacked one, or an .ssd file.
+        ssd: which description of the package: the name of its file, or the name that it has; None: the default one.
+
+    Raises:
+        ConfigurationError: there is no such package or description, or it has no system; has all findings.
+    """
+    package_path, chosen = named_package(Path(path), ssd) or (Path(path), ssd)
+    plain = read_system(package_path, chosen)
+    with Package(package_path) as package:
+        name = plain.file.name
+        structure = read_structure(package, name, Problems())
+        if structure is None:
+            raise ConfigurationError(f"'{path}' was changed while it was read", hint="Try again.")
+        variants = [
+            PackageVariant(other, found.name, found.version)
+            for other in package.descriptions
+            if (found := structure if other == name else read_structure(package, other, Problems())) is not None
+        ]
+        return _Inspected(str(path), package, name, structure, plain).inspection(tuple(variants))
+
+
+class _Inspected:
+    def __init__(self, file: str, package: Package, name: str, structure: Structure, plain: PlainConfig) -> None:
+        self._file = file
+        self._package = package
+        self._name = name
+        self._structure = structure
+        self._plain = plain
+
+    def inspection(self, variants: tuple[PackageVariant, ...]) -> PackageInspection:
+        structure, plain = self._structure, self._plain
+        data = plain.data if isinstance(plain.data, dict) else {}
+        times, connections = data.get("simulation"), data.get("connections")
+        simulation = times if isinstance(times, dict) else {}
+        step_size, algorithm = simulation.get("step_size"), simulation.get("algorithm")
+        elements = list(_elements(structure.system))
+        return PackageInspection(
+            file=self._file,
+            bytes=None if files.is_folder(self._package.root) else self._package.root.stat().st_size,
+            description=self._name,
+            name=structure.name,
+            version=structure.version,
+            variants=variants,
+            start_time=structure.start_time,
+            stop_time=structure.stop_time,
+            step_size=step_size if isinstance(step_size, float) else None,
+            algorithm=algorithm if isinstance(algorithm, str) else None,
+            needed=tuple(plain.needed.values()),
+            elements=tuple(self._element(path, element) for path, element in elements),
+            connectors=tuple(
+                PackageConnector(one.name, one.kind, one.type, one.unit.name if one.unit is not None else None)
+                for one in structure.system.connectors
+            ),
+            connections=len(connections) if isinstance(connections, list) else 0,
+            parameters=tuple(self._source(path, one) for path, element in elements for one in element.bindings),
+            annotations=dict(Counter(one.type for one in self._annotations([element for _, element in elements]))),
+            problems=tuple(map(str, plain.findings)),
+            warnings=tuple(map(str, plain.warnings)),
+        )
+
+    def _element(self, path: tuple[str, ...], element: Element) -> PackageElement:
+        is_component = isinstance(element, Component)
+        return PackageElement(
+            path=path,
+            kind="component" if is_component else "system",
+            source=element.source if isinstance(element, Component) else None,
+            instance=instance_name(path) if is_component else None,
+            implementation=element.implementation if isinstance(element, Component) else None,
+            connectors=dict(Counter(one.kind or "unspecified" for one in element.connectors)),
+            connections=len(element.connections) if isinstance(element, StructureSystem) else 0,
+            description=element.description,
+        )
+
+    def _source(self, path: tuple[str, ...], binding: Binding) -> PackageParameters:
+        mapping = binding.mapping
+        return PackageParameters(
+            element=path,
+            file=self._inside(binding.values.place.file),
+            line=binding.values.place.line,
+            parameters=len(binding.values.parameters),
+            prefix=binding.prefix,
+            mapping=self._inside(mapping.place.file) if mapping is not None else None,
+        )
+
+    def _annotations(self, elements: list[Element]) -> Iterator[Annotation]:
+        yield from annotations_of(self._structure)
+        for element in elements:
+            if element is not self._structure.system:
+                yield from element.annotations
+
+    def _inside(self, file: str) -> str:
+        """A file as the package names it."""
+        return file.removeprefix(self._package.shown("")).lstrip("/")
+
+
+def _elements(system: StructureSystem, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Element]]:
+    """The system and all elements inside it, in the order of the documents."""
+    yield path, system
+    for element in system.elements:
+        own = (*path, element.name)
+        if isinstance(element, StructureSystem):
+            yield from _elements(element, own)
+        else:
+            yield own, element
+
+
+# --- the page
+
+
+def _page(found: PackageInspection) -> list[str]:
+    lines = pairs(
+        [
+            ("File", f"{found.file} ({found.bytes} bytes)" if found.bytes is not None else f"{found.file} (a folder)"),
+            ("Description", found.description),
+            ("Name", _line(found.name)),
+            ("Version", f"SSP {found.version}"),
+            ("Variants", _variants(found)),
+            ("Experiment", _experiment(found)),
+            ("Needs", "; ".join(found.needed)),
+            ("System", _counts(found)),
+            ("Annotations", ", ".join(_times(_line(type_), count) for type_, count in found.annotations.items())),
+        ]
+    )
+    sections = [
+        ("Elements", table([_row(element) for element in found.elements], indent=2)),
+        (
+            f"Connectors of the system ({len(found.connectors)})",
+            table([[_line(c.name), c.kind or "", c.type or "", c.unit or ""] for c in found.connectors], indent=2),
+        ),
+        (f"Parameters ({len(found.parameters)})", table([_values(one) for one in found.parameters], indent=2)),
+        (f"Problems ({len(found.problems)})", [f"  {_line(one)}" for one in found.problems]),
+        (f"Warnings ({len(found.warnings)})", [f"  {_line(one)}" for one in found.warnings]),
+    ]
+    for title, content in sections:
+        if content:
+            lines += ["", title, *content]
+    return lines
+
+
+def _variants(found: PackageInspection) -> str:
+    if len(found.variants) <= 1:
+        return ""
+    names = [f"{one.file} ({_line(one.name)})" for one in found.variants]
+    return f"{', '.join(names)}: `--ssd` chooses one"
+
+
+def _experiment(found: PackageInspection) -> str:
+    times = [("start", found.start_time), ("stop", found.stop_time), ("step", found.step_size)]
+    parts = [f"{what} {short_number(value)} s" for what, value in times if value is not None]
+    return ", ".join([*parts, *([found.algorithm] if found.algorithm is not None else [])])
+
+
+def _counts(found: PackageInspection) -> str:
+    kinds = Counter(element.kind for element in found.elements)
+    systems = f" in {kinds['system']} systems" if kinds["system"] > 1 else ""
+    return f"{_many(kinds['component'], 'component')}{systems}, {_many(found.connections, 'connection')} between them"
+
+
+def _row(element: PackageElement) -> list[str]:
+    """An element of the tree, indented below the system that it is in."""
+    name = "  " * len(element.path) + (_line(element.path[-1]) if element.path else "the system")
+    connectors = ", ".join(_many(count, kind) for kind, count in element.connectors.items())
+    if element.kind == "system":
+        return [name, "", _many(element.connections, "connection"), "", connectors]
+    differs = element.instance is not None and element.path != (element.instance,)
+    instance = f"instance {element.instance}" if differs else ""
+    implementation = "" if element.implementation == "any" else str(element.implementation)
+    return [name, element.source or "no FMU", implementation, instance, connectors]
+
+
+def _values(source: PackageParameters) -> list[str]:
+    element = " / ".join(map(_line, source.element)) or "the system"
+    mapping = f"mapped by {source.mapping}" if source.mapping is not None else ""
+    prefix = f"prefix '{_line(source.prefix)}'" if source.prefix else ""
+    return [f"{source.file}:{source.line}", _many(source.parameters, "parameter"), f"of {element}", prefix, mapping]
+
+
+def _many(count: int, what: str) -> str:
+    return f"{count} {what}{'' if count == 1 else 's'}"
+
+
+def _times(what: str, count: int) -> str:
+    return what if count == 1 else f"{what} ({count})"
+
+
+def _line(text: str) -> str:
+    return " ".join(text.split())
