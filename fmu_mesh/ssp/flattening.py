@@ -71,11 +71,13 @@ class ValueChange(msgspec.Struct, frozen=True):
         linear: conversions and transformations together; what only the transformations do is ``own``.
         mapping: the values of the target by values of the source, as written; empty if there is no such mapping.
         ignore_units: whether the units of the two variables are not what counts, because ``linear`` has it all.
+        place: of the last transformation; None if there is none.
     """
 
     linear: Linear = Linear()
     mapping: dict[str, str] = {}
     ignore_units: bool = False
+    place: Place | None = None
 
 
 class FlatConnection(msgspec.Struct, frozen=True):
@@ -267,6 +269,8 @@ class _Flattening:
             self._problems.add(connection.place, found, f"one of {listed(names)}", near)
             return None
         own = (*path, element.name)
+        if not name or (isinstance(element, StructureSystem) and not element.is_known):
+            return None  # there is a finding
         if isinstance(element, StructureSystem):
             return self._of_system(element, own, name, index, connection, "element")
         return self._of_component(element, own, name, index, connection)
@@ -281,6 +285,8 @@ class _Flattening:
         owner: _Owner,
     ) -> _End | None:
         connector = next((one for one in system.connectors if one.name == name), None)
+        if not name:
+            return None  # there is a finding
         if connector is None:
             names = [one.name for one in system.connectors]
             found = f"the unknown connector '{name}' of the system '{system.name}'"
@@ -346,8 +352,9 @@ class _Flattening:
         way = [last]
         while not way[0].source.is_component and (before := self._inbound.get(way[0].source.node)) is not None:
             if before in way:
-                found = f"a circle of connectors of systems, through '{before.target}'"
-                self._problems.add(before.connection.place, found, "a source that computes the value")
+                first = min(way[: way.index(before) + 1], key=lambda one: one.connection.number)
+                found = f"a circle of connectors of systems, through '{first.target}'"
+                self._problems.add(first.connection.place, found, "a source that computes the value")
                 return None
             way.insert(0, before)
         return way
@@ -358,6 +365,7 @@ class _Flattening:
         relative = any(one.variable is not None and one.variable.relative_quantity for one in (source, target))
         unit, total, own = source.unit, Linear(), Linear()
         mapping: Transformation | None = None
+        place: Place | None = None
         for segment in way:
             connection, next_unit = segment.connection, segment.target.unit
             if not connection.suppress_unit_conversion:
@@ -369,6 +377,7 @@ class _Flattening:
             transformation = connection.transformation
             if transformation is None:
                 continue
+            place = transformation.place
             if transformation.kind == "linear":
                 linear = Linear(transformation.factor, transformation.offset)
                 total, own = total.then(linear), own.then(linear)
@@ -384,8 +393,8 @@ class _Flattening:
             return None
         entries = _entries(mapping) if mapping is not None else {}
         if mapping is None and _by_variables(source, target, own, relative=relative) == total:
-            return ValueChange(own)
-        return ValueChange(total, entries, ignore_units=mapping is None)
+            return ValueChange(own, place=place)
+        return ValueChange(total, entries, ignore_units=mapping is None, place=place)
 
     def _converted(self, unit: Unit | None, target: Unit | None, segment: _Segment, *, relative: bool) -> Linear | None:
         """The conversion between two units; None after a finding."""

@@ -231,7 +231,10 @@ _EXPECTED: Final = {
         for name, type_ in VARIABLE_TYPES.items()
         if type_ in INTEGERS
     },
-    **{name: f"a number from {-largest!r} to {largest!r}, INF, -INF or NaN" for name, largest in _LARGEST.items()},
+    **{
+        name: f"a number such as 2.5 or 1e-3, at most {largest:.3g}; INF, -INF or NaN"
+        for name, largest in _LARGEST.items()
+    },
     "Boolean": "true or false",
     "Enumeration": "the name of an item",
     "Binary": "an even number of hexadecimal digits",

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import posixpath
 from collections.abc import Iterable
-from typing import Final, Literal, NamedTuple, cast
+from typing import Final, Literal, NamedTuple, TypeVar, cast, get_args
 
 from msgspec.structs import replace
 
@@ -27,7 +27,6 @@ from .structure import (
     ConnectorKind,
     Enumeration,
     ParameterMapping,
-    ParameterSet,
     Place,
     Structure,
     StructureConnection,
@@ -37,6 +36,8 @@ from .structure import (
 from .xml_reading import XmlElement, read_xml
 
 __all__ = ["read_structure"]
+
+Named = TypeVar("Named", Component | StructureSystem, Connector)
 
 _FMU: Final = "application/x-fmu-sharedlibrary"
 _DEFINITION: Final = "application/x-ssp-definition"
@@ -49,7 +50,10 @@ _IMPLEMENTATIONS: Final[dict[str, Literal["any", "CoSimulation", "ModelExchange"
     "ModelExchange": "ModelExchange",
 }
 _MAXIMUM_DEPTH: Final = 32
-"""Most systems inside one another; a system that contains itself ends here."""
+"""Most systems inside one another."""
+
+_MAXIMUM_NESTED: Final = 1000
+"""Most components that are systems: a few small files that refer to one another could have any number of them."""
 
 
 def read_structure(package: Package, name: str, problems: Problems) -> Structure | None:
@@ -84,8 +88,17 @@ class _Reader:
         self._package = package
         self._problems = problems
         self._connections = 0
+        self._nested_systems = 0
+        self._being_read: list[str] = []
 
     def structure(self, name: str, depth: int) -> Structure | None:
+        self._being_read.append(name)
+        try:
+            return self._structure(name, depth)
+        finally:
+            self._being_read.pop()
+
+    def _structure(self, name: str, depth: int) -> Structure | None:
         root = self._root(name, "ssd:SystemStructureDescription")
         if root is None:
             return None
@@ -122,7 +135,7 @@ class _Reader:
         for child in element.inside("ssd:Elements"):
             match child.tag:
                 case "ssd:Component":
-                    elements += self._component(child, file, depth)
+                    elements.append(self._component(child, file, depth))
                 case "ssd:System" if depth < _MAXIMUM_DEPTH:
                     elements.append(self._system(child, file, depth + 1))
                 case "ssd:System":
@@ -130,7 +143,7 @@ class _Reader:
                 case "ssd:SignalDictionaryReference":
                     expected = "connections between the connectors themselves: signal dictionaries are not supported"
                     self._problems.add(child.place, "a reference to a signal dictionary", expected)
-        self._unique([(one.name, one.place) for one in elements], "element")
+        elements = self._unique(elements, "element")
         if (dictionaries := element.child("ssd:SignalDictionaries")) is not None and dictionaries.child() is not None:
             self._problems.warn(dictionaries.place, "signal dictionaries are not supported, and not read")
         self._not_verified(element)
@@ -147,70 +160,95 @@ class _Reader:
 
     # --- components
 
-    def _component(self, element: XmlElement, file: _File, depth: int) -> list[Component | StructureSystem]:
-        """A component, or the system that it is; nothing after a finding."""
+    def _component(self, element: XmlElement, file: _File, depth: int) -> Component | StructureSystem:
+        """A component, or the system that it is; after a finding with its connectors only."""
         type_ = (element.get("type") or _FMU).strip()
         source = element.get("source")
         if source is None:
             self._problems.add(element.place, "no source: nothing computes it", "an FMU as its source")
-            return []
+            return self._unknown(element, file)
+        if not element.get("name"):
+            return self._unknown(element, file)  # there is a finding
         if type_ not in (_FMU, _DEFINITION, _PACKAGE):
             expected = f"{_FMU}, {_DEFINITION} or {_PACKAGE}"
             self._problems.add(element.place, f"the type '{type_}'", expected)
-            return []
+            return self._unknown(element, file)
         if type_ != _FMU:
             return self._nested(element, file, source, depth)
         name = self._package.named_by(source, file.folder, element.place, self._problems)
+        if name is None:
+            return self._unknown(element, file)
         implementation = element.get("implementation")
         if implementation == "ScheduledExecution":
             expected = "CoSimulation or ModelExchange"
             self._problems.add(element.place, f"the implementation '{implementation}'", expected)
         self._not_verified(element)
-        return [
-            Component(
-                name=element.text("name"),
-                source=name or "",
-                place=element.place,
-                implementation=_IMPLEMENTATIONS.get(implementation or "", "any"),
-                connectors=self._connectors(element, file),
-                bindings=self._bindings(element, file, name),
-                annotations=element.annotations(),
-                description=element.get("description"),
-            )
-        ]
+        return Component(
+            name=element.text("name"),
+            source=name,
+            place=element.place,
+            implementation=_IMPLEMENTATIONS.get(implementation or "", "any"),
+            connectors=self._connectors(element, file),
+            bindings=self._bindings(element, file, name),
+            annotations=element.annotations(),
+            description=element.get("description"),
+        )
 
-    def _nested(self, element: XmlElement, file: _File, source: str, depth: int) -> list[Component | StructureSystem]:
+    def _nested(self, element: XmlElement, file: _File, source: str, depth: int) -> StructureSystem:
         """A component that is a system: that system under the name of the component, with its bindings last."""
+        self._nested_systems += 1
+        if self._nested_systems == _MAXIMUM_NESTED + 1:
+            found = f"more than {_MAXIMUM_NESTED} components that are systems"
+            self._problems.add(element.place, found, "fewer: do files refer to one another several times?")
+        if self._nested_systems > _MAXIMUM_NESTED:
+            return self._unknown(element, file)
         if depth >= _MAXIMUM_DEPTH:
             self._too_deep(element.place)
-            return []
+            return self._unknown(element, file)
         uri, _, fragment = source.partition("#")
         system: StructureSystem | None = None
         if not uri and fragment:
-            definition = element.with_id(fragment)
-            if definition is None or definition.tag != "ssd:System":
-                self._problems.add(element.place, f"the source '{source}'", f"the id of a System in {file.name}")
-                return []
-            system = self._system(definition, file, depth + 1)
+            system = self._defined(element, file, fragment, depth)
         else:
             name = self._package.named_by(uri, file.folder, element.place, self._problems)
-            if name is None:
-                return []
-            if not name.lower().endswith(".ssd"):
+            if name is not None and not name.lower().endswith(".ssd"):
                 name = posixpath.join(name, fragment or DEFAULT)
-            structure = self.structure(name, depth + 1)
-            system = structure.system if structure is not None else None
+            if name in self._being_read:
+                self._problems.add(element.place, f"the system '{name}' inside itself", "another system")
+            elif name is not None:
+                structure = self.structure(name, depth + 1)
+                system = structure.system if structure is not None else None
         if system is None:
-            return []
+            return self._unknown(element, file)
         own = self._bindings(element, file, None)
-        return [replace(system, name=element.text("name"), place=element.place, bindings=(*system.bindings, *own))]
+        return replace(system, name=element.text("name"), place=element.place, bindings=(*system.bindings, *own))
+
+    def _defined(self, element: XmlElement, file: _File, identifier: str, depth: int) -> StructureSystem | None:
+        """The system of the same file with this id; None after a finding."""
+        definition = element.with_id(identifier)
+        if definition is None or definition.tag != "ssd:System":
+            self._problems.add(element.place, f"the source '#{identifier}'", f"the id of a System in {file.name}")
+            return None
+        own = f"{file.name}#{identifier}"
+        if own in self._being_read or element.is_inside(definition):
+            self._problems.add(element.place, f"the system '#{identifier}' inside itself", "another system")
+            return None
+        self._being_read.append(own)
+        system = self._system(definition, file, depth + 1)
+        self._being_read.pop()
+        return system
+
+    def _unknown(self, element: XmlElement, file: _File) -> StructureSystem:
+        """What stands for a component that cannot be read, for which there is a finding."""
+        return StructureSystem(
+            element.text("name"), element.place, connectors=self._connectors(element, file), is_known=False
+        )
 
     # --- connectors and connections
 
     def _connectors(self, element: XmlElement, file: _File) -> tuple[Connector, ...]:
         connectors = [self._connector(one, file) for one in element.inside("ssd:Connectors")]
-        self._unique([(one.name, one.place) for one in connectors], "connector")
-        return tuple(connectors)
+        return tuple(self._unique(connectors, "connector"))
 
     def _connector(self, element: XmlElement, file: _File) -> Connector:
         type_ = element.child(*(f"ssc:{name}" for name in TYPES))
@@ -228,7 +266,7 @@ class _Reader:
         kind = element.get("kind")
         return Connector(
             name=element.text("name"),
-            kind=cast("ConnectorKind | None", kind),
+            kind=cast("ConnectorKind", kind) if kind in get_args(ConnectorKind) else None,
             place=place,
             type=name,
             unit=unit,
@@ -269,6 +307,10 @@ class _Reader:
         values = self._referred(element, inline, "ssv:ParameterSet", _SET, file, component)
         if values is None:
             return None
+        if element.get("source"):
+            parameters = parameter_set(values, self._problems)
+        else:  # a set inside this file
+            parameters = parameter_set(values, self._problems, file.units, file.enumerations)
         mapping = element.child("ssd:ParameterMapping")
         entries: ParameterMapping | None = None
         if mapping is not None:
@@ -276,7 +318,6 @@ class _Reader:
             if found is None:
                 return None
             entries = parameter_mapping(found, self._problems)
-        parameters: ParameterSet = parameter_set(values, self._problems)
         return Binding(parameters, element.place, element.get("prefix") or "", entries)
 
     def _referred(  # noqa: PLR0913, PLR0917  what a reference consists of
@@ -315,17 +356,19 @@ class _Reader:
 
     # --- findings
 
-    def _unique(self, named: Iterable[tuple[str, Place]], what: str) -> None:
-        first: dict[str, Place] = {}
-        for name, place in named:
-            if name in first:
-                found = f"a second {what} '{name}', first in line {first[name].line}"
-                self._problems.add(place, found, "names of their own inside a system")
-            first.setdefault(name, place)
+    def _unique(self, named: Iterable[Named], what: str) -> list[Named]:
+        """Those with a name that none before them has; the others are findings."""
+        first: dict[str, Named] = {}
+        for one in named:
+            if one.name in first:
+                found = f"a second {what} '{one.name}', first in line {first[one.name].place.line}"
+                self._problems.add(one.place, found, "names of their own inside a system")
+            first.setdefault(one.name, one)
+        return list(first.values())
 
     def _too_deep(self, place: Place) -> None:
         found = f"more than {_MAXIMUM_DEPTH} systems inside one another"
-        self._problems.add(place, found, "fewer: does a system contain itself?")
+        self._problems.add(place, found, "fewer")
 
     def _not_verified(self, element: XmlElement) -> None:
         for signature in element.children("ssc:Signature"):

@@ -209,11 +209,13 @@ class Annotation(msgspec.Struct, frozen=True):
     Attributes:
         type: its namespace, such as `org.openmodelica`.
         xml: the XML of its content.
+        text: the text of the first element inside it, without those in that element; empty if there is none.
     """
 
     type: str
     xml: bytes
     place: Place
+    text: str = ""
 
 
 class Component(msgspec.Struct, frozen=True):
@@ -235,7 +237,11 @@ class Component(msgspec.Struct, frozen=True):
 
 
 class StructureSystem(msgspec.Struct, frozen=True):
-    """A system: elements and the connections between them (SSP 2.0, 5.3)."""
+    """A system: elements and the connections between them (SSP 2.0, 5.3).
+
+    Attributes:
+        is_known: false: it stands for a component that cannot be read, for which there is a finding.
+    """
 
     name: str
     place: Place
@@ -245,6 +251,7 @@ class StructureSystem(msgspec.Struct, frozen=True):
     bindings: tuple[Binding, ...] = ()
     annotations: tuple[Annotation, ...] = ()
     description: str | None = None
+    is_known: bool = True
 
 
 Element = Component | StructureSystem

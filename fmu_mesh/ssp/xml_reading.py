@@ -94,10 +94,13 @@ class XmlElement:
 
     def annotations(self) -> tuple[Annotation, ...]:
         """The annotations of this element."""
-        return tuple(
-            Annotation(one.text("type"), b"".join(etree.tostring(child) for child in one._element), one.place)  # noqa: SLF001  of this class
-            for one in self.inside(f"{self.tag.partition(':')[0]}:Annotations")
-        )
+        return tuple(one._annotation() for one in self.inside(f"{self.tag.partition(':')[0]}:Annotations"))  # noqa: SLF001  of this class
+
+    def _annotation(self) -> Annotation:
+        """This element as an annotation."""
+        content = b"".join(etree.tostring(child) for child in self._element)
+        text = next((child.text or "" for child in self._element if isinstance(child.tag, str)), "")
+        return Annotation(self.text("type"), content, self.place, text)
 
     def with_id(self, identifier: str) -> XmlElement | None:
         """The element of the whole file with this `id`; None if there is none."""
@@ -105,6 +108,13 @@ class XmlElement:
             if isinstance(element.tag, str) and element.get("id") == identifier:
                 return XmlElement(element, self._file, self.version)
         return None
+
+    def is_inside(self, other: XmlElement) -> bool:
+        """Whether this element is another one, or anywhere inside it."""
+        own: Any = self._element
+        while own is not None and own is not other._element:
+            own = own.getparent()
+        return own is not None
 
     def check(self, problems: Problems) -> None:
         """Check this element and all that is inside it against the grammar."""
@@ -264,7 +274,7 @@ def _in_words(element: Any) -> str:  # noqa: ANN401  lxml ships no types
 def _end(element: Any, side: str) -> str:  # noqa: ANN401  lxml ships no types
     """One end of a connection as its attributes have it."""
     owner, connector = element.get(f"{side}Element"), element.get(f"{side}Connector")
-    return f"{owner}.{connector}" if owner else str(connector)
+    return f"{owner}.{connector or '?'}" if owner else connector or "?"
 
 
 def _number(text: str | None, default: float | None) -> float | None:
