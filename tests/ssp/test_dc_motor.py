@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Literal
 
 import pytest
 
@@ -31,10 +32,12 @@ def test_the_reference_reaches_the_steady_state(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("algorithm", ["jacobi", "gauss_seidel"])
-def test_the_mesh_reaches_the_steady_state_by_model_exchange(algorithm: str, tmp_path: Path) -> None:
+def test_the_mesh_reaches_the_steady_state_by_model_exchange(
+    algorithm: Literal["jacobi", "gauss_seidel"], tmp_path: Path
+) -> None:
     package = make_package(SYSTEMS["dc motor"](), tmp_path)
 
-    options = {"step_size": 0.001, "stop_time": 3.0, "algorithm": algorithm}
-    result = fmu_mesh.load(package).run(processes=False, record="memory", **options)
+    mesh = fmu_mesh.load(package)
+    result = mesh.run(processes=False, record="memory", step_size=0.001, stop_time=3.0, algorithm=algorithm)
 
     assert (result["SuT-rotor.w"][-1], result["SuT-winding.I"][-1]) == pytest.approx((SPEED, CURRENT), rel=1e-11)
