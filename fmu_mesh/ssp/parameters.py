@@ -17,7 +17,7 @@ from ..variables.model_description import ModelDescription, Value, Variable
 from ..variables.value_conversion import ValueRefused, to_value
 from .parameter_values import AppliedValue, changed, converted, target_of_connector, target_of_variable
 from .problems import Problems
-from .structure import Binding, Component, MappingEntry, Parameter, Place, StructureSystem, components_of
+from .structure import Binding, Component, MappingEntry, Parameter, ParameterSet, Place, StructureSystem, components_of
 
 __all__ = ["AppliedValue", "ResolvedParameters", "changed", "resolve_parameters"]
 
@@ -116,6 +116,8 @@ class _Resolution:
             if not self._note(owner, path, name, candidate):
                 place = candidate.entry.place if candidate.entry is not None else candidate.parameter.place
                 unmatched.append((name, place))
+            else:
+                self._check_unique(candidate.parameter, binding.values)
         if not unmatched:
             return
         names = list(islice(self._names(owner, path), _COMPARED_NAMES))
@@ -127,6 +129,13 @@ class _Resolution:
         if rest := unmatched[_SHOWN_NAMES:]:
             found = f"{len(rest)} more values for names that {whose} does not have: they have no effect"
             self._problems.warn(rest[0][1], f"{found} ({listed([name for name, _ in rest])})")
+
+    def _check_unique(self, parameter: Parameter, values: ParameterSet) -> None:
+        """Refuse to apply a parameter of which there are two with different values."""
+        second = values.ambiguous.get(parameter.name)
+        if second is not None:
+            found = f"a second parameter {shown(parameter.name)} with another value"
+            self._problems.add(second, found, f"one of this name (first: line {parameter.place.line})")
 
     def _named(self, binding: Binding) -> Iterator[tuple[str, _Candidate]]:
         """The values of a binding by the names that they are applied to: the prefix comes first, then the mapping."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -168,11 +169,12 @@ def _resolve(folder: Path, root: str) -> tuple[ResolvedParameters, Problems]:
         "</ssd:SystemStructureDescription>"
     )
     (folder / "SystemStructure.ssd").write_text(text)
+    for name in re.findall(r'source="([^"]+\.fmu)"', text):
+        (folder / name).touch()  # nothing reads it
     problems = Problems()
     with Package(folder) as package:
         structure = read_structure(package, "SystemStructure.ssd", problems)
     assert structure is not None
-    problems.findings[:] = [one for one in problems.findings if ".fmu" not in one.found]  # there are no FMUs
     return resolve_parameters(structure.system, lambda _path: ALL, problems), problems
 
 
@@ -410,6 +412,32 @@ def test_a_value_that_another_one_replaces_is_not_judged(tmp_path: Path) -> None
 
     assert _values(resolved) == {"g.n": 3}
     assert not problems.findings
+
+
+@pytest.mark.parametrize(
+    ("second", "findings"), [(_real("k", 1), 0), (_real("k", 2), 1), (_typed("k", "Integer", 1), 1)]
+)
+def test_to_apply_a_parameter_that_has_two_values_is_a_finding(tmp_path: Path, second: str, findings: int) -> None:
+    root = _system("root", _component("g", _binding(f"{_real('k', 1)}\n{second}")))
+
+    _, problems = _resolve(tmp_path, root)
+
+    assert len(problems.findings) == findings
+    if findings:
+        assert _one(problems.findings) == (
+            "5: Parameter 'k' of Component 'g': a second parameter 'k' with another value; expected one of this name "
+            "(first: line 4)"
+        )
+
+
+def test_a_parameter_that_has_two_values_and_is_not_applied_is_a_warning(tmp_path: Path) -> None:
+    both = _real("a", 1) + _real("a", 2) + _real("b", 3)
+
+    resolved, problems = _resolve(tmp_path, _system("root", _component("g", _binding(both, _entry("b", "k")))))
+
+    assert _values(resolved) == {"g.k": 3.0}
+    assert not problems.findings
+    assert "a second parameter of the same name: 'a'" in _one(problems.warnings)
 
 
 # --- types
