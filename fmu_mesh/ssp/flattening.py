@@ -69,14 +69,13 @@ class ValueChange(msgspec.Struct, frozen=True):
 
     Attributes:
         linear: conversions and transformations together; what only the transformations do is ``own``.
-        mapping: the values of the target by values of the source, as a configuration has them: those of an
-            Enumeration by the names of its items; empty if there is no such mapping.
+        mapping: the values of the target by values of the source, as written; empty if there is no such mapping.
         ignore_units: whether the units of the two variables are not what counts, because ``linear`` has it all.
         place: of the last transformation; None if there is none.
     """
 
     linear: Linear = Linear()
-    mapping: dict[str, bool | int | str] = {}
+    mapping: dict[str, str] = {}
     ignore_units: bool = False
     place: Place | None = None
 
@@ -440,14 +439,14 @@ def _by_variables(source: _End, target: _End, own: Linear, *, relative: bool) ->
     return change.then(own) if change is not None else None
 
 
-def _entries(mapping: Transformation) -> dict[str, bool | int | str]:
+def _entries(mapping: Transformation) -> dict[str, str]:
     """The entries of a mapping as a configuration has them."""
     match mapping.kind:
         case "boolean":
             words = {"1": "true", "0": "false"}
-            return {words.get(one.source, one.source): one.target in ("true", "1") for one in mapping.entries}
+            return {words.get(one.source, one.source): words.get(one.target, one.target) for one in mapping.entries}
         case "integer":
-            return {str(int(one.source)): int(one.target) for one in mapping.entries}
+            return {str(int(one.source)): str(int(one.target)) for one in mapping.entries}
         case _:
             return {one.source: one.target for one in mapping.entries}
 

@@ -350,22 +350,19 @@ def _whole(element: Any, items: Mapping[str, int]) -> int:  # noqa: ANN401  the 
     raise _Misfit("a whole number")
 
 
-def _mapped(
-    element: Any,  # noqa: ANN401  any type
-    items: Mapping[str, int],
-    mapping: Mapping[str, bool | int | str],
-) -> Any:  # noqa: ANN401  as above
+def _mapped(element: Any, items: Mapping[str, int], mapping: Mapping[str, str]) -> Any:  # noqa: ANN401  any type
     """A value after the mapping of a connection; one that it does not name stays what it is."""
     match element:
         case bool():
-            return mapping.get(str(element).lower(), element)
+            text = str(element).lower()
+            return mapping.get(text, text) == "true"
         case str():
             number = str(items.get(element))
-            return mapping[element] if element in mapping else mapping.get(number, element)
+            return mapping[element] if element in mapping else int(mapping[number]) if number in mapping else element
         case float() if not element.is_integer():
             return element
         case _:
-            return mapping.get(str(int(element)), int(element))
+            return int(mapping.get(str(int(element)), element))
 
 
 def _where(place: Place, origin: Place) -> str:
