@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Literal
 
 import pytest
 
@@ -31,7 +32,9 @@ def test_the_reference_reaches_the_steady_state(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("algorithm", ["jacobi", "gauss_seidel"])
-def test_the_mesh_reaches_the_steady_state_by_model_exchange(algorithm: str, tmp_path: Path) -> None:
+def test_the_mesh_reaches_the_steady_state_by_model_exchange(
+    algorithm: Literal["jacobi", "gauss_seidel"], tmp_path: Path
+) -> None:
     package = make_package(SYSTEMS["dc motor"](), tmp_path)
 
     mesh = fmu_mesh.load(package)
