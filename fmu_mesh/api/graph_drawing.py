@@ -66,8 +66,7 @@ class GraphEdge(msgspec.Struct, frozen=True):
 
     Attributes:
         source: the instance with the outputs; ``target``: the one with the inputs.
-        delay: 0 or 1 points.
-        variables: the connections.
+        delay: 0 or 1 points; -1 (`INITIAL`) for values of parameters. ``variables``: the connections.
         closes_cycle: whether it goes back against the order of execution; without such edges there is no cycle.
         cycle: number of the cycle in `SystemGraph.cycles` that it belongs to; None if it belongs to none.
     """
@@ -247,7 +246,7 @@ def drawing_of(
 
 def _legend(edges: Sequence[GraphEdge]) -> list[str]:
     texts = []
-    if any(edge.delay for edge in edges):
+    if any(edge.delay > 0 for edge in edges):
         texts.append("dashed: delay 1, the step uses the value at its start")
     if any(edge.cycle is not None for edge in edges):
         texts.append("thick and coloured: a cycle")
@@ -324,7 +323,7 @@ class _Planning:
                 edges[port.edge].target,
                 _row_y(rows[edges[port.edge].source][1][port.source], is_live=is_live),
                 _row_y(rows[edges[port.edge].target][0][port.target], is_live=is_live),
-                edges[port.edge].delay,
+                abs(edges[port.edge].delay),
             )
             for port in self._ports
         ]
@@ -423,10 +422,10 @@ def _wired(names: Sequence[str], edges: Sequence[GraphEdge]) -> tuple[list[_Port
 
 
 def _tip(edge: GraphEdge, variable: GraphVariable) -> str:
-    unit = f" ({variable.unit_text})" if variable.unit_text else ""
-    closing = ", closes a cycle" if edge.closes_cycle else ""
-    end = closing + (f", map {variable.map}" if variable.map else "")
-    return f"{edge.source}.{variable.source} -> {edge.target}.{variable.target}{unit}, delay {edge.delay}{end}"
+    end = f" ({variable.unit_text}), " if variable.unit_text else ", "
+    end += f"delay {edge.delay}" if edge.delay >= 0 else "in the initialization"
+    end += (", closes a cycle" if edge.closes_cycle else "") + (f", map {variable.map}" if variable.map else "")
+    return f"{edge.source}.{variable.source} -> {edge.target}.{variable.target}{end}"
 
 
 def _port_text(name: str, unit: str) -> str:

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 from ..system.graph import feedback_edges, topological_order
 
-__all__ = ["Arrangement", "Dot", "Wire", "arranged", "going_back"]
+__all__ = ["INITIAL", "Arrangement", "Dot", "Wire", "arranged", "going_back"]
 
 Dot = tuple[float, float]
 
@@ -75,6 +75,10 @@ class _End(NamedTuple):
 
 
 _Step = tuple[_End, _End]
+
+
+INITIAL = -1
+"""The delay of wires with values of parameters, which have no part in the steps."""
 
 
 def going_back(names: Sequence[str], wires: Sequence[tuple[str, str, int]]) -> set[int]:

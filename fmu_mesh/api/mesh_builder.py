@@ -6,12 +6,12 @@ import logging
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Self, Unpack, cast
+from typing import TYPE_CHECKING, Any, Literal, Self, Unpack, cast
 
 import msgspec
 
 from ..config.instance_sections import KIND
-from ..config.loading import PlainConfig, read_file, read_text
+from ..config.loading import PlainConfig, read_text
 from ..config.mesh import LimitsConfig
 from ..config.yaml_text import written
 from ..errors import CallRefused, ConfigurationError, FmuError, LoadFailed
@@ -21,12 +21,14 @@ from ..instances.registry import KINDS, check_engines
 from ..run.options import with_config_values, with_needed
 from ..run.preparing import KnownModels, planned
 from ..run.run_plan import RunPlan
+from ..ssp.configuration_files import read_configuration
 from ..text import listed, shown
 from .mesh_check import Check
 from .plan_options import PlanOptions, RunOptions, StartOptions, options_of, plain, with_record, with_scenario
 from .run_handle import Run
 
 if TYPE_CHECKING:
+    from ..errors import Finding
     from .open_system import System
     from .repeated_mesh import RepeatedMesh
     from .result import Result
@@ -101,9 +103,9 @@ class Mesh:
         return mesh
 
     @classmethod
-    def from_file(cls, path: str | Path) -> Self:
+    def from_file(cls, path: str | Path, *, ssd: str | None = None) -> Self:
         """As `load`."""
-        return cls.from_configuration(read_file(Path(path)))
+        return cls.from_configuration(read_configuration(Path(path), ssd))
 
     @classmethod
     def from_fmu(
@@ -323,6 +325,34 @@ class Mesh:
         except OSError as error:
             raise ConfigurationError(f"'{path}' cannot be written: {error.strerror}") from error
 
+    def to_ssp(self, path: str | Path, *, version: Literal["1.0", "2.0"] | None = None) -> tuple[Finding, ...]:
+        """Write the mesh as a package of SSP (docs/ssp.md): its FMUs, start values and connections in one file.
+
+        `load` reads it back. What SSP cannot say, such as the step size, is an annotation of the package. A mesh that
+        was loaded from a package, and whose instances and connections are still the same, keeps everything else in it.
+
+        Example:
+            >>> import fmu_mesh
+            >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
+            >>> mesh.to_ssp("pendulum_delay.ssp")
+            ()
+
+        Args:
+            path: the file, which ends in `.ssp`; an older one is replaced.
+            version: of SSP; None: that of the package that the mesh was loaded from, otherwise 1.0. Arrays and types
+                of FMI 3.0 need 2.0.
+
+        Returns:
+            What the package that the mesh was loaded from has, and this one has not.
+
+        Raises:
+            ConfigurationError: the mesh is wrong, SSP cannot say something, or a file cannot be read or written;
+                carries all findings. No file is left behind.
+        """
+        from ..ssp.exporting import export  # noqa: PLC0415  only this needs it
+
+        return export(self._plain, lambda: self.plan().plan.system, Path(path), version)
+
     # --- running
 
     def check(self, **options: Unpack[PlanOptions]) -> Check:
@@ -488,16 +518,21 @@ class Mesh:
         return section
 
 
-def load(path: str | Path) -> Mesh:
-    """Read a configuration file.
+def load(path: str | Path, *, ssd: str | None = None) -> Mesh:
+    """Read a configuration: a YAML file, or a package of SSP.
 
     Example:
         >>> import fmu_mesh
         >>> fmu_mesh.load("configs/pendulum_delay.yaml").instances
         ['pendulum', 'delay']
 
+    Args:
+        path: the YAML file; or an .ssp file, the folder of an unpacked one, or an .ssd file.
+        ssd: which system structure description of a package: the name of its file, such as "VarB.ssd", or the name that
+            it has; None: SystemStructure.ssd.
+
     Raises:
         ConfigurationError: the file cannot be read, or is no YAML. What it means is checked by `Mesh.check`, and before
             a run.
     """
-    return Mesh.from_file(path)
+    return Mesh.from_file(path, ssd=ssd)

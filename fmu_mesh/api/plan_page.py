@@ -120,6 +120,9 @@ def _connections(plan: Plan) -> list[str]:
     closing_ones = {str(c) for c in plan.closing}
     rows = []
     for c in plan.connections:
+        if c.initial_only:
+            rows.append([str(c), "", "value in the initialization", _arithmetic(c), "", c.units])
+            continue
         what = "value at the start of the step" if c.delay else "value at the end of the step"
         closing = "closes a cycle" if str(c) in closing_ones else ""
         if c.extrapolation == "linear":
@@ -191,7 +194,7 @@ def _order(plan: Plan) -> list[str]:
 def _groups(plan: Plan) -> list[str]:
     """For each cycle, what `group: auto` does or would do, and why."""
     config, instances = plan.system.config, plan.system.instances
-    edges = [(c.source_instance, c.target_instance) for c in plan.connections]
+    edges = [(c.source_instance, c.target_instance) for c in plan.connections if not c.initial_only]
     automatic = automatic_nodes(config, edges, {name: own.description for name, own in instances.items()})
     lines = []
     for cycle in plan.cycles:

@@ -44,6 +44,7 @@ class PlannedConnection(msgspec.Struct, frozen=True):
 
     Attributes:
         map: what the input gets instead of a value, items by their names; other values stay as they are.
+        initial_only: whether it gives a parameter its value in the initialization, and has no part in the steps.
     """
 
     source: str = msgspec.field(name="from")
@@ -54,6 +55,7 @@ class PlannedConnection(msgspec.Struct, frozen=True):
     units: str
     closes_cycle: bool
     map: dict[str, str] = {}
+    initial_only: bool = False
 
 
 class PlannedRecord(msgspec.Struct, frozen=True):
@@ -139,6 +141,7 @@ def plan_view(plan: Plan, loaded: LoadedConfig) -> PlanView:
             c.units,
             str(c) in closing,
             map_words(c.map, c.source, c.target),
+            c.initial_only,
         )
         for c in plan.connections
     ]

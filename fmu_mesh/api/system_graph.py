@@ -16,7 +16,7 @@ from msgspec.structs import replace
 from ..system.graph import strongly_connected, topological_order
 from ..system.value_map import map_text
 from .graph_drawing import GraphEdge, GraphNode, GraphVariable, drawing_of
-from .graph_layout import going_back
+from .graph_layout import INITIAL, going_back
 from .graph_pictures import figure_of_drawing, svg_of_drawing
 from .tables import shortened, table
 
@@ -168,7 +168,7 @@ def graph_of_plan(plan: Plan) -> SystemGraph:
     ]
     connections = [
         (
-            (c.source_instance, c.target_instance, c.delay or 0),
+            (c.source_instance, c.target_instance, INITIAL if c.initial_only else c.delay or 0),
             GraphVariable(
                 c.source_name,
                 c.target_name,
@@ -196,7 +196,7 @@ def graph_of_infos(mesh: str, infos: Sequence[InstanceInfo]) -> SystemGraph:
             both = [units.get(end, units.get(end.partition("[")[0], "")) for end in (c.source, c.target)]
             mapped = ", ".join(f"{have} -> {want}" for have, want in c.map)
             variable = GraphVariable(output, input_, both[0], both[1], c.factor, c.offset, mapped)
-            connections.append(((source, target, c.delay), variable))
+            connections.append(((source, target, INITIAL if c.initial_only else c.delay), variable))
     return graph_of(mesh, nodes, connections)
 
 
@@ -212,10 +212,11 @@ def graph_of(
     for key, variable in connections:
         edges.setdefault(key, []).append(variable)
     by_name = {node.instance: node for node in nodes}
-    order = topological_order(by_name, [(source, target) for source, target, delay in edges if not delay])
+    order = topological_order(by_name, [(source, target) for source, target, delay in edges if delay == 0])
     keys = list(edges)
-    back = going_back(order, keys)
-    ends = [(source, target) for source, target, _ in keys]
+    stepped = [key for key in keys if key[2] != INITIAL]
+    back = {stepped[number] for number in going_back(order, stepped)}
+    ends = [(source, target) for source, target, _ in stepped]
     parts = [part for part in strongly_connected(by_name, ends) if len(part) > 1 or (part[0], part[0]) in ends]
     cycles = sorted((tuple(sorted(part, key=order.index)) for part in parts), key=lambda cycle: order.index(cycle[0]))
     return SystemGraph(
@@ -227,10 +228,10 @@ def graph_of(
                 target=key[1],
                 delay=key[2],
                 variables=tuple(edges[key]),
-                closes_cycle=number in back,
-                cycle=next((n for n, c in enumerate(cycles) if key[0] in c and key[1] in c), None),
+                closes_cycle=key in back,
+                cycle=next((n for n, c in enumerate(cycles) if key in stepped and key[0] in c and key[1] in c), None),
             )
-            for number, key in enumerate(keys)
+            for key in keys
         ),
         tuple(cycles),
     )
@@ -253,7 +254,7 @@ def _live(node: GraphNode, status: InstanceStatus | None, before: InstanceStatus
 
 
 def _remark(edge: GraphEdge, variable: GraphVariable) -> str:
-    delay = "closes a cycle" if edge.closes_cycle else "delay 1" if edge.delay else ""
+    delay = "closes a cycle" if edge.closes_cycle else ("", "delay 1", "at the start")[edge.delay]
     return ", ".join(filter(None, [delay, "map" if variable.map else ""]))
 
 

@@ -48,7 +48,7 @@ def _add_schema(parser: CommandParser) -> None:
 
 def _check(arguments: argparse.Namespace) -> int:
     try:
-        check = load(arguments.config).check(**given_options(arguments))
+        check = load(arguments.config, ssd=arguments.ssd).check(**given_options(arguments))
         if not arguments.json and check.run is not None:
             print(check or check.page)
         check.require()

@@ -16,9 +16,9 @@ from argcomplete.completers import BaseCompleter, FilesCompleter
 from argcomplete.finders import CompletionFinder
 from argcomplete.shell_integration import shellcode
 
-from ..config.loading import read_file
 from ..config.mesh import SimulationConfig
 from ..errors import FmuMeshError
+from ..ssp.configuration_files import read_configuration
 from ..wire.client.reaching import Meshes
 from .arguments import CommandParser, Parsers
 
@@ -28,9 +28,12 @@ _SHELLS: Final = ("bash", "zsh", "fish")
 _PATIENCE_S: Final = 1.0
 _RESULTS: Final = ("csv", "mcap")
 _FILES: Final[Mapping[str, tuple[str, ...]]] = {
-    "CONFIG": ("yaml", "yml", "ssp"),
-    "CONFIG|MESH": ("yaml", "yml", "ssp"),
+    "CONFIG": ("yaml", "yml", "ssp", "ssd"),
+    "CONFIG|MESH": ("yaml", "yml", "ssp", "ssd"),
     "MODEL.fmu": ("fmu",),
+    "MODEL.fmu|PACKAGE": ("fmu", "ssp", "ssd"),
+    "SOURCE": ("ssp", "ssd", "yaml", "yml"),
+    "TARGET": ("ssp", "yaml", "yml"),
     "FMU": ("fmu",),
     "RESULTS.csv": _RESULTS,
     "BAG": ("mcap",),
@@ -84,7 +87,7 @@ def _offered(prefix: str, action: argparse.Action, parsed_args: argparse.Namespa
     if action.dest == "algorithm":
         return get_args(get_type_hints(SimulationConfig)["algorithm"])
     if action.dest == "node":
-        return _instances_in(parsed_args.config)
+        return _instances_in(parsed_args.config, getattr(parsed_args, "ssd", None))
     return ()
 
 
@@ -127,8 +130,8 @@ _from_running: Final[Mapping[str, Callable[[str, argparse.Namespace], list[str]]
 """What only running meshes know, by the destination of an argument."""
 
 
-def _instances_in(file: Path) -> Iterable[str]:
-    data = read_file(file).data
+def _instances_in(file: Path, ssd: str | None) -> Iterable[str]:
+    data = read_configuration(file, ssd).data
     instances = data.get("instances") if isinstance(data, dict) else None
     return [*instances] if isinstance(instances, dict) else []
 

@@ -4,19 +4,26 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import cast
+
+from msgspec.structs import asdict
 
 from ..api.attaching import attach
 from ..api.drawing import draw
 from ..api.mesh_builder import load
+from ..api.plan_options import PlanOptions
 from ..api.system_graph import SystemGraph
 from ..errors import ConfigurationError
 from ..files import replaced
+from ..ssp.configuration_files import names_package
 from .arguments import CommandParser, Parsers, add_json, add_quiet, add_reaching
 from .output.json_output import print_json
+from .run_options import add_options, add_ssd, read_options
 
 __all__ = ["PARSERS"]
 
-_CONFIGURATIONS = (".yaml", ".yml", ".ssp")
+_CONFIGURATIONS = (".yaml", ".yml")
+_OF_CONFIG = ("algorithm", "step_size", "stop_time", "start_values", "config_values", "allow_code")
 
 
 def _add_graph(parser: CommandParser) -> None:
@@ -24,7 +31,8 @@ def _add_graph(parser: CommandParser) -> None:
         "of",
         nargs="?",
         metavar="CONFIG|MESH",
-        help="a configuration file, or the name or key of a running mesh; default: the only one that runs",
+        help="a configuration file or a package of SSP, or the name or key of a running mesh; default: the only one "
+        "that runs",
     )
     parser.add_argument(
         "--output",
@@ -32,11 +40,8 @@ def _add_graph(parser: CommandParser) -> None:
         metavar="FILE.svg",
         help="write it into a .svg, .png, .pdf or .txt file; default: text on the terminal",
     )
-    parser.add_argument(
-        "--allow-code",
-        action="store_true",
-        help="run the Python code that CONFIG names although another user owns the file",
-    )
+    add_ssd(parser)
+    add_options(parser, *_OF_CONFIG)
     add_quiet(parser)
     add_json(parser, "JSON: one object with all instances and connections")
     add_reaching(parser)
@@ -61,10 +66,15 @@ def _graph(arguments: argparse.Namespace) -> int:
 
 def _graph_of(arguments: argparse.Namespace) -> SystemGraph:
     of = arguments.of
-    if of is not None and (Path(of).suffix.lower() in _CONFIGURATIONS or Path(of).is_file()):
-        return load(of).graph(allow_code=arguments.allow_code)
+    if of is not None and _is_configuration(Path(of)):
+        given = {name: value for name, value in asdict(read_options(arguments)).items() if name in _OF_CONFIG}
+        return load(of, ssd=arguments.ssd).graph(**cast("PlanOptions", given))
     with attach(of, connect=arguments.connect, timeout=arguments.timeout) as run:
         return run.graph()
+
+
+def _is_configuration(path: Path) -> bool:
+    return path.suffix.lower() in _CONFIGURATIONS or path.is_file() or names_package(path)
 
 
 def write(graph: SystemGraph, output: Path) -> None:

@@ -120,7 +120,7 @@ def _unknown(name: str) -> ConfigurationError:
     """The error for a first argument that is not a command, such as a file."""
     suffix = PurePath(name).suffix
     near = nearest(name, COMMANDS)
-    if suffix in (".yaml", ".yml", ".fmu"):
+    if suffix in (".yaml", ".yml", ".fmu", ".ssp", ".ssd"):
         hint = f"Did you mean `fmu-mesh {'run' if suffix == '.fmu' else 'launch'} {name}`?"
     else:
         hint = f"Did you mean '{near}'?" if near is not None else "`fmu-mesh --help` lists them."

@@ -17,12 +17,13 @@ from ..run.options import Options, option_fields
 from .arguments import endpoint, number, whole
 from .output.display import teller
 
-__all__ = ["add_configuration", "add_options", "given_options", "read_options"]
+__all__ = ["add_configuration", "add_options", "add_ssd", "given_options", "read_options"]
 
 
 def add_configuration(parser: argparse.ArgumentParser) -> None:
     """Add the argument CONFIG, and the flags that replace what CONFIG says."""
-    parser.add_argument("config", type=Path, metavar="CONFIG", help="the configuration file")
+    parser.add_argument("config", type=Path, metavar="CONFIG", help="the configuration file, or a package of SSP")
+    add_ssd(parser)
     add_options(
         parser.add_argument_group("instead of what CONFIG says"),
         "algorithm",
@@ -38,6 +39,12 @@ def add_configuration(parser: argparse.ArgumentParser) -> None:
         "connect",
     )
     add_options(parser, "allow_code")
+
+
+def add_ssd(parser: argparse.ArgumentParser) -> None:
+    """Add `--ssd`."""
+    text = "the description in a package of SSP: its file or its name; default: SystemStructure.ssd"
+    parser.add_argument("--ssd", metavar="NAME", help=text)
 
 
 def add_options(

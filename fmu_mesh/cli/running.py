@@ -101,7 +101,7 @@ def add_output(parser: CommandParser) -> None:
 def _launch(arguments: argparse.Namespace) -> int:
     with RunReporter(wanted=arguments.json) as reporter:
         options, how = given_options(arguments), _how(arguments)
-        run_mesh(load(arguments.config), options, arguments, reporter, how)
+        run_mesh(load(arguments.config, ssd=arguments.ssd), options, arguments, reporter, how)
     return 0
 
 
@@ -189,12 +189,12 @@ def _finish(plan: Plan, outcome: Outcome, arguments: argparse.Namespace) -> None
 
 
 def _node(arguments: argparse.Namespace) -> int:
-    run_node(load(arguments.config).plan(**given_options(arguments)).node(arguments.node))
+    run_node(load(arguments.config, ssd=arguments.ssd).plan(**given_options(arguments)).node(arguments.node))
     return 0
 
 
 def _master(arguments: argparse.Namespace) -> int:
-    plan = _planned(load(arguments.config), given_options(arguments), arguments)
+    plan = _planned(load(arguments.config, ssd=arguments.ssd), given_options(arguments), arguments)
     with (
         plotted_where_it_ends(plan.plan, arguments.plot),
         Display(
@@ -211,7 +211,7 @@ def _gateway(arguments: argparse.Namespace) -> int:
         if isinstance(event, Reachable):
             print(f"topics of ROS at {', '.join(event.endpoints)}", flush=True)
 
-    run_gateway(load(arguments.config).plan(**given_options(arguments)), show)
+    run_gateway(load(arguments.config, ssd=arguments.ssd).plan(**given_options(arguments)), show)
     return 0
 
 

@@ -12,6 +12,7 @@ from typing import Any, Literal, cast
 import msgspec
 from msgspec.structs import asdict
 
+from ..api.mesh_builder import load
 from ..errors import ConfigurationError, DeadlineExceeded, FmuMeshError
 from ..run.options import Options
 from ..sweeps.dask_cluster import dask_executor
@@ -26,7 +27,7 @@ from .output.display import say, stdout_as_stderr, teller
 from .output.json_output import Failure, failure_of, print_json
 from .output.progress import SweepProgressLine
 from .output.terminal import error_console
-from .run_options import add_options, read_options
+from .run_options import add_options, add_ssd, read_options
 from .running import add_output, interrupted_by_signals
 
 __all__ = ["PARSERS", "SweepReport"]
@@ -69,8 +70,12 @@ class SweepReport(msgspec.Struct, frozen=True):
 
 def _add_sweep(parser: CommandParser) -> None:
     parser.add_argument(
-        "config", type=Path, metavar="CONFIG", help="the configuration file; or the folder of a sweep, to continue it"
+        "config",
+        type=Path,
+        metavar="CONFIG",
+        help="the configuration file or package; or the folder of a sweep, to continue it",
     )
+    add_ssd(parser)
     what = parser.add_argument_group("what varies")
     what.add_argument(
         "--vary",
@@ -196,7 +201,7 @@ def _planned(arguments: argparse.Namespace) -> PlannedSweep:
         max_instances=dict(map(_limit, arguments.max_instances)),
     )
     base = {name: chosen[name] for name in SweepOptions.__annotations__ if name in chosen}
-    return planned_sweep(arguments.config, vary, **cast("SweepOptions", {**base, **own}))
+    return planned_sweep(load(arguments.config, ssd=arguments.ssd), vary, **cast("SweepOptions", {**base, **own}))
 
 
 @contextmanager

@@ -318,7 +318,7 @@ class MeshFollower:
 
 def _catalogue_of(mesh: str, infos: Mapping[str, InstanceInfo]) -> Catalogue:
     variables = {f"{name}.{v.name}": v for name, info in infos.items() for v in info.variables}
-    fed = {connection.target for info in infos.values() for connection in info.connections}
+    fed = {own.target for info in infos.values() for own in info.connections if not own.initial_only}
     elements = {
         f"{name.partition('.')[0]}.{element}": (name, number)
         for name, v in variables.items()

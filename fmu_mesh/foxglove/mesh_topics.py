@@ -100,7 +100,7 @@ def settable(infos: Iterable[InstanceInfo], targets: Iterable[Target]) -> dict[s
         infos: of all instances.
         targets: all variables.
     """
-    connected = {connection.target for info in infos for connection in info.connections}
+    connected = {own.target for info in infos for own in info.connections if not own.initial_only}
     connected |= {element[0] for name in connected if (element := split_element(name)) is not None}
     names = {target.name: target for target in targets}
     return {name: target for name, target in names.items() if name not in connected and _is_open(target.variable)}

@@ -336,8 +336,10 @@ def instance_info(plan: NodePlan, runner: Runner) -> InstanceInfo:
                 own.factor,
                 own.offset,
                 own.map,
+                initial_only,
             )
-            for feed in runner.plan.feeds
+            for initial_only, feeds in ((False, runner.plan.feeds), (True, runner.plan.parameters))
+            for feed in feeds
             for own in feed.columns
         ),
         node=plan.node,

@@ -53,10 +53,12 @@ class Initialization:
                 self._columns[link.source, column.name] = column
                 self._levels[link.source, column.name] = level
         for own in plan.instances:
-            self._columns |= {(own.name, column.name): column for column in own.outputs.columns}
+            columns = (*own.outputs.columns, *own.initial_outputs.columns)
+            self._columns |= {(own.name, column.name): column for column in columns}
             self._levels |= {(own.name, name): level for name, level in own.initialization.items()}
         self._known: dict[tuple[str, str, int | None], Value] = {}
         self._settled: set[Key] = set()
+        self._parameters: dict[Key, str] = {}
         self._end = 0.0
 
     def take(self, link: Link, tag: int, data: bytes) -> None:
@@ -137,7 +139,7 @@ class Initialization:
         their values of this sweep.
         """
         values: dict[str, Value] = {}
-        for feed in runner.plan.feeds:
+        for feed in (*runner.plan.feeds, *runner.plan.parameters):
             for column in feed.columns:
                 source, target = column.source, column.target
                 level, key = self._levels[feed.source, self._column(feed.source, source).name], (runner.name, target)
@@ -147,12 +149,21 @@ class Initialization:
                     values[target] = self._moved(feed.source, column, runner, point.sweeps)
                 elif level < below and key not in self._settled:
                     values[target] = self._moved(feed.source, column, runner)
+        for column in (column for feed in runner.plan.parameters for column in feed.columns):
+            if column.target in values and self._has(runner.name, column.target, values[column.target]):
+                del values[column.target]
         if values:
-            runner.instance.set_values(merged(values, runner.plan.inputs, runner.instance.get_values))
+            runner.instance.set_values(merged(values, runner.plan.initial_inputs, runner.instance.get_values))
+
+    def _has(self, instance: str, parameter: str, value: Value) -> bool:
+        """Whether a parameter has this value already; FMI 1.0 cannot set it a second time."""
+        before = self._parameters.get((instance, parameter))
+        self._parameters[instance, parameter] = text = repr(value)
+        return before == text
 
     def _moved(self, instance: str, column: FeedColumn, runner: Runner, sweep: int | None = None) -> Value:
         """The initial value that a connection from ``instance`` gives its input."""
-        input_type = runner.plan.inputs.column(column.target).type
+        input_type = runner.plan.initial_inputs.column(column.target).type
         change = ValueChange.of_column(instance, runner.name, input_type, column)
         return change.of(self._element(instance, column.source, sweep), InitializationFailed)
 

@@ -246,6 +246,7 @@ class _Member:
         self._feeds: list[_Feed] = []
         self._set_at = -1
         self._courses: dict[str, Course] = {}
+        self._parameters: dict[str, str] = {}
         self.step = 0
         self.settled: set[str] = set()
 
@@ -264,6 +265,8 @@ class _Member:
                 value = ValueChange.of_connection(c).of(value, InitializationFailed)
             else:
                 continue
+            if c.initial_only and self._has(c.target_name, value):
+                continue
             if not c.target_index:
                 values[c.target.name] = value
                 continue
@@ -277,6 +280,12 @@ class _Member:
         if values:
             self.instance.set_values(values)
 
+    def _has(self, parameter: str, value: Value) -> bool:
+        """Whether a connected parameter has this value already; FMI 1.0 cannot set it a second time."""
+        before = self._parameters.get(parameter)
+        self._parameters[parameter] = text = repr(value)
+        return before == text
+
     def bind(self, grid: TimeGrid, members: Mapping[str, _Member]) -> None:
         """Prepare `step_from`: what it needs at every point is looked up here, once."""
         self._courses = courses_of(self.plan.scenario, self.instance.description, grid, self._points)
@@ -285,6 +294,8 @@ class _Member:
             self._inputs.put(0, name, value)  # elements that are not connected keep it
         self.instance.bind(self._inputs, (self._outputs,), grid, self.plan.step_points)
         for c in self.connections:
+            if c.initial_only:
+                continue
             read, points = members[c.source_instance].reader(c.source_name)
             lead = CouplingRule(c.delay or 0, points, self._points).lead
             own = ValueChange.of_connection(c)

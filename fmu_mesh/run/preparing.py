@@ -15,7 +15,7 @@ from msgspec.structs import replace
 from .. import files
 from ..config.findings import Findings
 from ..config.instance_sections import InstanceSection, key_of, placed
-from ..config.loading import LoadedConfig, read_file, read_scenario
+from ..config.loading import LoadedConfig, read_scenario
 from ..config.mesh import LimitsConfig
 from ..errors import ConfigurationError, Finding, LoadFailed
 from ..instances.configuration import examine_data
@@ -23,6 +23,7 @@ from ..instances.python.unit_names import base_unit_of
 from ..instances.registry import check_showing, content, describe, expected_model
 from ..ros.bags.scenario_bags import bag_values
 from ..ros.gateway.mapping import resolve as resolve_ros
+from ..ssp.configuration_files import read_configuration
 from ..system.plan import Plan, make_plan
 from ..system.scenario import Scenario
 from ..system.system import build
@@ -35,6 +36,8 @@ from .run_plan import RunPlan
 __all__ = ["KnownModels", "plan_run", "planned", "prepare"]
 
 _MOST_KNOWN = 256
+_PACKAGE = ".ssd"
+"""The suffix of the file of a configuration that comes from a package."""
 
 
 class KnownModels:
@@ -99,18 +102,21 @@ def plan_run(
     path: Path,
     options: Options = Options(),  # noqa: B008 a frozen Struct
     tell: Callable[[str], None] = lambda _text: None,
+    *,
+    ssd: str | None = None,
 ) -> RunPlan:
     """Read, check and plan the configuration at ``path``.
 
     Args:
-        path: the YAML file.
+        path: the YAML file, or a package of SSP.
         options: what the command line changes.
         tell: called before something that takes long, such as compiling an FMU.
+        ssd: which description of a package; None: the default one.
 
     Raises:
         ConfigurationError: the configuration or an FMU is wrong; carries all findings.
     """
-    plain = with_needed(with_config_values(read_file(path), options.config_values), options)
+    plain = with_needed(with_config_values(read_configuration(path, ssd), options.config_values), options)
     loaded, findings = examine_data(plain, options.start_values)
     return planned(loaded, findings, options, tell)
 
@@ -218,16 +224,22 @@ def _located(loaded: LoadedConfig) -> LoadedConfig:
 
 
 def _check_owner(loaded: LoadedConfig, findings: Findings) -> None:
-    """Check that the code in a configuration is named by this user, or by root: everybody else could run code as us."""
-    try:
-        owner = loaded.file.stat().st_uid
-    except OSError:
-        return  # there is no file: a program of this user has made the configuration
-    if owner in {os.getuid(), 0}:
-        return
+    """Check that the code in a configuration is named by this user, or by root: everybody else could run code as us.
+
+    A package of SSP is made to be given to others, so whose file it is says nothing about who has written it.
+    """
+    if loaded.file.suffix.lower() == _PACKAGE:
+        found = "Python code, in a package of SSP"
+    else:
+        try:
+            owner = loaded.file.stat().st_uid
+        except OSError:
+            return  # there is no file: a program of this user has made the configuration
+        if owner in {os.getuid(), 0}:
+            return
+        found = f"Python code, in a file of the user {_user(owner)}"
     for name, section in loaded.config.instances.items():
         if section.names_code:
-            found = f"Python code, in a file of the user {_user(owner)}"
             findings.add(f"instances.{name}.{key_of(section)}", found, "a file of your own, or `--allow-code`")
 
 

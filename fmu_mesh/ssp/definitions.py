@@ -57,11 +57,12 @@ def unit_named(name: str, units: dict[str, Unit], place: Place, problems: Proble
         problems: where the warning goes.
     """
     if name and name not in units:
-        near = nearest(name, units)
+        defined = [unit.name for unit in units.values() if unit.base is not None]
+        near = nearest(name, defined)
         problems.warn(
             place,
             f"the unit {shown(name)}, which the file does not define: values in it are not converted",
-            f"one of its Units: {listed(list(units))}{f' (did you mean {shown(near)}?)' if near else ''}",
+            f"one of its Units: {listed(defined)}{f' (did you mean {shown(near)}?)' if near else ''}",
         )
         units[name] = Unit(name)
     return units[name] if name else Unit("")

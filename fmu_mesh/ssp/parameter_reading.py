@@ -12,8 +12,9 @@ from collections.abc import Mapping
 from typing import Final
 
 import numpy as np
+from msgspec.structs import replace
 
-from ..text import shown
+from ..text import listed, shown
 from ..variables.value_types import INTEGERS, VariableType
 from .definitions import enumeration_named, enumerations_of, transformation_of, unit_named, units_of
 from .grammar import PATTERNS
@@ -61,7 +62,8 @@ def parameter_set(
 ) -> ParameterSet:
     """The parameters of an SSV file, or of a set inside a system structure description.
 
-    A parameter whose values are wrong is a finding and has no values.
+    A parameter whose values are wrong is a finding and has no values. A second one of the same name, which tools write,
+    is a warning; if its value is another one, to apply it is a finding.
 
     Args:
         element: the `ssv:ParameterSet`.
@@ -71,21 +73,20 @@ def parameter_set(
     """
     own_units = {**units, **units_of(element, "ssv:Units", problems)}
     own_enumerations = {**enumerations, **enumerations_of(element, "ssv:Enumerations", problems)}
-    lines: dict[str, int] = {}
-    parameters: list[Parameter] = []
+    parameters: dict[str, Parameter] = {}
+    repeated: list[Parameter] = []
     for one in element.inside("ssv:Parameters"):
-        name = one.text("name")
-        if one.tag != "ssv:Parameter" or not name:
+        if one.tag != "ssv:Parameter" or not one.text("name"):
             continue  # there is a finding
-        if name in lines:
-            expected = f"one of this name (first: line {lines[name]})"
-            problems.add(one.place, f"a second parameter {shown(name)}", expected)
-            continue
-        lines[name] = one.place.line
         parameter = _parameter(one, own_units, own_enumerations, problems)
-        if parameter is not None:
-            parameters.append(parameter)
-    return ParameterSet(element.text("name"), tuple(parameters), element.place)
+        if parameter is not None and parameters.setdefault(parameter.name, parameter) is not parameter:
+            repeated.append(parameter)
+    if repeated:
+        names = [shown(name) for name in dict.fromkeys(one.name for one in repeated)]
+        found = f"a second parameter of the same name: {listed(names)}"
+        problems.warn(repeated[0].place, found, f"one (first: line {parameters[repeated[0].name].place.line})")
+    others = {one.name: one.place for one in repeated if not _is_same(one, parameters[one.name])}
+    return ParameterSet(element.text("name"), tuple(parameters.values()), element.place, others)
 
 
 def parameter_mapping(element: XmlElement, problems: Problems) -> ParameterMapping:
@@ -164,6 +165,11 @@ def _parameter(
         else None,
         dimensions,
     )
+
+
+def _is_same(one: Parameter, other: Parameter) -> bool:
+    """Whether two parameters of one name are the same but for their places."""
+    return replace(one, place=other.place) == other
 
 
 def _dimensions(element: XmlElement, problems: Problems) -> tuple[tuple[int, ...], bool]:

@@ -165,11 +165,17 @@ class Parameter(msgspec.Struct, frozen=True):
 
 
 class ParameterSet(msgspec.Struct, frozen=True):
-    """The parameters of an SSV file, or of an inline one (SSP 2.0, 6.1), in their order."""
+    """The parameters of an SSV file, or of an inline one (SSP 2.0, 6.1), in their order.
+
+    Attributes:
+        parameters: the first one of each name.
+        ambiguous: where a second one of a name has another value; that name must not be applied.
+    """
 
     name: str
     parameters: tuple[Parameter, ...]
     place: Place
+    ambiguous: dict[str, Place] = {}
 
 
 class MappingEntry(msgspec.Struct, frozen=True):
@@ -209,11 +215,13 @@ class Annotation(msgspec.Struct, frozen=True):
     Attributes:
         type: its namespace, such as `org.openmodelica`.
         xml: the XML of its content.
+        text: the text of the first element inside it, without those in that element; empty if there is none.
     """
 
     type: str
     xml: bytes
     place: Place
+    text: str = ""
 
 
 class Component(msgspec.Struct, frozen=True):

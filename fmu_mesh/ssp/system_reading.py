@@ -6,6 +6,7 @@ configuration came from which line.
 
 from __future__ import annotations
 
+import posixpath
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Final, Literal
@@ -21,6 +22,7 @@ from ..variables.model_description import Kind, ModelDescription
 from .annotations import OPEN_MODELICA, OPEN_SIMULATION_PLATFORM, base_step_size, common_solvers, step_size_hint
 from .flattening import FlatConnection, FlatValue, flatten
 from .naming import instance_name, mesh_name
+from .own_annotation import ANNOTATION_TYPE, AnnotationRefused, chosen_names, merged
 from .package import DEFAULT, Package
 from .parameters import AppliedValue, changed, resolve_parameters
 from .problems import Problems
@@ -40,7 +42,7 @@ _KINDS: Final[Mapping[str, Kind]] = {
     "CoSimulation": "co_simulation",
     "ModelExchange": "model_exchange",
 }
-_KNOWN: Final = {OPEN_MODELICA, OPEN_SIMULATION_PLATFORM}
+_KNOWN: Final = {OPEN_MODELICA, OPEN_SIMULATION_PLATFORM, ANNOTATION_TYPE}
 
 
 def read_system(path: Path, ssd: str | None = None) -> PlainConfig:
@@ -110,6 +112,9 @@ class _Configuration:
         self._file = Path(package.shown(name))
         self._lines: dict[str, int] = {}
         self._origins: dict[str, Origin] = {}
+        own = (one for one in structure.system.annotations if one.type == ANNOTATION_TYPE)
+        self._annotation = next(own, None)
+        self._names = self._chosen_names()
 
     def plain(self) -> PlainConfig:
         """All of it."""
@@ -127,6 +132,9 @@ class _Configuration:
         }
         if self._package.is_archive:  # beside the archive, and not in it
             data["record"] = {"file": "../results/{mesh}.csv"}
+        data = self._with_annotation(data)
+        times = data["simulation"]
+        assert isinstance(times, dict)  # `merged` adds to a mapping
         self._place("", self._structure.place)
         self._note_annotations(system, simulation.get("step_size"))
         return PlainConfig(
@@ -136,8 +144,35 @@ class _Configuration:
             tuple(self._problems.findings),
             origins=self._origins,
             warnings=tuple(self._problems.warnings),
-            needed={key: option for key, option in NEEDED.items() if key.partition(".")[2] not in simulation},
+            needed={key: option for key, option in NEEDED.items() if key.partition(".")[2] not in times},
         )
+
+    def _chosen_names(self) -> dict[str, str]:
+        """The name of each instance, by the one that follows from its element."""
+        defaults = [instance_name(path) for path in self._components]
+        if self._annotation is not None:
+            try:
+                return chosen_names(defaults, self._annotation.text)
+            except AnnotationRefused as refused:
+                self._problems.add(self._annotation.place, refused.found, refused.expected)
+                self._annotation = None
+        return {name: name for name in defaults}
+
+    def _with_annotation(self, data: dict[str, Plain]) -> dict[str, Plain]:
+        """The values with what our annotation says."""
+        if self._annotation is None:
+            return data
+        folder = ".." if self._package.is_archive else ""
+        try:
+            result = merged(data, self._annotation.text, moved=lambda path: posixpath.join(folder, path))
+        except AnnotationRefused as refused:
+            self._problems.add(self._annotation.place, refused.found, refused.expected)
+            return data
+        for path in result.paths:
+            self._place(path, self._annotation.place)
+        for gone in result.gone:
+            self._problems.warn(self._annotation.place, f"{gone} is not there any more")
+        return result.data
 
     def _describe(self, path: tuple[str, ...]) -> ModelDescription | None:
         """The model description of a component; None if it cannot be read: then the plan has a finding."""
@@ -169,7 +204,9 @@ class _Configuration:
             if applied is not None:
                 description = self._describe(path)
                 target = description.variable_of(variable) if description is not None else None
-                of_components.setdefault(path, {})[variable] = changed(applied, value.change, target)
+                given = changed(applied, value.change, target, path, self._problems)
+                if given is not None:
+                    of_components.setdefault(path, {})[variable] = given
         for connection in connections:
             path, variable = connection.target
             bound = of_components.get(path, {}).pop(variable, None)
@@ -207,7 +244,7 @@ class _Configuration:
     ) -> dict[str, Plain]:
         instances: dict[str, Plain] = {}
         for path, component in self._components.items():
-            name = instance_name(path)
+            name = self._names[instance_name(path)]
             section: dict[str, Plain] = {"fmu": component.source}
             place = f"instances.{name}"
             self._place(place, component.place)
@@ -239,7 +276,8 @@ class _Configuration:
     def _connection(self, number: int, connection: FlatConnection) -> dict[str, Plain]:
         """A connection as a configuration has it."""
         self._place(f"connections[{number}]", connection.place)
-        ends = [f"{instance_name(path)}.{variable}" for path, variable in (connection.source, connection.target)]
+        both = connection.source, connection.target
+        ends = [f"{self._names[instance_name(path)]}.{variable}" for path, variable in both]
         written: dict[str, Plain] = {"from": ends[0], "to": ends[1]}
         linear = connection.change.linear
         if linear.factor != 1.0:

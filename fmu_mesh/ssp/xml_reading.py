@@ -94,10 +94,13 @@ class XmlElement:
 
     def annotations(self) -> tuple[Annotation, ...]:
         """The annotations of this element."""
-        return tuple(
-            Annotation(one.text("type"), b"".join(etree.tostring(child) for child in one._element), one.place)  # noqa: SLF001  of this class
-            for one in self.inside(f"{self.tag.partition(':')[0]}:Annotations")
-        )
+        return tuple(one._annotation() for one in self.inside(f"{self.tag.partition(':')[0]}:Annotations"))  # noqa: SLF001  of this class
+
+    def _annotation(self) -> Annotation:
+        """This element as an annotation."""
+        content = b"".join(etree.tostring(child) for child in self._element)
+        text = next((child.text or "" for child in self._element if isinstance(child.tag, str)), "")
+        return Annotation(self.text("type"), content, self.place, text)
 
     def with_id(self, identifier: str) -> XmlElement | None:
         """The element of the whole file with this `id`; None if there is none."""

@@ -44,7 +44,7 @@ class Connection(msgspec.Struct, frozen=True):
         target_index: as ``source_index``, for the target.
         map: what the target gets instead of a value of the source, as numbers; other values stay as they are.
         items: the items of the target, if a value may be none of them.
-        delay: 0, 1, or None where the algorithm decides.
+        delay: 0, 1, or None where the algorithm decides; always None for a parameter.
         path: its place in the configuration file, such as `connections[2]`.
         units: the unit conversion in words; empty if there is none.
         extrapolation: whether the target's input changes linearly within a step.
@@ -64,6 +64,11 @@ class Connection(msgspec.Struct, frozen=True):
     units: str = ""
     map: tuple[tuple[int, int], ...] = ()
     items: tuple[tuple[str, int], ...] = ()
+
+    @property
+    def initial_only(self) -> bool:
+        """Whether its value is transferred in Initialization Mode only: its target is a parameter."""
+        return self.target.causality == "parameter"
 
     @property
     def source_name(self) -> str:
@@ -111,6 +116,8 @@ def resolve_connections(
         if _causality_is_right(connection, variables, findings):
             _check_types(connection, findings)
             _check_delay(connection, findings)
+            if connection.initial_only:
+                connection = replace(connection, delay=None)
             connection = _with_units(connection, config, findings)
             connections.append(_with_map(connection, config, findings))
     return tuple(connections)
@@ -272,13 +279,30 @@ def _causality_is_right(connection: Connection, variables: Variables, findings: 
         found = f"the wrong way round: '{source_name}' is an input and '{target_name}' an output"
         findings.add(connection.path, found, "output -> input", f"{target_name} -> {source_name}")
         return False
-    if source.causality != "output":
+    is_source = _is_source(source, target)
+    if not is_source:
         outputs = _names_of(connection.source_instance, "output", variables)
         findings.add(f"{connection.path}.from", f"'{source_name}' is {_a(source.causality)}", f"an output{outputs}")
-    if target.causality != "input":
+    is_target = target.causality == "input" or _is_open_parameter(target)
+    if not is_target:
         inputs = _names_of(connection.target_instance, "input", variables)
-        findings.add(f"{connection.path}.to", f"'{target_name}' is {_a(target.causality)}", f"an input{inputs}")
-    return source.causality == "output" and target.causality == "input"
+        expected = f"an input{inputs}"
+        if target.causality == "structuralParameter":
+            expected = "an input or a parameter; its value is needed before the initialization, so use `start_values`"
+        findings.add(f"{connection.path}.to", f"'{target_name}' is {_a(target.causality)}", expected)
+    return is_source and is_target
+
+
+def _is_source(source: Variable, target: Variable) -> bool:
+    """Whether a connection may begin at a variable: its value can be read at every point (SSP 2.0, 5.3.3.1.1)."""
+    if source.causality in ("output", "local", "calculatedParameter"):
+        return True
+    return source.causality == "parameter" and (source.variability == "constant" or target.causality == "parameter")
+
+
+def _is_open_parameter(target: Variable) -> bool:
+    """Whether a parameter can be set in Initialization Mode (FMI 2.0, 2.2.7 and 4.2.4; FMI 3.0, 2.3.3)."""
+    return target.causality == "parameter" and target.settable_before_start
 
 
 def _names_of(instance: str, causality: str, variables: Variables) -> str:
@@ -349,6 +373,9 @@ def _check_delay(connection: Connection, findings: Findings) -> None:
     if connection.source_instance == connection.target_instance and connection.delay == 0:
         found = f"delay 0 on {connection}, from an instance to itself"
         findings.add(f"{connection.path}.delay", found, "delay 1")
+    if connection.initial_only and connection.delay is not None:
+        found = f"delay {connection.delay} on {connection}, from which a parameter gets its value before the first step"
+        findings.add(f"{connection.path}.delay", found, "no delay")
 
 
 def _is_identity(connection: Connection) -> bool:

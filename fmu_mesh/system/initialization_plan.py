@@ -13,13 +13,14 @@ from operator import itemgetter
 
 import msgspec
 
-from ..variables.model_description import Variable
+from ..errors import ConfigurationError, Finding
+from ..variables.model_description import ModelDescription, Variable
 from ..variables.value_conversion import to_plain
 from ..variables.value_types import PlainValue, Value, VariableType, nested, zero
 from .graph import reaches, strongly_connected
 from .system import Connection, ResolvedSystem
 
-__all__ = ["InitializationPlan", "Loop", "Tear", "plan_initialization"]
+__all__ = ["InitializationPlan", "Loop", "Tear", "check_loops", "plan_initialization"]
 
 Key = tuple[str, str]
 
@@ -85,7 +86,7 @@ def plan_initialization(system: ResolvedSystem, connections: Sequence[Connection
             with a delay is torn before one without: so the values flow in the order of the steps.
     """
     outputs = tuple(dict.fromkeys((c.source_instance, c.source.name) for c in connections))
-    reached = _reached(connections)
+    reached = _reached(system, connections)
     edges = [(_source(c), target) for c in connections for target in reached[id(c)]]
     on_themselves = {source for source, target in edges if source == target}
     place = {key: number for number, key in enumerate(outputs)}
@@ -114,18 +115,41 @@ def plan_initialization(system: ResolvedSystem, connections: Sequence[Connection
     return InitializationPlan(levels=levels, loops=tuple(loops))
 
 
+def check_loops(plan: InitializationPlan, connections: Sequence[Connection], system: ResolvedSystem, file: str) -> None:
+    """Refuse parameters of FMI 1.0 in a loop: they cannot be set again after the initialization.
+
+    Args:
+        plan: what `plan_initialization` returned.
+        connections: all connections.
+        system: the system.
+        file: name of the configuration file, for the error.
+
+    Raises:
+        ConfigurationError: there is one; names the connection.
+    """
+    for c in connections:
+        target, source = c.target_instance, (c.source_instance, c.source.name)
+        if not c.initial_only or not system.instances[target].description.fmi_version.startswith("1"):
+            continue
+        if any(source in loop.outputs and any(name == target for name, _ in loop.outputs) for loop in plan.loops):
+            found = f"{c}, whose value depends on '{target}' itself in the initialization"
+            finding = Finding(file, c.path, found, "no such dependency: FMI 1.0 cannot set a parameter again")
+            raise ConfigurationError(str(finding), findings=(finding,))
+
+
 def _torn(
     members: Sequence[Key], connections: Sequence[Connection], reached: Mapping[int, Sequence[Key]]
 ) -> tuple[list[Connection], list[tuple[Key, Key]]]:
     """The connections of a loop at which it is torn, and the remaining edges.
 
-    Like the delays of Gauss-Seidel, it is the connection written last that closes a cycle.
+    Like the delays of Gauss-Seidel, it is the connection written last that closes a cycle; of those to parameters, none
+    if there is another one.
     """
     own = set(members)
     torn: set[int] = set()
     kept: list[tuple[Key, Key]] = []
     successors: dict[Key, list[Key]] = {key: [] for key in members}
-    for connection in sorted(connections, key=lambda c: c.delay or 0):
+    for connection in sorted(connections, key=lambda c: -1 if c.initial_only else c.delay or 0):
         source = _source(connection)
         targets = [key for key in reached[id(connection)] if key in own]
         if any(reaches(successors, target, source) for target in targets):
@@ -159,12 +183,21 @@ def _tear(system: ResolvedSystem, connection: Connection) -> Tear:
     )
 
 
-def _reached(connections: Sequence[Connection]) -> dict[int, list[Key]]:
+def _reached(system: ResolvedSystem, connections: Sequence[Connection]) -> dict[int, list[Key]]:
     """The connected outputs that depend on the target of a connection, by the id of the connection."""
     outputs: dict[str, dict[str, Variable]] = {}
+    parameters: dict[str, list[str]] = {}
     for c in connections:
         outputs.setdefault(c.source_instance, {})[c.source.name] = c.source
-    dependents = {instance: _Dependents(own.values()) for instance, own in outputs.items()}
+        if c.initial_only:
+            parameters.setdefault(c.target_instance, []).append(c.target.name)
+    dependents = {
+        instance: _Dependents(
+            (output, _dependencies(output, parameters.get(instance, []), system.instances[instance].description))
+            for output in own.values()
+        )
+        for instance, own in outputs.items()
+    }
     return {
         id(c): [(c.target_instance, name) for name in dependents[c.target_instance].of(c.target.name)]
         if c.target_instance in dependents
@@ -173,16 +206,33 @@ def _reached(connections: Sequence[Connection]) -> dict[int, list[Key]]:
     }
 
 
+def _dependencies(source: Variable, parameters: Sequence[str], description: ModelDescription) -> tuple[str, ...] | None:
+    """The knowns that the source of a connection depends on, with those of its ``parameters`` that are connected.
+
+    FMI 2.0 and 3.0 declare them for initial unknowns; a local variable that is none of them may depend on everything.
+    All others declare dependencies on inputs only. FMI 1.0 has no Initialization Mode: whatever is read there is read
+    after the parameters have been set.
+    """
+    version = description.fmi_version[:1]
+    given = source.causality == "parameter" or source.variability == "constant" or source.initial == "exact"
+    declared: tuple[str, ...] | None = () if given else source.dependencies
+    if not given and source.causality != "output" and version and not declared:
+        return None
+    if declared is None or version in ("2", "3") or (given and version != "1"):
+        return declared
+    return (*declared, *parameters)
+
+
 class _Dependents:
     """Which of the outputs of an instance depend on an input, in the order of the outputs."""
 
-    def __init__(self, outputs: Iterable[Variable]) -> None:
+    def __init__(self, outputs: Iterable[tuple[Variable, tuple[str, ...] | None]]) -> None:
         self._on_all: list[tuple[int, str]] = []
         self._on: dict[str, list[tuple[int, str]]] = {}
-        for number, output in enumerate(outputs):
-            if output.dependencies is None:
+        for number, (output, dependencies) in enumerate(outputs):
+            if dependencies is None:
                 self._on_all.append((number, output.name))
-            for known in dict.fromkeys(output.dependencies or ()):
+            for known in dict.fromkeys(dependencies or ()):
                 self._on.setdefault(known, []).append((number, output.name))
 
     def of(self, known: str) -> list[str]:

@@ -50,6 +50,8 @@ def _cannot_extrapolate(connection: Connection, description: ModelDescription, *
     target = connection.target
     if target.type != "Float64" or target.shape or connection.target_index:
         return f"'{target.name}' is no scalar Real input"
+    if connection.initial_only:
+        return f"'{target.name}' is a parameter"
     if target.variability != "continuous":
         return f"'{target.name}' is a {target.variability} input"
     if description.kind == "model_exchange":

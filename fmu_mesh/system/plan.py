@@ -13,14 +13,15 @@ from msgspec.structs import replace
 
 from ..config.instance_sections import InstanceSection, placed
 from ..config.mesh import InitializationConfig, LimitsConfig, TimeoutsConfig
-from ..errors import ConfigurationError, Finding
+from ..errors import ConfigurationError
 from ..simtime import TimeGrid
 from ..variables.value_conversion import to_plain
 from ..variables.value_types import PlainValue
+from .delays import algebraic_loop, with_delays
 from .digest import digest_of
 from .feeds import Feed, feeds_of
-from .graph import cycle_through, feedback_edges, is_cycle, strongly_connected, topological_order
-from .initialization_plan import InitializationPlan, Loop, plan_initialization
+from .graph import is_cycle, strongly_connected, topological_order
+from .initialization_plan import InitializationPlan, Loop, check_loops, plan_initialization
 from .layout import Layout, row_bytes, rows_for
 from .linear_inputs import LinearInput, linear_inputs
 from .memory_map import MASTER, RECORDER, MemoryMap, RingPlace, map_memory
@@ -45,6 +46,9 @@ class InstancePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         linear_inputs: the inputs whose connections are extrapolated.
         scenario: what a scenario prescribes for its variables.
         row: the inputs that are set in every step: ``inputs``, and the Float64 inputs of the scenario.
+        parameters: the connections to parameters, whose values are transferred in Initialization Mode only.
+        initial_inputs: what is set in Initialization Mode: ``inputs``, and the connected parameters.
+        initial_outputs: what is read in Initialization Mode only.
     """
 
     name: str
@@ -59,6 +63,9 @@ class InstancePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     linear_inputs: tuple[LinearInput, ...] = ()
     scenario: tuple[Schedule, ...] = ()
     row: Layout | None = None
+    parameters: tuple[Feed, ...] = ()
+    initial_inputs: Layout = Layout()
+    initial_outputs: Layout = Layout()
 
     @property
     def input_row(self) -> Layout:
@@ -72,8 +79,9 @@ class Link(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     Attributes:
         index: number of the link in the mesh; every frame has it.
         levels: initialization level of each column, in the order of `layout.names`; -1: not needed in initialization.
-        initial_only: whether it has no frames after Initialization Mode. A node that takes part in the iteration of a
-            loop needs the values of all torn connections of the loop, also of those between other nodes.
+        initial_only: whether it has no frames after Initialization Mode: it has values for parameters, or those of a
+            loop. A node that takes part in the iteration of a loop needs the values of all its torn connections, also
+            of those between other nodes.
     """
 
     index: int
@@ -200,17 +208,18 @@ def make_plan(
     Raises:
         ConfigurationError: a cycle has no delay; names the cycle.
     """
-    connections, closing = _with_delays(system)
+    connections, closing = with_delays(system)
     instant = [(c.source_instance, c.target_instance) for c in connections if c.delay == 0]
     loops = [loop for loop in strongly_connected(system.instances, instant) if is_cycle(loop, instant)]
     if loops:
-        findings = tuple(_algebraic_loop(loop, connections, file) for loop in loops)
+        findings = tuple(algebraic_loop(loop, connections, file) for loop in loops)
         text = f"{file}: {len(findings)} algebraic loops" if len(findings) > 1 else str(findings[0])
         raise ConfigurationError(text, findings=findings)
-    edges = [(c.source_instance, c.target_instance) for c in connections]
+    edges = [(c.source_instance, c.target_instance) for c in connections if not c.initial_only]
     order = topological_order(system.instances, instant)
     cycles = tuple(tuple(part) for part in strongly_connected(system.instances, edges) if is_cycle(part, edges))
     initialization = plan_initialization(system, connections)
+    check_loops(initialization, connections, system, file)
     points = window if window is not None else window_of(system)
     plan = Plan(
         system=system,
@@ -249,37 +258,6 @@ def _digest(system: ResolvedSystem, nodes: dict[str, NodePlan], contents: Mappin
     ]
     models = {name: (own.description.guid, contents.get(name, "")) for name, own in system.instances.items()}
     return digest_of(agreed, models)
-
-
-def _with_delays(system: ResolvedSystem) -> tuple[tuple[Connection, ...], tuple[Connection, ...]]:
-    """All connections with a delay of 0 or 1, and those that got 1 because they close a cycle."""
-    if system.config.simulation.algorithm == "jacobi":
-        return tuple(replace(c, delay=1) if c.delay is None else c for c in system.connections), ()
-    free = [c for c in system.connections if c.delay != 1]
-    edges = [(c.source_instance, c.target_instance, c.delay is None) for c in free]
-    closing = {id(free[index]) for index in feedback_edges(system.instances, edges)}
-    connections = []
-    for connection in system.connections:
-        delay = connection.delay
-        if delay is None:
-            delay = 1 if id(connection) in closing else 0
-        connections.append(replace(connection, delay=delay))
-    chosen = tuple(new for old, new in zip(system.connections, connections, strict=True) if id(old) in closing)
-    return tuple(connections), chosen
-
-
-def _algebraic_loop(loop: list[str], connections: tuple[Connection, ...], file: str) -> Finding:
-    edges = [(c.source_instance, c.target_instance) for c in connections if c.delay == 0]
-    walk = cycle_through(loop, edges)
-    first = next(
-        c for c in connections if c.delay == 0 and (c.source_instance, c.target_instance) == (walk[0], walk[1])
-    )
-    return Finding(
-        file=file,
-        path=first.path,
-        found=f"an algebraic loop: every connection on the cycle {' -> '.join(walk)} has delay 0",
-        expected="at least one connection with delay 1 (set `delay: 1`, or leave the delays to the algorithm)",
-    )
 
 
 def _nodes(plan: Plan) -> dict[str, NodePlan]:
@@ -355,7 +333,8 @@ def _output_layouts(plan: Plan) -> dict[str, Layout]:
     instances = plan.system.instances
     wanted: dict[str, set[str]] = {name: set() for name in instances}
     for c in plan.connections:
-        wanted[c.source_instance].add(c.source.name)
+        if not c.initial_only:
+            wanted[c.source_instance].add(c.source.name)
     for instance, variable in plan.system.recorded:
         wanted[instance].add(plan.system.base_of(instance, variable))
     return {
@@ -365,8 +344,10 @@ def _output_layouts(plan: Plan) -> dict[str, Layout]:
 
 
 def _instance_plan(plan: Plan, instance: SystemInstance, outputs: Layout) -> InstancePlan:
-    incoming = [c for c in plan.connections if c.target_instance == instance.name]
-    connected = {c.target.name for c in incoming}
+    stepped = [c for c in plan.connections if c.target_instance == instance.name and not c.initial_only]
+    initial = [c for c in plan.connections if c.target_instance == instance.name and c.initial_only]
+    connected, parameters = {c.target.name for c in stepped}, {c.target.name for c in initial}
+    read = {c.source.name for c in plan.connections if c.source_instance == instance.name} - {*outputs.names}
     levels = plan.initialization.levels
     return InstancePlan(
         name=instance.name,
@@ -375,12 +356,15 @@ def _instance_plan(plan: Plan, instance: SystemInstance, outputs: Layout) -> Ins
         step_points=instance.step_points,
         outputs=outputs,
         inputs=Layout.of(v for v in instance.description.variables if v.name in connected),
-        feeds=feeds_of(incoming),
+        feeds=feeds_of(stepped),
         initialization={variable: level for (owner, variable), level in levels.items() if owner == instance.name},
         section=placed(plan.system.config.instances[instance.name]),
         linear_inputs=linear_inputs(plan.connections, instance.name),
         scenario=instance.scenario,
         row=row_of(instance.description, instance.scenario, connected),
+        parameters=feeds_of(initial),
+        initial_inputs=Layout.of(v for v in instance.description.variables if v.name in connected | parameters),
+        initial_outputs=Layout.of(v for v in instance.description.variables if v.name in read),
     )
 
 
@@ -389,7 +373,7 @@ def _links(plan: Plan) -> tuple[Link, ...]:
     needed: dict[tuple[str, str], set[str]] = {}
     for c in plan.connections:
         target_node = plan.node_of(c.target_instance)
-        if target_node != plan.node_of(c.source_instance):
+        if not c.initial_only and target_node != plan.node_of(c.source_instance):
             needed.setdefault((c.source_instance, target_node), set()).add(c.source.name)
     for name, variable in plan.system.recorded:
         needed.setdefault((name, RECORDER), set()).add(plan.system.base_of(name, variable))
@@ -419,8 +403,13 @@ def _links(plan: Plan) -> tuple[Link, ...]:
 
 
 def _needed_initially(plan: Plan, needed: dict[tuple[str, str], set[str]]) -> dict[tuple[str, str], set[str]]:
-    """Outputs by (instance, node) that a node needs to iterate a loop and that no other link has."""
+    """What a node needs for parameters or to iterate a loop and no other link has, by (instance, node)."""
     initial: dict[tuple[str, str], set[str]] = {}
+    for c in plan.connections:
+        node = plan.node_of(c.target_instance)
+        own = c.source_instance, node
+        if c.initial_only and node != plan.node_of(c.source_instance) and c.source.name not in needed.get(own, ()):
+            initial.setdefault(own, set()).add(c.source.name)
     for loop in plan.initialization.loops:
         for node in loop.nodes:
             for tear in loop.tears:

@@ -45,6 +45,8 @@ def why_not_settable(variable: Variable, source: str | None) -> str | None:
     match variable.causality:
         case "input" if source is not None:
             return f"is connected to '{source}'; only unconnected inputs can be set"
+        case "parameter" if source is not None:
+            return f"gets its value from '{source}'; only parameters without a connection can be prescribed"
         case "parameter" | "calculatedParameter" if variable.variability != "tunable":
             return f"is a {variable.variability} parameter; only tunable ones can be set while it runs"
         case "input" | "parameter" | "calculatedParameter":

@@ -145,13 +145,14 @@ def build(
         raise ValueError(f"no model description and no finding for {missing}")
     collected.raise_any()
     if config.group == "auto":
-        edges = [(c.source_instance, c.target_instance) for c in connections]
+        edges = [(c.source_instance, c.target_instance) for c in connections if not c.initial_only]
         nodes = automatic_nodes(config, edges, descriptions)
         instances = {name: replace(own, node=nodes.get(name, own.node)) for name, own in instances.items()}
     instances = {name: _with_scenario(own, prescribed) for name, own in instances.items()}
     warnings = loaded.findings()
     forbidden_start_values(config, descriptions, warnings, strict=False)
     unit_warnings(connections, descriptions, warnings)
+    _replaced_start_values(config, connections, warnings)
     warnings.merge(prescribed.warnings)
     _needed_tools(config, descriptions, warnings)
     ending_warnings(loaded, records, warnings)
@@ -310,6 +311,14 @@ def _needed_tools(config: Config, descriptions: Mapping[str, ModelDescription], 
             found = f"the FMU of '{name}' needs an execution tool ({tool or 'it does not say which'})"
             place = f"instances.{name}.{key_of(section)}"
             findings.add(place, found, f"{tool or 'that tool'} on the host that runs it")
+
+
+def _replaced_start_values(config: Config, connections: Iterable[Connection], findings: Findings) -> None:
+    """Note which start values have no effect because a connection gives the parameter its value."""
+    for c in connections:
+        if c.initial_only and c.target.name in config.instances[c.target_instance].start_values:
+            found = f"a start value for '{c.target.name}', which gets its value from the connection {c} ({c.path})"
+            findings.add(f"instances.{c.target_instance}.start_values.{c.target.name}", found, "")
 
 
 def _check_zenoh(loaded: LoadedConfig, findings: Findings) -> None:

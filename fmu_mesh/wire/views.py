@@ -57,7 +57,12 @@ class VariableView(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 class ConnectionView(msgspec.Struct, frozen=True):
-    """One connection in `info`; ``map``: what the input gets instead of a value, both as numbers."""
+    """One connection in `info`.
+
+    Attributes:
+        map: what the input gets instead of a value, both as numbers.
+        initial_only: whether it gives a parameter its value in the initialization, and has no part in the steps.
+    """
 
     source: str = msgspec.field(name="from")
     target: str = msgspec.field(name="to")
@@ -65,6 +70,7 @@ class ConnectionView(msgspec.Struct, frozen=True):
     factor: float = 1.0
     offset: float = 0.0
     map: tuple[tuple[int, int], ...] = ()
+    initial_only: bool = False
 
 
 class InstanceInfo(msgspec.Struct, frozen=True):

@@ -117,6 +117,34 @@ MODELS = {
         ),
         integers=(Var("above", output=True), Var("events")),
     ),
+    "Winding": Model(
+        states=1,
+        indicators=(),
+        reals=(
+            Var("I", "fixed", 0.0, output=True),
+            Var("der(I)", derivative="I"),
+            Var("M", output=True),
+            Var("R", "fixed", 1.0),
+            Var("L", "fixed", 0.001),
+            Var("k", "fixed", 0.1),
+            Var("U", "continuous", 0.0),
+            Var("w", "continuous", 0.0),
+        ),
+        integers=(),
+    ),
+    "Rotor": Model(
+        states=1,
+        indicators=(),
+        reals=(
+            Var("w", "fixed", 0.0, output=True),
+            Var("der(w)", derivative="w"),
+            Var("J", "fixed", 0.001),
+            Var("d", "fixed", 0.0),
+            Var("M_A", "continuous", 0.0),
+            Var("M_B", "continuous", 0.0),
+        ),
+        integers=(),
+    ),
 }
 
 

@@ -342,14 +342,19 @@ def test_a_parameter_that_is_wrong_is_a_finding_with_its_line(inside: str, messa
     assert _one(problems.findings).startswith(f"x.ssv:{message}")
 
 
-def test_of_two_parameters_with_one_name_the_second_is_a_finding_with_both_lines() -> None:
+@pytest.mark.parametrize(("other", "ambiguous"), [("1", {}), ("2", {"a": 4})])
+def test_a_second_parameter_of_one_name_is_a_warning_and_ambiguous_if_its_value_is_another(
+    other: str, ambiguous: dict[str, int]
+) -> None:
     parameter = '<ssv:Parameter name="a"><ssv:Real value="{}"/></ssv:Parameter>\n'
 
-    values, problems = _set(parameter.format(1) + parameter.format(2))
+    values, problems = _set(parameter.format(1) + parameter.format(other))
 
     assert [one.values for one in values.parameters] == [("1",)]
-    assert _one(problems.findings) == (
-        "x.ssv:4: Parameter 'a': a second parameter 'a'; expected one of this name (first: line 3)"
+    assert {name: place.line for name, place in values.ambiguous.items()} == ambiguous
+    assert not problems.findings
+    assert _one(problems.warnings) == (
+        "x.ssv:4: Parameter 'a': a second parameter of the same name: 'a'; expected one (first: line 3)"
     )
 
 

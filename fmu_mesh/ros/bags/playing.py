@@ -15,8 +15,9 @@ import msgspec
 
 from ...config.loading import LoadedConfig
 from ...errors import ConfigurationError, MeshLost
-from ...instances.configuration import load
+from ...instances.configuration import examine_data
 from ...simtime import ENDLESS, TimeGrid
+from ...ssp.configuration_files import read_configuration
 from ...system.scenario import BAG_STAMP_S
 from ...variables.model_description import Value
 from ...wire.client.mesh_client import MeshClient
@@ -86,7 +87,7 @@ def play_bag(client: MeshClient, bag: Bag, loaded: LoadedConfig | None = None, *
     infos = {name: client.instance_info(name) for name in mesh.instances}
     step_points = {name: round(info.step_size / mesh.step_size) for name, info in infos.items()}
     if loaded is None or how.get("config") is not None:
-        loaded = load(Path(how.get("config") or mesh.config))
+        loaded = _configuration(Path(how.get("config") or mesh.config))
     topics = chosen_topics(loaded, infos, bag, how.get("topics", ()))
     samples = bag.samples(topics, how.get("stamps", "header"))
     moments, merged, beyond = schedule(samples, grid_of(mesh), step_points, start=how.get("start"))
@@ -96,6 +97,18 @@ def play_bag(client: MeshClient, bag: Bag, loaded: LoadedConfig | None = None, *
     count, first = play(client, moments, step_points, how.get("timeout", _TIMEOUT_S))
     past = sum(len(moment.values) for moment in moments) - count
     return Played(count, names, first, moments[-1].point, merged, past, beyond)
+
+
+def _configuration(path: Path) -> LoadedConfig:
+    """The configuration of a mesh that runs; an option may have given its times.
+
+    Raises:
+        ConfigurationError: it cannot be read, or something else in it is wrong.
+    """
+    loaded, findings = examine_data(read_configuration(path))
+    if any(finding.path.partition(".")[0] != "simulation" for finding in findings):
+        findings.raise_any()
+    return loaded
 
 
 def _nothing(file: Path, names: str, beyond: int) -> ConfigurationError:

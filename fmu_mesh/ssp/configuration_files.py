@@ -1,0 +1,60 @@
+"""A configuration file of any format: YAML, or a package of SSP. Both become the same plain values."""
+
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path
+from typing import Final
+
+from .. import files
+from ..config.loading import PlainConfig, read_file
+from ..errors import ConfigurationError
+from .package import is_package
+
+__all__ = ["names_package", "read_configuration"]
+
+_YAML: Final = (".yaml", ".yml", ".json")
+_ARCHIVE: Final = b"PK\x03\x04"
+
+
+def read_configuration(path: Path, ssd: str | None = None) -> PlainConfig:
+    """Read the values of a configuration; what they mean is not checked yet.
+
+    Example:
+        >>> read_configuration(Path("configs/pendulum_delay.yaml")).data["mesh"]
+        'pendulum_delay'
+
+    Args:
+        path: a YAML file; or an .ssp file, a folder that was one, an .ssd file, or an .ssd inside an .ssp.
+        ssd: which description of a package: the name of its file, or the name that it has; None: the default one.
+
+    Raises:
+        ConfigurationError: it cannot be read, or it is neither YAML nor a package.
+    """
+    if path.suffix.lower() == ".ssd" and (archive := files.archive_on_the_way(path)) is not None and ssd is None:
+        path, ssd = archive, path.relative_to(archive).as_posix()
+    if not names_package(path):
+        if ssd is not None:
+            raise ConfigurationError(f"--ssd chooses a description in a package of SSP, and '{path}' is no package")
+        return read_file(path)
+    from .system_reading import read_system  # noqa: PLC0415  it imports FMPy, which is slow
+
+    return read_system(path, ssd)
+
+
+def names_package(path: Path) -> bool:
+    """Whether a path is that of a package of SSP: by its suffix, or by what is in it if it has another one."""
+    if is_package(path):
+        return True
+    if files.is_folder(path):
+        return any(path.glob("*.ssd"))
+    if path.suffix.lower() in _YAML or not files.is_file(path):
+        return False
+    try:
+        with path.open("rb") as file:
+            if file.read(len(_ARCHIVE)) != _ARCHIVE:
+                return False
+            with zipfile.ZipFile(file) as archive:  # only its list of files is read here
+                return any(name.lower().endswith(".ssd") and "/" not in name for name in archive.namelist())
+    except (OSError, ValueError, zipfile.BadZipFile):
+        return False  # whoever reads it says why

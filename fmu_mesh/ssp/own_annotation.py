@@ -1,0 +1,331 @@
+"""Our annotation of a system structure description: what SSP cannot say about a mesh, as JSON.
+
+Owns which keys of a configuration stand there, and how they come back. Everything that SSP can say stands in the
+description itself, so what another tool changes there is right. Where the annotation stands is `exporting` and
+`ssd_reading`.
+
+Example:
+    >>> data = {"mesh": "m", "simulation": {"step_size": 0.1}, "instances": {"a": {"fmu": "a.fmu", "group": "g"}}}
+    >>> described = {"mesh": "m", "simulation": {}, "instances": {"a": {"fmu": "a.fmu"}}}
+    >>> text = written(data, described)
+    >>> merged(described, text).data == data
+    True
+"""
+
+from __future__ import annotations
+
+import json
+import posixpath
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from typing import Any, Final, NamedTuple
+
+from ..text import listed
+
+__all__ = [
+    "ANNOTATION_ELEMENT",
+    "ANNOTATION_TYPE",
+    "AnnotationRefused",
+    "Merged",
+    "merged",
+    "names_in",
+    "without",
+    "written",
+]
+
+ANNOTATION_TYPE: Final = "io.github.fmu-mesh"
+"""The type of our annotation. It is one of the root system."""
+
+ANNOTATION_ELEMENT: Final = "{https://fmu-mesh.github.io/ssp/1}Mesh"
+"""The element inside it; its text is the JSON."""
+
+_VERSION: Final = 1
+_OF_SSP: Final = ("fmu", "kind", "start_values")
+_INSTANCE_KEYS: Final = (
+    "group",
+    "host",
+    "interpolation",
+    "retry_discarded_steps",
+    "sha256",
+    "solver",
+    "step_size",
+    "strict",
+    "tolerance",
+)
+"""All other keys of an FMU. No key that names another kind of instance: a package never names code of the user."""
+
+_CONNECTION_KEYS: Final = ("delay", "extrapolation")
+_SECTIONS: Final = (
+    "group",
+    "initialization",
+    "record",
+    "scenario",
+    "zenoh",
+    "timeouts",
+    "limits",
+    "strict",
+    "ros",
+)
+"""The top-level keys that stand there as they are."""
+
+_KNOWN: Final = ("version", "mesh", "names", "simulation", "instances", "connections", *_SECTIONS)
+_ABSENT: Final = object()
+_LARGEST_TEXT: Final = 4 * 2**20
+"""In characters, as a configuration file."""
+
+
+class AnnotationRefused(ValueError):
+    """The text of an annotation is none of ours.
+
+    Args:
+        found: what there is.
+        expected: what should be there.
+    """
+
+    def __init__(self, found: str, expected: str) -> None:
+        super().__init__(f"{found}; expected {expected}")
+        self.found = found
+        self.expected = expected
+
+
+class Merged(NamedTuple):
+    """A configuration with what an annotation says.
+
+    Attributes:
+        data: the values of the configuration.
+        paths: what the annotation says of it, such as `simulation.step_size`.
+        gone: what the annotation says about instances and connections that there are not.
+    """
+
+    data: dict[str, Any]
+    paths: list[str]
+    gone: list[str]
+
+
+def written(
+    data: Mapping[str, Any],
+    described: Mapping[str, Any],
+    *,
+    names: Mapping[str, str] = {},
+    moved: Callable[[str], str] = lambda path: path,
+) -> str | None:
+    """The text of the annotation for the values of a valid configuration; None if SSP can say all of it.
+
+    Args:
+        data: the values, with a scenario in the place of the path of one.
+        described: what the description says without an annotation of ours, with the same names.
+        names: the instances whose names do not follow from those of their elements, by the names that would follow.
+        moved: from the path of a result file to one for the folder of the package.
+    """
+    simulation, said = data["simulation"], described.get("simulation", {})
+    known = {_ends(one): one for one in described.get("connections", ()) if isinstance(one, dict)}
+    own = {
+        "mesh": data["mesh"] if described.get("mesh") != data["mesh"] else None,
+        "names": dict(names),
+        "simulation": {key: simulation[key] for key in simulation if key not in said or said[key] != simulation[key]},
+        "instances": dict(_own_instances(data["instances"], described.get("instances", {}))),
+        "connections": list(_own_connections(data.get("connections", ()), known)),
+    }
+    sections = {key: data[key] for key in _SECTIONS if key in data and data[key] != described.get(key, _ABSENT)}
+    if "record" in sections:
+        sections["record"] = _with_files(sections["record"], moved)
+    content = {**{key: value for key, value in own.items() if value}, **sections}
+    return json.dumps({"version": _VERSION, **content}, indent=2, allow_nan=False) if content else None
+
+
+def without(data: Mapping[str, Any], text: str) -> dict[str, Any]:
+    """A configuration without the keys that its annotation has set: what the description itself says.
+
+    Raises:
+        AnnotationRefused: the text is no annotation of ours.
+    """
+    content = _parsed(text)
+    sections = _mapping(content, "instances")
+    connections = {(entry.get("from"), entry.get("to")): entry for entry in content.get("connections", [])}
+    return {
+        **{key: value for key, value in data.items() if key not in content},
+        "simulation": _without(data["simulation"], _mapping(content, "simulation")),
+        "instances": {name: _without(own, sections.get(name, {})) for name, own in data["instances"].items()},
+        "connections": [
+            {**_without(one, connections.get(_ends(one), {})), "from": one["from"], "to": one["to"]}
+            for one in data.get("connections", ())
+        ],
+    }
+
+
+def names_in(text: str) -> dict[str, str]:
+    """The names of the instances that do not follow from those of their elements, by the names that would follow.
+
+    Raises:
+        AnnotationRefused: the text is no annotation of ours.
+    """
+    names = _mapping(_parsed(text), "names")
+    if not all(isinstance(name, str) for name in names.values()):
+        raise AnnotationRefused("a name in 'names' that is no text", "the name of an instance")
+    return dict(names)
+
+
+def chosen_names(defaults: Sequence[str], text: str) -> dict[str, str]:
+    """The name of each instance, by the name that follows from its element.
+
+    Args:
+        defaults: the names that follow from the elements of the description.
+        text: the text of the annotation.
+
+    Raises:
+        AnnotationRefused: the text is no annotation of ours, or gives one name to two instances.
+    """
+    wanted = names_in(text)
+    chosen = {default: wanted.get(default, default) for default in defaults}
+    first: dict[str, str] = {}
+    for default, name in chosen.items():
+        if name in first:
+            found = f"the name '{name}' of the elements '{first[name]}' and '{default}'"
+            raise AnnotationRefused(found, "a name of its own for each of them")
+        first[name] = default
+    return chosen
+
+
+def merged(data: Mapping[str, Any], text: str, *, moved: Callable[[str], str] = lambda path: path) -> Merged:
+    """A configuration of a description with what its annotation says.
+
+    Args:
+        data: what the description itself says: a mapping as in a configuration file, with long connections, and with
+            the names that `chosen_names` gives. It is not changed.
+        text: the text of the annotation.
+        moved: from the path of a result file for the folder of the package to one for the folder of the configuration.
+
+    Raises:
+        AnnotationRefused: the text is no annotation of ours.
+    """
+    content = _parsed(text)
+    simulation = _mapping(content, "simulation")
+    made = {**data, "simulation": {**data.get("simulation", {}), **simulation}}
+    result = Merged(made, [f"simulation.{key}" for key in simulation], [])
+    if "mesh" in content:
+        made["mesh"] = content["mesh"]
+        result.paths.append("mesh")
+    _merge_instances(content, result)
+    _merge_connections(content, result)
+    for key in _SECTIONS:
+        if key in content:
+            made[key] = _with_files(content[key], moved) if key == "record" else content[key]
+            result.paths.append(key)
+    return result
+
+
+def _parsed(text: str) -> dict[str, Any]:
+    """The content of an annotation, with a known version and known keys."""
+    expected = "the JSON that fmu_mesh writes"
+    if len(text) > _LARGEST_TEXT:
+        raise AnnotationRefused(f"{len(text)} characters", f"{_LARGEST_TEXT} characters at most")
+    try:
+        content = json.loads(text, parse_constant=_no_number)
+    except (ValueError, RecursionError) as error:
+        raise AnnotationRefused(f"no JSON: {error}", expected) from error
+    if not isinstance(content, dict):
+        raise AnnotationRefused("no mapping", expected)
+    if content.get("version") != _VERSION:
+        raise AnnotationRefused(f"version {content.get('version')!r}", f"version {_VERSION}")
+    for key in content:
+        if key not in _KNOWN:
+            raise AnnotationRefused(f"the key '{key}'", f"one of {listed(_KNOWN)}")
+    _mapping(content, "names")
+    return content
+
+
+def _no_number(text: str) -> float:
+    raise ValueError(f"'{text}' is no number of JSON")
+
+
+def _mapping(content: Mapping[str, Any], key: str) -> dict[str, Any]:
+    section = content.get(key, {})
+    if not isinstance(section, dict):
+        raise AnnotationRefused(f"no mapping in '{key}'", "a mapping")
+    return section
+
+
+def _without(section: Mapping[str, Any], keys: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in section.items() if key not in keys}
+
+
+def _ends(connection: Mapping[str, Any]) -> tuple[str, str]:
+    return connection["from"], connection["to"]
+
+
+def _own_instances(
+    instances: Mapping[str, Mapping[str, Any]], described: Mapping[str, Mapping[str, Any]]
+) -> Iterator[tuple[str, dict[str, Any]]]:
+    """The keys of the instances that SSP does not have, and that the description does not say."""
+    for name, section in instances.items():
+        said = described.get(name, {})
+        kept = {
+            key: section[key]
+            for key in section
+            if key not in _OF_SSP and (key not in said or said[key] != section[key])
+        }
+        kept |= {key: None for key in said if key not in _OF_SSP and key not in section}
+        if kept:
+            yield name, kept
+
+
+def _own_connections(
+    connections: Iterable[Mapping[str, Any] | str], described: Mapping[tuple[str, str], Mapping[str, Any]]
+) -> Iterator[dict[str, Any]]:
+    """The connections with keys that SSP does not have, by their ends."""
+    for connection in connections:
+        if isinstance(connection, str):
+            continue  # the short form has no keys
+        said = described.get(_ends(connection), {})
+        kept = {key: connection[key] for key in _CONNECTION_KEYS if key in connection}
+        kept = {key: value for key, value in kept.items() if value != said.get(key)}
+        if kept:
+            yield {"from": connection["from"], "to": connection["to"], **kept}
+
+
+def _merge_instances(content: Mapping[str, Any], result: Merged) -> None:
+    instances = {name: dict(section) for name, section in result.data.get("instances", {}).items()}
+    result.data["instances"] = instances
+    for name, section in _mapping(content, "instances").items():
+        if not isinstance(section, dict):
+            raise AnnotationRefused(f"no mapping for the instance '{name}'", "a mapping")
+        for key in section:
+            if key not in _INSTANCE_KEYS:
+                raise AnnotationRefused(f"the key '{key}' of '{name}'", f"one of {listed(_INSTANCE_KEYS)}")
+        if name in instances:
+            instances[name] |= section
+            result.paths.extend(f"instances.{name}.{key}" for key in section)
+        else:
+            result.gone.append(f"the instance '{name}', which the annotation has {listed([*section])} for")
+
+
+def _merge_connections(content: Mapping[str, Any], result: Merged) -> None:
+    entries = content.get("connections", [])
+    if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
+        raise AnnotationRefused("no list of mappings in 'connections'", "a list of mappings")
+    if not entries:
+        return
+    connections = [dict(one) for one in result.data.get("connections", ())]
+    result.data["connections"] = connections
+    numbers = {_ends(one): number for number, one in enumerate(connections)}
+    for entry in entries:
+        keys = {key: value for key, value in entry.items() if key not in ("from", "to")}
+        for key in keys:
+            if key not in _CONNECTION_KEYS:
+                raise AnnotationRefused(f"the key '{key}' of a connection", f"one of {listed(_CONNECTION_KEYS)}")
+        ends = entry.get("from"), entry.get("to")
+        number = numbers.get(ends) if all(isinstance(end, str) for end in ends) else None
+        if number is not None:
+            connections[number] |= keys
+            result.paths.extend(f"connections[{number}].{key}" for key in keys)
+        else:
+            result.gone.append(f"the connection {ends[0]} -> {ends[1]}, which the annotation has {listed([*keys])} for")
+
+
+def _with_files(record: Any, moved: Callable[[str], str]) -> Any:  # noqa: ANN401  a section as in a file
+    """The section `record` with other paths of its result files."""
+    if isinstance(record, list):
+        return [_with_files(one, moved) for one in record]
+    if not isinstance(record, dict) or not isinstance(record.get("file"), str):
+        return record
+    file = record["file"]
+    return {**record, "file": file if posixpath.isabs(file) else moved(file)}

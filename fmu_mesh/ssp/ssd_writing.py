@@ -1,0 +1,350 @@
+"""From a mesh to the XML of a system structure description, of SSP 1.0 or 2.0.
+
+Owns which elements and attributes stand for what, and what a version cannot say. Which files go into the package is
+`exporting`, and what no version can say is `own_annotation`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Final, Literal, NamedTuple
+
+import msgspec
+from lxml import etree
+
+from ..config.findings import Findings
+from ..config.mesh import ConnectionConfig
+from ..instances.fmi.fmu_kind import FmuConfig
+from ..system.system import Connection, ResolvedSystem
+from ..system.value_map import map_words
+from ..variables.model_description import ModelDescription, Value, Variable
+from ..variables.units import BaseUnit
+from ..variables.value_conversion import to_value
+from ..variables.value_types import flattened
+from .grammar import NAMESPACES
+from .xml_writing import XmlNode, annotations_element, child, is_xml_text, number_text, tag_of, write_units
+
+__all__ = ["ElementNames", "NewDocument", "SspVersion", "ssd_of"]
+
+SspVersion = Literal["1.0", "2.0"]
+
+_KINDS_OF_1: Final = ("input", "output", "parameter", "calculatedParameter")
+_KINDS: Final = (*_KINDS_OF_1, "structuralParameter")
+"""The connectors that are written even if nothing uses them."""
+
+_TYPES_OF_1: Final = {
+    "Float64": "Real",
+    "Int32": "Integer",
+    "Boolean": "Boolean",
+    "String": "String",
+    "Enumeration": "Enumeration",
+    "Binary": "Binary",
+}
+"""The names in SSP 1.0 of the types that it has."""
+
+_IMPLEMENTATIONS: Final = {"co_simulation": "CoSimulation", "model_exchange": "ModelExchange"}
+_INT_32: Final = range(-(2**31), 2**31)
+_SOURCES_OF_PARAMETERS: Final = ("constant", "calculatedParameter")
+
+
+class ElementNames(msgspec.Struct, frozen=True):
+    """The names of the elements.
+
+    Attributes:
+        elements: the name of the component, by instance.
+        sources: the path of the FMU in the package, by instance.
+    """
+
+    elements: Mapping[str, str]
+    sources: Mapping[str, str]
+
+
+class NewDocument(NamedTuple):
+    """A system structure description.
+
+    Attributes:
+        units: the names of the units that it defines.
+    """
+
+    xml: bytes
+    units: set[str]
+
+
+def ssd_of(
+    system: ResolvedSystem, names: ElementNames, version: SspVersion, annotation: str | None, findings: Findings
+) -> NewDocument:
+    """A system structure description.
+
+    Args:
+        system: the mesh; all of its instances are FMUs.
+        names: how the components are called, and where their FMUs are.
+        version: the version of SSP.
+        annotation: the text of our annotation; None: there is none.
+        findings: gets what this version, or no version, can say. Then the document is useless.
+    """
+    writer = _Writer(system, names, version, findings)
+    return NewDocument(writer.document(annotation), writer.units)
+
+
+class _Writer:
+    """Writes one document; units and enumerations are collected on the way."""
+
+    def __init__(self, system: ResolvedSystem, names: ElementNames, version: SspVersion, findings: Findings) -> None:
+        self._system = system
+        self._names = names
+        self._version: SspVersion = version
+        self._findings = findings
+        self._units: dict[str, BaseUnit] = {}
+        self._enumerations: dict[tuple[tuple[str, int], ...], str] = {}
+
+    @property
+    def units(self) -> set[str]:
+        """The names of the units that the document defines."""
+        return {*self._units}
+
+    def document(self, annotation: str | None) -> bytes:
+        config = self._system.config
+        root = etree.Element(
+            tag_of("ssd:SystemStructureDescription"),
+            {"version": self._version, "name": config.mesh, "generationTool": "fmu_mesh"},
+            nsmap={prefix: NAMESPACES[prefix] for prefix in ("ssd", "ssc", "ssv")},
+        )
+        own = child(root, "ssd:System", name=config.mesh)
+        elements = child(own, "ssd:Elements")
+        for name in self._system.instances:
+            self._component(elements, name)
+        if self._system.connections:
+            connections = child(own, "ssd:Connections")
+            for connection in self._system.connections:
+                self._connection(connections, connection)
+        if annotation is not None:
+            own.append(annotations_element(annotation))
+        self._definitions(root)
+        experiment = {"startTime": number_text(config.simulation.start_time)}
+        if config.simulation.stop_time is not None:
+            experiment["stopTime"] = number_text(config.simulation.stop_time)
+        child(root, "ssd:DefaultExperiment", **experiment)
+        etree.indent(root)
+        return bytes(etree.tostring(root, encoding="UTF-8", xml_declaration=True)) + b"\n"
+
+    # --- components
+
+    def _component(self, parent: XmlNode, name: str) -> None:
+        section = self._system.config.instances[name]
+        description = self._system.instances[name].description
+        component = child(parent, "ssd:Component", name=self._names.elements[name], source=self._names.sources[name])
+        if isinstance(section, FmuConfig) and section.kind in _IMPLEMENTATIONS:
+            component.set("implementation", _IMPLEMENTATIONS[section.kind])
+        connected = self._connected(name)
+        connectors = [
+            variable
+            for variable in description.variables
+            if variable.name in connected or self._has_connector(variable, section.start_values)
+        ]
+        if connectors:
+            parent = child(component, "ssd:Connectors")
+            for variable in connectors:
+                self._connector(parent, variable, description)
+        variables = {variable.name: variable for variable in description.variables}
+        if section.start_values:
+            self._binding(component, name, [(variables[key], value) for key, value in section.start_values.items()])
+
+    def _connected(self, name: str) -> set[str]:
+        """The variables of an instance that are ends of connections."""
+        sources = {one.source.name for one in self._system.connections if one.source_instance == name}
+        return sources | {one.target.name for one in self._system.connections if one.target_instance == name}
+
+    def _has_connector(self, variable: Variable, start_values: Mapping[str, Any]) -> bool:
+        """Whether an unconnected variable is shown to other tools: it can be connected or set, and has a type."""
+        return (variable.causality in _KINDS or variable.name in start_values) and self._is_known(variable)
+
+    def _is_known(self, variable: Variable) -> bool:
+        """Whether this version of SSP has the kind and the type of a variable."""
+        if self._version == "2.0":
+            return True
+        return variable.causality in _KINDS_OF_1 and not variable.shape and variable.type in _TYPES_OF_1
+
+    def _type(self, variable: Variable) -> str:
+        """The name of a type: of the FMU's own version, where this version of SSP has it."""
+        if self._version == "1.0":
+            return _TYPES_OF_1.get(variable.type, variable.type)
+        return variable.declared_type or variable.type
+
+    def _connector(self, parent: XmlNode, variable: Variable, description: ModelDescription) -> None:
+        connector = child(parent, "ssd:Connector", name=variable.name, kind=variable.causality)
+        attributes: dict[str, str] = {}
+        if variable.type in ("Float64", "Float32") and (unit := self._unit(variable)) is not None:
+            attributes["unit"] = unit
+        if variable.type == "Enumeration":
+            enumeration = self._enumeration(variable, description)
+            if enumeration is None:
+                return  # the type of the FMU's variable counts
+            attributes["name"] = enumeration
+        child(connector, f"ssc:{self._type(variable)}", **attributes)
+        self._dimensions(connector, variable)
+
+    def _dimensions(self, parent: XmlNode, variable: Variable) -> None:
+        for dimension, size in zip(variable.dimensions, variable.shape, strict=True):
+            if isinstance(dimension, str) and parent.tag == tag_of("ssd:Connector"):
+                child(parent, "ssc:Dimension", sizeConnector=dimension)
+            else:
+                child(parent, "ssc:Dimension", size=str(size))
+
+    # --- start values
+
+    def _binding(self, component: XmlNode, name: str, written: Sequence[tuple[Variable, Any]]) -> None:
+        binding = child(child(component, "ssd:ParameterBindings"), "ssd:ParameterBinding")
+        values = child(binding, "ssd:ParameterValues")
+        own = child(values, "ssv:ParameterSet", version=self._version, name=self._names.elements[name])
+        parameters = child(own, "ssv:Parameters")
+        units: dict[str, BaseUnit] = {}
+        for variable, plain in written:
+            place = f"instances.{name}.start_values.{variable.name}"
+            if self._version == "1.0" and (variable.shape or variable.type not in _TYPES_OF_1):
+                self._needs_2(place, f"a start value of type {variable.type_name} for '{variable.name}'")
+                continue
+            value = to_value(plain, variable)
+            texts = [_text_of(element, variable) for element in flattened(value, len(variable.shape))]
+            if not all(is_xml_text(text) for text in texts):
+                found = f"a control character in the start value of '{variable.name}'"
+                self._findings.add(place, found, "text without control characters: XML has no place for them")
+                continue
+            parameter = child(parameters, "ssv:Parameter", name=variable.name)
+            self._value(parameter, variable, texts)
+            if variable.type in ("Float64", "Float32") and (unit := self._unit(variable)) is not None:
+                parameter[0].set("unit", unit)
+                units[unit] = self._units[unit]
+            self._dimensions(parameter, variable)
+        if units:
+            write_units(child(own, "ssv:Units"), units)
+
+    def _value(self, parameter: XmlNode, variable: Variable, texts: Sequence[str]) -> None:
+        type_ = self._type(variable)
+        if variable.type == "Enumeration" and not variable.items:
+            type_ = "Integer"  # there are no names of items
+        node = child(parameter, f"ssv:{type_}")
+        if not variable.shape:
+            node.set("value", texts[0])
+        elif type_ in ("String", "Enumeration", "Binary"):
+            for text in texts:
+                child(node, "ssv:Value", value=text)
+        else:
+            node.set("value", " ".join(texts))
+
+    # --- connections
+
+    def _connection(self, parent: XmlNode, connection: Connection) -> None:
+        index = int(connection.path.removeprefix("connections[").rstrip("]"))
+        config = self._system.config.connections[index]
+        self._check_ends(connection)
+        attributes = {
+            "startElement": self._names.elements[connection.source_instance],
+            "startConnector": connection.source.name,
+            "startIndices": " ".join(str(number + 1) for number in connection.source_index),
+            "endElement": self._names.elements[connection.target_instance],
+            "endConnector": connection.target.name,
+            "endIndices": " ".join(str(number + 1) for number in connection.target_index),
+            "suppressUnitConversion": "true" if config.ignore_units else "",
+        }
+        node = child(parent, "ssd:Connection", **{name: text for name, text in attributes.items() if text})
+        self._transformation(node, connection, config)
+
+    def _transformation(self, node: XmlNode, connection: Connection, config: ConnectionConfig) -> None:
+        if (config.factor, config.offset) != (1.0, 0.0):
+            child(
+                node, "ssc:LinearTransformation", factor=number_text(config.factor), offset=number_text(config.offset)
+            )
+        if not connection.map:
+            return
+        source, target = connection.source, connection.target
+        kind = _map_kind(source, target)
+        place = f"{connection.path}.map"
+        if kind is None:
+            expected = "two ends of type Boolean, or none: SSP has no other maps of Boolean"
+            self._findings.add(place, f"a map from {source.type_name} to {target.type_name}", expected)
+            return
+        pairs = {str(have): str(want) for have, want in connection.map}
+        if kind != "Integer":
+            pairs = map_words(connection.map, source, target)
+        elif self._version == "1.0" and not all(number in _INT_32 for pair in connection.map for number in pair):
+            self._needs_2(place, "a number of more than 32 bits")
+        parent = child(node, f"ssc:{kind}MappingTransformation")
+        for have, want in pairs.items():
+            child(parent, "ssc:MapEntry", source=have, target=want)
+
+    def _check_ends(self, connection: Connection) -> None:
+        source, target = connection.source, connection.target
+        if target.causality != "input" and source.causality not in _SOURCES_OF_PARAMETERS:
+            found = f"{connection}, from {source.role} to {target.role}"
+            expected = "a start value for it: SSP has such connections from calculated parameters only"
+            self._findings.add(connection.path, found, expected)
+        if self._version == "2.0":
+            return
+        for variable, index in ((source, connection.source_index), (target, connection.target_index)):
+            if index:
+                self._needs_2(connection.path, f"{connection}, which connects an element of an array")
+            elif not self._is_known(variable):
+                what = variable.causality if variable.causality not in _KINDS_OF_1 else f"type {variable.type_name}"
+                self._needs_2(connection.path, f"{connection}, where '{variable.name}' is of {what}")
+
+    def _needs_2(self, path: str, found: str) -> None:
+        self._findings.add(path, found, 'SSP 2.0, as with `version="2.0"` or `--version 2.0`')
+
+    # --- definitions
+
+    def _unit(self, variable: Variable) -> str | None:
+        """The name of a variable's unit in the document; None if the FMU's counts.
+
+        That is where the FMU does not define it, or where another FMU has another definition of this name.
+        """
+        name, base = variable.unit, variable.base_unit
+        if name is None or base is None or not base.usable:
+            return None
+        return name if self._units.setdefault(name, base) == base else None
+
+    def _enumeration(self, variable: Variable, description: ModelDescription) -> str | None:
+        """The name of an enumeration in the document; None if it cannot be defined there."""
+        if not variable.items or not all(number in _INT_32 for _, number in variable.items):
+            return None
+        if variable.items not in self._enumerations:
+            wanted, names = f"{description.model_name}.{variable.name}", {*self._enumerations.values()}
+            name, number = wanted, 1
+            while name in names:
+                number += 1
+                name = f"{wanted} {number}"
+            self._enumerations[variable.items] = name
+        return self._enumerations[variable.items]
+
+    def _definitions(self, root: XmlNode) -> None:
+        if self._enumerations:
+            parent = child(root, "ssd:Enumerations")
+            for items, name in self._enumerations.items():
+                enumeration = child(parent, "ssc:Enumeration", name=name)
+                for item, number in items:
+                    child(enumeration, "ssc:Item", name=item, value=str(number))
+        if self._units:
+            write_units(child(root, "ssd:Units"), self._units)
+
+
+def _map_kind(source: Variable, target: Variable) -> str | None:
+    """Which of the mappings of SSP a map is; None if it is none of them."""
+    types = {source.type, target.type}
+    if types == {"Boolean"}:
+        return "Boolean"
+    if types == {"Enumeration"} and source.items and target.items:
+        return "Enumeration"
+    return "Integer" if "Boolean" not in types else None
+
+
+def _text_of(value: Value, variable: Variable) -> str:
+    """A scalar value as an attribute of a parameter set has it."""
+    match value:
+        case bool():
+            return "true" if value else "false"
+        case float():
+            return number_text(value)
+        case bytes():
+            return value.hex().upper()
+        case int() if variable.type == "Enumeration":
+            return next((item for item, number in variable.items if number == value), str(value))
+    return str(value)
