@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+import io
+import zipfile
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 import fmu_mesh
+from tests.ssp.comparing import differences
 from tests.ssp.packages import write_package
+from tests.ssp.reference_run import run_system
+from tests.ssp.reference_system import read_system
 from tests.ssp.supported_systems import SUPPORTED, Supported
 
-RUNS = [
-    pytest.param(own, algorithm, id=f"{own.name}, {algorithm}") for own in SUPPORTED for algorithm in own.algorithms
-]
+RUNS = [(own, algorithm) for own in SUPPORTED for algorithm in own.algorithms]
+
+
+def name_of(part: Supported | str) -> str:
+    return part if isinstance(part, str) else part.name
 
 
 def package_of(own: Supported, folder: Path, suffix: str = ".ssp") -> Path:
@@ -66,9 +73,6 @@ def text_of(own: Supported, name: str, folder: Path) -> str:
     if name in files:
         content = files[name]
         return content if isinstance(content, str) else content.decode()
-    import io
-    import zipfile
-
     outer = next(one for one in files if name.startswith(f"{one}/"))
     data = files[outer]
     assert isinstance(data, bytes)
@@ -76,13 +80,25 @@ def text_of(own: Supported, name: str, folder: Path) -> str:
         return archive.read(name.removeprefix(f"{outer}/")).decode()
 
 
-@pytest.mark.parametrize(("own", "algorithm"), RUNS)
+@pytest.mark.parametrize(("own", "algorithm"), [run for run in RUNS if run[0].in_reference], ids=name_of)
+def test_a_run_equals_the_independent_reference(own: Supported, algorithm: str, tmp_path: Path) -> None:
+    path, result = package_of(own, tmp_path), tmp_path / "result.csv"
+    file = own.ssd if own.ssd in own.files(tmp_path / "built") else "SystemStructure.ssd"
+    reference = read_system(path, tmp_path / "unpacked", file or "SystemStructure.ssd")
+
+    fmu_mesh.load(path, ssd=file).run(output=result, processes=False, **options_of(own, algorithm))
+
+    outputs, rows = run_system(reference, step_size=0.125, stop_time=1.0, algorithm=algorithm)
+    assert differences(result, outputs, rows) == []
+
+
+@pytest.mark.parametrize(("own", "algorithm"), RUNS, ids=name_of)
 def test_a_run_in_processes_is_the_run_in_one_process(own: Supported, algorithm: str, tmp_path: Path) -> None:
     mesh = fmu_mesh.load(package_of(own, tmp_path), ssd=own.ssd)
     apart, here = tmp_path / "apart.csv", tmp_path / "here.csv"
 
-    mesh.run(record=apart, **options_of(own, algorithm))
-    mesh.run(record=here, processes=False, **options_of(own, algorithm))
+    mesh.run(output=apart, **options_of(own, algorithm))
+    mesh.run(output=here, processes=False, **options_of(own, algorithm))
 
     assert len(here.read_text().splitlines()) == 1 + 9
     assert apart.read_bytes() == here.read_bytes()
