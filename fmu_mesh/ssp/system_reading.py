@@ -7,6 +7,7 @@ configuration came from which line.
 from __future__ import annotations
 
 import posixpath
+import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Final, Literal
@@ -18,7 +19,7 @@ from ..errors import ConfigurationError, LoadFailed
 from ..instances.fmi.archive.archive import Terms
 from ..instances.fmi.archive.reading import read_description
 from ..text import listed, nearest
-from ..variables.model_description import Kind, ModelDescription
+from ..variables.model_description import Kind, ModelDescription, Variable
 from .annotations import OPEN_MODELICA, OPEN_SIMULATION_PLATFORM, base_step_size, common_solvers, step_size_hint
 from .flattening import FlatConnection, FlatValue, flatten
 from .naming import instance_name, mesh_name
@@ -287,7 +288,11 @@ class _Configuration:
         if connection.change.ignore_units:
             written["ignore_units"] = True
         if connection.change.mapping:
-            written["map"] = dict(connection.change.mapping)
+            path, name = connection.target
+            description = self._describe(path)
+            target = description.variable_of(name) if description is not None else None
+            entries = connection.change.mapping.items()
+            written["map"] = {have: _map_value(want, target) for have, want in entries}
         if connection.change.place is not None:
             for key in ("factor", "offset", "map"):
                 self._place(f"connections[{number}].{key}", connection.change.place)
@@ -320,3 +325,11 @@ class _Configuration:
                 unknown.setdefault(annotation.type, annotation)
         for type_, annotation in unknown.items():
             self._problems.warn(annotation.place, f"the annotation '{type_}' is not known, and has no effect")
+
+
+def _map_value(text: str, target: Variable | None) -> bool | int | str:
+    """The value that a mapping gives to a variable: as a configuration has it, from the text of the mapping."""
+    if target is not None and target.type == "Boolean":
+        return text == "true"
+    names = [item for item, _ in target.items] if target is not None else []
+    return int(text) if text not in names and re.fullmatch(r"-?[0-9]+", text) else text
