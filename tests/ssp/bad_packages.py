@@ -762,7 +762,7 @@ BINDINGS = (
         (D_VALUE, D_VALUE.replace('Real value="0.25"', 'String value="short"')),
         at='String value="short"',
         element="Parameter 'd'",
-        words=("String", "Real"),
+        words=("the String value 'short' for the Real 'd'",),
     ),
     fault(
         "an inline value of a unit with another dimension",

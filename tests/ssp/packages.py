@@ -157,8 +157,7 @@ def bound(values: str, mapping: str | None = None, **attributes: object) -> str:
 
 def parameter(name: str, value: object, type_: str = "Real", *inside: str, **of_the_type: object) -> str:
     """One parameter; a ``value`` of None leaves the attribute out."""
-    text = {True: "true", False: "false"}.get(value, value) if isinstance(value, bool) else value
-    return element("ssv:Parameter", element(f"ssv:{type_}", value=text, **of_the_type), *inside, name=name)
+    return element("ssv:Parameter", element(f"ssv:{type_}", value=value, **of_the_type), *inside, name=name)
 
 
 def parameter_set(*parameters: str, units: Iterable[str] = (), version: str = "1.0", **attributes: object) -> str:
