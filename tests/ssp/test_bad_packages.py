@@ -17,7 +17,7 @@ TOGETHER = (
     "a kind that is not the causality of the FMU",
     "an implementation that does not exist",
     "a factor that is no number",
-    "an SSV with a parameter twice",
+    "an SSV with a parameter without a type",
     "an SSM of another version",
     "two units of one name",
     "an inline value of another type",
@@ -71,7 +71,7 @@ def test_a_fault_is_found_with_its_file_line_and_element(fault: Fault, tmp_path:
 
 @pytest.mark.parametrize("name", ["bad", "bad.ssd"])
 def test_a_folder_and_a_description_have_the_findings_of_the_package(name: str, tmp_path: Path) -> None:
-    fault = next(fault for fault in BAD_PACKAGES if fault.name == "an SSV with a parameter twice")
+    fault = next(fault for fault in BAD_PACKAGES if fault.name == "an SSV with a parameter without a type")
     folder = write_package(tmp_path / "bad", edited(*fault.edits))
     path = folder if name == "bad" else folder / "SystemStructure.ssd"
 

@@ -34,7 +34,7 @@ def test_the_reference_reaches_the_steady_state(tmp_path: Path) -> None:
 def test_the_mesh_reaches_the_steady_state_by_model_exchange(algorithm: str, tmp_path: Path) -> None:
     package = make_package(SYSTEMS["dc motor"](), tmp_path)
 
-    options = {"step_size": 0.001, "stop_time": 3.0, "algorithm": algorithm}
-    result = fmu_mesh.load(package).run(processes=False, record="memory", **options)
+    mesh = fmu_mesh.load(package)
+    result = mesh.run(processes=False, record="memory", step_size=0.001, stop_time=3.0, algorithm=algorithm)
 
     assert (result["SuT-rotor.w"][-1], result["SuT-winding.I"][-1]) == pytest.approx((SPEED, CURRENT), rel=1e-11)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -168,11 +169,12 @@ def _resolve(folder: Path, root: str) -> tuple[ResolvedParameters, Problems]:
         "</ssd:SystemStructureDescription>"
     )
     (folder / "SystemStructure.ssd").write_text(text)
+    for name in re.findall(r'source="([^"]+\.fmu)"', text):
+        (folder / name).touch()  # nothing reads it
     problems = Problems()
     with Package(folder) as package:
         structure = read_structure(package, "SystemStructure.ssd", problems)
     assert structure is not None
-    problems.findings[:] = [one for one in problems.findings if ".fmu" not in one.found]  # there are no FMUs
     return resolve_parameters(structure.system, lambda _path: ALL, problems), problems
 
 
