@@ -25,6 +25,7 @@ from tests.equivalence.test_types import written as written_types
 from tests.fmus.helpers import find_fmu
 from tests.fmus.packing import repacked, unpacked
 from tests.helpers import FMUS, Place, write_config
+from tests.ssp.unit_fmus import with_units
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 WITH_FMUS_ONLY = ("chain8", "cycle2", "path_filter", "pendulum_delay", "pendulum_ros")
@@ -191,20 +192,6 @@ def test_a_package_runs_in_processes_as_its_mesh_does(place: Place) -> None:
 
 
 # --- units, enumerations, maps
-
-
-def with_units(folder: Path, name: str, unit: str, base: str) -> Path:
-    """The FMU Gain with a unit of its own for its input and its output."""
-
-    def changed(text: str) -> str:
-        units = f'<UnitDefinitions><Unit name="{unit}"><BaseUnit {base}/></Unit></UnitDefinitions>'
-        text = text.replace("<LogCategories>", f"{units}<LogCategories>", 1)
-        for variable in ("u", "y"):
-            before, _, after = text.partition(f'name="{variable}"')
-            text = f'{before}name="{variable}"{after.replace("<Real", f"<Real unit={chr(34)}{unit}{chr(34)}", 1)}'
-        return text
-
-    return repacked(folder / f"{name}.fmu", description=changed)
 
 
 def test_units_are_defined_and_converted_as_before(tmp_path: Path) -> None:
