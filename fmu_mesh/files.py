@@ -33,6 +33,7 @@ __all__ = [
     "Kept",
     "OwnFile",
     "archive_on_the_way",
+    "beside",
     "exists",
     "is_file",
     "is_folder",
@@ -84,6 +85,18 @@ def is_folder(path: Path) -> bool:
     return os.path.isdir(path)  # noqa: PTH112 see `exists`
 
 
+def beside(file: Path, relative: str) -> Path:
+    """The absolute path that a relative path in ``file`` means.
+
+    Links in the folder are resolved, the last part is not: `/dev/stdout` stays `/dev/stdout`. From a file inside an
+    archive, `..` leads out of the archive, to what is beside it where it was named, which may be a link.
+    """
+    path = file.absolute().parent / relative
+    if archive_on_the_way(file) is not None:
+        path = Path(os.path.normpath(path))
+    return path.parent.resolve() / path.name
+
+
 def open_alone(path: Path, result: Path | None = None) -> OwnFile:
     """Open a result file for a single writer: two runs of one configuration would mix their rows.
 
@@ -101,7 +114,10 @@ def open_alone(path: Path, result: Path | None = None) -> OwnFile:
         hint = "Wait for its end, or choose another file with --output."
         raise ConfigurationError(f"another run is writing the result file '{result or path}'", hint=hint) from error
     except OSError as error:
-        raise ConfigurationError(f"the result file '{result or path}' cannot be written: {error.strerror}") from error
+        archive = archive_on_the_way(result or path)
+        hint = f"'{archive}' is a file: a path in a package starts inside of it, and `../` leads to what is beside it."
+        text = f"the result file '{result or path}' cannot be written: {error.strerror}"
+        raise ConfigurationError(text, hint=hint if archive is not None else None) from error
 
 
 def unwritable(path: Path, error: OSError) -> ConfigurationError:

@@ -156,7 +156,8 @@ def with_way_out(error: LoadFailed, path: Path) -> LoadFailed:
         near = nearest_file(path)
         return error.instead_of_hint(f"Did you mean '{near}'?") if near is not None else error
     if names_package(path):
-        return error.instead_of_hint(f"A package of SSP is run by `fmu-mesh launch {path}`.")
+        hint = f"It is a package of SSP: `fmu-mesh launch {path}` runs it, and `fmu-mesh inspect {path}` shows it."
+        return error.instead_of_hint(hint)
     if path.suffix in (".yaml", ".yml"):
         return error.instead_of_hint(f"A configuration is run by `fmu-mesh launch {path}`.")
     return error

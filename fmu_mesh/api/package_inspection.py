@@ -13,13 +13,12 @@ from .. import files
 from ..config.loading import PlainConfig
 from ..errors import ConfigurationError
 from ..ssp.configuration_files import named_package
-from ..ssp.naming import instance_name
 from ..ssp.package import Package
 from ..ssp.problems import Problems
 from ..ssp.ssd_reading import annotations_of, read_structure
-from ..ssp.structure import Annotation, Binding, Component, Element, Structure, StructureSystem
+from ..ssp.structure import Annotation, Binding, Component, Element, Structure, StructureSystem, components_of
 from ..ssp.system_reading import read_system
-from ..text import short_number
+from ..text import printable, short_number
 from .tables import pairs, table
 
 __all__ = ["PackageInspection", "inspect_package"]
@@ -185,6 +184,10 @@ class _Inspected:
         self._name = name
         self._structure = structure
         self._plain = plain
+        data = plain.data if isinstance(plain.data, dict) else {}
+        instances = data.get("instances")
+        components = [path for path, _ in components_of(structure.system)]
+        self._instances = dict(zip(components, instances if isinstance(instances, dict) else (), strict=False))
 
     def inspection(self, variants: tuple[PackageVariant, ...]) -> PackageInspection:
         structure, plain = self._structure, self._plain
@@ -223,7 +226,7 @@ class _Inspected:
             path=path,
             kind="component" if is_component else "system",
             source=element.source if isinstance(element, Component) else None,
-            instance=instance_name(path) if is_component else None,
+            instance=self._instances.get(path),
             implementation=element.implementation if isinstance(element, Component) else None,
             connectors=dict(Counter(one.kind or "unspecified" for one in element.connectors)),
             connections=len(element.connections) if isinstance(element, StructureSystem) else 0,
@@ -343,4 +346,4 @@ def _times(what: str, count: int) -> str:
 
 
 def _line(text: str) -> str:
-    return " ".join(text.split())
+    return printable(" ".join(text.split()))

@@ -18,7 +18,8 @@ from argcomplete.shell_integration import shellcode
 
 from ..config.mesh import SimulationConfig
 from ..errors import FmuMeshError
-from ..ssp.configuration_files import read_configuration
+from ..ssp.configuration_files import named_package, read_configuration
+from ..ssp.package import Package
 from ..wire.client.reaching import Meshes
 from .arguments import CommandParser, Parsers
 
@@ -45,6 +46,9 @@ _FILES: Final[Mapping[str, tuple[str, ...]]] = {
     "FILE.yaml": ("yaml", "yml"),
 }
 """The endings of files by the `metavar` of an argument."""
+
+_PACKAGES: Final = ("config", "fmu", "source", "of")
+"""The arguments that may name a package of SSP."""
 
 
 def complete(parser_of: Callable[[Collection[str]], tuple[CommandParser, Mapping[str, CommandParser]]]) -> int:
@@ -86,6 +90,8 @@ def _offered(prefix: str, action: argparse.Action, parsed_args: argparse.Namespa
         return _from_running[action.dest](prefix, parsed_args)
     if action.dest == "algorithm":
         return get_args(get_type_hints(SimulationConfig)["algorithm"])
+    if action.dest == "ssd":
+        return _descriptions_in(parsed_args)
     if action.dest == "node":
         return _instances_in(parsed_args.config, getattr(parsed_args, "ssd", None))
     return ()
@@ -134,6 +140,15 @@ def _instances_in(file: Path, ssd: str | None) -> Iterable[str]:
     data = read_configuration(file, ssd).data
     instances = data.get("instances") if isinstance(data, dict) else None
     return [*instances] if isinstance(instances, dict) else []
+
+
+def _descriptions_in(given: argparse.Namespace) -> Iterable[str]:
+    """The descriptions of the package that an argument names."""
+    path = next((path for name in _PACKAGES if (path := getattr(given, name, None)) is not None), None)
+    if path is None or (named := named_package(Path(path))) is None:
+        return ()
+    with Package(named[0]) as package:
+        return package.descriptions
 
 
 def _add_completion(parser: CommandParser) -> None:

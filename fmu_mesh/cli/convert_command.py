@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 from pathlib import Path
 
 from .. import files
 from ..api.converting import convert
 from ..errors import ConfigurationError
+from ..ssp.configuration_files import named_package, read_configuration
+from ..ssp.package import DEFAULT, Package
 from .arguments import CommandParser, Parsers, add_quiet, add_ssd
 from .output.display import say
 from .run_options import add_options, read_options
@@ -43,8 +46,21 @@ def _convert(arguments: argparse.Namespace) -> int:
     if not arguments.quiet:
         for finding in lost:
             say(f"warning: {finding}")
-    print(f"{target}: run it with `fmu-mesh launch {target}`")
+    print(f"{target}: run it with `{_launch(source, arguments.ssd, target)}`")
     return 0
+
+
+def _launch(source: Path, ssd: str | None, target: Path) -> str:
+    """The command that runs what was written."""
+    words = ["fmu-mesh", "launch", str(target)]
+    named = named_package(source, ssd)
+    is_chosen = named is not None and (named[1] is not None or source.suffix.lower() == ".ssd")
+    if is_chosen and target.suffix.lower() == ".ssp":
+        name = read_configuration(source, ssd).file.name
+        with Package(target) as package:
+            if name != DEFAULT and name in package.descriptions:
+                words += ["--ssd", name]
+    return shlex.join(words)
 
 
 PARSERS: Parsers = {"convert": _add_convert}

@@ -63,7 +63,8 @@ def _inspect(arguments: argparse.Namespace) -> int:
 
 def _inspect_package(arguments: argparse.Namespace) -> int:
     if arguments.variables:
-        hint = f"Those of an FMU are shown by `fmu-mesh inspect {arguments.fmu}/resources/NAME.fmu`."
+        path = arguments.fmu.parent if arguments.fmu.suffix.lower() == ".ssd" else arguments.fmu
+        hint = f"Those of an FMU are shown by `fmu-mesh inspect {path}/resources/NAME.fmu`."
         raise ConfigurationError("a package of SSP has no variables of its own", hint=hint)
     from ..api.package_inspection import inspect_package  # noqa: PLC0415  it needs more than an FMU does
 

@@ -30,6 +30,7 @@ from ..instances.registry import KINDS, describe
 from ..run.options import Options
 from ..run.preparing import planned
 from ..simtime import steps_between
+from ..ssp.configuration_files import names_package
 from ..system.connections import resolve_connections, unit_warnings
 from ..text import short_number, short_path, shown
 from ..variables.model_description import ModelDescription, Variable
@@ -116,6 +117,9 @@ def _fmus(given: Sequence[Path]) -> list[Path]:
     for path in given:
         is_unpacked = files.is_folder(path) and files.exists(path / "modelDescription.xml")
         own = sorted(path.glob("*.fmu")) if files.is_folder(path) and not is_unpacked else [path]
+        if names_package(path) and own in ([], [path]):
+            hint = f"`fmu-mesh launch {path}` runs it, `fmu-mesh convert {path} mesh.yaml` makes a file to change."
+            raise ConfigurationError(f"'{path}' is a package of SSP, which says already what runs.", hint=hint)
         if not own:
             raise ConfigurationError(f"there is no FMU in '{path}'.", hint="Name a folder with FMUs, or FMUs.")
         if not files.exists(own[0]):

@@ -24,6 +24,7 @@ from fmu_mesh.config.scenario_section import ScenarioConfig, ScenarioSource, con
 from fmu_mesh.config.structure import check
 from fmu_mesh.config.yaml_text import Plain, read
 from fmu_mesh.errors import Finding
+from fmu_mesh.files import archive_on_the_way, beside
 from fmu_mesh.text import listed, nearest, nearest_file, shown
 
 __all__ = [
@@ -115,12 +116,8 @@ class LoadedConfig(msgspec.Struct, frozen=True):
         return Finding(origin.file or str(self.file), path, found, expected, suggestion, origin.line)
 
     def resolve(self, relative: str) -> Path:
-        """The absolute path for a path in the file, which is relative to the folder of the file.
-
-        Links in the folder are resolved, the last part is not: `/dev/stdout` stays `/dev/stdout`.
-        """
-        path = self.file.absolute().parent / relative
-        return path.parent.resolve() / path.name
+        """The absolute path for a path in the file, which is relative to the folder of the file."""
+        return beside(self.file, relative)
 
 
 def load(path: Path, overrides: Sequence[str], kinds: Kinds) -> LoadedConfig:
@@ -207,9 +204,13 @@ def read_scenario(loaded: LoadedConfig) -> ScenarioSource | None:
     path = loaded.resolve(section)
     if not section or not path.is_file():
         findings = loaded.findings()
-        findings.add("scenario", f"no such file '{section}'", "a file with values and events", nearest_file(path))
+        found, expected = f"no such file '{section}'", "a file with values and events"
+        if (archive := archive_on_the_way(path)) is not None:
+            found, expected = f"'{section}' inside '{archive.name}'", f"{expected}; `../NAME` is beside that archive"
+        findings.add("scenario", found, expected, nearest_file(path))
         findings.raise_any()
-    plain = read_file(path if Path(section).is_absolute() else loaded.file.parent / section)
+    shown_path = loaded.file.parent / section  # from inside an archive, only the resolved path can be opened
+    plain = read_file(shown_path if shown_path.is_file() else path)
     findings = Findings(str(plain.file), plain.lines, None, plain.findings)
     check(plain.data, scenario_type(), "", findings)
     findings.raise_any()

@@ -13,6 +13,7 @@ from msgspec import Meta, inspect
 
 from fmu_mesh.config.base import Base
 from fmu_mesh.config.findings import Findings
+from fmu_mesh.files import beside
 
 __all__ = ["ScenarioConfig", "ScenarioEvent", "ScenarioSource", "ScenarioValues"]
 
@@ -105,8 +106,7 @@ class ScenarioSource(NamedTuple):
 
     def resolve(self, relative: str) -> Path:
         """The absolute path for a path in the file."""
-        path = self.file.absolute().parent / relative
-        return path.parent.resolve() / path.name
+        return beside(self.file, relative)
 
 
 def scenario_type() -> inspect.Type:

@@ -12,6 +12,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from ..config.mesh import ZenohConfig
+from ..files import beside
 from ..system.plan import MASTER
 from ..wire.runtime import socket_endpoint
 from ..wire.session import Wiring
@@ -29,7 +30,7 @@ def wiring(config: ZenohConfig, config_file: Path, folder: Path, process: str, p
         process: name of the node, or `MASTER`.
         peers: the nodes that this one exchanges frames with; of two nodes, the one with the later name connects.
     """
-    base = config_file.absolute().parent / config.config if config.config is not None else None
+    base = beside(config_file, config.config) if config.config is not None else None
     if config.mode == "client":
         return Wiring(mode="client", connect=tuple(config.connect), config=base)
     listen = [socket_endpoint(folder, process)]

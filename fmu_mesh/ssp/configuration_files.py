@@ -17,6 +17,7 @@ RESULT_BESIDE_PACKAGE: Final = "../results/{mesh}.csv"
 """The result file of a package that says none: beside the archive, and not in it."""
 
 _YAML: Final = (".yaml", ".yml", ".json")
+_PARTS: Final = (".ssv", ".ssm", ".ssb")
 _ARCHIVE: Final = b"PK\x03\x04"
 
 
@@ -40,6 +41,10 @@ def read_configuration(path: Path, ssd: str | None = None) -> PlainConfig:
         return read_system(*package)
     if ssd is not None:
         raise ConfigurationError(f"--ssd chooses a description in a package of SSP, and '{path}' is no package")
+    archive = files.archive_on_the_way(path)
+    if path.suffix.lower() in _PARTS or (archive is not None and names_package(archive)):
+        hint = "Name the package: the .ssp, its folder, or an .ssd in it."
+        raise ConfigurationError(f"'{path}' is a part of a package of SSP", hint=hint)
     return read_file(path)
 
 

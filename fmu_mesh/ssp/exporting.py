@@ -16,7 +16,7 @@ from ..config.findings import Findings
 from ..config.loading import PlainConfig, read_file
 from ..config.mesh import Config
 from ..errors import ConfigurationError, Finding, LoadFailed
-from ..files import archive_on_the_way, is_file, is_folder
+from ..files import archive_on_the_way, beside, is_file, is_folder
 from ..system.system import ResolvedSystem
 from ..text import nearest_file
 from .document_changes import own_annotation_in, with_own_annotation
@@ -181,7 +181,7 @@ def _with_scenario(plain: PlainConfig, findings: Findings) -> dict[str, Any]:
     scenario = data.get("scenario")
     if not isinstance(scenario, str):
         return data
-    file = plain.file.parent / scenario
+    file = beside(plain.file, scenario)
     if not is_file(file):
         findings.add("scenario", f"no such file '{scenario}'", "a file with values and events", nearest_file(file))
         return data

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import posixpath
 import re
+import zipfile
 from contextlib import ExitStack
 from pathlib import Path, PurePosixPath
 from types import TracebackType
@@ -17,6 +18,7 @@ from urllib.parse import unquote
 from .. import files
 from ..errors import ConfigurationError, LoadFailed
 from ..instances.fmi.archive.archive import OpenFmu, opened
+from ..instances.fmi.archive.archive_entries import LIMITS_HINT
 from ..text import listed, nearest, nearest_file
 from .problems import Problems
 from .structure import Place
@@ -26,6 +28,7 @@ __all__ = ["DEFAULT", "Package", "is_package"]
 DEFAULT: Final = "SystemStructure.ssd"
 _SCHEME: Final = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):")
 _SUFFIXES: Final = (".ssp", ".ssd")
+_ARCHIVE: Final = b"PK\x03\x04"
 
 
 def is_package(path: Path) -> bool:
@@ -59,6 +62,8 @@ class Package:
         self._containers: dict[str, OpenFmu] = {}
         if is_ssd and not files.is_file(path):
             raise _no_such_file(path)
+        if is_ssd and _beginning(path) == _ARCHIVE:
+            raise ConfigurationError(f"'{path}' is a ZIP archive, and no description", hint="Name it .ssp.")
         self._container("")
 
     def __enter__(self) -> Self:
@@ -130,7 +135,11 @@ class Package:
         if not name or name == ".":
             problems.add(place, f"the source '{uri}', which is this file itself", expected)
             return None
-        if text.startswith("/") or name.startswith("../") or name == ".." or "\\" in text or "\0" in text:
+        if "\\" in text:
+            near = nearest(name.replace("\\", "/"), self.names())
+            problems.add(place, f"the source '{uri}' with a backslash", "`/` between folders and files", near)
+            return None
+        if text.startswith("/") or name.startswith("../") or name == ".." or "\0" in text:
             problems.add(place, f"the source '{uri}', which leads out of the package", expected)
             return None
         if not self.exists(name):
@@ -167,8 +176,33 @@ class Package:
                 self._containers[name] = self._open.enter_context(opened(path))
             except LoadFailed as error:
                 text = error.message.replace(", so it is no FMU", "")
-                raise ConfigurationError(text, hint=error.hint) from error
+                raise ConfigurationError(text, hint=_way_out(path, error)) from error
         return self._containers[name]
+
+
+def _way_out(path: Path, error: LoadFailed) -> str | None:
+    """What to do about an archive that cannot be opened."""
+    if error.hint == LIMITS_HINT:  # the limits of a configuration are known when the package has been read
+        return "If you trust it, unpack it, and name the folder instead."
+    if error.hint is not None or not files.is_file(path):
+        return error.hint
+    match _beginning(path):
+        case b"":
+            return "The file is empty."
+        case begin if begin == _ARCHIVE and not zipfile.is_zipfile(path):
+            return "It begins like one, and its end is missing: was it copied completely?"
+        case begin if begin.startswith((b"<", b"\xef\xbb\xbf<")):
+            return "It is XML: name it .ssd if it is a system structure description."
+    return None
+
+
+def _beginning(path: Path) -> bytes:
+    """The first bytes of a file; empty if it cannot be read."""
+    try:
+        with path.open("rb") as file:
+            return file.read(len(_ARCHIVE))
+    except OSError:
+        return b""
 
 
 def _no_such_file(path: Path) -> ConfigurationError:

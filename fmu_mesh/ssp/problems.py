@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from ..errors import ConfigurationError, Finding
+from ..text import printable
 from .structure import Place
 
 __all__ = ["Problems"]
@@ -42,6 +43,7 @@ class Problems:
 
     @staticmethod
     def _add(found_so_far: list[Finding], place: Place, found: str, expected: str, suggestion: str | None) -> None:
-        finding = Finding(place.file, place.element, found, expected, suggestion, place.line or None)
+        near = printable(suggestion) if suggestion is not None else None
+        finding = Finding(place.file, place.element, printable(found), printable(expected), near, place.line or None)
         if finding not in found_so_far:  # an element may be read more than once
             found_so_far.append(finding)

@@ -96,7 +96,7 @@ def _chosen(package: Package, ssd: str | None) -> str:
             titles.setdefault(structure.name, name)
     if ssd in titles:
         return titles[ssd]
-    near = nearest(ssd, [*names, *titles])
+    near = nearest(ssd, [*names, *(posixpath.splitext(name)[0] for name in names), *titles])
     hint = f"Did you mean '{near}'?" if near is not None else f"It has {listed(names)}."
     raise ConfigurationError(f"'{package.root}' has no description '{ssd}'", hint=hint)
 

@@ -7,14 +7,16 @@ Owns the safety of the parser, the namespaces, and the check against `grammar`. 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
-from typing import Any, Final
+from collections.abc import Iterator, Mapping
+from functools import lru_cache
+from typing import Any, Final, NamedTuple
+from xml.parsers import expat
 
 from lxml import etree
 
 from ..errors import LoadFailed
 from ..instances.fmi.archive.examining import safe_xml
-from ..text import listed, nearest, shown
+from ..text import listed, nearest, printable, shown
 from .grammar import GRAMMAR, NAMESPACES, PATTERNS, Attribute, Rule
 from .problems import Problems
 from .structure import Annotation, Place
@@ -27,6 +29,25 @@ _VERSIONS: Final = ("1.0", "2.0")
 _INLINE: Final = ("ssv:ParameterSet", "ssm:ParameterMapping", "ssb:SignalDictionary")
 _UNBOUND: Final = re.compile(r"Namespace prefix (\S+)(?: for \S+)? on (\S+) is not defined")
 _DOCUMENT_TYPE: Final = re.compile(rb"<!DOCTYPE")
+_KNOWN_LINES: Final = 65535
+"""lxml knows the lines of elements up to this one, and later ones not exactly."""
+
+
+class _Document(NamedTuple):
+    """What all elements of a file have in common.
+
+    Attributes:
+        file: as messages name it.
+        lines: those of all elements, where lxml may not know them; it also keeps the elements, which are its keys.
+    """
+
+    file: str
+    lines: Mapping[Any, int]
+
+    def place(self, element: Any) -> Place:  # noqa: ANN401  lxml ships no types
+        """Where an element is."""
+        line = self.lines.get(element) or element.sourceline or 0
+        return Place(self.file, line, printable(_in_words(element)))
 
 
 class XmlElement:
@@ -38,16 +59,16 @@ class XmlElement:
         version: of the file, `1.0` or `2.0`.
     """
 
-    def __init__(self, element: Any, file: str, version: str) -> None:  # noqa: ANN401  lxml ships no types
+    def __init__(self, element: Any, document: _Document, version: str) -> None:  # noqa: ANN401  lxml ships no types
         self._element = element
-        self._file = file
+        self._document = document
         self.tag = _name_of(element)
         self.version = version
 
     @property
     def place(self) -> Place:
         """Its file and line, and its name in words: `Connector 'u' of Component 'gain'`."""
-        return Place(self._file, self._element.sourceline or 0, _in_words(self._element))
+        return self._document.place(self._element)
 
     def get(self, name: str) -> str | None:
         """An attribute as text; None if it is not given."""
@@ -81,7 +102,7 @@ class XmlElement:
             if isinstance(child.tag, str) and (not tags or _name_of(child) in tags):
                 # A parameter set or a mapping inside a description has a version of its own.
                 own = child.get("version") if _name_of(child) in _INLINE else None
-                yield XmlElement(child, self._file, (own or self.version).strip())
+                yield XmlElement(child, self._document, (own or self.version).strip())
 
     def child(self, *tags: str) -> XmlElement | None:
         """The first child with one of these tags; None if there is none."""
@@ -106,7 +127,7 @@ class XmlElement:
         """The element of the whole file with this `id`; None if there is none."""
         for element in self._element.getroottree().iter():
             if isinstance(element.tag, str) and element.get("id") == identifier:
-                return XmlElement(element, self._file, self.version)
+                return XmlElement(element, self._document, self.version)
         return None
 
     def is_inside(self, other: XmlElement) -> bool:
@@ -180,7 +201,8 @@ def read_xml(data: bytes, file: str, tag: str, problems: Problems) -> XmlElement
     except LoadFailed as error:
         _add_syntax(data, file, error, problems)
         return None
-    found = XmlElement(root, file, (root.get("version") or "").strip())
+    document = _Document(file, _far_lines(data, root))
+    found = XmlElement(root, document, (root.get("version") or "").strip())
     if found.tag != tag:
         local = etree.QName(root).localname
         wanted = tag.partition(":")[2]
@@ -201,6 +223,23 @@ def read_xml(data: bytes, file: str, tag: str, problems: Problems) -> XmlElement
 _ROOTS: Final = ("SystemStructureDescription", "ParameterSet", "ParameterMapping", "SignalDictionary")
 
 
+def _far_lines(data: bytes, root: Any) -> Mapping[Any, int]:  # noqa: ANN401  lxml ships no types
+    """The line of each element of a file with more lines than lxml knows; empty for other files.
+
+    The file has no document type: `safe_xml` has parsed it.
+    """
+    if data.count(b"\n") < _KNOWN_LINES:
+        return {}
+    lines: list[int] = []
+    parser = expat.ParserCreate()
+    parser.StartElementHandler = lambda *_: lines.append(parser.CurrentLineNumber)
+    try:
+        parser.Parse(data, True)  # noqa: FBT003  its only form
+    except expat.ExpatError:
+        return {}  # an encoding that only lxml knows
+    return dict(zip(root.iter("*"), lines, strict=False))
+
+
 def _add_syntax(data: bytes, file: str, error: LoadFailed, problems: Problems) -> None:
     """Add a finding for XML that cannot be parsed, or must not be."""
     cause = error.__cause__
@@ -212,8 +251,9 @@ def _add_syntax(data: bytes, file: str, error: LoadFailed, problems: Problems) -
         else:
             problems.add(Place(file, line, ""), f"no well-formed XML: {cause.msg}", "XML 1.0")
         return
-    match = _DOCUMENT_TYPE.search(data)
-    line = data.count(b"\n", 0, match.start()) + 1 if match is not None else 1
+    text = data.replace(b"\0", b"")  # in UTF-16 every second byte of it
+    match = _DOCUMENT_TYPE.search(text)
+    line = text.count(b"\n", 0, match.start()) + 1 if match is not None else 1
     found = "a document type, with which XML can expand without limit and read other files"
     problems.add(Place(file, line, ""), found, "none: no file of SSP has one")
 
@@ -243,10 +283,14 @@ def _wrong_namespace(tag: str, near: str | None, rule: Rule) -> str | None:
 
 
 def _name_of(element: Any) -> str:  # noqa: ANN401  lxml ships no types
-    name = etree.QName(element)
-    if name.namespace in _PREFIXES:
-        return f"{_PREFIXES[name.namespace]}:{name.localname}"
-    return str(element.tag)
+    return _with_prefix(element.tag)
+
+
+@lru_cache(maxsize=256)
+def _with_prefix(tag: str) -> str:
+    """A tag with the usual prefix in the place of its namespace."""
+    name = etree.QName(tag)
+    return f"{_PREFIXES[name.namespace]}:{name.localname}" if name.namespace in _PREFIXES else tag
 
 
 def _kind(tag: str) -> str:

@@ -49,7 +49,7 @@ def examine(fmu: OpenFmu) -> Contents:
         kind = "a folder" if path.is_dir() else "a ZIP archive"
         raise LoadFailed(
             f"'{path}' is {kind}, but has no modelDescription.xml at its root, so it is no FMU.",
-            hint="An FMU that was zipped inside a folder of its own must be zipped again without that folder.",
+            hint=_what_it_is(path, contents.names),
         )
     roots = {name: safe_xml(data, f"the {name} of '{path}'") for name, data in contents.xml.items()}
     root = roots["modelDescription.xml"]
@@ -67,6 +67,14 @@ def examine(fmu: OpenFmu) -> Contents:
         text = f"the modelDescription.xml of '{path}' has illegal values: {'; '.join(illegal[:_SHOWN])}{rest}."
         raise LoadFailed(text, hint="Report it to the maker of its tool, or correct the file.")
     return contents
+
+
+def _what_it_is(path: Path, names: Collection[str]) -> str:
+    """What an archive is instead of an FMU, and what to do."""
+    if any(name.lower().endswith(".ssd") and "/" not in name for name in names):
+        fmu = next((name for name in sorted(names) if name.lower().endswith(".fmu")), "resources/model.fmu")
+        return f"It is a package of SSP: name an FMU in it, as '{path}/{fmu}'."
+    return "An FMU that was zipped inside a folder of its own must be zipped again without that folder."
 
 
 def safe_xml(data: bytes, what: str) -> Any:  # noqa: ANN401 lxml ships no types

@@ -1,0 +1,61 @@
+"""A package of SSP in processes: commands for what runs, parts started manually, and a package that changes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import fmu_mesh
+from tests.helpers import Place
+from tests.ssp.packages import write_package
+from tests.ssp.ship import INSTANCES, SHIP
+
+
+def equal(one: Path, other: Path) -> bool:
+    return bool(fmu_mesh.Result.read(one).compare(fmu_mesh.Result.read(other)))
+
+
+def test_a_package_that_runs_is_seen_and_steered_by_the_names_of_its_instances(place: Place) -> None:
+    package = write_package(place.folder / "ship.ssp", SHIP)
+    launched = place.start("launch", package, "--paused", "--no-progress")
+    assert place.run("wait", "DP_ship", "--state", "paused").wait() == 0
+
+    assert all(name in place.run("ls").output for name in INSTANCES)
+    assert "fed by       Pendulum.a -> DP-32-Controller.u" in place.run("info", "DP-32-Controller").output
+    assert "from point 0 on" in place.run("set", "DP-32-Controller.k", "2.5").output
+    assert place.run("step", "5").wait() == 0
+    assert "2.5" in place.run("get", "DP-32-Controller.k").output
+    assert "Did you mean 'DP-32-Controller'?" in place.run("get", "DP Controller.k").errors
+    assert "DP-32-Controller.u" in place.run("graph", "DP_ship").output
+    assert place.run("resume").wait() == 0
+    assert launched.wait() == 0
+    assert place.run("rerun", "results/DP_ship.csv").wait() == 0
+
+
+def test_nodes_and_a_master_that_are_started_manually_give_the_result_of_launch(place: Place) -> None:
+    package = write_package(place.folder / "ship.ssp", SHIP)
+    parts = [place.start("node", package, "--ssd", "VarB", name) for name in INSTANCES]
+    parts.append(place.start("master", package, "--ssd", "VarB", "--output", "own.csv", "--no-progress"))
+
+    assert [part.wait() for part in parts] == [0, 0, 0, 0]
+    assert place.run("launch", package, "--ssd", "VarB", "--local").wait() == 0
+
+    assert equal(place.folder / "own.csv", place.folder / "results/Variant_B.csv")
+
+
+def test_a_run_goes_on_where_its_package_is_replaced_or_deleted(place: Place) -> None:
+    package = write_package(place.folder / "ship.ssp", SHIP)
+    kept = package.read_bytes()
+    assert place.run("launch", package, "--output", "first.csv", "--no-progress").wait() == 0
+    launched = place.start("launch", package, "--paused", "--output", "second.csv", "--no-progress")
+    assert place.run("wait", "DP_ship", "--state", "paused").wait() == 0
+
+    package.write_bytes(b"")
+    assert place.run("step", "5").wait() == 0
+    package.unlink()
+    assert place.run("resume").wait() == 0
+
+    assert launched.wait() == 0
+    assert equal(place.folder / "first.csv", place.folder / "second.csv")
+    assert "does not exist" in place.run("rerun", "second.csv").errors
+    package.write_bytes(kept)
+    assert place.run("rerun", "second.csv").wait() == 0
