@@ -33,7 +33,7 @@ COMMANDS: Final[Mapping[str, tuple[str, str]]] = {
     "check": ("checking", "check a configuration and show its plan, without running it"),
     "graph": ("graphing", "draw the graph of a configuration or of a running mesh"),
     "convert": ("convert_command", "convert a package of SSP into a configuration file, or a mesh into a package"),
-    "inspect": ("inspecting", "show the properties of an FMU, without running it"),
+    "inspect": ("inspecting", "show the properties of an FMU, or of a package of SSP, without running it"),
     "schema": ("checking", "print the JSON Schema of configurations"),
     "ls": ("looking", "list meshes, instances and variables"),
     "status": ("looking", "show the state and progress of a mesh or an instance"),
