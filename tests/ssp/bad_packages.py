@@ -476,7 +476,14 @@ SOURCES = tuple(
         ("a path out of the package", "../Gain.fmu", ("the source '../Gain.fmu', which leads out of the package",)),
         ("a path out of the package, coded", "resources/%2E%2E/../../Gain.fmu", ("which leads out of the package",)),
         ("an absolute path", "/etc/Gain.fmu", ("the source '/etc/Gain.fmu', which leads out of the package",)),
-        ("a backslash", "resources\\Gain.fmu", ("with a backslash", "resources/Gain.fmu",)),
+        (
+            "a backslash",
+            "resources\\Gain.fmu",
+            (
+                "with a backslash",
+                "resources/Gain.fmu",
+            ),
+        ),
         (
             "an FMU that is not there",
             "resources/Gian.fmu",
