@@ -5,9 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import fmu_mesh
+from fmu_mesh.ros.bags.playing import running_configuration
 from tests.helpers import Place
-from tests.ssp.packages import write_package
-from tests.ssp.ship import INSTANCES, SHIP
+from tests.ssp.packages import component, connector, description, fmus, system, write_package
+from tests.ssp.ship import INSTANCES, SHIP, without_times
 
 
 def equal(one: Path, other: Path) -> bool:
@@ -40,6 +41,31 @@ def test_nodes_and_a_master_that_are_started_manually_give_the_result_of_launch(
     assert place.run("launch", package, "--ssd", "VarB", "--local").wait() == 0
 
     assert equal(place.folder / "own.csv", place.folder / "results/Variant_B.csv")
+
+
+def test_a_bag_is_played_into_a_package_whose_times_an_option_has_given(place: Place) -> None:
+    package = write_package(place.folder / "ship.ssp", SHIP)
+    assert place.run("launch", package, "--local", "--output", "bag.mcap").wait() == 0
+    gain = component("the gain", "Gain", connector("u", "input"), connector("y", "output"))
+    free = {"SystemStructure.ssd": description(system("root", gain), name="free", stop_time=None), **fmus("Gain")}
+    write_package(place.folder / "free.ssp", free)
+    times = ["--step-size", "0.01", "--stop-time", "1", "--algorithm", "jacobi"]
+    launched = place.start("launch", "free.ssp", *times, "--paused", "--no-progress")
+    assert place.run("wait", "free", "--state", "paused").wait() == 0
+
+    played = place.run("play", "bag.mcap", "free", "--topic", "/Pendulum/a=the-32-gain.u")
+
+    assert (played.wait(), launched.wait()) == (0, 0), (played.errors, launched.errors)
+    assert "played 100 values of /Pendulum/a from point 0 to point 99" in played.output
+
+
+def test_a_package_is_the_configuration_of_a_mesh_that_others_look_at(place: Place) -> None:
+    package = write_package(place.folder / "ship.ssp", without_times(SHIP))
+
+    loaded = running_configuration(package)
+
+    assert loaded.config.mesh == "DP_ship"
+    assert [*loaded.config.instances] == [*INSTANCES]
 
 
 def test_a_run_goes_on_where_its_package_is_replaced_or_deleted(place: Place) -> None:

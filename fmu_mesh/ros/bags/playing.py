@@ -26,7 +26,7 @@ from ...wire.client.readings import Target
 from ...wire.views import Command, MeshInfo
 from .bag import Bag, BagSample, chosen_topics, timed
 
-__all__ = ["Moment", "PlayOptions", "Played", "grid_of", "play", "play_bag", "schedule"]
+__all__ = ["Moment", "PlayOptions", "Played", "grid_of", "play", "play_bag", "running_configuration", "schedule"]
 
 _TIMEOUT_S = 60.0
 
@@ -87,7 +87,7 @@ def play_bag(client: MeshClient, bag: Bag, loaded: LoadedConfig | None = None, *
     infos = {name: client.instance_info(name) for name in mesh.instances}
     step_points = {name: round(info.step_size / mesh.step_size) for name, info in infos.items()}
     if loaded is None or how.get("config") is not None:
-        loaded = _configuration(Path(how.get("config") or mesh.config))
+        loaded = running_configuration(Path(how.get("config") or mesh.config))
     topics = chosen_topics(loaded, infos, bag, how.get("topics", ()))
     samples = bag.samples(topics, how.get("stamps", "header"))
     moments, merged, beyond = schedule(samples, grid_of(mesh), step_points, start=how.get("start"))
@@ -99,8 +99,8 @@ def play_bag(client: MeshClient, bag: Bag, loaded: LoadedConfig | None = None, *
     return Played(count, names, first, moments[-1].point, merged, past, beyond)
 
 
-def _configuration(path: Path) -> LoadedConfig:
-    """The configuration of a mesh that runs; an option may have given its times.
+def running_configuration(path: Path) -> LoadedConfig:
+    """The configuration of a mesh that runs, from a YAML file or a package of SSP; an option may have given its times.
 
     Raises:
         ConfigurationError: it cannot be read, or something else in it is wrong.

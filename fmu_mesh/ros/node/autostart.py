@@ -7,8 +7,8 @@ import time
 from pathlib import Path
 
 from ...errors import FmuMeshError
-from ...instances.configuration import load
 from ...wire.client.reaching import Meshes
+from ..bags.playing import running_configuration
 from .rclpy_modules import RosNode, ros_module
 
 __all__ = ["Autostart"]
@@ -66,7 +66,7 @@ class Autostart:
         config = self._node.get_parameter("config").value
         timeout_s = self._node.get_parameter("autostart_timeout").value
         try:
-            mesh = load(Path(config)).config.mesh
+            mesh = running_configuration(Path(config)).config.mesh
         except FmuMeshError:
             return True  # `configure` reports what is wrong with the file
         deadline = time.monotonic() + timeout_s

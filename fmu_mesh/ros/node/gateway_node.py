@@ -16,11 +16,10 @@ from msgspec.structs import replace
 
 from ...config.mesh import RosConfig
 from ...errors import ConfigurationError, FmuMeshError, MeshLost
-from ...instances.configuration import load
 from ...wire.client.mesh_client import MeshClient
 from ...wire.client.reaching import Meshes
 from ...wire.client.readings import Target
-from ..bags.playing import grid_of
+from ..bags.playing import grid_of, running_configuration
 from ..gateway.gateway import Gateway
 from ..gateway.mapping import descriptions_of, resolve
 from ..gateway.profile import DEPTH, Profile, Put, Take
@@ -137,7 +136,7 @@ class GatewayNode:
         return True
 
     def _configure(self) -> None:
-        loaded = load(Path(self._node.get_parameter("config").value))
+        loaded = running_configuration(Path(self._node.get_parameter("config").value))
         if loaded.config.ros is None:
             loaded = replace(loaded, config=replace(loaded.config, ros=RosConfig()))
         endpoints = [endpoint for endpoint in self._node.get_parameter("connect").value if endpoint]
