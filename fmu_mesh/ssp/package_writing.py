@@ -6,6 +6,7 @@ in the files is not its business.
 
 from __future__ import annotations
 
+import lzma
 import os
 import re
 import shutil
@@ -32,6 +33,9 @@ _TIME: Final = (1980, 1, 1, 0, 0, 0)
 
 _ARCHIVES: Final = (".fmu", ".ssp")
 """Files that are archives themselves, and are not compressed again."""
+
+_DAMAGED: Final = (zipfile.BadZipFile, zlib.error, lzma.LZMAError, EOFError, NotImplementedError)
+"""What `zipfile` raises for an entry that it cannot read; the last one for a compression that it does not know."""
 
 _CHUNK: Final = 2**20
 _UNSAFE: Final = re.compile(r"[^A-Za-z0-9_.-]")
@@ -69,7 +73,7 @@ def write_package(path: Path, entries: Iterable[PackageEntry]) -> None:
                 _add(package, entry)
     except LoadFailed as error:
         raise ConfigurationError(error.message, hint=error.hint) from error
-    except (zipfile.BadZipFile, zlib.error, EOFError) as error:
+    except _DAMAGED as error:
         raise ConfigurationError(f"'{path}' cannot be written, because a file for it is damaged: {error}") from error
     except OSError as error:
         at = f" ('{error.filename}')" if error.filename and Path(error.filename) != path else ""

@@ -109,6 +109,11 @@ def backslashes(path: Path) -> None:
             archive.writestr(entry, content)
 
 
+def nameless(path: Path) -> None:
+    write_package(path, {**GOOD, "\x01": ""})
+    path.write_bytes(path.read_bytes().replace(b"\x01PK", b"\0PK"))  # a name ends at a zero
+
+
 def uri_with_backslash(path: Path) -> None:
     write_package(path, edited(TEXT.replace("resources/Gain.fmu", "resources\\Gain.fmu")))
 
@@ -120,6 +125,7 @@ DAMAGED: dict[str, tuple[str, Callable[[Path], object], str]] = {
     "an archive as a description": ("a.ssd", lambda path: path.write_bytes(b"PK\x03\x04"), "Name it .ssp."),
     "a bomb": ("a.ssp", bomb, "If you trust it, unpack it, and name the folder instead."),
     "names with backslashes": ("a.ssp", backslashes, "zip it again"),
+    "an entry without a name": ("a.ssp", nameless, "is a damaged ZIP archive: it has an entry without a name."),
     "a URI with a backslash": ("a.ssp", uri_with_backslash, "Did you mean 'resources/Gain.fmu'?"),
     "another case": (
         "a.ssp",
@@ -146,6 +152,20 @@ def test_a_damaged_package_is_refused_with_the_way_out(fault: str, tmp_path: Pat
         fmu_mesh.load(tmp_path / name).check().require()
 
     assert words in "\n".join(map(str, [caught.value, *caught.value.findings]))
+
+
+def test_a_file_of_a_package_that_cannot_be_unpacked_keeps_it_from_being_exported(tmp_path: Path) -> None:
+    path = write_package(tmp_path / "odd.ssp", {**GOOD, "extra.bin": "?"})
+    data = bytearray(path.read_bytes())
+    data[data.rindex(b"extra.bin") - 46 + 10] = 99  # its compression, in the list of files
+    path.write_bytes(data)
+    mesh = fmu_mesh.load(path)
+
+    with pytest.raises(fmu_mesh.ConfigurationError, match="compression method is not supported"):
+        mesh.to_ssp(tmp_path / "made.ssp")
+
+    assert mesh.check()
+    assert [file.name for file in tmp_path.iterdir()] == ["odd.ssp"]
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ from pathlib import Path
 import fmu_mesh
 from fmu_mesh.ros.bags.playing import running_configuration
 from tests.helpers import Place
-from tests.ssp.packages import component, connector, description, fmus, system, write_package
+from tests.ssp.packages import Files, component, connector, description, fmus, system, write_package
 from tests.ssp.ship import INSTANCES, SHIP, without_times
 
 
@@ -47,7 +47,10 @@ def test_a_bag_is_played_into_a_package_whose_times_an_option_has_given(place: P
     package = write_package(place.folder / "ship.ssp", SHIP)
     assert place.run("launch", package, "--local", "--output", "bag.mcap").wait() == 0
     gain = component("the gain", "Gain", connector("u", "input"), connector("y", "output"))
-    free = {"SystemStructure.ssd": description(system("root", gain), name="free", stop_time=None), **fmus("Gain")}
+    free: Files = {
+        "SystemStructure.ssd": description(system("root", gain), name="free", stop_time=None),
+        **fmus("Gain"),
+    }
     write_package(place.folder / "free.ssp", free)
     times = ["--step-size", "0.01", "--stop-time", "1", "--algorithm", "jacobi"]
     launched = place.start("launch", "free.ssp", *times, "--paused", "--no-progress")

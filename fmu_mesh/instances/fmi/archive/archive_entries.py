@@ -106,6 +106,8 @@ def _check(path: Path, archive: zipfile.ZipFile, limits: LimitsConfig) -> None:
 
 def _check_entry(path: Path, entry: zipfile.ZipInfo) -> None:
     name = entry.filename
+    if not name:
+        raise LoadFailed(f"'{path}' is a damaged ZIP archive: it has an entry without a name.")
     relative = PurePosixPath(name)
     has_drive = any(":" in part for part in relative.parts[:1])
     has_name = bool(relative.parts) or entry.is_dir()
