@@ -114,10 +114,11 @@ def open_alone(path: Path, result: Path | None = None) -> OwnFile:
         hint = "Wait for its end, or choose another file with --output."
         raise ConfigurationError(f"another run is writing the result file '{result or path}'", hint=hint) from error
     except OSError as error:
-        archive = archive_on_the_way(result or path)
-        hint = f"'{archive}' is a file: a path in a package starts inside of it, and `../` leads to what is beside it."
+        hint, archive = "Choose another file with --output.", archive_on_the_way(result or path)
+        if archive is not None:
+            hint = f"'{archive}' is a file, and no folder. {hint}"
         text = f"the result file '{result or path}' cannot be written: {error.strerror}"
-        raise ConfigurationError(text, hint=hint if archive is not None else None) from error
+        raise ConfigurationError(text, hint=hint) from error
 
 
 def unwritable(path: Path, error: OSError) -> ConfigurationError:
