@@ -66,7 +66,9 @@ def _graph(arguments: argparse.Namespace) -> int:
 
 def _graph_of(arguments: argparse.Namespace) -> SystemGraph:
     of = arguments.of
-    if of is not None and _is_configuration(Path(of)):
+    if of is None and arguments.ssd is not None:
+        raise ConfigurationError("--ssd chooses a description in a package of SSP, and none is named")
+    if of is not None and (arguments.ssd is not None or _is_configuration(Path(of))):
         given = {name: value for name, value in asdict(read_options(arguments)).items() if name in _OF_CONFIG}
         return load(of, ssd=arguments.ssd).graph(**cast("PlanOptions", given))
     with attach(of, connect=arguments.connect, timeout=arguments.timeout) as run:

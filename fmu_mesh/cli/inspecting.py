@@ -40,6 +40,15 @@ def _add_inspect(parser: CommandParser) -> None:
 
 
 def _inspect(arguments: argparse.Namespace) -> int:
+    try:
+        return _inspected(arguments)
+    except ConfigurationError as error:
+        if arguments.json:
+            print_failure(error)
+        raise
+
+
+def _inspected(arguments: argparse.Namespace) -> int:
     if named_package(arguments.fmu, arguments.ssd) is not None:
         return _inspect_package(arguments)
     if arguments.ssd is not None:
@@ -49,10 +58,7 @@ def _inspect(arguments: argparse.Namespace) -> int:
     try:
         inspection = inspect(arguments.fmu)
     except LoadFailed as error:  # a wrong argument: nothing was going to run
-        wrong = ConfigurationError(error.message, hint=error.hint)
-        if arguments.json:
-            print_failure(wrong)
-        raise wrong from error
+        raise ConfigurationError(error.message, hint=error.hint) from error
     if arguments.json:
         sys.stdout.buffer.write(msgspec.json.format(msgspec.json.encode(inspection)) + b"\n")
         return 0
@@ -68,12 +74,7 @@ def _inspect_package(arguments: argparse.Namespace) -> int:
         raise ConfigurationError("a package of SSP has no variables of its own", hint=hint)
     from ..api.package_inspection import inspect_package  # noqa: PLC0415  it needs more than an FMU does
 
-    try:
-        found = inspect_package(arguments.fmu, ssd=arguments.ssd)
-    except ConfigurationError as error:
-        if arguments.json:
-            print_failure(error)
-        raise
+    found = inspect_package(arguments.fmu, ssd=arguments.ssd)
     if arguments.json:
         sys.stdout.buffer.write(msgspec.json.format(msgspec.json.encode(found)) + b"\n")
     else:

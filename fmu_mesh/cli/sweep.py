@@ -36,7 +36,7 @@ _LOOK_S = 0.1
 _SHOWN_FAILURES = 5
 _HERE = "here"
 """`--dask` without an address."""
-_ASKED = ("vary", "sampler", "reduce", "no_curves", "processes", "reset", "max_instances", "folder")
+_ASKED = ("ssd", "vary", "sampler", "reduce", "no_curves", "processes", "reset", "max_instances", "folder")
 """What the folder of a sweep says."""
 
 

@@ -54,8 +54,15 @@ def named_package(path: Path, ssd: str | None = None) -> tuple[Path, str | None]
     Example:
         >>> named_package(Path("configs/pendulum_delay.yaml")) is None
         True
+
+    Raises:
+        ConfigurationError: the path is that of a description, and another one is chosen.
     """
-    if path.suffix.lower() == ".ssd" and (archive := files.archive_on_the_way(path)) is not None and ssd is None:
+    is_description = path.suffix.lower() == ".ssd" and not files.is_folder(path)
+    if is_description and ssd is not None:
+        hint = f"Name the package, '{path.parent}', or leave --ssd out."
+        raise ConfigurationError(f"'{path}' is one description, and --ssd chooses one", hint=hint)
+    if is_description and (archive := files.archive_on_the_way(path)) is not None:
         return archive, path.relative_to(archive).as_posix()
     return (path, ssd) if names_package(path) else None
 

@@ -76,7 +76,8 @@ def write_package(path: Path, entries: Iterable[PackageEntry]) -> None:
     except _DAMAGED as error:
         raise ConfigurationError(f"'{path}' cannot be written, because a file for it is damaged: {error}") from error
     except OSError as error:
-        at = f" ('{error.filename}')" if error.filename and Path(error.filename) != path else ""
+        is_own = not error.filename or Path(error.filename).parent == Path(os.path.realpath(path)).parent
+        at = "" if is_own else f" ('{error.filename}')"
         raise ConfigurationError(f"'{path}' cannot be written: {error.strerror or error}{at}") from error
 
 

@@ -81,6 +81,14 @@ def test_a_result_of_a_package_that_was_moved_runs_again_from_the_yaml_file_that
     assert main(["compare", "moved.rerun.csv", "results/DP_ship.csv"]) == 0
 
 
+def test_inspect_tells_a_program_what_is_wrong_with_its_arguments(capsys: pytest.CaptureFixture[str]) -> None:
+    package = packed()
+
+    for arguments in ([package, "--ssd", "VarC"], [f"{package}/VarB.ssd", "--ssd", "VarB"], [package, "x"]):
+        assert main(["inspect", *arguments, "--json"]) == 2
+        assert json.loads(capsys.readouterr().out)["error"]["kind"] == "ConfigurationError"
+
+
 @pytest.mark.parametrize("name", ["VarB", "VarB.ssd", "Variant B"])
 def test_the_file_and_the_name_of_a_description_choose_it(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     package = packed()
@@ -127,6 +135,7 @@ def test_a_sweep_of_a_package_goes_on_from_its_folder(capsys: pytest.CaptureFixt
 
     assert main(["sweep", package, *vary]) == 0
     assert main(["sweep", "results/DP_ship_sweep"]) == 0
+    assert main(["sweep", "results/DP_ship_sweep", "--ssd", "VarB"]) == 2
 
     assert "2 of them before" in capsys.readouterr().out
     with Path("results/DP_ship_sweep/table.csv").open() as table:
@@ -223,6 +232,11 @@ def test_a_result_file_inside_a_package_is_refused_with_the_way_out(capsys: pyte
         (["check", "ship/resources/values.ssv"], "is a part of a package of SSP. Name the package"),
         (["launch", "ship.ssp/VarC.ssd"], "'ship.ssp' has no description 'VarC.ssd'. Did you mean 'VarB.ssd'?"),
         (["launch", "shop.ssp"], "shop.ssp: no such file. Did you mean 'ship.ssp'?"),
+        (["launch", "ship.ssp/VarB.ssd", "--ssd", "VarB"], "Name the package, 'ship.ssp', or leave --ssd out."),
+        (["inspect", "ship/VarB.ssd", "--ssd", "VarB"], "Name the package, 'ship', or leave --ssd out."),
+        (["graph", "DP_ship", "--ssd", "VarB"], "'DP_ship' is no package"),
+        (["graph", "--ssd", "VarB"], "--ssd chooses a description in a package of SSP, and none is named"),
+        (["convert", "ship.ssp", "no/ship.ssp"], "'no/ship.ssp' cannot be written: No such file or directory"),
         (["launch", "ship.ssp", "--ssd", "VarC"], "'ship.ssp' has no description 'VarC'. Did you mean 'VarB'?"),
         (["new", "ship.ssp"], "`fmu-mesh convert ship.ssp mesh.yaml` makes a file to change"),
         (["new", "ship"], "`fmu-mesh launch ship` runs it"),
