@@ -12,6 +12,8 @@ from pathlib import Path
 import pytest
 
 from tests.helpers import Place, write_config
+from tests.ssp.packages import write_package
+from tests.ssp.ship import SHIP
 
 BASH = """
 source <(fmu-mesh completion bash)
@@ -67,6 +69,20 @@ def test_a_shell_completes_commands_options_files_and_instances_of_a_file(place:
     assert offered(place, shell, "node", "pair.yaml", "d") == ["delay"]
     assert offered(place, shell, "launch", "pair.yaml", "--algorithm", "j") == ["jacobi"]
     assert offered(place, shell, "wait", "--state", "run") == ["running"]
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_a_shell_completes_packages_and_their_descriptions_and_instances(place: Place, shell: str) -> None:
+    write_package(place.folder / "ship.ssp", SHIP)
+    write_package(place.folder / "unpacked", SHIP)
+
+    assert offered(place, shell, "launch", "s") == ["ship.ssp"]
+    assert offered(place, shell, "convert", "s") == ["ship.ssp"]
+    for command in ("launch", "check", "inspect", "graph", "sweep", "convert"):
+        assert offered(place, shell, command, "ship.ssp", "--ssd", "") == ["SystemStructure.ssd", "VarB.ssd"], command
+    assert offered(place, shell, "check", "unpacked", "--ssd", "V") == ["VarB.ssd"]
+    assert offered(place, shell, "check", "nothing.ssp", "--ssd", "V") == []
+    assert offered(place, shell, "node", "ship.ssp", "D") == ["DP-32-Controller"]
 
 
 def test_a_shell_completes_what_is_running(place: Place) -> None:
