@@ -170,6 +170,9 @@ class _Configuration:
         except AnnotationRefused as refused:
             self._problems.add(self._annotation.place, refused.found, refused.expected)
             return data
+        record = result.data.get("record")
+        if self._package.is_archive and isinstance(record, dict) and "file" not in record:
+            result.data["record"] = {**record, "file": RESULT_BESIDE_PACKAGE}
         for path in result.paths:
             self._place(path, self._annotation.place)
         for gone in result.gone:
