@@ -287,7 +287,7 @@ class _Configuration:
         linear = connection.change.linear
         if linear.factor != 1.0:
             written["factor"] = linear.factor
-        if linear.offset != 0.0:
+        if not linear.identity and repr(linear.offset) != "0.0":  # -0.0 is another offset for a factor
             written["offset"] = linear.offset
         if connection.change.ignore_units:
             written["ignore_units"] = True
