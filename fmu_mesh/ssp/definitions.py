@@ -1,4 +1,4 @@
-"""What a file defines for its other parts (SSP 2.0, 4.3, 4.4): units, enumerations, and transformations of values.
+"""What a file defines for its other parts (SSP 2.0, 4.4, 4.5): units, enumerations, and transformations of values.
 
 Units and enumerations belong to their file. What a unit of one file is in another one is decided by its base units.
 """
@@ -153,8 +153,8 @@ def _base_unit(element: XmlElement, problems: Problems) -> BaseUnit | None:
     """A unit in base units; None after a finding."""
     unit = BaseUnit(
         **{name: element.integer(name) for name in ("kg", "m", "s", "A", "K", "mol", "cd", "rad")},
-        factor=element.number("factor", 1.0) or 0.0,
-        offset=element.number("offset", 0.0) or 0.0,
+        factor=element.number("factor", 1.0),
+        offset=element.number("offset", 0.0),
     )
     if unit.usable:
         return unit
@@ -164,7 +164,7 @@ def _base_unit(element: XmlElement, problems: Problems) -> BaseUnit | None:
 
 
 def _linear(element: XmlElement, problems: Problems) -> Transformation:
-    factor, offset = element.number("factor", 1.0) or 0.0, element.number("offset", 0.0) or 0.0
+    factor, offset = element.number("factor", 1.0), element.number("offset", 0.0)
     if not (math.isfinite(factor) and math.isfinite(offset)):
         problems.add(element.place, f"factor {factor:g} and offset {offset:g}", "finite numbers")
         factor, offset = 1.0, 0.0

@@ -17,12 +17,12 @@ from msgspec.structs import replace
 from ..text import listed, shown
 from ..variables.value_types import INTEGERS, VariableType
 from .definitions import enumeration_named, enumerations_of, transformation_of, unit_named, units_of
-from .grammar import PATTERNS
+from .grammar import PATTERNS, number_of
 from .problems import Problems
 from .structure import Enumeration, MappingEntry, Parameter, ParameterMapping, ParameterSet, Unit
 from .xml_reading import XmlElement
 
-__all__ = ["VARIABLE_TYPES", "number_of", "parameter_mapping", "parameter_set", "refuse_ambiguous"]
+__all__ = ["VARIABLE_TYPES", "parameter_mapping", "parameter_set", "refuse_ambiguous"]
 
 VARIABLE_TYPES: Final[dict[str, VariableType]] = {
     "Real": "Float64",
@@ -42,7 +42,7 @@ VARIABLE_TYPES: Final[dict[str, VariableType]] = {
     "Enumeration": "Enumeration",
     "Binary": "Binary",
 }
-"""The types of variables by the names of the elements for types (SSP 2.0, 4.4.1)."""
+"""The types of variables by the names of the elements for types (SSP 2.0, 4.5.1)."""
 
 _TYPES: Final = tuple(f"ssv:{name}" for name in VARIABLE_TYPES)
 _WITH_ELEMENTS: Final = ("String", "Enumeration", "Binary")
@@ -137,16 +137,6 @@ def refuse_ambiguous(values: ParameterSet, names: Iterable[str], problems: Probl
             problems.add(values.ambiguous[name], found, f"one of this name (first: line {first})")
 
 
-def number_of(text: str) -> float:
-    """The value of a text that is an xs:double, exactly as Python reads the same digits.
-
-    Example:
-        >>> number_of("1e-3"), number_of("-INF")
-        (0.001, -inf)
-    """
-    return float(text.replace("INF", "inf"))
-
-
 def _parameter(
     element: XmlElement, units: dict[str, Unit], enumerations: Mapping[str, Enumeration], problems: Problems
 ) -> Parameter | None:
@@ -188,7 +178,7 @@ def _is_same(one: Parameter, other: Parameter) -> bool:
 
 
 def _dimensions(element: XmlElement, problems: Problems) -> tuple[tuple[int, ...], bool]:
-    """The sizes of an array, and whether all of them are known: a parameter has fixed sizes only (SSP 2.0, 4.4.3)."""
+    """The sizes of an array, and whether all of them are known: a parameter has fixed sizes only (SSP 2.0, 4.5.3)."""
     sizes: list[int] = []
     fits = True
     for dimension in element.children("ssc:Dimension"):

@@ -20,7 +20,8 @@ from ..variables.units import Linear, conversion
 from ..variables.value_conversion import to_plain
 from ..variables.value_types import INTEGERS, PlainValue, VariableType, flattened, is_float, nested
 from .flattening import ValueChange
-from .parameter_reading import VARIABLE_TYPES, number_of
+from .grammar import number_of
+from .parameter_reading import VARIABLE_TYPES
 from .problems import Problems
 from .structure import Connector, MappingEntry, Parameter, Place, Transformation, Unit
 
@@ -222,7 +223,7 @@ def _unit_conversion(unit: Unit, parameter: Parameter, target: ValueTarget, prob
 def _transformed(
     value: AppliedValue, elements: list[Any], transformation: Transformation, target: ValueTarget
 ) -> tuple[AppliedValue, list[Any], str]:
-    """A value after the transformation of its mapping (SSP 2.0, 4.4.2), and what was done in words.
+    """A value after the transformation of its mapping (SSP 2.0, 4.5.2), and what was done in words.
 
     Raises:
         _Misfit: the transformation is not one for such values.

@@ -170,6 +170,9 @@ class _Configuration:
         except AnnotationRefused as refused:
             self._problems.add(self._annotation.place, refused.found, refused.expected)
             return data
+        record = result.data.get("record")
+        if self._package.is_archive and isinstance(record, dict) and "file" not in record:
+            result.data["record"] = {**record, "file": RESULT_BESIDE_PACKAGE}
         for path in result.paths:
             self._place(path, self._annotation.place)
         for gone in result.gone:
@@ -211,12 +214,12 @@ class _Configuration:
                     of_components.setdefault(path, {})[variable] = given
         for connection in connections:
             path, variable = connection.target
-            bound = of_components.get(path, {}).pop(variable, None)
-            if bound is not None and not self._is_input(path, variable):
-                found = f"a value for '{'.'.join((*path, variable))}', which a connection gives its value"
-                self._problems.warn(bound.origin, found)
-            elif bound is not None:
-                of_components[path][variable] = bound  # the value before the first one of the connection
+            bound = of_components.get(path, {}).get(variable)
+            if bound is None or self._is_input(path, variable):
+                continue  # an input has it before the first value of the connection
+            found = f"a value for '{'.'.join((*path, variable))}', which a connection gives its value"
+            self._problems.warn(bound.origin, found)
+            del of_components[path][variable]
 
     def _is_input(self, path: tuple[str, ...], name: str) -> bool:
         description = self._describe(path)
@@ -284,7 +287,7 @@ class _Configuration:
         linear = connection.change.linear
         if linear.factor != 1.0:
             written["factor"] = linear.factor
-        if linear.offset != 0.0:
+        if not linear.identity and repr(linear.offset) != "0.0":  # -0.0 is another offset for a factor
             written["offset"] = linear.offset
         if connection.change.ignore_units:
             written["ignore_units"] = True

@@ -17,7 +17,7 @@ from lxml import etree
 from ..errors import LoadFailed
 from ..instances.fmi.archive.examining import safe_xml
 from ..text import listed, nearest, printable, shown
-from .grammar import GRAMMAR, NAMESPACES, PATTERNS, Attribute, Rule
+from .grammar import GRAMMAR, NAMESPACES, PATTERNS, Attribute, Rule, number_of
 from .problems import Problems
 from .structure import Annotation, Place
 
@@ -79,9 +79,15 @@ class XmlElement:
         """A required attribute; empty where it is missing, for which there is a finding."""
         return self.get(name) or ""
 
-    def number(self, name: str, default: float | None = None) -> float | None:
+    def number(self, name: str, default: float) -> float:
         """A number; ``default`` where it is not given, or is no number."""
-        return _number(self.get(name), default)
+        found = self.optional_number(name)
+        return default if found is None else found
+
+    def optional_number(self, name: str) -> float | None:
+        """A number; None where it is not given, or is no number."""
+        text = (self.get(name) or "").strip()
+        return number_of(text) if PATTERNS["number"].fullmatch(text) else None
 
     def integer(self, name: str, default: int = 0) -> int:
         """A whole number; ``default`` where it is not given, or is none."""
@@ -115,10 +121,10 @@ class XmlElement:
 
     def annotations(self) -> tuple[Annotation, ...]:
         """The annotations of this element."""
-        return tuple(one._annotation() for one in self.inside(f"{self.tag.partition(':')[0]}:Annotations"))  # noqa: SLF001  of this class
+        return tuple(one.as_annotation() for one in self.inside(f"{self.tag.partition(':')[0]}:Annotations"))
 
-    def _annotation(self) -> Annotation:
-        """This element as an annotation."""
+    def as_annotation(self) -> Annotation:
+        """This element, an `ssc:Annotation`, as a value."""
         content = b"".join(etree.tostring(child) for child in self._element)
         text = next((child.text or "" for child in self._element if isinstance(child.tag, str)), "")
         return Annotation(self.text("type"), content, self.place, text)
@@ -319,11 +325,3 @@ def _end(element: Any, side: str) -> str:  # noqa: ANN401  lxml ships no types
     """One end of a connection as its attributes have it."""
     owner, connector = element.get(f"{side}Element"), element.get(f"{side}Connector")
     return f"{owner}.{connector or '?'}" if owner else connector or "?"
-
-
-def _number(text: str | None, default: float | None) -> float | None:
-    """The value of an xs:double."""
-    text = (text or "").strip()
-    if not PATTERNS["number"].fullmatch(text):
-        return default
-    return float(text.replace("INF", "inf"))
