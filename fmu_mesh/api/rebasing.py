@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 from ..config.instance_sections import InstanceSection, key_of, keys_of
 from ..config.loading import PlainConfig
@@ -41,9 +41,9 @@ def rebased(configuration: PlainConfig, folder: Path) -> dict[str, Any]:
 
     for name, section in examine_data(configuration)[0].config.instances.items():
         _move_files(data["instances"][name], section, moved, Path(old))
-    for section, key in _places(data):
-        if _is_relative(section.get(key)):
-            section[key] = moved(section[key])
+    for mapping, key in _places(data):
+        if _is_relative(mapping.get(key)):
+            mapping[key] = moved(mapping[key])
     return data
 
 
@@ -80,5 +80,5 @@ def _in(section: object, key: str) -> Iterator[_Place]:
         yield section, key
 
 
-def _is_relative(path: object) -> bool:
+def _is_relative(path: object) -> TypeGuard[str]:
     return isinstance(path, str) and path != "" and not path.startswith("~") and not Path(path).is_absolute()

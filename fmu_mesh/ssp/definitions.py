@@ -1,4 +1,4 @@
-"""What a file defines for its other parts (SSP 2.0, 4.3, 4.4): units, enumerations, and transformations of values.
+"""What a file defines for its other parts (SSP 2.0, 4.4, 4.5): units, enumerations, and transformations of values.
 
 Units and enumerations belong to their file. What a unit of one file is in another one is decided by its base units.
 """

@@ -30,7 +30,7 @@ from .package_writing import ArchiveEntry, PackageEntry
 __all__ = ["KeptPackage", "kept_package"]
 
 _FOLDERS: Final = ("resources/", "documentation/", "extra/")
-"""The folders of a package that has been unpacked (SSP 2.0, 3.1); others may have nothing to do with it."""
+"""The folders of a package that has been unpacked (SSP 2.0, 3); others may have nothing to do with it."""
 
 _NAMESPACES: Final = frozenset(NAMESPACES.values())
 _LOST: Final = {

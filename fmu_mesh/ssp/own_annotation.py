@@ -114,7 +114,8 @@ def written(
         data: the values, with a scenario in the place of the path of one.
         described: what the description says without an annotation of ours, with the same names.
         names: the instances whose names do not follow from those of their elements, by the names that would follow.
-        moved: from the path of a result file to one for the folder of the package.
+        moved: from the path of a result file to one for the folder of the package. The annotation gets it without what
+            leads out of that folder, because a package is given to others.
     """
     simulation, said = data["simulation"], described.get("simulation", {})
     known = {_ends(one): one for one in described.get("connections", ()) if isinstance(one, dict)}
@@ -127,7 +128,7 @@ def written(
     }
     sections = {key: data[key] for key in _SECTIONS if key in data and data[key] != described.get(key, _ABSENT)}
     if "record" in sections:
-        sections["record"] = _with_files(sections["record"], moved)
+        sections["record"] = _with_files(sections["record"], lambda path: _inside(moved(path)))
     content = {**{key: value for key, value in own.items() if value}, **sections}
     return json.dumps({"version": _VERSION, **content}, indent=2, allow_nan=False) if content else None
 
@@ -208,7 +209,7 @@ def merged(data: Mapping[str, Any], text: str, *, moved: Callable[[str], str] = 
     _merge_connections(content, result)
     for key in _SECTIONS:
         if key in content:
-            made[key] = _with_files(content[key], moved) if key == "record" else content[key]
+            made[key] = content[key] if key != "record" else _with_files(content[key], lambda path: moved(_own(path)))
             result.paths.append(key)
     return result
 
@@ -327,5 +328,22 @@ def _with_files(record: Any, moved: Callable[[str], str]) -> Any:  # noqa: ANN40
         return [_with_files(one, moved) for one in record]
     if not isinstance(record, dict) or not isinstance(record.get("file"), str):
         return record
-    file = record["file"]
-    return {**record, "file": file if posixpath.isabs(file) else moved(file)}
+    return {**record, "file": moved(record["file"])}
+
+
+def _inside(path: str) -> str:
+    """The path of a result file without what leads out of the folder of the package."""
+    if posixpath.isabs(path):
+        return posixpath.join("results", posixpath.basename(path))
+    return "/".join(part for part in posixpath.normpath(path).split("/") if part != "..")
+
+
+def _own(path: str) -> str:
+    """The path of a result file in an annotation.
+
+    Raises:
+        AnnotationRefused: it leads out of the folder of the package: somebody else may have written it.
+    """
+    if _inside(path) != posixpath.normpath(path):
+        raise AnnotationRefused(f"the result file '{path}'", "a path into the folder of the package, without '..'")
+    return path

@@ -42,7 +42,7 @@ VARIABLE_TYPES: Final[dict[str, VariableType]] = {
     "Enumeration": "Enumeration",
     "Binary": "Binary",
 }
-"""The types of variables by the names of the elements for types (SSP 2.0, 4.4.1)."""
+"""The types of variables by the names of the elements for types (SSP 2.0, 4.5.1)."""
 
 _TYPES: Final = tuple(f"ssv:{name}" for name in VARIABLE_TYPES)
 _WITH_ELEMENTS: Final = ("String", "Enumeration", "Binary")
@@ -191,7 +191,7 @@ def _is_same(one: Parameter, other: Parameter) -> bool:
 
 
 def _dimensions(element: XmlElement, problems: Problems) -> tuple[tuple[int, ...], bool]:
-    """The sizes of an array, and whether all of them are known: a parameter has fixed sizes only (SSP 2.0, 4.4.3)."""
+    """The sizes of an array, and whether all of them are known: a parameter has fixed sizes only (SSP 2.0, 4.5.3)."""
     sizes: list[int] = []
     fits = True
     for dimension in element.children("ssc:Dimension"):

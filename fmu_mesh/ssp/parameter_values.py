@@ -222,7 +222,7 @@ def _unit_conversion(unit: Unit, parameter: Parameter, target: ValueTarget, prob
 def _transformed(
     value: AppliedValue, elements: list[Any], transformation: Transformation, target: ValueTarget
 ) -> tuple[AppliedValue, list[Any], str]:
-    """A value after the transformation of its mapping (SSP 2.0, 4.4.2), and what was done in words.
+    """A value after the transformation of its mapping (SSP 2.0, 4.5.2), and what was done in words.
 
     Raises:
         _Misfit: the transformation is not one for such values.

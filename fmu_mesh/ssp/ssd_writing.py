@@ -132,7 +132,9 @@ class _Writer:
     def _component(self, parent: XmlNode, name: str) -> None:
         section = self._system.config.instances[name]
         description = self._system.instances[name].description
-        component = child(parent, "ssd:Component", name=self._names.elements[name], source=self._names.sources[name])
+        # The type is the default of the standard, but OMSimulator leaves out components of SSP 2.0 without one.
+        source, type_ = self._names.sources[name], "application/x-fmu-sharedlibrary"
+        component = child(parent, "ssd:Component", name=self._names.elements[name], type=type_, source=source)
         if isinstance(section, FmuConfig) and section.kind in _IMPLEMENTATIONS:
             component.set("implementation", _IMPLEMENTATIONS[section.kind])
         connected = self._connected(name)

@@ -1,7 +1,7 @@
 """What the XML files of a package say, as frozen Structs: names and values as they are written, each with its place.
 
 Owns the words of the standard: elements, connectors, connections, bindings, parameter sets and mappings. Names of units
-are resolved, because each file has its own (SSP 2.0, 4.3.2); everything else is resolved by `flattening` and
+are resolved, because each file has its own (SSP 2.0, 4.4.2); everything else is resolved by `flattening` and
 `parameters`.
 """
 
@@ -76,7 +76,7 @@ class Unit(msgspec.Struct, frozen=True):
 
 
 class Enumeration(msgspec.Struct, frozen=True):
-    """An enumeration that a file defines (SSP 2.0, 4.3.1): the values by the names of the items."""
+    """An enumeration that a file defines (SSP 2.0, 4.4.1): the values by the names of the items."""
 
     name: str
     items: dict[str, int]
@@ -111,7 +111,7 @@ class MapEntry(msgspec.Struct, frozen=True):
 
 
 class Transformation(msgspec.Struct, frozen=True):
-    """A transformation of a connection or of a mapped parameter (SSP 2.0, 4.4.2).
+    """A transformation of a connection or of a mapped parameter (SSP 2.0, 4.5.2).
 
     Attributes:
         kind: linear: factor and offset; otherwise ``entries``.
@@ -210,7 +210,7 @@ class Binding(msgspec.Struct, frozen=True):
 
 
 class Annotation(msgspec.Struct, frozen=True):
-    """One annotation (SSP 2.0, 4.2.1).
+    """One annotation (SSP 2.0, 4.2).
 
     Attributes:
         type: its namespace, such as `org.openmodelica`.

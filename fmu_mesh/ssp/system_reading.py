@@ -215,12 +215,12 @@ class _Configuration:
                     of_components.setdefault(path, {})[variable] = given
         for connection in connections:
             path, variable = connection.target
-            bound = of_components.get(path, {}).pop(variable, None)
-            if bound is not None and not self._is_input(path, variable):
-                found = f"a value for '{'.'.join((*path, variable))}', which a connection gives its value"
-                self._problems.warn(bound.origin, found)
-            elif bound is not None:
-                of_components[path][variable] = bound  # the value before the first one of the connection
+            bound = of_components.get(path, {}).get(variable)
+            if bound is None or self._is_input(path, variable):
+                continue  # an input has it before the first value of the connection
+            found = f"a value for '{'.'.join((*path, variable))}', which a connection gives its value"
+            self._problems.warn(bound.origin, found)
+            del of_components[path][variable]
 
     def _is_input(self, path: tuple[str, ...], name: str) -> bool:
         description = self._describe(path)

@@ -294,7 +294,7 @@ def _causality_is_right(connection: Connection, variables: Variables, findings: 
 
 
 def _is_source(source: Variable, target: Variable) -> bool:
-    """Whether a connection may begin at a variable: its value can be read at every point (SSP 2.0, 5.3.3.1.1)."""
+    """Whether a connection may begin at a variable: its value can be read at every point (SSP 2.0, 5.3.2.1)."""
     if source.causality in ("output", "local", "calculatedParameter"):
         return True
     return source.causality == "parameter" and (source.variability == "constant" or target.causality == "parameter")
