@@ -329,7 +329,7 @@ class _Configuration:
                 self._note_annotations(element, step_size)
         for annotation in annotations:
             if annotation.type not in _KNOWN:
-                found = "an annotation of a type that is not known: it has no effect"
+                found = "its type is not known: it has no effect"
                 self._problems.warn_once(("annotation", annotation.type), annotation.place, found, "annotation")
 
 

@@ -105,4 +105,4 @@ def test_annotations_of_one_unknown_type_are_one_warning(tmp_path: Path) -> None
     (warning,) = check(tmp_path, system("root", *gains, annotations=[unknown])).warnings
 
     assert "Annotation 'com.example.tool' of System 'root'" in warning
-    assert warning.endswith("of a type that is not known: it has no effect; 2 more annotations likewise")
+    assert warning.endswith(": its type is not known: it has no effect; 2 more annotations likewise")
