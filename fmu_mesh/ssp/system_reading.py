@@ -322,7 +322,7 @@ class _Configuration:
                 f"the {solver} for the whole system '{system.name}' is not used: an FMU for co-simulation has its own "
                 "solver, and one for model exchange gets one of its own, see `solver`"
             )
-            self._problems.warn(annotation.place, found)
+            self._problems.warn_once(("solver", solver), annotation.place, found, "system")
         for element in system.elements:
             annotations += element.annotations if isinstance(element, Component) else ()
             if isinstance(element, StructureSystem):
