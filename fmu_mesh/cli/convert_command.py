@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 from pathlib import Path
 
 from .. import files
 from ..api.converting import convert
+from ..api.package_inspection import inspect_package
 from ..errors import ConfigurationError
 from .arguments import CommandParser, Parsers, add_quiet, add_ssd
 from .output.display import say
@@ -15,6 +17,8 @@ from .run_options import add_options, read_options
 __all__ = ["PARSERS"]
 
 _TIMES = ("algorithm", "step_size", "stop_time")
+_DESCRIPTION = ".ssd"
+_DEFAULT = "SystemStructure.ssd"
 
 
 def _add_convert(parser: CommandParser) -> None:
@@ -43,8 +47,20 @@ def _convert(arguments: argparse.Namespace) -> int:
     if not arguments.quiet:
         for finding in lost:
             say(f"warning: {finding}")
-    print(f"{target}: run it with `fmu-mesh launch {target}`")
+    of_package = source.name if arguments.ssd is None and source.suffix == _DESCRIPTION else arguments.ssd
+    print(f"{target}: run it with `fmu-mesh launch {target}{_option(target, of_package)}`")
     return 0
+
+
+def _option(target: Path, ssd: str | None) -> str:
+    """The option that a copy of a package needs to run another description of it than the default one."""
+    if ssd is None or target.suffix.lower() != ".ssp":
+        return ""
+    try:
+        name = inspect_package(target, ssd=ssd).description
+    except ConfigurationError:
+        return ""  # it has a new description, which is its only one
+    return "" if name == _DEFAULT else f" --ssd {shlex.quote(name)}"
 
 
 PARSERS: Parsers = {"convert": _add_convert}

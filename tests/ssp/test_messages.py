@@ -5,7 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 import fmu_mesh
+from fmu_mesh.cli.main import main
 from tests.ssp.packages import (
     bound,
     component,
@@ -106,3 +109,30 @@ def test_annotations_of_one_unknown_type_are_one_warning(tmp_path: Path) -> None
 
     assert "Annotation 'com.example.tool' of System 'root'" in warning
     assert warning.endswith(": its type is not known: it has no effect; 2 more annotations likewise")
+
+
+@pytest.mark.parametrize(
+    ("options", "command"),
+    [
+        ((), "copy.ssp"),
+        (("--ssd", "variant"), "copy.ssp --ssd 'Variant B.ssd'"),
+        (("--ssd", "variant", "--version", "2.0"), "copy.ssp"),
+    ],
+)
+def test_the_command_that_runs_a_converted_package_chooses_its_description(
+    options: tuple[str, ...],
+    command: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    root = system("root", component("gain", "Gain"))
+    variant = description(root, name="variant")
+    package: dict[str, str | bytes] = {SSD: description(root), "Variant B.ssd": variant, **fmus("Gain")}
+    write_package(Path("own.ssp"), package)
+    needed = ("--step-size", "0.125", "--algorithm", "jacobi")
+
+    assert main(["convert", "own.ssp", "copy.ssp", *needed, *options]) == 0
+
+    assert capsys.readouterr().out == f"copy.ssp: run it with `fmu-mesh launch {command}`\n"
