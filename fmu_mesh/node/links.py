@@ -37,7 +37,8 @@ class OutLink:
         self._rows = max(1, _FRAME_BYTES // max(layout.row_size, 1))
         self._outputs = outputs
         self._put = put
-        self._picked = _picked(outputs.layout, layout)
+        # Without frames, its columns may be none of the outputs that are read in the steps.
+        self._picked = [] if link.initial_only else _picked(outputs.layout, layout)
 
     @property
     def has_frames(self) -> bool:

@@ -128,7 +128,12 @@ def _write_new(plain: PlainConfig, resolve: Callable[[], ResolvedSystem], path: 
     models = {name: Path(instance.fmu) for name, instance in system.instances.items()}
     resources = resource_names(models.values())
     elements, changed = _element_names([*models])
-    names = ElementNames(elements, {name: resources[model] for name, model in models.items()})
+    sections = data["instances"]
+    names = ElementNames(
+        elements,
+        {name: resources[model] for name, model in models.items()},
+        {name: sections[name]["kind"] for name in models if sections[name].get("kind", "auto") != "auto"},
+    )
     data = {**data, "simulation": {"algorithm": system.config.simulation.algorithm, **data["simulation"]}}
     annotation = written(data, _described(system.config), names=changed, moved=_to_package(plain.file))
     document = ssd_of(system, names, version, annotation, findings)

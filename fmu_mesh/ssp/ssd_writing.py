@@ -14,10 +14,9 @@ from lxml import etree
 
 from ..config.findings import Findings
 from ..config.mesh import ConnectionConfig
-from ..instances.fmi.fmu_kind import FmuConfig
 from ..system.system import Connection, ResolvedSystem
 from ..system.value_map import map_words
-from ..variables.model_description import ModelDescription, Value, Variable
+from ..variables.model_description import Kind, ModelDescription, Value, Variable
 from ..variables.units import BaseUnit
 from ..variables.value_conversion import to_value
 from ..variables.value_types import flattened
@@ -42,21 +41,23 @@ _TYPES_OF_1: Final = {
 }
 """The names in SSP 1.0 of the types that it has."""
 
-_IMPLEMENTATIONS: Final = {"co_simulation": "CoSimulation", "model_exchange": "ModelExchange"}
+_IMPLEMENTATIONS: Final[dict[Kind, str]] = {"co_simulation": "CoSimulation", "model_exchange": "ModelExchange"}
 _INT_32: Final = range(-(2**31), 2**31)
 _SOURCES_OF_PARAMETERS: Final = ("constant", "calculatedParameter")
 
 
 class ElementNames(msgspec.Struct, frozen=True):
-    """The names of the elements.
+    """The names of the elements, and what they are made from.
 
     Attributes:
         elements: the name of the component, by instance.
         sources: the path of the FMU in the package, by instance.
+        kinds: co_simulation or model_exchange, by instance; one that the configuration leaves open has none.
     """
 
     elements: Mapping[str, str]
     sources: Mapping[str, str]
+    kinds: Mapping[str, Kind]
 
 
 class NewDocument(NamedTuple):
@@ -130,26 +131,26 @@ class _Writer:
     # --- components
 
     def _component(self, parent: XmlNode, name: str) -> None:
-        section = self._system.config.instances[name]
+        start_values = self._system.config.instances[name].start_values
         description = self._system.instances[name].description
         # The type is the default of the standard, but OMSimulator leaves out components of SSP 2.0 without one.
         source, type_ = self._names.sources[name], "application/x-fmu-sharedlibrary"
         component = child(parent, "ssd:Component", name=self._names.elements[name], type=type_, source=source)
-        if isinstance(section, FmuConfig) and section.kind in _IMPLEMENTATIONS:
-            component.set("implementation", _IMPLEMENTATIONS[section.kind])
+        if name in self._names.kinds:
+            component.set("implementation", _IMPLEMENTATIONS[self._names.kinds[name]])
         connected = self._connected(name)
         connectors = [
             variable
             for variable in description.variables
-            if variable.name in connected or self._has_connector(variable, section.start_values)
+            if variable.name in connected or self._has_connector(variable, start_values)
         ]
         if connectors:
             parent = child(component, "ssd:Connectors")
             for variable in connectors:
                 self._connector(parent, variable, description)
         variables = {variable.name: variable for variable in description.variables}
-        if section.start_values:
-            self._binding(component, name, [(variables[key], value) for key, value in section.start_values.items()])
+        if start_values:
+            self._binding(component, name, [(variables[key], value) for key, value in start_values.items()])
 
     def _connected(self, name: str) -> set[str]:
         """The variables of an instance that are ends of connections."""

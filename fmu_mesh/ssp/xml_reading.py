@@ -102,10 +102,10 @@ class XmlElement:
 
     def annotations(self) -> tuple[Annotation, ...]:
         """The annotations of this element."""
-        return tuple(one._annotation() for one in self.inside(f"{self.tag.partition(':')[0]}:Annotations"))  # noqa: SLF001  of this class
+        return tuple(one.as_annotation() for one in self.inside(f"{self.tag.partition(':')[0]}:Annotations"))
 
-    def _annotation(self) -> Annotation:
-        """This element as an annotation."""
+    def as_annotation(self) -> Annotation:
+        """This element, an `ssc:Annotation`, as a value."""
         content = b"".join(etree.tostring(child) for child in self._element)
         text = next((child.text or "" for child in self._element if isinstance(child.tag, str)), "")
         return Annotation(self.text("type"), content, self.place, text)

@@ -283,12 +283,14 @@ def _causality_is_right(connection: Connection, variables: Variables, findings: 
     if not is_source:
         outputs = _names_of(connection.source_instance, "output", variables)
         findings.add(f"{connection.path}.from", f"'{source_name}' is {_a(source.causality)}", f"an output{outputs}")
-    is_target = target.causality == "input" or _is_open_parameter(target)
+    is_target = target.causality == "input" or (_is_open_parameter(target) and not source.changes)
     if not is_target:
         inputs = _names_of(connection.target_instance, "input", variables)
         expected = f"an input{inputs}"
         if target.causality == "structuralParameter":
             expected = "an input or a parameter; its value is needed before the initialization, so use `start_values`"
+        elif target.causality == "parameter" and source.changes:
+            expected += f"; a parameter gets its value once, and '{source_name}' changes"
         findings.add(f"{connection.path}.to", f"'{target_name}' is {_a(target.causality)}", expected)
     return is_source and is_target
 

@@ -70,14 +70,16 @@ def resolve_map(
 
 
 def checked_items(source: Variable, target: Variable, pairs: Pairs) -> tuple[tuple[str, int], ...]:
-    """The items of an Enumeration if a value of the output may be none of them; empty if there is nothing to check.
+    """The items of an Enumeration if a number or a map may give it none of them; empty if there is nothing to check.
+
+    What one Enumeration gives another one without a map is up to the two FMUs.
 
     Args:
         source: the output.
         target: the input.
         pairs: the entries of the `map` of the connection.
     """
-    if target.type != "Enumeration" or not target.items:
+    if target.type != "Enumeration" or not target.items or (source.type == "Enumeration" and not pairs):
         return ()
     if source.type == "Enumeration" and source.items:
         changed, known = dict(pairs), {number for _, number in target.items}

@@ -106,6 +106,11 @@ class Variable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return self.variability != "constant" and self.causality != "independent"
 
     @property
+    def changes(self) -> bool:
+        """Whether it may have another value at every point (FMI 2.0, 2.2.7: it is discrete or continuous)."""
+        return self.variability in ("discrete", "continuous")
+
+    @property
     def role(self) -> str:
         """Causality and initial for a message about setting it: `an output with initial 'calculated'`."""
         if self.variability == "constant":

@@ -70,7 +70,7 @@ BAD = [
     ),
     pytest.param(
         ("pendulum.a -> delay.x", "pendulum.a -> delay.d"),
-        ["'delay.d' is a parameter", "expected an input of 'delay': x"],
+        ["'delay.d' is a parameter", "expected an input of 'delay': x; a parameter gets its value once"],
         id="output to parameter",
     ),
     pytest.param(
@@ -302,7 +302,7 @@ def test_the_wrong_thing_for_a_command_is_told_with_the_right_one(
         (["launch", "mesh.yaml", "--window"], "fmu-mesh: --window needs a value, as in `--window N`\n"),
         (["set", "Gain.k"], "fmu-mesh: `fmu-mesh set` needs VALUE. `fmu-mesh set --help` tells more.\n"),
         (["set"], "fmu-mesh: `fmu-mesh set` needs KEY and VALUE. "),
-        (["inspect"], "fmu-mesh: `fmu-mesh inspect` needs MODEL.fmu. "),
+        (["inspect"], "fmu-mesh: `fmu-mesh inspect` needs MODEL.fmu|PACKAGE. "),
     ],
 )
 def test_a_wrong_value_of_an_option_is_told_in_words(
