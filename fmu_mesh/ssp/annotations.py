@@ -12,7 +12,7 @@ from typing import Any, Final
 
 from lxml import etree
 
-from .grammar import PATTERNS
+from .grammar import PATTERNS, number_of
 from .problems import Problems
 from .structure import Annotation
 
@@ -80,5 +80,5 @@ def _elements(annotation: Annotation, local: str) -> Iterator[Any]:
 def _positive(text: str | None) -> float | None:
     if text is None or not PATTERNS["number"].fullmatch(text.strip()):
         return None
-    value = float(text.strip().replace("INF", "inf"))
+    value = number_of(text.strip())
     return value if math.isfinite(value) and value > 0.0 else None

@@ -165,8 +165,8 @@ def _base_unit(element: XmlElement, problems: Problems) -> BaseUnit | None:
     """A unit in base units; None after a finding."""
     unit = BaseUnit(
         **{name: element.integer(name) for name in ("kg", "m", "s", "A", "K", "mol", "cd", "rad")},
-        factor=element.number("factor", 1.0) or 0.0,
-        offset=element.number("offset", 0.0) or 0.0,
+        factor=element.number("factor", 1.0),
+        offset=element.number("offset", 0.0),
     )
     if unit.usable:
         return unit
@@ -176,7 +176,7 @@ def _base_unit(element: XmlElement, problems: Problems) -> BaseUnit | None:
 
 
 def _linear(element: XmlElement, problems: Problems) -> Transformation:
-    factor, offset = element.number("factor", 1.0) or 0.0, element.number("offset", 0.0) or 0.0
+    factor, offset = element.number("factor", 1.0), element.number("offset", 0.0)
     if not (math.isfinite(factor) and math.isfinite(offset)):
         problems.add(element.place, f"factor {factor:g} and offset {offset:g}", "finite numbers")
         factor, offset = 1.0, 0.0

@@ -10,7 +10,7 @@ from typing import Final, NamedTuple
 
 import msgspec
 
-__all__ = ["GRAMMAR", "NAMESPACES", "PATTERNS", "TYPES", "Attribute", "Rule"]
+__all__ = ["GRAMMAR", "NAMESPACES", "PATTERNS", "TYPES", "Attribute", "Rule", "number_of"]
 
 NAMESPACES: Final = {
     "ssd": "http://ssp-standard.org/SSP1/SystemStructureDescription",
@@ -344,3 +344,13 @@ GRAMMAR: Final[dict[str, Rule]] = {
     "ssb:Annotations": Rule({}, {"ssc:Annotation": True}),
 }
 """By tag with the usual prefix."""
+
+
+def number_of(text: str) -> float:
+    """The value of a text that is an xs:double, exactly as Python reads the same digits.
+
+    Example:
+        >>> number_of("1e-3"), number_of("-INF")
+        (0.001, -inf)
+    """
+    return float(text.replace("INF", "inf"))

@@ -67,6 +67,9 @@ _SECTIONS: Final = (
 )
 """The top-level keys that stand there as they are."""
 
+_DEFAULT_RESULT: Final = "results/{mesh}.csv"
+"""The result file of a package that says none, relative to the folder of the package."""
+
 _KNOWN: Final = ("version", "mesh", "names", "simulation", "instances", "connections", *_SECTIONS)
 _ABSENT: Final = object()
 _LARGEST_TEXT: Final = 4 * 2**20
@@ -128,7 +131,11 @@ def written(
     }
     sections = {key: data[key] for key in _SECTIONS if key in data and data[key] != described.get(key, _ABSENT)}
     if "record" in sections:
-        sections["record"] = _with_files(sections["record"], lambda path: _inside(moved(path)))
+        record = _with_files(sections.pop("record"), lambda path: _inside(moved(path)))
+        if isinstance(record, dict) and record.get("file") == _DEFAULT_RESULT:
+            del record["file"]
+        if record != {}:
+            sections["record"] = record
     content = {**{key: value for key, value in own.items() if value}, **sections}
     return json.dumps({"version": _VERSION, **content}, indent=2, allow_nan=False) if content else None
 

@@ -17,12 +17,12 @@ from msgspec.structs import replace
 from ..text import listed, shown
 from ..variables.value_types import INTEGERS, VariableType
 from .definitions import enumeration_named, enumerations_of, transformation_of, unit_named, units_of
-from .grammar import PATTERNS
+from .grammar import PATTERNS, number_of
 from .problems import Problems
 from .structure import Enumeration, MappingEntry, Parameter, ParameterMapping, ParameterSet, Unit
 from .xml_reading import XmlElement
 
-__all__ = ["VARIABLE_TYPES", "number_of", "parameter_mapping", "parameter_set", "refuse_ambiguous"]
+__all__ = ["VARIABLE_TYPES", "parameter_mapping", "parameter_set", "refuse_ambiguous"]
 
 VARIABLE_TYPES: Final[dict[str, VariableType]] = {
     "Real": "Float64",
@@ -138,16 +138,6 @@ def refuse_ambiguous(values: ParameterSet, names: Iterable[str], problems: Probl
             first = next(one.place.line for one in values.parameters if one.name == name)
             found = f"a second parameter {shown(name)} with another value"
             problems.add(values.ambiguous[name], found, f"one of this name (first: line {first})")
-
-
-def number_of(text: str) -> float:
-    """The value of a text that is an xs:double, exactly as Python reads the same digits.
-
-    Example:
-        >>> number_of("1e-3"), number_of("-INF")
-        (0.001, -inf)
-    """
-    return float(text.replace("INF", "inf"))
 
 
 def _parameter(

@@ -20,7 +20,8 @@ from ..variables.units import Linear, conversion
 from ..variables.value_conversion import to_plain
 from ..variables.value_types import INTEGERS, PlainValue, VariableType, flattened, is_float, nested
 from .flattening import ValueChange
-from .parameter_reading import VARIABLE_TYPES, number_of
+from .grammar import number_of
+from .parameter_reading import VARIABLE_TYPES
 from .problems import Problems
 from .structure import Connector, MappingEntry, Parameter, Place, Transformation, Unit
 

@@ -115,7 +115,10 @@ class _Reader:
         times: dict[str, float | None] = {"start_time": None, "stop_time": None}
         annotations = root.annotations()
         if experiment is not None:
-            times = {"start_time": experiment.number("startTime"), "stop_time": experiment.number("stopTime")}
+            times = {
+                "start_time": experiment.optional_number("startTime"),
+                "stop_time": experiment.optional_number("stopTime"),
+            }
             annotations += experiment.annotations()
         system = self._system(top, file, depth)
         return Structure(root.text("name"), root.version, system, root.place, annotations=annotations, **times)

@@ -174,6 +174,9 @@ class _Configuration:
         except AnnotationRefused as refused:
             self._problems.add(self._annotation.place, refused.found, refused.expected)
             return data
+        record = result.data.get("record")
+        if self._package.is_archive and isinstance(record, dict) and "file" not in record:
+            result.data["record"] = {**record, "file": RESULT_BESIDE_PACKAGE}
         for path in result.paths:
             self._place(path, self._annotation.place)
         for gone in result.gone:
@@ -288,7 +291,7 @@ class _Configuration:
         linear = connection.change.linear
         if linear.factor != 1.0:
             written["factor"] = linear.factor
-        if linear.offset != 0.0:
+        if not linear.identity and repr(linear.offset) != "0.0":  # -0.0 is another offset for a factor
             written["offset"] = linear.offset
         if connection.change.ignore_units:
             written["ignore_units"] = True

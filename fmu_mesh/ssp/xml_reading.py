@@ -15,7 +15,7 @@ from lxml import etree
 from ..errors import LoadFailed
 from ..instances.fmi.archive.examining import safe_xml
 from ..text import listed, nearest, shown
-from .grammar import GRAMMAR, NAMESPACES, PATTERNS, Attribute, Rule
+from .grammar import GRAMMAR, NAMESPACES, PATTERNS, Attribute, Rule, number_of
 from .problems import Problems
 from .structure import Annotation, Place
 
@@ -58,9 +58,15 @@ class XmlElement:
         """A required attribute; empty where it is missing, for which there is a finding."""
         return self.get(name) or ""
 
-    def number(self, name: str, default: float | None = None) -> float | None:
+    def number(self, name: str, default: float) -> float:
         """A number; ``default`` where it is not given, or is no number."""
-        return _number(self.get(name), default)
+        found = self.optional_number(name)
+        return default if found is None else found
+
+    def optional_number(self, name: str) -> float | None:
+        """A number; None where it is not given, or is no number."""
+        text = (self.get(name) or "").strip()
+        return number_of(text) if PATTERNS["number"].fullmatch(text) else None
 
     def integer(self, name: str, default: int = 0) -> int:
         """A whole number; ``default`` where it is not given, or is none."""
@@ -294,11 +300,3 @@ def _entry(element: Any) -> str | None:  # noqa: ANN401  lxml ships no types
     if source and target:
         return f"'{source} to {target}'"
     return f"'{source}'" if source else f"to '{target}'" if target else None
-
-
-def _number(text: str | None, default: float | None) -> float | None:
-    """The value of an xs:double."""
-    text = (text or "").strip()
-    if not PATTERNS["number"].fullmatch(text):
-        return default
-    return float(text.replace("INF", "inf"))

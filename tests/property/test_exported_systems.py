@@ -15,6 +15,7 @@ import fmu_mesh
 from fmu_mesh.config.base import NAME_PATTERN
 from fmu_mesh.ssp.system_reading import read_system
 from fmu_mesh.system.plan import Plan
+from fmu_mesh.variables.units import Linear
 from tests.fmus.helpers import find_fmu
 from tests.helpers import FMUS
 from tests.ssp.unit_fmus import with_units
@@ -202,7 +203,10 @@ def content_of(plan: Plan) -> list[object]:
         )
         for one in plan.system.instances.values()
     ]
-    connections = [(str(one), repr((one.factor, one.offset)), one.map, one.delay) for one in plan.connections]
+    connections = [
+        (str(one), repr(Linear() if (own := Linear(one.factor, one.offset)).identity else own), one.map, one.delay)
+        for one in plan.connections
+    ]
     records = plan.system.records
     config = plan.system.config
     return [

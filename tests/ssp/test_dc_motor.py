@@ -1,4 +1,4 @@
-"""A DC motor of two models for model exchange reaches its steady state (the public one: `test_public_systems`)."""
+"""A DC motor of two models for model exchange reaches its steady state."""
 
 from __future__ import annotations
 
