@@ -21,7 +21,7 @@ from .tables import pairs, table
 
 __all__ = ["plan_page", "slower_than_it_could_be", "start_value_origin"]
 
-_PROBLEM_CHARACTERS = 100
+_PROBLEM_CHARACTERS = 200
 
 
 def plan_page(plan: Plan, loaded: LoadedConfig | None = None) -> list[str]:

@@ -82,6 +82,11 @@ class Findings:
         place, file = (path, origin.file) if origin.file else (origin.text, self._file)
         self._items.append(Finding(file, place, found, expected, suggestion, origin.line))
 
+    def explain(self, paths: Iterable[str]) -> None:
+        """Take findings at, inside or around these paths as consequences of the ones that there are already."""
+        self._places |= {*paths}
+        self._settled |= {*paths}
+
     def merge(self, findings: Iterable[Finding]) -> None:
         """Add earlier findings. Later ones at, inside or around their places are ignored as consequences."""
         for finding in findings:

@@ -61,6 +61,7 @@ class PlainConfig(NamedTuple):
         origins: where a value was written, by path in the file, if that is another file.
         warnings: findings that do not prevent a run.
         needed: what an option has to give because the file cannot say it: the option, by path in the file.
+        explained: paths about which the findings say already, in the words of the file, what is wrong.
     """
 
     data: Plain
@@ -71,6 +72,7 @@ class PlainConfig(NamedTuple):
     origins: dict[str, ValueOrigin] = {}
     warnings: tuple[Finding, ...] = ()
     needed: dict[str, str] = {}
+    explained: tuple[str, ...] = ()
 
 
 class LoadedConfig(msgspec.Struct, frozen=True):
@@ -222,6 +224,7 @@ def examine_data(plain: PlainConfig, overrides: Sequence[str], kinds: Kinds) -> 
     data, path, lines = plain.data, plain.file, plain.lines
     replaced = dict(plain.overrides)
     findings = Findings(str(path), lines, replaced, plain.findings, plain.origins)
+    findings.explain(plain.explained)
     sections = kinds.own()
     if isinstance(data, dict):
         data = _with_long_connections(data, findings)

@@ -6,7 +6,8 @@ Units and enumerations belong to their file. What a unit of one file is in anoth
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
+from types import MappingProxyType
 from typing import Final, Literal
 
 from ..text import listed, nearest, shown
@@ -28,43 +29,58 @@ _KINDS: Final[dict[str, Literal["linear", "boolean", "integer", "enumeration"]]]
 _BOOLEANS: Final = {"true": "true", "1": "true", "false": "false", "0": "false"}
 
 
-def units_of(root: XmlElement, tag: str, problems: Problems) -> dict[str, Unit]:
-    """The units that a file defines, by name.
+def units_of(
+    root: XmlElement, tag: str, problems: Problems, around: Mapping[str, Unit] = MappingProxyType({})
+) -> dict[str, Unit]:
+    """The units of a file, by name; those that it uses and does not define have no base units.
 
     Args:
         root: the root of the file, or of a parameter set inside another file.
         tag: of the list in it: `ssd:Units`, `ssv:Units` or `ssb:Units`.
         problems: where a second unit of one name goes, and a unit into which nothing can be converted; such a unit has
-            no base units.
+            no base units. There is one warning about all units that are not defined.
+        around: the units of the file around a parameter set.
     """
-    units: dict[str, Unit] = {}
+    units = dict(around)
     for element in _unique(root, tag, "ssc:Unit", problems):
         name, base = element.text("name"), element.child("ssc:BaseUnit")
         units[name] = Unit(name, _base_unit(base, problems) if base is not None else None)
-    return units
+    undefined: dict[str, Place] = {}
+    for element in root.own_elements():
+        used = element.get("unit")
+        if used and used not in units:
+            undefined.setdefault(used, element.place)
+    if undefined:
+        _warn_undefined(undefined, [unit.name for unit in units.values() if unit.base is not None], problems)
+    return {**units, **{name: Unit(name) for name in undefined}}
 
 
-def unit_named(name: str, units: dict[str, Unit], place: Place, problems: Problems) -> Unit:
+def _warn_undefined(undefined: Mapping[str, Place], defined: Collection[str], problems: Problems) -> None:
+    """One warning about all units that a file uses and does not define."""
+    names, place = [*undefined], next(iter(undefined.values()))
+    if len(names) == 1:
+        found = f"the unit {shown(names[0])}, which the file does not define: values in it are not converted"
+        problems.warn(place, found, _defined(names[0], defined, "Unit"))
+        return
+    found = f"the units {listed([shown(name) for name in names])}, which the file does not define: values in them"
+    problems.warn(place, f"{found} are not converted", _defined("", defined, "Unit"))
+
+
+def _defined(name: str, defined: Collection[str], kind: Literal["Unit", "Enumeration"]) -> str:
+    """What a file should refer to instead of a name that it does not define."""
+    if not defined:
+        return f"a definition in {kind}s"
+    near = nearest(name, defined)
+    return f"one of its {kind}s: {listed([*defined])}{f' (did you mean {shown(near)}?)' if near is not None else ''}"
+
+
+def unit_named(name: str, units: Mapping[str, Unit]) -> Unit:
     """The unit that an attribute `unit` names; an empty name is explicitly no unit.
-
-    A unit that the file does not define has no base units. There is one warning for each such name and file, because
-    it is added to ``units``.
 
     Args:
         name: the value of the attribute.
         units: what `units_of` returned for the file.
-        place: the element with the attribute.
-        problems: where the warning goes.
     """
-    if name and name not in units:
-        defined = [unit.name for unit in units.values() if unit.base is not None]
-        near = nearest(name, defined)
-        problems.warn(
-            place,
-            f"the unit {shown(name)}, which the file does not define: values in it are not converted",
-            f"one of its Units: {listed(defined)}{f' (did you mean {shown(near)}?)' if near else ''}",
-        )
-        units[name] = Unit(name)
     return units[name] if name else Unit("")
 
 
@@ -104,12 +120,8 @@ def enumeration_named(
     """
     found = enumerations.get(name)
     if found is None and name:  # without a name there is a finding
-        near = nearest(name, enumerations)
-        problems.warn(
-            place,
-            f"the enumeration {shown(name)}, which the file does not define: the items of the FMU count",
-            f"one of its Enumerations: {listed(list(enumerations))}{f' (did you mean {shown(near)}?)' if near else ''}",
-        )
+        found_name = f"the enumeration {shown(name)}, which the file does not define: the items of the FMU count"
+        problems.warn(place, found_name, _defined(name, enumerations, "Enumeration"))
     return found
 
 

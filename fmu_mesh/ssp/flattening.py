@@ -167,7 +167,6 @@ class _Flattening:
         self._units = units
         self._problems = problems
         self._inbound: dict[tuple[Path, str], _Segment] = {}
-        self._warned: set[tuple[str, str]] = set()
 
     def collect(self, system: StructureSystem, path: Path) -> None:
         """Give every connection of a system, and of those in it, its direction."""
@@ -226,7 +225,7 @@ class _Flattening:
         missing = [one.name for one in component.connectors if description.variable_of(one.name) is None]
         if missing:  # one that is connected is a finding
             found = f"connectors for variables that {component.source} does not have: {listed(missing)}"
-            self._problems.warn(component.place, found)
+            self._problems.warn_once((component.source, *missing), component.place, found, "component")
         for connector in component.connectors:
             variable = description.variable_of(connector.name)
             if variable is None:
@@ -401,14 +400,14 @@ class _Flattening:
         if unit is None or target is None or not unit.name or not target.name or unit == target:
             return Linear()
         if unit.base is None or target.base is None:
-            if unit.name != target.name and (unit.name, target.name) not in self._warned:
-                self._warned.add((unit.name, target.name))
+            if unit.name != target.name:
                 undefined = unit.name if unit.base is None else target.name
                 found = (
                     f"'{segment.source}' in '{unit.name}' goes to '{segment.target}' in '{target.name}' unconverted, "
                     f"because the unit '{undefined}' is not defined"
                 )
-                self._problems.warn(segment.connection.place, found)
+                like = "connection", unit.name, target.name
+                self._problems.warn_once(like, segment.connection.place, found, "connection")
             return Linear()
         change = conversion(unit.base, target.base, relative=relative)
         if change is None:

@@ -32,6 +32,7 @@ __all__ = ["KeptPackage", "kept_package"]
 _FOLDERS: Final = ("resources/", "documentation/", "extra/")
 """The folders of a package that has been unpacked (SSP 2.0, 3); others may have nothing to do with it."""
 
+_DOCUMENTS: Final = (".ssd", ".ssv", ".ssm")
 _NAMESPACES: Final = frozenset(NAMESPACES.values())
 _LOST: Final = {
     "SignalDictionary": "signal dictionaries",
@@ -60,10 +61,15 @@ class KeptPackage(NamedTuple):
         """The description as messages name it."""
         return str(self.root / self.name)
 
-    @property
-    def version(self) -> str:
-        """The version of SSP that the description says."""
-        return str(self._tree().get("version"))
+    def is_of(self, version: str) -> bool:
+        """Whether the description, and all sets and mappings that it has or refers to, are of a version of SSP."""
+        own = self._tree()
+        with Package(self.root) as package:
+            names = [name for name in _sources(own) if name.lower().endswith(_DOCUMENTS) and package.exists(name)]
+            others = [safe_xml(package.read(name), f"'{package.shown(name)}'") for name in names]
+        elements = (one for root in (own, *others) for one in root.iter() if isinstance(one.tag, str))
+        said = {one.get("version") for one in elements if etree.QName(one).namespace in _NAMESPACES}
+        return said <= {version, None}
 
     @contextmanager
     def copied(self, document: bytes) -> Iterator[list[PackageEntry]]:

@@ -71,7 +71,7 @@ def parameter_set(
         units: those of the file around it, which a set inside a description may use; its own ones come first.
         enumerations: as ``units``.
     """
-    own_units = {**units, **units_of(element, "ssv:Units", problems)}
+    own_units = units_of(element, "ssv:Units", problems, units)
     own_enumerations = {**enumerations, **enumerations_of(element, "ssv:Enumerations", problems)}
     parameters: dict[str, Parameter] = {}
     repeated: list[Parameter] = []
@@ -82,9 +82,11 @@ def parameter_set(
         if parameter is not None and parameters.setdefault(parameter.name, parameter) is not parameter:
             repeated.append(parameter)
     if repeated:
-        names = [shown(name) for name in dict.fromkeys(one.name for one in repeated)]
-        found = f"a second parameter of the same name: {listed(names)}"
-        problems.warn(repeated[0].place, found, f"one (first: line {parameters[repeated[0].name].place.line})")
+        first = parameters[repeated[0].name].place.line
+        lines = [str(one.place.line) for one in repeated[1:]]
+        more = f", and other names again in line{'s' if len(lines) > 1 else ''} {listed(lines)}" if lines else ""
+        found = f"a second parameter of this name{more}"
+        problems.warn(repeated[0].place, found, f"one of each name (first: line {first})")
     others = {one.name: one.place for one in repeated if not _is_same(one, parameters[one.name])}
     return ParameterSet(element.text("name"), tuple(parameters.values()), element.place, others)
 
@@ -115,10 +117,11 @@ def parameter_mapping(element: XmlElement, problems: Problems) -> ParameterMappi
         lines[target] = one.place.line
         suppressed = one.boolean("suppressUnitConversion")
         entries.append(MappingEntry(source, target, one.place, suppressed, transformation_of(one, problems)))
-    if without:
-        several = f"{len(without)} entries with an empty source, which map nothing"
-        found = several if len(without) > 1 else "an entry with an empty source, which maps nothing"
-        problems.warn(without[0].place, found)
+    if len(without) == 1:
+        problems.warn(without[0].place, "an empty source, which maps nothing")
+    elif without:
+        found = f"{len(without)} entries with an empty source, which map nothing (first: line {without[0].place.line})"
+        problems.warn(element.place, found)
     return ParameterMapping(tuple(entries), element.place)
 
 
@@ -164,7 +167,7 @@ def _parameter(
         kind,
         values if fits else (),
         element.place,
-        unit_named(unit, units, type_.place, problems) if unit is not None else None,
+        unit_named(unit, units) if unit is not None else None,
         enumeration_named(enumeration, enumerations, type_.place, problems)
         if kind == "Enumeration" and enumeration is not None
         else None,

@@ -211,7 +211,7 @@ def _unit_conversion(unit: Unit, parameter: Parameter, target: ValueTarget, prob
                 f"a value in '{unit.name}' for {target.words} in '{want.name}' is not converted, because the unit "
                 f"'{undefined}' is not defined"
             )
-            problems.warn(parameter.place, found)
+            problems.warn_once(("value", parameter.place.file, unit.name, want.name), parameter.place, found, "value")
         return Linear()
     change = conversion(unit.base, want.base, relative=target.is_relative)
     if change is None:

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Hashable
+
+from msgspec.structs import replace
+
 from ..errors import ConfigurationError, Finding
 from ..text import printable
 from .structure import Place
@@ -20,6 +24,7 @@ class Problems:
     def __init__(self) -> None:
         self.findings: list[Finding] = []
         self.warnings: list[Finding] = []
+        self._alike: dict[Hashable, tuple[int, list[Finding]]] = {}  # by kind: where the first one is, and all
 
     def add(self, place: Place, found: str, expected: str, suggestion: str | None = None) -> None:
         """Add a finding: there is ``found`` instead of ``expected``."""
@@ -28,6 +33,26 @@ class Problems:
     def warn(self, place: Place, found: str, expected: str = "") -> None:
         """Add a warning."""
         self._add(self.warnings, place, found, expected, None)
+
+    def warn_once(self, like: Hashable, place: Place, found: str, what: str) -> None:
+        """Add a warning, or let the first one of its kind say how many others there are.
+
+        Args:
+            like: equal for all warnings of one kind.
+            place: where it is.
+            found: what there is.
+            what: the warnings of this kind are about, such as `value`.
+        """
+        finding = Finding(place.file, place.element, found, "", None, place.line or None)
+        index, alike = self._alike.setdefault(like, (len(self.warnings), []))
+        if finding in alike:
+            return  # an element may be read more than once
+        alike.append(finding)
+        if len(alike) == 1:
+            self.warnings.append(finding)
+        else:
+            more = f"one more {what}" if len(alike) == 2 else f"{len(alike) - 1} more {what}s"
+            self.warnings[index] = replace(alike[0], found=f"{alike[0].found}; {more} likewise")
 
     def raise_any(self, file: str) -> None:
         """Raise one error with all findings in the order of their files and lines; do nothing if there are none.

@@ -14,7 +14,7 @@ from msgspec.structs import replace
 
 from ..errors import ConfigurationError
 from ..text import shown
-from .definitions import enumerations_of, transformation_of, unit_named, units_of
+from .definitions import enumeration_named, enumerations_of, transformation_of, unit_named, units_of
 from .grammar import TYPES
 from .package import DEFAULT, Package
 from .parameter_reading import parameter_mapping, parameter_set, refuse_ambiguous
@@ -259,11 +259,9 @@ class _Reader:
         if type_ is not None:
             name = type_.tag.partition(":")[2]
             written = type_.get("unit")
-            unit = unit_named(written, file.units, place, self._problems) if written is not None else None
+            unit = unit_named(written, file.units) if written is not None else None
             if name == "Enumeration" and (wanted := type_.text("name")):
-                enumeration = file.enumerations.get(wanted)
-                if enumeration is None:
-                    self._problems.warn(place, f"the enumeration '{wanted}', which the file does not define")
+                enumeration = enumeration_named(wanted, file.enumerations, place, self._problems)
             if name == "Binary" and (type_.get("mime-type") or "").startswith(_MODELICA):
                 name = None  # the FMU's variable says the type
         kind = element.get("kind")

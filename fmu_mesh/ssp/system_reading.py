@@ -29,7 +29,7 @@ from .package import DEFAULT, Package
 from .parameters import AppliedValue, changed, resolve_parameters
 from .problems import Problems
 from .ssd_reading import annotations_of, read_structure
-from .structure import Annotation, Component, Place, Structure, StructureSystem, components_of
+from .structure import Component, Place, Structure, StructureSystem, components_of
 
 __all__ = ["NEEDED", "read_system"]
 
@@ -125,6 +125,9 @@ class _Configuration:
         units = {node: value.unit for node, value in parameters.of_systems.items() if value.unit is not None}
         connections, values = flatten(system, self._describe, self._problems, units)
         self._settle(connections, values, parameters.of_components, parameters.of_systems)
+        if not self._components and _is_known(system):
+            found = "no component in it, nor in a system inside it: there is nothing to run"
+            self._problems.add(system.place, found, "a Component with an FMU")
         simulation = self._simulation()
         data: dict[str, Plain] = {
             "mesh": mesh_name(self._structure.name or self._package.root.stem),
@@ -147,6 +150,7 @@ class _Configuration:
             origins=self._origins,
             warnings=tuple(self._problems.warnings),
             needed={key: option for key, option in NEEDED.items() if key.partition(".")[2] not in times},
+            explained=() if self._components else ("instances",),
         )
 
     def _chosen_names(self) -> dict[str, str]:
@@ -317,18 +321,25 @@ class _Configuration:
             found = f"a step size of {own[0]:g} s for the system '{system.name}'"
             self._problems.warn(own[1].place, found, "that of the root system, which all its instances have")
         for solver, annotation in common_solvers(annotations):
-            found = f"the {solver} of the system '{system.name}', which is not used"
-            self._problems.warn(annotation.place, found, "one solver per model-exchange FMU, see `solver`")
-        unknown: dict[str, Annotation] = {}
+            found = (
+                f"the {solver} for the whole system '{system.name}' is not used: an FMU for co-simulation has its own "
+                "solver, and one for model exchange gets one of its own, see `solver`"
+            )
+            self._problems.warn_once(("solver", solver), annotation.place, found, "system")
         for element in system.elements:
             annotations += element.annotations if isinstance(element, Component) else ()
             if isinstance(element, StructureSystem):
                 self._note_annotations(element, step_size)
         for annotation in annotations:
             if annotation.type not in _KNOWN:
-                unknown.setdefault(annotation.type, annotation)
-        for type_, annotation in unknown.items():
-            self._problems.warn(annotation.place, f"the annotation '{type_}' is not known, and has no effect")
+                found = "its type is not known: it has no effect"
+                self._problems.warn_once(("annotation", annotation.type), annotation.place, found, "annotation")
+
+
+def _is_known(system: StructureSystem) -> bool:
+    """Whether everything in a system could be read; otherwise there is a finding."""
+    inside = (element for element in system.elements if isinstance(element, StructureSystem))
+    return system.is_known and all(_is_known(element) for element in inside)
 
 
 def _map_value(text: str, target: Variable | None) -> bool | int | str:

@@ -119,6 +119,14 @@ class XmlElement:
         child = self.child(tag)
         return child.children() if child is not None else iter(())
 
+    def own_elements(self) -> Iterator[XmlElement]:
+        """All elements of SSP inside this one, in their order; a set or a mapping inside a description has its own."""
+        for child in self.children():
+            rule = GRAMMAR.get(child.tag)
+            if rule is not None and not rule.anything and child.tag not in _INLINE:
+                yield child
+                yield from child.own_elements()
+
     def annotations(self) -> tuple[Annotation, ...]:
         """The annotations of this element."""
         return tuple(one.as_annotation() for one in self.inside(f"{self.tag.partition(':')[0]}:Annotations"))
@@ -171,21 +179,24 @@ class XmlElement:
                 problems.add(self.place, f"no {_kind(tag)}", "one")
 
     def _check_attributes(self, rule: Rule, problems: Problems) -> None:
-        for name, text in self._element.attrib.items():
-            if name.startswith("{"):
-                continue  # of another namespace, such as xsi:schemaLocation
+        attributes = {name: text for name, text in self._element.attrib.items() if not name.startswith("{")}
+        missing = [name for name, one in rule.attributes.items() if one.required and name not in attributes]
+        unknown = [name for name in attributes if name not in rule.attributes]
+        meant = missing if len(missing) == len(unknown) == 1 else []  # most likely it has only a wrong name
+        for name, text in attributes.items():
             attribute = rule.attributes.get(name)
             if attribute is None:
                 names = [*rule.attributes]
                 expected = f"one of {listed(names)}" if names else "no attributes"
-                problems.add(self.place, f"the attribute '{name}'", expected, nearest(name, names))
+                near = meant[0] if meant else nearest(name, names)
+                problems.add(self.place, f"the attribute '{name}'", expected, near)
                 continue
             _check_value(self, name, text, attribute, problems)
             if attribute.since == "2.0" and self.version == "1.0":
                 problems.warn(self.place, f"the attribute '{name}' of SSP 2.0 in a file that says version 1.0")
-        for name, attribute in rule.attributes.items():
-            if attribute.required and self._element.get(name) is None:
-                problems.add(self.place, f"no attribute '{name}'", attribute.expected)
+        for name in missing:
+            if name not in meant:
+                problems.add(self.place, f"no attribute '{name}'", rule.attributes[name].expected)
         if rule.since == "2.0" and self.version == "1.0":
             problems.warn(self.place, f"{_kind(self.tag)} of SSP 2.0 in a file that says version 1.0")
 
@@ -312,7 +323,7 @@ def _in_words(element: Any) -> str:  # noqa: ANN401  lxml ships no types
         if local == "Connection":
             name = f"'{_end(element, 'start')} - {_end(element, 'end')}'"
         if local == "MappingEntry":
-            name = f"'{element.get('source')} to {element.get('target')}'"
+            name = _entry(element)
         if not words:
             words.append(local if name is None else f"{local} {name}")
         elif name is not None and local not in _ROOTS:
@@ -325,3 +336,11 @@ def _end(element: Any, side: str) -> str:  # noqa: ANN401  lxml ships no types
     """One end of a connection as its attributes have it."""
     owner, connector = element.get(f"{side}Element"), element.get(f"{side}Connector")
     return f"{owner}.{connector or '?'}" if owner else connector or "?"
+
+
+def _entry(element: Any) -> str | None:  # noqa: ANN401  lxml ships no types
+    """What an entry of a mapping maps: `'gain to motor.k'`, or what there is of that."""
+    source, target = element.get("source"), element.get("target")
+    if source and target:
+        return f"'{source} to {target}'"
+    return f"'{source}'" if source else f"to '{target}'" if target else None

@@ -324,6 +324,19 @@ def test_another_version_of_ssp_is_a_new_description(foreign: Path, tmp_path: Pa
 
     assert b'version="2.0"' in content_of(tmp_path / "new.ssp")[MAIN]
     assert loaded(foreign).to_ssp(tmp_path / "copy.ssp", version="1.0") == ()
+
+
+def test_a_version_that_only_one_document_of_a_package_does_not_have_is_a_new_description(tmp_path: Path) -> None:
+    files = files_of_package()
+    files["resources/first.ssv"] = files["resources/first.ssv"].replace(b'version="1.0"', b'version="2.0"')
+    package = packed(tmp_path / "mixed.ssp", files)
+
+    assert loaded(package).to_ssp(tmp_path / "copy.ssp") == ()
+    assert loaded(package).to_ssp(tmp_path / "new.ssp", version="1.0")
+
+    assert "resources/first.ssv" in content_of(tmp_path / "copy.ssp")
+    documents = [text for name, text in content_of(tmp_path / "new.ssp").items() if not name.endswith(".fmu")]
+    assert not any(b'version="2.0"' in text for text in documents)
     # What comes from a package of 2.0 stays one of 2.0.
     assert loaded(tmp_path / "new.ssp").to_ssp(tmp_path / "again.ssp") == ()
     assert (tmp_path / "again.ssp").read_bytes() == (tmp_path / "new.ssp").read_bytes()

@@ -188,7 +188,7 @@ def test_options_change_the_plan(tmp_path: Path, capsys: pytest.CaptureFixture[s
 def test_what_is_odd_but_can_run_is_a_warning(tmp_path: Path) -> None:
     plan = prepare(write(tmp_path, JACOBI))
     a = plan.system.instances["a"]
-    odd = replace(a, description=replace(a.description, problems=("line 3:\n  no  attribute " + 100 * "x",)))
+    odd = replace(a, description=replace(a.description, problems=("line 3:\n  no  attribute " + 300 * "x",)))
     finding = Finding("mesh.yaml", "connections[0]", "it connects rad to deg", "the same unit")
     system = replace(plan.system, instances={**plan.system.instances, "a": odd}, warnings=(finding,))
 
@@ -197,7 +197,7 @@ def test_what_is_odd_but_can_run_is_a_warning(tmp_path: Path) -> None:
     assert page[page.index("Warnings") :] == [
         "Warnings",
         "  mesh.yaml: connections[0]: it connects rad to deg; expected the same unit",
-        f"  a: Gain.fmu: line 3: no attribute {'x' * 76}...",
+        f"  a: Gain.fmu: line 3: no attribute {'x' * 176}...",
     ]
 
 

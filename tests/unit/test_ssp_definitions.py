@@ -110,7 +110,26 @@ def test_an_empty_unit_is_no_unit_and_without_the_attribute_nothing_is_said() ->
 
     assert [one.unit for one in values.parameters] == [Unit(""), None]
     assert not problems.warnings
-    assert unit_named("", {}, values.place, problems) == Unit("")
+    assert unit_named("", {}) == Unit("")
+
+
+def test_all_units_that_a_file_uses_and_does_not_define_are_one_warning() -> None:
+    parameter = '<ssv:Parameter name="{}"><ssv:Real value="1" unit="{}"/></ssv:Parameter>\n'
+    units = {"a": "m", "b": "[m]", "c": "[rad]", "d": "[m]"}
+
+    values, problems = _set("".join(map(parameter.format, units, units.values())), f"<ssv:Units>{METRE}</ssv:Units>")
+
+    assert [one.unit for one in values.parameters][1:] == [Unit("[m]"), Unit("[rad]"), Unit("[m]")]
+    assert _one(problems.warnings) == (
+        "x.ssv:4: Real of Parameter 'b': the units '[m]', '[rad]', which the file does not define: values in them are "
+        "not converted; expected one of its Units: m"
+    )
+
+
+def test_a_unit_that_a_file_without_units_uses_is_a_warning() -> None:
+    _, problems = _set('<ssv:Parameter name="a">\n<ssv:Real value="1" unit="m"/></ssv:Parameter>')
+
+    assert _one(problems.warnings).endswith("values in it are not converted; expected a definition in Units")
 
 
 def test_a_set_inside_a_description_may_use_the_units_of_the_description() -> None:
@@ -355,7 +374,18 @@ def test_a_second_parameter_of_one_name_is_a_warning_and_ambiguous_if_its_value_
     assert {name: place.line for name, place in values.ambiguous.items()} == ambiguous
     assert not problems.findings
     assert _one(problems.warnings) == (
-        "x.ssv:4: Parameter 'a': a second parameter of the same name: 'a'; expected one (first: line 3)"
+        "x.ssv:4: Parameter 'a': a second parameter of this name; expected one of each name (first: line 3)"
+    )
+
+
+def test_all_parameters_that_have_the_name_of_another_one_are_one_warning() -> None:
+    parameter = '<ssv:Parameter name="{}"><ssv:Real value="1"/></ssv:Parameter>\n'
+
+    _, problems = _set("".join(parameter.format(name) for name in ("a", "b", "a", "b", "a")))
+
+    assert _one(problems.warnings) == (
+        "x.ssv:5: Parameter 'a': a second parameter of this name, and other names again in lines 6, 7; expected one of "
+        "each name (first: line 3)"
     )
 
 
@@ -414,7 +444,15 @@ def test_entries_with_an_empty_source_map_nothing_and_one_warning_says_so() -> N
 
     assert [(one.source, one.suppress_unit_conversion) for one in mapping.entries] == [("a", True)]
     assert not problems.findings
-    assert _one(problems.warnings) == "x.ssm:2: MappingEntry ' to x': 2 entries with an empty source, which map nothing"
+    assert _one(problems.warnings) == (
+        "x.ssm:1: ParameterMapping: 2 entries with an empty source, which map nothing (first: line 2)"
+    )
+
+
+def test_one_entry_with_an_empty_source_is_named_by_its_target() -> None:
+    _, problems = _mapping('<ssm:MappingEntry source="" target="x"/>')
+
+    assert _one(problems.warnings) == "x.ssm:2: MappingEntry to 'x': an empty source, which maps nothing"
 
 
 @pytest.mark.parametrize("attribute", ["source", "target"])

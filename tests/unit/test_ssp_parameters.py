@@ -446,7 +446,7 @@ def test_a_parameter_that_has_two_values_and_is_not_applied_is_a_warning(tmp_pat
 
     assert _values(resolved) == {"g.k": 3.0}
     assert not problems.findings
-    assert "a second parameter of the same name: 'a'" in _one(problems.warnings)
+    assert "Parameter 'a' of Component 'g': a second parameter of this name" in _one(problems.warnings)
 
 
 # --- types
