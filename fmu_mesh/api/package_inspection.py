@@ -16,7 +16,7 @@ from ..ssp.configuration_files import named_package
 from ..ssp.package import Package
 from ..ssp.problems import Problems
 from ..ssp.ssd_reading import annotations_of, read_structure
-from ..ssp.structure import Annotation, Binding, Component, Element, Structure, StructureSystem, components_of
+from ..ssp.system_structure import Annotation, Binding, Component, Element, Structure, StructureSystem, components_of
 from ..ssp.system_reading import read_system
 from ..text import printable, short_number
 from .tables import pairs, table

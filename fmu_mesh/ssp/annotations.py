@@ -14,7 +14,7 @@ from lxml import etree
 
 from .grammar import PATTERNS, number_of
 from .problems import Problems
-from .structure import Annotation
+from .system_structure import Annotation
 
 __all__ = ["OPEN_MODELICA", "OPEN_SIMULATION_PLATFORM", "base_step_size", "common_solvers", "step_size_hint"]
 

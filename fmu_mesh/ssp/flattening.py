@@ -20,7 +20,7 @@ from ..variables.model_description import ModelDescription, Variable
 from ..variables.units import Linear, conversion
 from ..variables.value_types import element_name
 from .problems import Problems
-from .structure import (
+from .system_structure import (
     Component,
     Connector,
     Place,

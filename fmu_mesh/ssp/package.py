@@ -21,7 +21,7 @@ from ..instances.fmi.archive.archive import OpenFmu, opened
 from ..instances.fmi.archive.archive_entries import LIMITS_HINT
 from ..text import listed, nearest, nearest_file
 from .problems import Problems
-from .structure import Place
+from .system_structure import Place
 
 __all__ = ["DEFAULT", "Package", "is_package"]
 

@@ -1,6 +1,6 @@
 """From the XML of parameter values and of parameter mappings to Structs (SSP 2.0, 6 and 7).
 
-Owns which texts are values of which type. What the names mean in a system is `parameters`.
+Owns which texts are values of which type. What the names mean in a system is `parameter_bindings`.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from msgspec.structs import replace
 
 from ..text import listed, shown
 from ..variables.value_types import INTEGERS, VariableType
-from .definitions import enumeration_named, enumerations_of, transformation_of, unit_named, units_of
+from .file_definitions import enumeration_named, enumerations_of, transformation_of, unit_named, units_of
 from .grammar import PATTERNS, number_of
 from .problems import Problems
-from .structure import Enumeration, MappingEntry, Parameter, ParameterMapping, ParameterSet, Unit
+from .system_structure import Enumeration, MappingEntry, Parameter, ParameterMapping, ParameterSet, Unit
 from .xml_reading import XmlElement
 
 __all__ = ["VARIABLE_TYPES", "parameter_mapping", "parameter_set", "refuse_ambiguous"]

@@ -1,7 +1,7 @@
 """From one value of a parameter set to the start value of one variable.
 
 Owns the order of the steps, unit conversion first, then the transformation, then the type and the shape of the target,
-and what can be converted without loss. Which value belongs to which variable is `parameters`.
+and what can be converted without loss. Which value belongs to which variable is `parameter_bindings`.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from .flattening import ValueChange
 from .grammar import number_of
 from .parameter_reading import VARIABLE_TYPES
 from .problems import Problems
-from .structure import Connector, MappingEntry, Parameter, Place, Transformation, Unit
+from .system_structure import Connector, MappingEntry, Parameter, Place, Transformation, Unit
 
 __all__ = ["AppliedValue", "ValueTarget", "changed", "converted", "target_of_connector", "target_of_variable"]
 

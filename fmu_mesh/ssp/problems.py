@@ -8,7 +8,7 @@ from msgspec.structs import replace
 
 from ..errors import ConfigurationError, Finding
 from ..text import printable
-from .structure import Place
+from .system_structure import Place
 
 __all__ = ["Problems"]
 

@@ -1,7 +1,7 @@
 """From a system structure description to Structs, with the systems, parameter sets and mappings that it refers to.
 
 A component that is a system itself (`application/x-ssp-definition`, `application/x-ssp-package`, `#id`) is read as the
-system (SSP 2.0, 5.4). What connections and bindings mean is `flattening` and `parameters`.
+system (SSP 2.0, 5.4). What connections and bindings mean is `flattening` and `parameter_bindings`.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ from msgspec.structs import replace
 
 from ..errors import ConfigurationError
 from ..text import shown
-from .definitions import enumeration_named, enumerations_of, transformation_of, unit_named, units_of
+from .file_definitions import enumeration_named, enumerations_of, transformation_of, unit_named, units_of
 from .grammar import TYPES
 from .package import DEFAULT, Package
 from .parameter_reading import parameter_mapping, parameter_set, refuse_ambiguous
 from .problems import Problems
-from .structure import (
+from .system_structure import (
     Annotation,
     Binding,
     Component,

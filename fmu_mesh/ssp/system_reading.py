@@ -26,10 +26,10 @@ from .flattening import FlatConnection, FlatValue, flatten
 from .naming import instance_name, mesh_name
 from .own_annotation import ANNOTATION_TYPE, AnnotationRefused, chosen_names, merged
 from .package import DEFAULT, Package
-from .parameters import AppliedValue, changed, resolve_parameters
+from .parameter_bindings import AppliedValue, changed, resolve_parameters
 from .problems import Problems
 from .ssd_reading import annotations_of, read_structure
-from .structure import Component, Place, Structure, StructureSystem, components_of
+from .system_structure import Component, Place, Structure, StructureSystem, components_of
 
 __all__ = ["NEEDED", "read_system"]
 

@@ -19,7 +19,7 @@ from ..instances.fmi.archive.examining import safe_xml
 from ..text import listed, nearest, printable, shown
 from .grammar import GRAMMAR, NAMESPACES, PATTERNS, Attribute, Rule, number_of
 from .problems import Problems
-from .structure import Annotation, Place
+from .system_structure import Annotation, Place
 
 __all__ = ["XmlElement", "read_xml"]
 

@@ -18,7 +18,7 @@ from ..variables.value_conversion import ValueRefused, to_value
 from .parameter_reading import refuse_ambiguous
 from .parameter_values import AppliedValue, changed, converted, target_of_connector, target_of_variable
 from .problems import Problems
-from .structure import Binding, Component, MappingEntry, Parameter, Place, StructureSystem, components_of
+from .system_structure import Binding, Component, MappingEntry, Parameter, Place, StructureSystem, components_of
 
 __all__ = ["AppliedValue", "ResolvedParameters", "changed", "resolve_parameters"]
 

@@ -7,11 +7,11 @@ import math
 import pytest
 
 from fmu_mesh.errors import Finding
-from fmu_mesh.ssp.definitions import enumeration_named, enumerations_of, unit_named, units_of
+from fmu_mesh.ssp.file_definitions import enumeration_named, enumerations_of, unit_named, units_of
 from fmu_mesh.ssp.grammar import number_of
 from fmu_mesh.ssp.parameter_reading import parameter_mapping, parameter_set
 from fmu_mesh.ssp.problems import Problems
-from fmu_mesh.ssp.structure import Enumeration, ParameterMapping, ParameterSet, Transformation, Unit
+from fmu_mesh.ssp.system_structure import Enumeration, ParameterMapping, ParameterSet, Transformation, Unit
 from fmu_mesh.ssp.xml_reading import XmlElement, read_xml
 from fmu_mesh.variables.units import BaseUnit
 

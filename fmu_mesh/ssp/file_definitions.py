@@ -15,7 +15,7 @@ from ..variables.units import BaseUnit
 from ..variables.value_types import INTEGERS
 from .grammar import PATTERNS
 from .problems import Problems
-from .structure import Enumeration, MapEntry, Place, Transformation, Unit
+from .system_structure import Enumeration, MapEntry, Place, Transformation, Unit
 from .xml_reading import XmlElement
 
 __all__ = ["enumeration_named", "enumerations_of", "transformation_of", "unit_named", "units_of"]

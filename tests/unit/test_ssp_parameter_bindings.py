@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 from fmu_mesh.errors import Finding
 from fmu_mesh.ssp.flattening import ValueChange
 from fmu_mesh.ssp.package import Package
-from fmu_mesh.ssp.parameters import AppliedValue, ResolvedParameters, changed, resolve_parameters
+from fmu_mesh.ssp.parameter_bindings import AppliedValue, ResolvedParameters, changed, resolve_parameters
 from fmu_mesh.ssp.problems import Problems
 from fmu_mesh.ssp.ssd_reading import read_structure
-from fmu_mesh.ssp.structure import (
+from fmu_mesh.ssp.system_structure import (
     Binding,
     Component,
     Parameter,

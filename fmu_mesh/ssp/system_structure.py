@@ -2,7 +2,7 @@
 
 Owns the words of the standard: elements, connectors, connections, bindings, parameter sets and mappings. Names of units
 are resolved, because each file has its own (SSP 2.0, 4.4.2); everything else is resolved by `flattening` and
-`parameters`.
+`parameter_bindings`.
 """
 
 from __future__ import annotations
