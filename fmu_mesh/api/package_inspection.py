@@ -16,8 +16,16 @@ from ..ssp.configuration_files import named_package
 from ..ssp.package import Package
 from ..ssp.problems import Problems
 from ..ssp.ssd_reading import annotations_of, read_structure
-from ..ssp.system_structure import Annotation, Binding, Component, Element, Structure, StructureSystem, components_of
 from ..ssp.system_reading import read_system
+from ..ssp.system_structure import (
+    Annotation,
+    Binding,
+    Element,
+    Structure,
+    StructureComponent,
+    StructureSystem,
+    components_of,
+)
 from ..text import printable, short_number
 from .tables import pairs, table
 
@@ -221,13 +229,13 @@ class _Inspected:
         )
 
     def _element(self, path: tuple[str, ...], element: Element) -> PackageElement:
-        is_component = isinstance(element, Component)
+        is_component = isinstance(element, StructureComponent)
         return PackageElement(
             path=path,
             kind="component" if is_component else "system",
-            source=element.source if isinstance(element, Component) else None,
+            source=element.source if isinstance(element, StructureComponent) else None,
             instance=self._instances.get(path),
-            implementation=element.implementation if isinstance(element, Component) else None,
+            implementation=element.implementation if isinstance(element, StructureComponent) else None,
             connectors=dict(Counter(one.kind or "unspecified" for one in element.connectors)),
             connections=len(element.connections) if isinstance(element, StructureSystem) else 0,
             description=element.description,

@@ -15,7 +15,7 @@ from ..variables.units import BaseUnit
 from ..variables.value_types import INTEGERS
 from .grammar import PATTERNS
 from .problems import Problems
-from .system_structure import Enumeration, MapEntry, Place, Transformation, Unit
+from .system_structure import Enumeration, FilePlace, MapEntry, Transformation, Unit
 from .xml_reading import XmlElement
 
 __all__ = ["enumeration_named", "enumerations_of", "transformation_of", "unit_named", "units_of"]
@@ -45,7 +45,7 @@ def units_of(
     for element in _unique(root, tag, "ssc:Unit", problems):
         name, base = element.text("name"), element.child("ssc:BaseUnit")
         units[name] = Unit(name, _base_unit(base, problems) if base is not None else None)
-    undefined: dict[str, Place] = {}
+    undefined: dict[str, FilePlace] = {}
     for element in root.own_elements():
         used = element.get("unit")
         if used and used not in units:
@@ -55,7 +55,7 @@ def units_of(
     return {**units, **{name: Unit(name) for name in undefined}}
 
 
-def _warn_undefined(undefined: Mapping[str, Place], defined: Collection[str], problems: Problems) -> None:
+def _warn_undefined(undefined: Mapping[str, FilePlace], defined: Collection[str], problems: Problems) -> None:
     """One warning about all units that a file uses and does not define."""
     names, place = [*undefined], next(iter(undefined.values()))
     if len(names) == 1:
@@ -108,7 +108,7 @@ def enumerations_of(root: XmlElement, tag: str, problems: Problems) -> dict[str,
 
 
 def enumeration_named(
-    name: str, enumerations: Mapping[str, Enumeration], place: Place, problems: Problems
+    name: str, enumerations: Mapping[str, Enumeration], place: FilePlace, problems: Problems
 ) -> Enumeration | None:
     """The enumeration that an attribute `name` of a type names; None after a warning if the file does not define it.
 

@@ -21,16 +21,16 @@ from ..variables.units import Linear, conversion
 from ..variables.value_types import element_name
 from .problems import Problems
 from .system_structure import (
-    Component,
     Connector,
-    Place,
+    FilePlace,
+    StructureComponent,
     StructureConnection,
     StructureSystem,
     Transformation,
     Unit,
 )
 
-__all__ = ["Describe", "FlatConnection", "FlatValue", "ValueChange", "flatten"]
+__all__ = ["Describe", "FlatConnection", "FlatValue", "PathChange", "flatten"]
 
 Path = tuple[str, ...]
 Describe = Callable[[Path], ModelDescription | None]
@@ -64,7 +64,7 @@ _TYPES: Final = {"Real": "Float64", "Integer": "Int32"}
 """The types of SSP 1.0 in the words of FMI 3.0."""
 
 
-class ValueChange(msgspec.Struct, frozen=True):
+class PathChange(msgspec.Struct, frozen=True):
     """What happens to a value on its way from one component to another.
 
     Attributes:
@@ -77,7 +77,7 @@ class ValueChange(msgspec.Struct, frozen=True):
     linear: Linear = Linear()
     mapping: dict[str, str] = {}
     ignore_units: bool = False
-    place: Place | None = None
+    place: FilePlace | None = None
 
 
 class FlatConnection(msgspec.Struct, frozen=True):
@@ -90,8 +90,8 @@ class FlatConnection(msgspec.Struct, frozen=True):
 
     source: tuple[Path, str]
     target: tuple[Path, str]
-    change: ValueChange
-    place: Place
+    change: PathChange
+    place: FilePlace
 
 
 class FlatValue(msgspec.Struct, frozen=True):
@@ -104,8 +104,8 @@ class FlatValue(msgspec.Struct, frozen=True):
 
     connector: tuple[Path, str]
     target: tuple[Path, str]
-    change: ValueChange
-    place: Place
+    change: PathChange
+    place: FilePlace
 
 
 class _End(msgspec.Struct, frozen=True):
@@ -217,7 +217,7 @@ class _Flattening:
 
     # --- ends
 
-    def _check_connectors(self, component: Component, path: Path) -> None:
+    def _check_connectors(self, component: StructureComponent, path: Path) -> None:
         """Check that the connectors of a component are what its FMU has."""
         description = self._describe(path)
         if description is None:
@@ -299,7 +299,12 @@ class _Flattening:
         return _End(path, name, owner, connector.kind or "unspecified", unit)
 
     def _of_component(
-        self, component: Component, path: Path, name: str, index: tuple[int, ...], connection: StructureConnection
+        self,
+        component: StructureComponent,
+        path: Path,
+        name: str,
+        index: tuple[int, ...],
+        connection: StructureConnection,
     ) -> _End | None:
         connector = next((one for one in component.connectors if one.name == name), None)
         description = self._describe(path)
@@ -358,13 +363,13 @@ class _Flattening:
             way.insert(0, before)
         return way
 
-    def _change(self, way: Sequence[_Segment]) -> ValueChange | None:
+    def _change(self, way: Sequence[_Segment]) -> PathChange | None:
         """What happens to a value on its way; None after a finding."""
         source, target = way[0].source, way[-1].target
         relative = any(one.variable is not None and one.variable.relative_quantity for one in (source, target))
         unit, total, own = source.unit, Linear(), Linear()
         mapping: Transformation | None = None
-        place: Place | None = None
+        place: FilePlace | None = None
         for segment in way:
             connection, next_unit = segment.connection, segment.target.unit
             if not connection.suppress_unit_conversion:
@@ -392,8 +397,8 @@ class _Flattening:
             return None
         entries = _entries(mapping) if mapping is not None else {}
         if mapping is None and _by_variables(source, target, own, relative=relative) == total:
-            return ValueChange(own, place=place)
-        return ValueChange(total, entries, ignore_units=mapping is None, place=place)
+            return PathChange(own, place=place)
+        return PathChange(total, entries, ignore_units=mapping is None, place=place)
 
     def _converted(self, unit: Unit | None, target: Unit | None, segment: _Segment, *, relative: bool) -> Linear | None:
         """The conversion between two units; None after a finding."""

@@ -21,7 +21,7 @@ from ..instances.fmi.archive.archive import OpenFmu, opened
 from ..instances.fmi.archive.archive_entries import LIMITS_HINT
 from ..text import listed, nearest, nearest_file
 from .problems import Problems
-from .system_structure import Place
+from .system_structure import FilePlace
 
 __all__ = ["DEFAULT", "Package", "is_package"]
 
@@ -116,7 +116,7 @@ class Package:
         except LoadFailed as error:
             raise ConfigurationError(error.message, hint=error.hint) from error
 
-    def named_by(self, uri: str, base: str, place: Place, problems: Problems) -> str | None:
+    def named_by(self, uri: str, base: str, place: FilePlace, problems: Problems) -> str | None:
         """The name of the file that a URI means; None after a finding.
 
         Args:

@@ -18,7 +18,15 @@ from ..variables.value_conversion import ValueRefused, to_value
 from .parameter_reading import refuse_ambiguous
 from .parameter_values import AppliedValue, changed, converted, target_of_connector, target_of_variable
 from .problems import Problems
-from .system_structure import Binding, Component, MappingEntry, Parameter, Place, StructureSystem, components_of
+from .system_structure import (
+    Binding,
+    FilePlace,
+    MappingEntry,
+    ParameterValue,
+    StructureComponent,
+    StructureSystem,
+    components_of,
+)
 
 __all__ = ["AppliedValue", "ResolvedParameters", "changed", "resolve_parameters"]
 
@@ -63,7 +71,7 @@ def resolve_parameters(
 class _Candidate(msgspec.Struct, frozen=True):
     """A value that a name leads to."""
 
-    parameter: Parameter
+    parameter: ParameterValue
     entry: MappingEntry | None
 
 
@@ -74,7 +82,7 @@ class _Resolution:
         self._of_components: dict[Path, dict[str, _Candidate]] = {}
         self._of_systems: dict[tuple[Path, str], _Candidate] = {}
         self._originals: dict[Path, dict[str, str]] = {}
-        self._inside: dict[Path, tuple[set[str], dict[str, Component | StructureSystem]]] = {}
+        self._inside: dict[Path, tuple[set[str], dict[str, StructureComponent | StructureSystem]]] = {}
 
     def collect(self, system: StructureSystem, path: Path) -> None:
         """Note the values of all bindings, those of the highest level last, so that they replace the others."""
@@ -106,13 +114,13 @@ class _Resolution:
 
     # --- names
 
-    def _apply_all(self, owner: Component | StructureSystem, path: Path) -> None:
+    def _apply_all(self, owner: StructureComponent | StructureSystem, path: Path) -> None:
         for binding in owner.bindings:
             self._apply(binding, owner, path)
 
-    def _apply(self, binding: Binding, owner: Component | StructureSystem, path: Path) -> None:
+    def _apply(self, binding: Binding, owner: StructureComponent | StructureSystem, path: Path) -> None:
         """Note the values of one binding at all variables and connectors that their names mean."""
-        unmatched: list[tuple[str, Place]] = []
+        unmatched: list[tuple[str, FilePlace]] = []
         for name, candidate in self._named(binding):
             if not self._note(owner, path, name, candidate):
                 place = candidate.entry.place if candidate.entry is not None else candidate.parameter.place
@@ -146,9 +154,9 @@ class _Resolution:
             found = f"the source {shown(entry.source)}, which the parameter set '{binding.values.name}' does not have"
             self._problems.warn(entry.place, found, f"a name such as '{near}'" if near is not None else "")
 
-    def _note(self, owner: Component | StructureSystem, path: Path, name: str, candidate: _Candidate) -> bool:
+    def _note(self, owner: StructureComponent | StructureSystem, path: Path, name: str, candidate: _Candidate) -> bool:
         """Give a value to everything that has a name inside an element; return whether there is such a thing."""
-        if isinstance(owner, Component):
+        if isinstance(owner, StructureComponent):
             return self._note_variable(path, name, candidate)
         if not owner.is_known:
             return True  # for which there is a finding
@@ -191,9 +199,9 @@ class _Resolution:
             self._originals[path] = names
         return self._originals[path][variable.name]
 
-    def _names(self, owner: Component | StructureSystem, path: Path) -> Iterator[str]:
+    def _names(self, owner: StructureComponent | StructureSystem, path: Path) -> Iterator[str]:
         """The names of what can have a value inside an element."""
-        if isinstance(owner, Component):
+        if isinstance(owner, StructureComponent):
             description = self._describe(path)
             for variable in description.variables if description is not None else ():
                 if variable.settable_before_start:
@@ -206,7 +214,11 @@ class _Resolution:
     # --- values
 
     def _of_component(
-        self, component: Component, path: Path, description: ModelDescription, candidates: dict[str, _Candidate]
+        self,
+        component: StructureComponent,
+        path: Path,
+        description: ModelDescription,
+        candidates: dict[str, _Candidate],
     ) -> dict[str, AppliedValue]:
         """The values of one component: scalars first, because they may be the sizes of its arrays."""
         values: dict[str, AppliedValue] = {}

@@ -19,7 +19,7 @@ from ..variables.value_types import INTEGERS, VariableType
 from .file_definitions import enumeration_named, enumerations_of, transformation_of, unit_named, units_of
 from .grammar import PATTERNS, number_of
 from .problems import Problems
-from .system_structure import Enumeration, MappingEntry, Parameter, ParameterMapping, ParameterSet, Unit
+from .system_structure import Enumeration, MappingEntry, ParameterMapping, ParameterSet, ParameterValue, Unit
 from .xml_reading import XmlElement
 
 __all__ = ["VARIABLE_TYPES", "parameter_mapping", "parameter_set", "refuse_ambiguous"]
@@ -73,8 +73,8 @@ def parameter_set(
     """
     own_units = units_of(element, "ssv:Units", problems, units)
     own_enumerations = {**enumerations, **enumerations_of(element, "ssv:Enumerations", problems)}
-    parameters: dict[str, Parameter] = {}
-    repeated: list[Parameter] = []
+    parameters: dict[str, ParameterValue] = {}
+    repeated: list[ParameterValue] = []
     for one in element.inside("ssv:Parameters"):
         if one.tag != "ssv:Parameter" or not one.text("name"):
             continue  # there is a finding
@@ -142,7 +142,7 @@ def refuse_ambiguous(values: ParameterSet, names: Iterable[str], problems: Probl
 
 def _parameter(
     element: XmlElement, units: dict[str, Unit], enumerations: Mapping[str, Enumeration], problems: Problems
-) -> Parameter | None:
+) -> ParameterValue | None:
     """One parameter; None if it has no type."""
     types = [*element.children(*_TYPES)]
     if not types:
@@ -162,7 +162,7 @@ def _parameter(
         found = f"{len(values)} value{'s' if len(values) > 1 else ''} for the dimensions {sizes}"
         problems.add(type_.place, found, f"{math.prod(dimensions)} values, row by row")
         fits = False
-    return Parameter(
+    return ParameterValue(
         element.text("name"),
         kind,
         values if fits else (),
@@ -175,7 +175,7 @@ def _parameter(
     )
 
 
-def _is_same(one: Parameter, other: Parameter) -> bool:
+def _is_same(one: ParameterValue, other: ParameterValue) -> bool:
     """Whether two parameters of one name are the same but for their places."""
     return replace(one, place=other.place) == other
 

@@ -19,11 +19,11 @@ from ..variables.model_description import Variable
 from ..variables.units import Linear, conversion
 from ..variables.value_conversion import to_plain
 from ..variables.value_types import INTEGERS, PlainValue, VariableType, flattened, is_float, nested
-from .flattening import ValueChange
+from .flattening import PathChange
 from .grammar import number_of
 from .parameter_reading import VARIABLE_TYPES
 from .problems import Problems
-from .system_structure import Connector, MappingEntry, Parameter, Place, Transformation, Unit
+from .system_structure import Connector, FilePlace, MappingEntry, ParameterValue, Transformation, Unit
 
 __all__ = ["AppliedValue", "ValueTarget", "changed", "converted", "target_of_connector", "target_of_variable"]
 
@@ -44,7 +44,7 @@ class AppliedValue(msgspec.Struct, frozen=True):
 
     value: PlainValue
     type: VariableType
-    origin: Place
+    origin: FilePlace
     how: str = ""
     unit: Unit | None = None
     shape: tuple[int, ...] = ()
@@ -110,7 +110,7 @@ def target_of_connector(connector: Connector, path: tuple[str, ...]) -> ValueTar
 
 
 def converted(
-    parameter: Parameter, entry: MappingEntry | None, target: ValueTarget, problems: Problems
+    parameter: ParameterValue, entry: MappingEntry | None, target: ValueTarget, problems: Problems
 ) -> AppliedValue | None:
     """The value of a parameter as one for a target; None after a finding.
 
@@ -151,7 +151,7 @@ def converted(
 
 
 def changed(
-    value: AppliedValue, change: ValueChange, variable: Variable | None, path: tuple[str, ...], problems: Problems
+    value: AppliedValue, change: PathChange, variable: Variable | None, path: tuple[str, ...], problems: Problems
 ) -> AppliedValue | None:
     """A value of a connector as that of a variable that it leads to; None after a finding.
 
@@ -182,7 +182,7 @@ def changed(
 
 
 def _shape(
-    parameter: Parameter, sizes: tuple[int, ...], target: ValueTarget, problems: Problems
+    parameter: ParameterValue, sizes: tuple[int, ...], target: ValueTarget, problems: Problems
 ) -> tuple[int, ...] | None:
     """The shape that the value gets; None after a finding. An array of unknown dimensions takes those of the target."""
     if target.shape is None or target.shape == sizes:
@@ -199,7 +199,7 @@ def _number_of_values(shape: tuple[int, ...]) -> str:
     return f"{' x '.join(map(str, shape))} values, with a Dimension for each size" if shape else "one value"
 
 
-def _unit_conversion(unit: Unit, parameter: Parameter, target: ValueTarget, problems: Problems) -> Linear | None:
+def _unit_conversion(unit: Unit, parameter: ParameterValue, target: ValueTarget, problems: Problems) -> Linear | None:
     """The conversion from the unit of a parameter to that of the target; None after a finding."""
     want = target.unit
     if want is None or not unit.name or not want.name or unit == want:
@@ -257,7 +257,7 @@ def _transformed(
 
 
 def _connected(
-    value: AppliedValue, elements: list[Any], change: ValueChange
+    value: AppliedValue, elements: list[Any], change: PathChange
 ) -> tuple[AppliedValue, list[Any], list[str]]:
     """A value after the connections on its way, and what was done in words.
 
@@ -368,7 +368,7 @@ def _mapped(element: Any, items: Mapping[str, int], mapping: Mapping[str, str]) 
             return int(mapping.get(str(int(element)), element))
 
 
-def _where(place: Place, origin: Place) -> str:
+def _where(place: FilePlace, origin: FilePlace) -> str:
     """A place as somebody finds it who has found the origin of the value."""
     return f"line {place.line}" if place.file == origin.file else f"{PurePosixPath(place.file).name}:{place.line}"
 

@@ -8,7 +8,7 @@ from msgspec.structs import replace
 
 from ..errors import ConfigurationError, Finding
 from ..text import printable
-from .system_structure import Place
+from .system_structure import FilePlace
 
 __all__ = ["Problems"]
 
@@ -26,15 +26,15 @@ class Problems:
         self.warnings: list[Finding] = []
         self._alike: dict[Hashable, tuple[int, list[Finding]]] = {}  # by kind: where the first one is, and all
 
-    def add(self, place: Place, found: str, expected: str, suggestion: str | None = None) -> None:
+    def add(self, place: FilePlace, found: str, expected: str, suggestion: str | None = None) -> None:
         """Add a finding: there is ``found`` instead of ``expected``."""
         self._add(self.findings, place, found, expected, suggestion)
 
-    def warn(self, place: Place, found: str, expected: str = "") -> None:
+    def warn(self, place: FilePlace, found: str, expected: str = "") -> None:
         """Add a warning."""
         self._add(self.warnings, place, found, expected, None)
 
-    def warn_once(self, like: Hashable, place: Place, found: str, what: str) -> None:
+    def warn_once(self, like: Hashable, place: FilePlace, found: str, what: str) -> None:
         """Add a warning, or let the first one of its kind say how many others there are.
 
         Args:
@@ -67,7 +67,7 @@ class Problems:
             raise ConfigurationError(text, findings=tuple(ordered))
 
     @staticmethod
-    def _add(found_so_far: list[Finding], place: Place, found: str, expected: str, suggestion: str | None) -> None:
+    def _add(found_so_far: list[Finding], place: FilePlace, found: str, expected: str, suggestion: str | None) -> None:
         near = printable(suggestion) if suggestion is not None else None
         finding = Finding(place.file, place.element, printable(found), printable(expected), near, place.line or None)
         if finding not in found_so_far:  # an element may be read more than once

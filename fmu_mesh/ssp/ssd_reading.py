@@ -22,13 +22,13 @@ from .problems import Problems
 from .system_structure import (
     Annotation,
     Binding,
-    Component,
     Connector,
     ConnectorKind,
     Enumeration,
+    FilePlace,
     ParameterMapping,
-    Place,
     Structure,
+    StructureComponent,
     StructureConnection,
     StructureSystem,
     Unit,
@@ -37,7 +37,7 @@ from .xml_reading import XmlElement, read_xml
 
 __all__ = ["read_structure"]
 
-Named = TypeVar("Named", Component | StructureSystem, Connector)
+Named = TypeVar("Named", StructureComponent | StructureSystem, Connector)
 
 _FMU: Final = "application/x-fmu-sharedlibrary"
 _DEFINITION: Final = "application/x-ssp-definition"
@@ -129,12 +129,12 @@ class _Reader:
             data = self._package.read(name)
         except ConfigurationError as error:
             hint = f" {error.hint}" if error.hint else ""
-            self._problems.add(Place(self._package.shown(name), 0, ""), f"{error.message}{hint}", "")
+            self._problems.add(FilePlace(self._package.shown(name), 0, ""), f"{error.message}{hint}", "")
             return None
         return read_xml(data, self._package.shown(name), tag, self._problems)
 
     def _system(self, element: XmlElement, file: _File, depth: int) -> StructureSystem:
-        elements: list[Component | StructureSystem] = []
+        elements: list[StructureComponent | StructureSystem] = []
         for child in element.inside("ssd:Elements"):
             match child.tag:
                 case "ssd:Component":
@@ -163,7 +163,7 @@ class _Reader:
 
     # --- components
 
-    def _component(self, element: XmlElement, file: _File, depth: int) -> Component | StructureSystem:
+    def _component(self, element: XmlElement, file: _File, depth: int) -> StructureComponent | StructureSystem:
         """A component, or the system that it is; after a finding with its connectors only."""
         type_ = (element.get("type") or _FMU).strip()
         source = element.get("source")
@@ -186,7 +186,7 @@ class _Reader:
             expected = "CoSimulation or ModelExchange"
             self._problems.add(element.place, f"the implementation '{implementation}'", expected)
         self._not_verified(element)
-        return Component(
+        return StructureComponent(
             name=element.text("name"),
             source=name,
             place=element.place,
@@ -368,7 +368,7 @@ class _Reader:
             first.setdefault(one.name, one)
         return list(first.values())
 
-    def _too_deep(self, place: Place) -> None:
+    def _too_deep(self, place: FilePlace) -> None:
         found = f"more than {_MAXIMUM_DEPTH} systems inside one another"
         self._problems.add(place, found, "fewer")
 

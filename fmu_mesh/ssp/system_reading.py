@@ -29,7 +29,7 @@ from .package import DEFAULT, Package
 from .parameter_bindings import AppliedValue, changed, resolve_parameters
 from .problems import Problems
 from .ssd_reading import annotations_of, read_structure
-from .system_structure import Component, Place, Structure, StructureSystem, components_of
+from .system_structure import FilePlace, Structure, StructureComponent, StructureSystem, components_of
 
 __all__ = ["NEEDED", "read_system"]
 
@@ -271,7 +271,7 @@ class _Configuration:
             instances[name] = section
         return instances
 
-    def _step_size(self, component: Component, simulation: Mapping[str, Plain]) -> float | None:
+    def _step_size(self, component: StructureComponent, simulation: Mapping[str, Plain]) -> float | None:
         """The step size that libcosim is told for a component: the nearest multiple of the base step size."""
         hint, base = step_size_hint(component.annotations, self._problems), simulation.get("step_size")
         if hint is None or not isinstance(base, float):
@@ -306,7 +306,7 @@ class _Configuration:
                 self._place(f"connections[{number}].{key}", connection.change.place)
         return written
 
-    def _place(self, path: str, place: Place) -> None:
+    def _place(self, path: str, place: FilePlace) -> None:
         """Note where a part of the configuration is written; in another file than the description, with that file."""
         if place.file == str(self._file):
             self._lines[path] = place.line
@@ -327,7 +327,7 @@ class _Configuration:
             )
             self._problems.warn_once(("solver", solver), annotation.place, found, "system")
         for element in system.elements:
-            annotations += element.annotations if isinstance(element, Component) else ()
+            annotations += element.annotations if isinstance(element, StructureComponent) else ()
             if isinstance(element, StructureSystem):
                 self._note_annotations(element, step_size)
         for annotation in annotations:

@@ -17,18 +17,18 @@ from ..variables.units import BaseUnit
 __all__ = [
     "Annotation",
     "Binding",
-    "Component",
     "Connector",
     "ConnectorKind",
     "Element",
     "Enumeration",
+    "FilePlace",
     "MapEntry",
     "MappingEntry",
-    "Parameter",
     "ParameterMapping",
     "ParameterSet",
-    "Place",
+    "ParameterValue",
     "Structure",
+    "StructureComponent",
     "StructureConnection",
     "StructureSystem",
     "Transformation",
@@ -49,7 +49,7 @@ ConnectorKind = Literal[
 ]
 
 
-class Place(msgspec.Struct, frozen=True):
+class FilePlace(msgspec.Struct, frozen=True):
     """Where something is written.
 
     Attributes:
@@ -95,7 +95,7 @@ class Connector(msgspec.Struct, frozen=True):
 
     name: str
     kind: ConnectorKind | None
-    place: Place
+    place: FilePlace
     type: str | None = None
     unit: Unit | None = None
     enumeration: Enumeration | None = None
@@ -107,7 +107,7 @@ class MapEntry(msgspec.Struct, frozen=True):
 
     source: str
     target: str
-    place: Place
+    place: FilePlace
 
 
 class Transformation(msgspec.Struct, frozen=True):
@@ -118,7 +118,7 @@ class Transformation(msgspec.Struct, frozen=True):
     """
 
     kind: Literal["linear", "boolean", "integer", "enumeration"]
-    place: Place
+    place: FilePlace
     factor: float = 1.0
     offset: float = 0.0
     entries: tuple[MapEntry, ...] = ()
@@ -135,7 +135,7 @@ class StructureConnection(msgspec.Struct, frozen=True):
 
     start_connector: str
     end_connector: str
-    place: Place
+    place: FilePlace
     start_element: str | None = None
     end_element: str | None = None
     start_index: tuple[int, ...] = ()
@@ -145,7 +145,7 @@ class StructureConnection(msgspec.Struct, frozen=True):
     number: int = 0
 
 
-class Parameter(msgspec.Struct, frozen=True):
+class ParameterValue(msgspec.Struct, frozen=True):
     """One parameter of a parameter set (SSP 2.0, 6.2).
 
     Attributes:
@@ -158,7 +158,7 @@ class Parameter(msgspec.Struct, frozen=True):
     name: str
     type: str
     values: tuple[str, ...]
-    place: Place
+    place: FilePlace
     unit: Unit | None = None
     enumeration: Enumeration | None = None
     dimensions: tuple[int, ...] = ()
@@ -173,9 +173,9 @@ class ParameterSet(msgspec.Struct, frozen=True):
     """
 
     name: str
-    parameters: tuple[Parameter, ...]
-    place: Place
-    ambiguous: dict[str, Place] = {}
+    parameters: tuple[ParameterValue, ...]
+    place: FilePlace
+    ambiguous: dict[str, FilePlace] = {}
 
 
 class MappingEntry(msgspec.Struct, frozen=True):
@@ -183,7 +183,7 @@ class MappingEntry(msgspec.Struct, frozen=True):
 
     source: str
     target: str
-    place: Place
+    place: FilePlace
     suppress_unit_conversion: bool = False
     transformation: Transformation | None = None
 
@@ -192,7 +192,7 @@ class ParameterMapping(msgspec.Struct, frozen=True):
     """The entries of an SSM file, or of an inline one (SSP 2.0, 7.1)."""
 
     entries: tuple[MappingEntry, ...]
-    place: Place
+    place: FilePlace
 
 
 class Binding(msgspec.Struct, frozen=True):
@@ -204,7 +204,7 @@ class Binding(msgspec.Struct, frozen=True):
     """
 
     values: ParameterSet
-    place: Place
+    place: FilePlace
     prefix: str = ""
     mapping: ParameterMapping | None = None
 
@@ -220,11 +220,11 @@ class Annotation(msgspec.Struct, frozen=True):
 
     type: str
     xml: bytes
-    place: Place
+    place: FilePlace
     text: str = ""
 
 
-class Component(msgspec.Struct, frozen=True):
+class StructureComponent(msgspec.Struct, frozen=True):
     """An FMU of a system (SSP 2.0, 5.4). Components that are systems themselves are read as systems.
 
     Attributes:
@@ -234,7 +234,7 @@ class Component(msgspec.Struct, frozen=True):
 
     name: str
     source: str
-    place: Place
+    place: FilePlace
     implementation: Literal["any", "CoSimulation", "ModelExchange"] = "any"
     connectors: tuple[Connector, ...] = ()
     bindings: tuple[Binding, ...] = ()
@@ -250,9 +250,9 @@ class StructureSystem(msgspec.Struct, frozen=True):
     """
 
     name: str
-    place: Place
+    place: FilePlace
     connectors: tuple[Connector, ...] = ()
-    elements: tuple[Component | StructureSystem, ...] = ()
+    elements: tuple[StructureComponent | StructureSystem, ...] = ()
     connections: tuple[StructureConnection, ...] = ()
     bindings: tuple[Binding, ...] = ()
     annotations: tuple[Annotation, ...] = ()
@@ -260,7 +260,7 @@ class StructureSystem(msgspec.Struct, frozen=True):
     is_known: bool = True
 
 
-Element = Component | StructureSystem
+Element = StructureComponent | StructureSystem
 
 
 class Structure(msgspec.Struct, frozen=True):
@@ -274,17 +274,19 @@ class Structure(msgspec.Struct, frozen=True):
     name: str
     version: str
     system: StructureSystem
-    place: Place
+    place: FilePlace
     start_time: float | None = None
     stop_time: float | None = None
     annotations: tuple[Annotation, ...] = ()
 
 
-def components_of(system: StructureSystem, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Component]]:
+def components_of(
+    system: StructureSystem, path: tuple[str, ...] = ()
+) -> Iterator[tuple[tuple[str, ...], StructureComponent]]:
     """All components with the names of the elements on the way to them, in the order of the documents."""
     for element in system.elements:
         own = (*path, element.name)
-        if isinstance(element, Component):
+        if isinstance(element, StructureComponent):
             yield own, element
         else:
             yield from components_of(element, own)

@@ -19,7 +19,7 @@ from ..instances.fmi.archive.examining import safe_xml
 from ..text import listed, nearest, printable, shown
 from .grammar import GRAMMAR, NAMESPACES, PATTERNS, Attribute, Rule, number_of
 from .problems import Problems
-from .system_structure import Annotation, Place
+from .system_structure import Annotation, FilePlace
 
 __all__ = ["XmlElement", "read_xml"]
 
@@ -44,10 +44,10 @@ class _Document(NamedTuple):
     file: str
     lines: Mapping[Any, int]
 
-    def place(self, element: Any) -> Place:  # noqa: ANN401  lxml ships no types
+    def place(self, element: Any) -> FilePlace:  # noqa: ANN401  lxml ships no types
         """Where an element is."""
         line = self.lines.get(element) or element.sourceline or 0
-        return Place(self.file, line, printable(_in_words(element)))
+        return FilePlace(self.file, line, printable(_in_words(element)))
 
 
 class XmlElement:
@@ -66,7 +66,7 @@ class XmlElement:
         self.version = version
 
     @property
-    def place(self) -> Place:
+    def place(self) -> FilePlace:
         """Its file and line, and its name in words: `Connector 'u' of Component 'gain'`."""
         return self._document.place(self._element)
 
@@ -264,15 +264,15 @@ def _add_syntax(data: bytes, file: str, error: LoadFailed, problems: Problems) -
         line = cause.lineno or 1
         if (unbound := _UNBOUND.search(cause.msg or "")) is not None:
             found = f"the prefix '{unbound[1]}' of {unbound[1]}:{unbound[2]}, which is bound to no namespace"
-            problems.add(Place(file, line, ""), found, f'xmlns:{unbound[1]}="..." on it or on an element around it')
+            problems.add(FilePlace(file, line, ""), found, f'xmlns:{unbound[1]}="..." on it or on an element around it')
         else:
-            problems.add(Place(file, line, ""), f"no well-formed XML: {cause.msg}", "XML 1.0")
+            problems.add(FilePlace(file, line, ""), f"no well-formed XML: {cause.msg}", "XML 1.0")
         return
     text = data.replace(b"\0", b"")  # in UTF-16 every second byte of it
     match = _DOCUMENT_TYPE.search(text)
     line = text.count(b"\n", 0, match.start()) + 1 if match is not None else 1
     found = "a document type, with which XML can expand without limit and read other files"
-    problems.add(Place(file, line, ""), found, "none: no file of SSP has one")
+    problems.add(FilePlace(file, line, ""), found, "none: no file of SSP has one")
 
 
 def _check_value(element: XmlElement, name: str, text: str, attribute: Attribute, problems: Problems) -> None:

@@ -10,17 +10,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fmu_mesh.errors import Finding
-from fmu_mesh.ssp.flattening import ValueChange
+from fmu_mesh.ssp.flattening import PathChange
 from fmu_mesh.ssp.package import Package
 from fmu_mesh.ssp.parameter_bindings import AppliedValue, ResolvedParameters, changed, resolve_parameters
 from fmu_mesh.ssp.problems import Problems
 from fmu_mesh.ssp.ssd_reading import read_structure
 from fmu_mesh.ssp.system_structure import (
     Binding,
-    Component,
-    Parameter,
+    FilePlace,
     ParameterSet,
-    Place,
+    ParameterValue,
+    StructureComponent,
     StructureSystem,
     Unit,
     components_of,
@@ -289,7 +289,7 @@ def test_any_bindings_give_what_a_search_over_all_of_them_gives(
     bindings: list[tuple[tuple[str, ...], list[str]]],
 ) -> None:
     """The system has the components `b`, `a.b` and, inside the system `a`, `b` again."""
-    place = Place("x.ssv", 1, "")
+    place = FilePlace("x.ssv", 1, "")
     numbered = [
         (owner, {name: float(100 * number + index) for index, name in enumerate(names)})
         for number, (owner, names) in enumerate(bindings)
@@ -298,7 +298,7 @@ def test_any_bindings_give_what_a_search_over_all_of_them_gives(
     def own(path: tuple[str, ...]) -> tuple[Binding, ...]:
         return tuple(
             Binding(
-                ParameterSet("s", tuple(Parameter(n, "Real", (str(v),), place) for n, v in values.items()), place),
+                ParameterSet("s", tuple(ParameterValue(n, "Real", (str(v),), place) for n, v in values.items()), place),
                 place,
             )
             for owner, values in numbered
@@ -306,9 +306,9 @@ def test_any_bindings_give_what_a_search_over_all_of_them_gives(
         )
 
     inner = StructureSystem(
-        "a", place, elements=(Component("b", "", place, bindings=own(("a", "b"))),), bindings=own(("a",))
+        "a", place, elements=(StructureComponent("b", "", place, bindings=own(("a", "b"))),), bindings=own(("a",))
     )
-    others = tuple(Component(name, "", place, bindings=own((name,))) for name in ("a.b", "b"))
+    others = tuple(StructureComponent(name, "", place, bindings=own((name,))) for name in ("a.b", "b"))
     root = StructureSystem("root", place, elements=(inner, *others), bindings=own(()))
 
     expected: dict[tuple[tuple[str, ...], str], float] = {}
@@ -352,9 +352,11 @@ def test_a_name_may_be_a_connector_of_a_system_and_a_variable_at_once(tmp_path: 
 
 
 def test_the_value_of_an_fmu_that_cannot_be_read_is_not_judged() -> None:
-    place = Place("x.ssd", 1, "")
-    values = ParameterSet("s", (Parameter("k", "Real", ("1",), place),), place)
-    system = StructureSystem("r", place, elements=(Component("g", "g.fmu", place, bindings=(Binding(values, place),)),))
+    place = FilePlace("x.ssd", 1, "")
+    values = ParameterSet("s", (ParameterValue("k", "Real", ("1",), place),), place)
+    system = StructureSystem(
+        "r", place, elements=(StructureComponent("g", "g.fmu", place, bindings=(Binding(values, place),)),)
+    )
     problems = Problems()
 
     assert resolve_parameters(system, lambda _path: None, problems) == ResolvedParameters({}, {})
@@ -749,27 +751,27 @@ def test_a_transformation_that_does_not_fit_the_value_or_the_variable_is_a_findi
 
 
 def _applied(value: PlainValue, type_: VariableType, shape: tuple[int, ...] = (), **more: object) -> AppliedValue:
-    return AppliedValue(value, type_, Place("x.ssv", 9, "Parameter 'a'"), shape=shape, **more)  # type: ignore[arg-type]  # by keyword
+    return AppliedValue(value, type_, FilePlace("x.ssv", 9, "Parameter 'a'"), shape=shape, **more)  # type: ignore[arg-type]  # by keyword
 
 
 @pytest.mark.parametrize(
     ("value", "change", "target", "expected"),
     [
-        (_applied(3.0, "Float64"), ValueChange(), "k", 3.0),
-        (_applied(3.0, "Float64"), ValueChange(Linear(2.0, 1.0)), "k", 7.0),
-        (_applied("INF", "Float64"), ValueChange(Linear(-2.0, 1.0)), "k", "-INF"),
-        (_applied(3, "Int32"), ValueChange(Linear(0.5, 0.0)), "k", 1.5),
-        (_applied([1.0, 2.0, 3.0], "Float64", (3,)), ValueChange(Linear(2.0, 0.0)), "v", [2.0, 4.0, 6.0]),
-        (_applied(bool(1), "Boolean"), ValueChange(mapping={"true": "false"}), "b", False),
-        (_applied(3, "Int32"), ValueChange(mapping={"3": "1"}), "gear", 1),
-        (_applied("one", "Enumeration", items={"one": 3}), ValueChange(mapping={"3": "1"}), "gear", 1),
-        (_applied("one", "Enumeration"), ValueChange(mapping={"one": "first"}), "gear", "first"),
-        (_applied("AP8=", "Binary"), ValueChange(), "data", "AP8="),
-        (_applied(4.0, "Float64"), ValueChange(), "n", 4),
+        (_applied(3.0, "Float64"), PathChange(), "k", 3.0),
+        (_applied(3.0, "Float64"), PathChange(Linear(2.0, 1.0)), "k", 7.0),
+        (_applied("INF", "Float64"), PathChange(Linear(-2.0, 1.0)), "k", "-INF"),
+        (_applied(3, "Int32"), PathChange(Linear(0.5, 0.0)), "k", 1.5),
+        (_applied([1.0, 2.0, 3.0], "Float64", (3,)), PathChange(Linear(2.0, 0.0)), "v", [2.0, 4.0, 6.0]),
+        (_applied(bool(1), "Boolean"), PathChange(mapping={"true": "false"}), "b", False),
+        (_applied(3, "Int32"), PathChange(mapping={"3": "1"}), "gear", 1),
+        (_applied("one", "Enumeration", items={"one": 3}), PathChange(mapping={"3": "1"}), "gear", 1),
+        (_applied("one", "Enumeration"), PathChange(mapping={"one": "first"}), "gear", "first"),
+        (_applied("AP8=", "Binary"), PathChange(), "data", "AP8="),
+        (_applied(4.0, "Float64"), PathChange(), "n", 4),
     ],
 )
 def test_the_value_of_a_connector_becomes_that_of_a_variable(
-    value: AppliedValue, change: ValueChange, target: str, expected: PlainValue
+    value: AppliedValue, change: PathChange, target: str, expected: PlainValue
 ) -> None:
     problems = Problems()
 
@@ -784,13 +786,13 @@ def test_the_value_of_a_connector_becomes_that_of_a_variable(
 @pytest.mark.parametrize(
     ("value", "change", "target", "message"),
     [
-        (_applied("x", "String"), ValueChange(Linear(2.0)), "s", "the String value 'x' for the String 's' of 'g'"),
-        (_applied(1.5, "Float64"), ValueChange(), "n", "the Float64 value 1.5 for the Int32 'n' of 'g'"),
-        (_applied(1.5, "Float64"), ValueChange(), "v", "the Float64 value 1.5 for the Float64[3] 'v' of 'g'"),
+        (_applied("x", "String"), PathChange(Linear(2.0)), "s", "the String value 'x' for the String 's' of 'g'"),
+        (_applied(1.5, "Float64"), PathChange(), "n", "the Float64 value 1.5 for the Int32 'n' of 'g'"),
+        (_applied(1.5, "Float64"), PathChange(), "v", "the Float64 value 1.5 for the Float64[3] 'v' of 'g'"),
     ],
 )
 def test_the_value_of_a_connector_that_a_variable_cannot_have_is_a_finding_at_the_value(
-    value: AppliedValue, change: ValueChange, target: str, message: str
+    value: AppliedValue, change: PathChange, target: str, message: str
 ) -> None:
     problems = Problems()
 
