@@ -1,67 +1,31 @@
 """From nested systems to connections between components.
 
-Owns the direction of a connection, which follows from the owners and kinds of its ends and never from the words start
-and end (SSP 2.0, 5.3.2.1), the way of a value through the connectors of systems, and what happens to it on that way:
-unit conversion first, then the transformation, at every connection.
+Owns the way of a value through the connectors of systems, and what happens to it on that way: unit conversion first,
+then the transformation, at every connection.
 
 A connection between components stands where the last of the connections that it consists of stands in the documents.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from types import MappingProxyType
-from typing import Final, Literal
 
 import msgspec
 
-from ..text import listed, nearest
-from ..variables.model_description import ModelDescription, Variable
 from ..variables.units import Linear, conversion
-from ..variables.value_types import element_name
+from .connection_ends import ConnectionEnd, ConnectionEnds, Describe, Segment
 from .problems import Problems
 from .system_structure import (
-    Connector,
     FilePlace,
-    StructureComponent,
-    StructureConnection,
     StructureSystem,
     Transformation,
     Unit,
 )
 
-__all__ = ["Describe", "FlatConnection", "FlatValue", "PathChange", "flatten"]
+__all__ = ["FlatConnection", "FlatValue", "PathChange", "flatten"]
 
 Path = tuple[str, ...]
-Describe = Callable[[Path], ModelDescription | None]
-"""The model description of the component at a path; None if it cannot be read."""
-
-_Owner = Literal["system", "element"]
-
-_INTO_AN_ELEMENT: Final[dict[tuple[_Owner, str], tuple[str, ...]]] = {
-    ("system", "structuralParameter"): ("structuralParameter", "parameter", "input", "inout"),
-    ("system", "parameter"): ("parameter", "input", "inout"),
-    ("system", "input"): ("input", "inout"),
-    ("element", "constant"): ("structuralParameter", "parameter", "input", "inout"),
-    ("element", "calculatedParameter"): ("parameter", "input", "inout"),
-    ("element", "output"): ("input", "inout"),
-    ("element", "local"): ("input", "inout"),
-    ("element", "inout"): ("input",),
-}
-_OUT_OF_THE_SYSTEM: Final[dict[tuple[_Owner, str], tuple[str, ...]]] = {
-    ("system", "structuralParameter"): ("calculatedParameter", "output", "local"),
-    ("system", "parameter"): ("calculatedParameter", "output", "local"),
-    ("system", "input"): ("output", "local"),
-    ("element", "constant"): ("constant", "calculatedParameter", "output", "local"),
-    ("element", "calculatedParameter"): ("calculatedParameter", "output", "local"),
-    ("element", "output"): ("output", "local"),
-    ("element", "local"): ("output", "local"),
-    ("element", "inout"): ("output", "local"),
-}
-"""By owner and kind of the source: the kinds that a destination may have (SSP 2.0, 5.3.2.1)."""
-
-_TYPES: Final = {"Real": "Float64", "Integer": "Int32"}
-"""The types of SSP 1.0 in the words of FMI 3.0."""
 
 
 class PathChange(msgspec.Struct, frozen=True):
@@ -108,40 +72,6 @@ class FlatValue(msgspec.Struct, frozen=True):
     place: FilePlace
 
 
-class _End(msgspec.Struct, frozen=True):
-    """One end of a connection.
-
-    Attributes:
-        owner: whose connector it is, as seen from the system with the connection.
-        variable: that of an FMU; None for a connector of a system.
-    """
-
-    path: Path
-    name: str
-    owner: _Owner
-    kind: str
-    unit: Unit | None
-    variable: Variable | None = None
-    index: tuple[int, ...] = ()
-    is_component: bool = False
-
-    @property
-    def node(self) -> tuple[Path, str]:
-        """What it is connected by: the variable, or an element of it."""
-        return self.path, element_name(self.name, tuple(one - 1 for one in self.index)) if self.index else self.name
-
-    def __str__(self) -> str:
-        return ".".join((*self.path, self.node[1]))
-
-
-class _Segment(msgspec.Struct, frozen=True):
-    """A connection with its direction."""
-
-    source: _End
-    target: _End
-    connection: StructureConnection
-
-
 def flatten(
     system: StructureSystem,
     describe: Describe,
@@ -163,10 +93,9 @@ def flatten(
 
 class _Flattening:
     def __init__(self, describe: Describe, problems: Problems, units: Mapping[tuple[Path, str], Unit]) -> None:
-        self._describe = describe
-        self._units = units
         self._problems = problems
-        self._inbound: dict[tuple[Path, str], _Segment] = {}
+        self._ends = ConnectionEnds(describe, problems, units)
+        self._inbound: dict[tuple[Path, str], Segment] = {}
 
     def collect(self, system: StructureSystem, path: Path) -> None:
         """Give every connection of a system, and of those in it, its direction."""
@@ -174,13 +103,9 @@ class _Flattening:
             if isinstance(element, StructureSystem):
                 self.collect(element, (*path, element.name))
             else:
-                self._check_connectors(element, (*path, element.name))
+                self._ends.check(element, (*path, element.name))
         for connection in system.connections:
-            first = self._end(system, path, connection, "start")
-            second = self._end(system, path, connection, "end")
-            if first is None or second is None:
-                continue
-            segment = self._directed(first, second, connection)
+            segment = self._ends.segment(system, path, connection)
             if segment is None:
                 continue
             other = self._inbound.get(segment.target.node)
@@ -215,143 +140,9 @@ class _Flattening:
         values.sort(key=lambda one: one[0])
         return [one for _, one in connections], [one for _, one in values]
 
-    # --- ends
-
-    def _check_connectors(self, component: StructureComponent, path: Path) -> None:
-        """Check that the connectors of a component are what its FMU has."""
-        description = self._describe(path)
-        if description is None:
-            return
-        missing = [one.name for one in component.connectors if description.variable_of(one.name) is None]
-        if missing:  # one that is connected is a finding
-            found = f"connectors for variables that {component.source} does not have: {listed(missing)}"
-            self._problems.warn_once((component.source, *missing), component.place, found, "component")
-        for connector in component.connectors:
-            variable = description.variable_of(connector.name)
-            if variable is None:
-                continue
-            has = _kind_of(variable)
-            old = description.fmi_version.startswith("1.") and connector.kind not in ("input", "output")
-            if connector.kind not in (has, variable.causality, "unspecified", None) and not old:
-                found = f"the kind '{connector.kind}', while the variable of the FMU is of causality '{has}'"
-                self._problems.add(connector.place, found, f"the kind '{has}'")
-            type_ = _TYPES.get(connector.type or "", connector.type)
-            if type_ not in (None, variable.type):
-                found = f"the type {connector.type}, while the FMU has {variable.type_name}, which counts"
-                self._problems.warn(connector.place, found)
-            self._check_unit(connector, variable)
-
-    def _check_unit(self, connector: Connector, variable: Variable) -> None:
-        """Warn where a connector and its variable have units that are not the same."""
-        unit = connector.unit
-        if unit is None or not unit.name or not variable.unit or unit.name == variable.unit:
-            return
-        if unit.base is None or variable.base_unit is None or unit.base == variable.base_unit:
-            return
-        found = f"the unit '{unit.name}', while the FMU has '{variable.unit}'; that of the connector counts"
-        self._problems.warn(connector.place, found)
-
-    def _end(
-        self, system: StructureSystem, path: Path, connection: StructureConnection, side: Literal["start", "end"]
-    ) -> _End | None:
-        """One end of a connection; None after a finding."""
-        element_named = connection.start_element if side == "start" else connection.end_element
-        name = connection.start_connector if side == "start" else connection.end_connector
-        index = connection.start_index if side == "start" else connection.end_index
-        if element_named is None:
-            return self._of_system(system, path, name, index, connection, "system")
-        element = next((one for one in system.elements if one.name == element_named), None)
-        if element is None:
-            names = [one.name for one in system.elements]
-            found = f"the unknown element '{element_named}' of the system '{system.name}'"
-            near = nearest(element_named, names)
-            self._problems.add(connection.place, found, f"one of {listed(names)}", near)
-            return None
-        own = (*path, element.name)
-        if not name or (isinstance(element, StructureSystem) and not element.is_known):
-            return None  # there is a finding
-        if isinstance(element, StructureSystem):
-            return self._of_system(element, own, name, index, connection, "element")
-        return self._of_component(element, own, name, index, connection)
-
-    def _of_system(  # noqa: PLR0913, PLR0917  what an end is
-        self,
-        system: StructureSystem,
-        path: Path,
-        name: str,
-        index: tuple[int, ...],
-        connection: StructureConnection,
-        owner: _Owner,
-    ) -> _End | None:
-        connector = next((one for one in system.connectors if one.name == name), None)
-        if not name:
-            return None  # there is a finding
-        if connector is None:
-            names = [one.name for one in system.connectors]
-            found = f"the unknown connector '{name}' of the system '{system.name}'"
-            self._problems.add(connection.place, found, f"one of {listed(names)}", nearest(name, names))
-            return None
-        if index:
-            expected = "the whole array, or elements of the arrays of components only"
-            self._problems.add(connection.place, f"an element of the connector '{name}' of a system", expected)
-            return None
-        unit = connector.unit or self._units.get((path, name))
-        return _End(path, name, owner, connector.kind or "unspecified", unit)
-
-    def _of_component(
-        self,
-        component: StructureComponent,
-        path: Path,
-        name: str,
-        index: tuple[int, ...],
-        connection: StructureConnection,
-    ) -> _End | None:
-        connector = next((one for one in component.connectors if one.name == name), None)
-        description = self._describe(path)
-        variable = description.variable_of(name) if description is not None else None
-        if connector is None and (variable is not None or description is None):
-            found = f"'{component.name}' has no connector '{name}'"
-            if description is None:
-                names = [one.name for one in component.connectors]
-                self._problems.add(connection.place, found, f"one of {listed(names)}", nearest(name, names))
-                return None
-            self._problems.warn(connection.place, f"{found}; the variable of its FMU is taken")
-        elif connector is None:
-            names = [one.name for one in component.connectors]
-            found = f"the unknown connector '{name}' of '{component.name}'"
-            self._problems.add(connection.place, found, f"one of {listed(names)}", nearest(name, names))
-            return None
-        elif description is not None and variable is None:
-            names = [one.name for one in description.variables]
-            found = f"the variable '{name}', which the FMU of '{component.name}' does not have"
-            self._problems.add(connection.place, found, f"one of {listed(names)}", nearest(name, names))
-            return None
-        kind: str | None = connector.kind if connector is not None else None
-        if kind in (None, "unspecified") and variable is not None:
-            kind = _kind_of(variable)
-        unit = connector.unit if connector is not None else None
-        if unit is None and variable is not None and variable.unit:
-            unit = Unit(variable.unit, variable.base_unit)
-        return _End(path, name, "element", kind or "unspecified", unit, variable, index, is_component=True)
-
-    def _directed(self, first: _End, second: _End, connection: StructureConnection) -> _Segment | None:
-        """A connection with its direction; None after a finding."""
-        forwards, backwards = _may_flow(first, second), _may_flow(second, first)
-        if forwards and not backwards:
-            return _Segment(first, second, connection)
-        if backwards and not forwards:
-            return _Segment(second, first, connection)
-        ends = f"{_in_words(first)} and {_in_words(second)}"
-        if forwards:
-            expected = "a kind for one of the two connectors"
-            self._problems.add(connection.place, f"no direction between {ends}", expected)
-        else:
-            self._problems.add(connection.place, f"a connection between {ends}", "a source and a destination")
-        return None
-
     # --- ways
 
-    def _way_to(self, last: _Segment) -> list[_Segment] | None:
+    def _way_to(self, last: Segment) -> list[Segment] | None:
         """The connections on the way to a component, the first one first; None if they form a circle."""
         way = [last]
         while not way[0].source.is_component and (before := self._inbound.get(way[0].source.node)) is not None:
@@ -363,7 +154,7 @@ class _Flattening:
             way.insert(0, before)
         return way
 
-    def _change(self, way: Sequence[_Segment]) -> PathChange | None:
+    def _change(self, way: Sequence[Segment]) -> PathChange | None:
         """What happens to a value on its way; None after a finding."""
         source, target = way[0].source, way[-1].target
         relative = any(one.variable is not None and one.variable.relative_quantity for one in (source, target))
@@ -400,7 +191,7 @@ class _Flattening:
             return PathChange(own, place=place)
         return PathChange(total, entries, ignore_units=mapping is None, place=place)
 
-    def _converted(self, unit: Unit | None, target: Unit | None, segment: _Segment, *, relative: bool) -> Linear | None:
+    def _converted(self, unit: Unit | None, target: Unit | None, segment: Segment, *, relative: bool) -> Linear | None:
         """The conversion between two units; None after a finding."""
         if unit is None or target is None or not unit.name or not target.name or unit == target:
             return Linear()
@@ -423,18 +214,7 @@ class _Flattening:
         return change
 
 
-def _may_flow(source: _End, target: _End) -> bool:
-    """Whether values may go from one end to the other."""
-    table = _OUT_OF_THE_SYSTEM if target.owner == "system" else _INTO_AN_ELEMENT
-    kinds = [kind for owner, kind in table if owner == source.owner] if source.kind == "unspecified" else [source.kind]
-    for kind in kinds:
-        targets = table.get((source.owner, kind), ())
-        if target.kind in targets or (targets and target.kind == "unspecified"):
-            return True
-    return False
-
-
-def _by_variables(source: _End, target: _End, own: Linear, *, relative: bool) -> Linear | None:
+def _by_variables(source: ConnectionEnd, target: ConnectionEnd, own: Linear, *, relative: bool) -> Linear | None:
     """What a connection does by the units of the two variables alone; None if it would be refused."""
     have, want = source.variable, target.variable
     if have is None or want is None or have.base_unit is None or want.base_unit is None:
@@ -453,13 +233,3 @@ def _entries(mapping: Transformation) -> dict[str, str]:
             return {str(int(one.source)): str(int(one.target)) for one in mapping.entries}
         case _:
             return {one.source: one.target for one in mapping.entries}
-
-
-def _kind_of(variable: Variable) -> str:
-    """The kind of a connector for a variable."""
-    return "constant" if variable.variability == "constant" else variable.causality
-
-
-def _in_words(end: _End) -> str:
-    whose = "the system" if end.owner == "system" else "an element"
-    return f"'{end}' ({end.kind} of {whose})"
