@@ -196,6 +196,7 @@ def with_needed(plain: PlainConfig, options: Options) -> PlainConfig:
             data = _replaced(data, key.split("."), value)
             overrides[key] = _as_option(setting, value)
     findings = Findings(str(plain.file), plain.lines, overrides, plain.findings, plain.origins)
+    findings.explain(plain.explained)
     for key, option in plain.needed.items():
         if _is_absent(data, key):
             findings.add(key, "the package gives none", option)

@@ -110,7 +110,9 @@ class ConnectionEnds:
         description = self._describe(path)
         if description is None:
             return
-        missing = [one.name for one in component.connectors if description.variable_of(one.name) is None]
+        clocks = {clock.name for clock in description.clocks}
+        names = [one.name for one in component.connectors if one.name not in clocks]
+        missing = [name for name in names if description.variable_of(name) is None]
         if missing:  # one that is connected is a finding
             found = f"connectors for variables that {component.source} does not have: {listed(missing)}"
             self._problems.warn_once((component.source, *missing), component.place, found, "component")
@@ -226,8 +228,15 @@ class ConnectionEnds:
             return None
         elif description is not None and variable is None:
             names = [one.name for one in description.variables]
-            found = f"the variable '{name}', which the FMU of '{component.name}' does not have"
-            self._problems.add(connection.place, found, f"one of {listed(names)}", nearest(name, names))
+            found, near = (
+                f"the variable '{name}', which the FMU of '{component.name}' does not have",
+                nearest(name, names),
+            )
+            expected = f"one of {listed(names)}"
+            if name in (clock.name for clock in description.clocks):
+                found, near = f"the clock '{name}' of '{component.name}'", None
+                expected = "no connection: a clock of an FMU ticks by itself"
+            self._problems.add(connection.place, found, expected, near)
             return None
         kind: str | None = connector.kind if connector is not None else None
         if kind in (None, "unspecified") and variable is not None:

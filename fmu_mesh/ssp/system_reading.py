@@ -114,6 +114,7 @@ class _Configuration:
         self._file = Path(package.shown(name))
         self._lines: dict[str, int] = {}
         self._origins: dict[str, ValueOrigin] = {}
+        self._explained: tuple[str, ...] = ()
         own = (one for one in structure.system.annotations if one.type == ANNOTATION_TYPE)
         self._annotation = next(own, None)
         self._names = self._chosen_names()
@@ -128,6 +129,8 @@ class _Configuration:
         if not self._components and _is_known(system):
             found = "no component in it, nor in a system inside it: there is nothing to run"
             self._problems.add(system.place, found, "a Component with an FMU")
+        if not self._components:
+            self._explained += ("instances",)
         simulation = self._simulation()
         data: dict[str, Plain] = {
             "mesh": mesh_name(self._structure.name or self._package.root.stem),
@@ -150,7 +153,7 @@ class _Configuration:
             origins=self._origins,
             warnings=tuple(self._problems.warnings),
             needed={key: option for key, option in NEEDED.items() if key.partition(".")[2] not in times},
-            explained=() if self._components else ("instances",),
+            explained=self._explained,
         )
 
     def _chosen_names(self) -> dict[str, str]:
@@ -239,7 +242,10 @@ class _Configuration:
             simulation["start_time"] = structure.start_time
         if structure.stop_time is not None:
             simulation["stop_time"] = structure.stop_time
+        before = len(self._problems.findings)
         found = base_step_size(annotations_of(structure), self._problems)
+        if len(self._problems.findings) > before:
+            self._explained += ("simulation.step_size", "simulation.algorithm")
         if found is not None:
             step_size, annotation = found
             simulation |= {"step_size": step_size, "algorithm": "jacobi"}
@@ -272,11 +278,11 @@ class _Configuration:
         return instances
 
     def _step_size(self, component: StructureComponent, simulation: Mapping[str, Plain]) -> float | None:
-        """The step size that libcosim is told for a component: the nearest multiple of the base step size."""
+        """The step size that libcosim takes for a component: a multiple of the base step size, in whole nanoseconds."""
         hint, base = step_size_hint(component.annotations, self._problems), simulation.get("step_size")
         if hint is None or not isinstance(base, float):
             return None
-        points = max(1, round(hint[0] / base))
+        points = max(1, round(hint[0] * 1e9) // max(1, round(base * 1e9)))
         if points * base != hint[0]:
             found = f"the step size {hint[0]:g} s, for which {points * base:.12g} s is taken"
             self._problems.warn(hint[1].place, found, f"a whole multiple of {base:g} s")

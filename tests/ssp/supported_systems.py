@@ -498,13 +498,28 @@ def _open_simulation_platform(_folder: Path) -> dict[str, str | bytes]:
         return element("ssc:Annotation", inside, type="com.opensimulationplatform")
 
     algorithm = '<osp:FixedStepAlgorithm xmlns:osp="osp" baseStepSize="0.125"/>'
-    hint = '<osp:StepSizeHint xmlns:osp="osp" value="0.25"/>'
+    hint = '<osp:StepSizeHint xmlns:osp="osp" value="0.3"/>'
     root = system(
         "root",
         pendulum(),
         gain("gain", annotations=[annotation(hint)]),
         connections=[connection("pendulum.a", "gain.u")],
         annotations=[annotation(f"<osp:Algorithm xmlns:osp='osp'>{algorithm}</osp:Algorithm>")],
+    )
+    return {SSD: description(root), **fmus("DampedPendulum", "Gain")}
+
+
+def _open_modelica(_folder: Path) -> dict[str, str | bytes]:
+    settings = (
+        '<oms:SimulationInformation xmlns:oms="oms"><oms:FixedStepMaster description="oms-ma" stepSize="0.125"/>'
+        '<oms:VariableStepSolver description="cvode"/></oms:SimulationInformation>'
+    )
+    root = system(
+        "root",
+        pendulum(),
+        gain("gain"),
+        connections=[connection("pendulum.a", "gain.u")],
+        annotations=[element("ssc:Annotation", settings, type="org.openmodelica")],
     )
     return {SSD: description(root), **fmus("DampedPendulum", "Gain")}
 
@@ -757,8 +772,16 @@ SUPPORTED = (
         "step sizes of the Open Simulation Platform",
         _open_simulation_platform,
         ("pendulum.a -> gain.u",),
+        warnings=(("the step size 0.3 s", "0.25 s is taken", "a whole multiple of 0.125 s"),),
         step_size=None,
         step_sizes={"gain": 0.25},
+    ),
+    Supported(
+        "the step size of OMSimulator",
+        _open_modelica,
+        ("pendulum.a -> gain.u",),
+        warnings=(("the VariableStepSolver for the whole system 'root' is not used",),),
+        step_size=None,
     ),
     Supported(
         "what changes nothing",

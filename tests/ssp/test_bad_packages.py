@@ -9,8 +9,10 @@ import pytest
 
 import fmu_mesh
 from fmu_mesh.errors import Finding
+from tests.fmus.helpers import find_fmu
+from tests.fmus.packing import repacked
 from tests.ssp.bad_packages import BAD_ARCHIVES, BAD_PACKAGES, GOOD, Fault, edited
-from tests.ssp.packages import write_package
+from tests.ssp.packages import Files, component, connection, connector, description, system, write_package
 
 TOGETHER = (
     "a connector that the system does not have",
@@ -107,6 +109,24 @@ def test_an_archive_with_a_fault_is_refused(name: str, tmp_path: Path) -> None:
     text = "\n".join(map(str, [caught.value, *caught.value.findings]))
     assert all(word in text for word in words), text
     assert [file.name for file in tmp_path.iterdir()] == ["bad.ssp"]
+
+
+def test_a_connection_of_a_clock_is_refused(tmp_path: Path) -> None:
+    def with_clock(text: str) -> str:
+        clock = '<Clock name="tick" valueReference="900" causality="input" intervalVariability="constant" '
+        return text.replace("</ModelVariables>", f'{clock}intervalDecimal="0.5"/></ModelVariables>')
+
+    fmu = repacked(tmp_path / "Ticking.fmu", source=find_fmu("AllTypes3", tmp_path), description=with_clock)
+    ticking = [component(name, "Ticking", connector("tick", "input", "Clock")) for name in ("one", "two")]
+    root = system("root", *ticking, connections=[connection("one.tick", "two.tick")])
+    files: Files = {"SystemStructure.ssd": description(root, version="2.0"), "resources/Ticking.fmu": fmu.read_bytes()}
+    mesh = fmu_mesh.load(write_package(tmp_path / "bad.ssp", files))
+
+    check = mesh.check(step_size=0.5, algorithm="jacobi")
+
+    assert [finding.found for finding in check.findings] == ["the clock 'tick' of 'one'", "the clock 'tick' of 'two'"]
+    assert {finding.expected for finding in check.findings} == {"no connection: a clock of an FMU ticks by itself"}
+    assert not [warning for warning in check.warnings if "tick" in str(warning)]
 
 
 def test_few_files_that_refer_to_one_another_do_not_become_many_systems(tmp_path: Path) -> None:
