@@ -15,12 +15,12 @@ from urllib.parse import unquote
 
 from lxml import etree
 
+from ..archives.archive_entries import checked_archive, entry_name
+from ..archives.safe_xml import safe_xml
 from ..config.loading import PlainConfig
 from ..config.mesh import LimitsConfig
 from ..errors import Finding
 from ..files import archive_on_the_way, is_file
-from ..instances.fmi.archive.archive_entries import checked_archive, entry_name
-from ..instances.fmi.archive.examining import safe_xml
 from ..text import listed
 from .grammar import NAMESPACES
 from .own_annotation import ANNOTATION_TYPE

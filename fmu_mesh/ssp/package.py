@@ -16,9 +16,9 @@ from typing import Final, Self
 from urllib.parse import unquote
 
 from .. import files
+from ..archives.archive_entries import LIMITS_HINT
 from ..errors import ConfigurationError, LoadFailed
 from ..instances.fmi.archive.archive import OpenFmu, opened
-from ..instances.fmi.archive.archive_entries import LIMITS_HINT
 from ..text import listed, nearest, nearest_file
 from .problems import Problems
 from .system_structure import FilePlace

@@ -21,10 +21,10 @@ from tempfile import TemporaryFile
 from typing import IO, Final, NamedTuple
 
 from .. import files
+from ..archives.inner_files import inner_file
 from ..config.mesh import LimitsConfig
 from ..errors import ConfigurationError, LoadFailed
 from ..instances.fmi.archive.archive import content_of
-from ..instances.fmi.archive.inner_files import inner_file
 
 __all__ = ["ArchiveEntry", "PackageEntry", "resource_names", "write_package"]
 

@@ -14,8 +14,8 @@ from xml.parsers import expat
 
 from lxml import etree
 
+from ..archives.safe_xml import safe_xml
 from ..errors import LoadFailed
-from ..instances.fmi.archive.examining import safe_xml
 from ..text import listed, nearest, printable, shown
 from .grammar import GRAMMAR, NAMESPACES, PATTERNS, Attribute, Rule, number_of
 from .problems import Problems

@@ -13,10 +13,10 @@ from pathlib import Path
 import pytest
 
 from fmu_mesh import files
+from fmu_mesh.archives import inner_files
 from fmu_mesh.config.mesh import LimitsConfig
 from fmu_mesh.errors import ConfigurationError, LoadFailed
 from fmu_mesh.instances.fmi import Terms, content_of, open_instance, read_description, sha256_of, size_of
-from fmu_mesh.instances.fmi.archive import inner_files
 from fmu_mesh.instances.fmi.archive.archive import opened
 from fmu_mesh.instances.fmi.archive.sources import extract
 from fmu_mesh.run.preparing import prepare

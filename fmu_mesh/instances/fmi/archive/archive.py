@@ -3,7 +3,7 @@
 Owns the private folder that an instance uses. That folder has the layout of the FMU and can always be removed: if the
 FMU is a folder, it holds copies of the binaries and links to all other files. It lies below a folder that is passed in,
 so that it is removed even if the process that used it was killed. The protection against hostile archives is in
-`archive_entries`; what the files mean, in `fmu_mesh.instances.fmi.archive.examining`.
+`fmu_mesh.archives`; what the files mean, in `fmu_mesh.instances.fmi.archive.examining`.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from typing import IO, Protocol
 import msgspec
 
 from .... import files
+from ....archives.archive_entries import LIMITS_HINT, checked_archive, entry_name, reading, write_entry
+from ....archives.inner_files import inner_file, inner_sha256, inner_size
 from ....config.mesh import LimitsConfig
 from ....errors import LoadFailed
-from .archive_entries import LIMITS_HINT, checked_archive, entry_name, reading, write_entry
-from .inner_files import inner_file, inner_sha256, inner_size
 
 __all__ = ["Contents", "OpenFmu", "Terms", "content_of", "opened", "sha256_of", "size_of", "unpacked"]
 

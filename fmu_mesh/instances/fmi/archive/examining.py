@@ -16,10 +16,11 @@ from typing import Any, Final
 import fmpy
 from lxml import etree
 
+from ....archives.safe_xml import safe_xml
 from ....errors import LoadFailed
 from .archive import Contents, OpenFmu
 
-__all__ = ["examine", "find_library", "library_name", "safe_xml", "source_names"]
+__all__ = ["examine", "find_library", "library_name", "source_names"]
 
 _SHOWN: Final = 3
 _SUFFIX: Final = str(fmpy.sharedLibraryExtension)
@@ -75,28 +76,6 @@ def _what_it_is(path: Path, names: Collection[str]) -> str:
         fmu = next((name for name in sorted(names) if name.lower().endswith(".fmu")), "resources/model.fmu")
         return f"It is a package of SSP: name an FMU in it, as '{path}/{fmu}'."
     return "An FMU that was zipped inside a folder of its own must be zipped again without that folder."
-
-
-def safe_xml(data: bytes, what: str) -> Any:  # noqa: ANN401 lxml ships no types
-    """Parse ``data``, which errors call ``what``, and return the root element.
-
-    A document type declaration is refused before it is read, because it can declare entities that expand without end
-    or read other files. No FMI document has one.
-
-    Raises:
-        LoadFailed: there is a document type, or it is not well-formed XML.
-    """
-    try:
-        # Two passes: a parser target gets the declaration before lxml acts on it, but it builds no tree.
-        etree.fromstring(data, _parser(target=_NoDocumentType()))
-        return etree.fromstring(data, _parser())
-    except _DocumentTypeError as error:
-        raise LoadFailed(
-            f"{what} declares a document type, with which XML can expand without limit and read other files.",
-            hint="No FMI document has one: remove its <!DOCTYPE>.",
-        ) from error
-    except etree.XMLSyntaxError as error:
-        raise LoadFailed(f"{what} cannot be read: {error.msg}") from error
 
 
 def library_name(identifier: str, fmi_version: str) -> str:
@@ -157,26 +136,6 @@ def find_library(path: Path, names: Collection[str], identifiers: Sequence[str],
         f"'{path}' has no binary for this platform ({folder.rpartition('/')[2]}); it has: "
         f"{', '.join(platforms) or 'no platform at all'}.",
         hint="Export it for this platform, or with its sources.",
-    )
-
-
-class _DocumentTypeError(Exception):
-    """The document has a document type declaration."""
-
-
-class _NoDocumentType:
-    """A parser target that only looks for a document type declaration."""
-
-    def doctype(self, *_declared: str | None) -> None:
-        raise _DocumentTypeError
-
-    def close(self) -> None:
-        """The document has no such declaration."""
-
-
-def _parser(**options: object) -> Any:  # noqa: ANN401 lxml ships no types
-    return etree.XMLParser(
-        resolve_entities=False, no_network=True, load_dtd=False, dtd_validation=False, huge_tree=False, **options
     )
 
 

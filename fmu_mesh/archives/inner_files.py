@@ -14,10 +14,10 @@ from contextlib import ExitStack
 from pathlib import Path, PurePosixPath
 from typing import IO, Final, NamedTuple
 
-from .... import files
-from ....config.mesh import LimitsConfig
-from ....errors import LoadFailed
-from ....text import nearest
+from .. import files
+from ..config.mesh import LimitsConfig
+from ..errors import LoadFailed
+from ..text import nearest
 from .archive_entries import checked_archive, entry_name, reading
 
 __all__ = ["InnerFile", "inner_file", "inner_sha256", "inner_size"]

@@ -16,8 +16,8 @@ from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 from typing import IO, Final
 
-from ....config.mesh import LimitsConfig
-from ....errors import LoadFailed
+from ..config.mesh import LimitsConfig
+from ..errors import LoadFailed
 
 __all__ = ["LIMITS_HINT", "checked_archive", "entry_name", "reading", "write_entry"]
 

@@ -1,0 +1,1 @@
+"""Files of other people: ZIP archives, files inside them, and XML, each protected against hostile content."""
