@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -24,11 +24,12 @@ _PACKAGE: Final = ".ssp"
 Version = Literal["1.0", "2.0"]
 
 
-def convert(
+def convert(  # noqa: PLR0913  keywords, each of which stands alone
     source: Path,
     target: Path,
     *,
     ssd: str | None = None,
+    ssv: Sequence[str | Path] = (),
     version: Version | None = None,
     simulation: Mapping[str, Any] = {},
 ) -> tuple[Finding, ...]:
@@ -45,6 +46,7 @@ def convert(
         source: what `fmu_mesh.load` reads.
         target: a .yaml, .yml or .ssp file; a file that exists is replaced.
         ssd: which description of a package.
+        ssv: files with values that replace those of a package, as for `fmu_mesh.load`.
         version: of SSP; None: that of the package that is read, or 1.0.
         simulation: keys of the section `simulation`, in the place of what ``source`` says.
 
@@ -59,7 +61,7 @@ def convert(
         raise ConfigurationError(f"'{target}' is no format of a configuration", hint="Name it .yaml or .ssp.")
     if version is not None and suffix != _PACKAGE:
         raise ConfigurationError(f"--version is that of a package of SSP, and '{target}' is none")
-    given = read_configuration(source, ssd)
+    given = read_configuration(source, ssd, ssv)
     mesh = Mesh.from_configuration(given)
     if simulation:
         mesh.configure(simulation=dict(simulation))

@@ -104,9 +104,9 @@ class Mesh:
         return mesh
 
     @classmethod
-    def from_file(cls, path: str | Path, *, ssd: str | None = None) -> Self:
+    def from_file(cls, path: str | Path, *, ssd: str | None = None, ssv: Sequence[str | Path] = ()) -> Self:
         """As `load`."""
-        return cls.from_configuration(read_configuration(Path(path), ssd))
+        return cls.from_configuration(read_configuration(Path(path), ssd, ssv))
 
     @classmethod
     def from_fmu(
@@ -523,7 +523,7 @@ class Mesh:
         return section
 
 
-def load(path: str | Path, *, ssd: str | None = None) -> Mesh:
+def load(path: str | Path, *, ssd: str | None = None, ssv: Sequence[str | Path] = ()) -> Mesh:
     """Read a configuration: a YAML file, or a package of SSP.
 
     Example:
@@ -535,9 +535,11 @@ def load(path: str | Path, *, ssd: str | None = None) -> Mesh:
         path: the YAML file; or an .ssp file, the folder of an unpacked one, or an .ssd file.
         ssd: which system structure description of a package: the name of its file, such as "VarB.ssd", or the name that
             it has; None: SystemStructure.ssd.
+        ssv: files with parameter values (SSP 2.0, 6) that replace those of a package; of several, the last one counts.
+            Each is a file in the package, or else on the disk. Its names are those of the root system: `inner.gain.k`.
 
     Raises:
         ConfigurationError: the file cannot be read, or is no YAML. What it means is checked by `Mesh.check`, and before
             a run.
     """
-    return Mesh.from_file(path, ssd=ssd)
+    return Mesh.from_file(path, ssd=ssd, ssv=ssv)

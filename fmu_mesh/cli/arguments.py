@@ -19,6 +19,7 @@ __all__ = [
     "CommandParser",
     "Parsers",
     "add_json",
+    "add_package",
     "add_quiet",
     "add_reaching",
     "add_ssd",
@@ -116,6 +117,13 @@ def add_reaching(parser: argparse.ArgumentParser, timeout_s: float = _TIMEOUT_S)
         metavar="S",
         help=f"deadline of every query in s ({timeout_s:g})",
     )
+
+
+def add_package(parser: argparse.ArgumentParser) -> None:
+    """Add what chooses a variant of a package: `--ssd` and `--ssv`."""
+    add_ssd(parser)
+    text = "values of an SSV file, which replace those of a package: a file in it, or another one; repeatable"
+    parser.add_argument("--ssv", action="append", default=[], metavar="FILE.ssv", help=text)
 
 
 def add_ssd(parser: argparse.ArgumentParser) -> None:

@@ -7,14 +7,13 @@ import sys
 
 import msgspec
 
-from ..api.mesh_builder import load
 from ..api.plan_view import PlanView
 from ..config.structure import schema_text
 from ..errors import FmuMeshError
 from ..instances.configuration import installed_config
 from .arguments import CommandParser, Parsers, add_json, add_quiet
 from .output.json_output import Failure, failure_of, print_json
-from .run_options import add_configuration, given_options
+from .run_options import add_configuration, given_options, mesh_of
 
 __all__ = ["PARSERS", "CheckReport"]
 
@@ -48,7 +47,7 @@ def _add_schema(parser: CommandParser) -> None:
 
 def _check(arguments: argparse.Namespace) -> int:
     try:
-        check = load(arguments.config, ssd=arguments.ssd).check(**given_options(arguments))
+        check = mesh_of(arguments).check(**given_options(arguments))
         if not arguments.json and check.run is not None:
             print(check or check.page)
         check.require()

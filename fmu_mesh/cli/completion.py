@@ -33,6 +33,7 @@ _FILES: Final[Mapping[str, tuple[str, ...]]] = {
     "CONFIG|MESH": ("yaml", "yml", "ssp", "ssd"),
     "MODEL.fmu": ("fmu",),
     "MODEL.fmu|PACKAGE": ("fmu", "ssp", "ssd"),
+    "FILE.ssv": ("ssv",),
     "SOURCE": ("ssp", "ssd", "yaml", "yml"),
     "TARGET": ("ssp", "yaml", "yml"),
     "FMU": ("fmu",),

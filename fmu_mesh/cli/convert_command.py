@@ -11,7 +11,7 @@ from ..api.converting import convert
 from ..errors import ConfigurationError
 from ..ssp.configuration_files import named_package, read_configuration
 from ..ssp.package import DEFAULT, Package
-from .arguments import CommandParser, Parsers, add_quiet, add_ssd
+from .arguments import CommandParser, Parsers, add_package, add_quiet
 from .output.display import say
 from .run_options import add_options, read_options
 
@@ -23,7 +23,7 @@ _TIMES = ("algorithm", "step_size", "stop_time")
 def _add_convert(parser: CommandParser) -> None:
     parser.add_argument("source", type=Path, metavar="SOURCE", help="a package of SSP, or a configuration file")
     parser.add_argument("target", type=Path, metavar="TARGET", help="the new file: .yaml, or .ssp")
-    add_ssd(parser)
+    add_package(parser)
     parser.add_argument(
         "--version",
         choices=("1.0", "2.0"),
@@ -42,7 +42,7 @@ def _convert(arguments: argparse.Namespace) -> int:
         raise ConfigurationError(f"'{target}' exists.", hint="--force overwrites it.")
     options = read_options(arguments)
     given = {name: value for name in _TIMES if (value := getattr(options, name)) is not None}
-    lost = convert(source, target, ssd=arguments.ssd, version=arguments.version, simulation=given)
+    lost = convert(source, target, ssd=arguments.ssd, ssv=arguments.ssv, version=arguments.version, simulation=given)
     if not arguments.quiet:
         for finding in lost:
             say(f"warning: {finding}")

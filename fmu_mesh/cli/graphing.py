@@ -16,7 +16,7 @@ from ..api.system_graph import SystemGraph
 from ..errors import ConfigurationError
 from ..files import replaced
 from ..ssp.configuration_files import names_package
-from .arguments import CommandParser, Parsers, add_json, add_quiet, add_reaching, add_ssd
+from .arguments import CommandParser, Parsers, add_json, add_package, add_quiet, add_reaching
 from .output.json_output import print_json
 from .run_options import add_options, read_options
 
@@ -40,7 +40,7 @@ def _add_graph(parser: CommandParser) -> None:
         metavar="FILE.svg",
         help="write it into a .svg, .png, .pdf or .txt file; default: text on the terminal",
     )
-    add_ssd(parser)
+    add_package(parser)
     add_options(parser, *_OF_CONFIG)
     add_quiet(parser)
     add_json(parser, "JSON: one object with all instances and connections")
@@ -66,11 +66,12 @@ def _graph(arguments: argparse.Namespace) -> int:
 
 def _graph_of(arguments: argparse.Namespace) -> SystemGraph:
     of = arguments.of
-    if of is None and arguments.ssd is not None:
-        raise ConfigurationError("--ssd chooses a description in a package of SSP, and none is named")
-    if of is not None and (arguments.ssd is not None or _is_configuration(Path(of))):
+    chooses = arguments.ssd is not None or arguments.ssv
+    if of is None and chooses:
+        raise ConfigurationError("--ssd and --ssv choose a variant of a package of SSP, and none is named")
+    if of is not None and (chooses or _is_configuration(Path(of))):
         given = {name: value for name, value in asdict(read_options(arguments)).items() if name in _OF_CONFIG}
-        return load(of, ssd=arguments.ssd).graph(**cast("PlanOptions", given))
+        return load(of, ssd=arguments.ssd, ssv=arguments.ssv).graph(**cast("PlanOptions", given))
     with attach(of, connect=arguments.connect, timeout=arguments.timeout) as run:
         return run.graph()
 

@@ -9,21 +9,22 @@ from typing import Any, Literal, cast
 
 from msgspec.structs import asdict
 
+from ..api.mesh_builder import Mesh, load
 from ..api.plan_options import PlanOptions
 from ..config.base import Endpoint
 from ..config.mesh import MAX_WINDOW
 from ..errors import ConfigurationError
 from ..run.options import Options, option_fields
-from .arguments import add_ssd, endpoint, number, whole
+from .arguments import add_package, endpoint, number, whole
 from .output.display import teller
 
-__all__ = ["add_configuration", "add_options", "given_options", "read_options"]
+__all__ = ["add_configuration", "add_options", "given_options", "mesh_of", "read_options"]
 
 
 def add_configuration(parser: argparse.ArgumentParser) -> None:
     """Add the argument CONFIG, and the flags that replace what CONFIG says."""
     parser.add_argument("config", type=Path, metavar="CONFIG", help="the configuration file, or a package of SSP")
-    add_ssd(parser)
+    add_package(parser)
     add_options(
         parser.add_argument_group("instead of what CONFIG says"),
         "algorithm",
@@ -39,6 +40,11 @@ def add_configuration(parser: argparse.ArgumentParser) -> None:
         "connect",
     )
     add_options(parser, "allow_code")
+
+
+def mesh_of(arguments: argparse.Namespace) -> Mesh:
+    """The mesh of CONFIG, in the variant that the flags of `add_configuration` choose."""
+    return load(arguments.config, ssd=arguments.ssd, ssv=arguments.ssv)
 
 
 def add_options(

@@ -13,7 +13,7 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING
 
-from ..api.mesh_builder import Mesh, load
+from ..api.mesh_builder import Mesh
 from ..api.plan_options import PlanOptions, StartOptions
 from ..api.run_handle import Run
 from ..errors import ConfigurationError
@@ -30,7 +30,7 @@ from .output.display import Display, stdout_as_stderr, summary, warn
 from .output.profile_table import show_profile
 from .output.reports import RunReporter
 from .plotting import check_plot, plot_results, plotted_where_it_ends
-from .run_options import add_configuration, add_options, given_options
+from .run_options import add_configuration, add_options, given_options, mesh_of
 
 if TYPE_CHECKING:
     from ..sweeps.sweeping import Sweep
@@ -101,7 +101,7 @@ def add_output(parser: CommandParser) -> None:
 def _launch(arguments: argparse.Namespace) -> int:
     with RunReporter(wanted=arguments.json) as reporter:
         options, how = given_options(arguments), _how(arguments)
-        run_mesh(load(arguments.config, ssd=arguments.ssd), options, arguments, reporter, how)
+        run_mesh(mesh_of(arguments), options, arguments, reporter, how)
     return 0
 
 
@@ -189,12 +189,12 @@ def _finish(plan: Plan, outcome: Outcome, arguments: argparse.Namespace) -> None
 
 
 def _node(arguments: argparse.Namespace) -> int:
-    run_node(load(arguments.config, ssd=arguments.ssd).plan(**given_options(arguments)).node(arguments.node))
+    run_node(mesh_of(arguments).plan(**given_options(arguments)).node(arguments.node))
     return 0
 
 
 def _master(arguments: argparse.Namespace) -> int:
-    plan = _planned(load(arguments.config, ssd=arguments.ssd), given_options(arguments), arguments)
+    plan = _planned(mesh_of(arguments), given_options(arguments), arguments)
     with (
         plotted_where_it_ends(plan.plan, arguments.plot),
         Display(
@@ -211,7 +211,7 @@ def _gateway(arguments: argparse.Namespace) -> int:
         if isinstance(event, Reachable):
             print(f"topics of ROS at {', '.join(event.endpoints)}", flush=True)
 
-    run_gateway(load(arguments.config, ssd=arguments.ssd).plan(**given_options(arguments)), show)
+    run_gateway(mesh_of(arguments).plan(**given_options(arguments)), show)
     return 0
 
 

@@ -12,7 +12,6 @@ from typing import Any, Literal, cast
 import msgspec
 from msgspec.structs import asdict
 
-from ..api.mesh_builder import load
 from ..errors import ConfigurationError, DeadlineExceeded, FmuMeshError
 from ..run.options import Options
 from ..sweeps.dask_cluster import dask_executor
@@ -22,12 +21,12 @@ from ..sweeps.sweep_folder import is_sweep
 from ..sweeps.sweeping import ExecutorSweep, Sweep, SweepPart
 from ..sweeps.variants import Values, read_values
 from ..text import short_path, shown
-from .arguments import CommandParser, Parsers, add_json, add_ssd, count, whole
+from .arguments import CommandParser, Parsers, add_json, add_package, count, whole
 from .output.display import say, stdout_as_stderr, teller
 from .output.json_output import Failure, failure_of, print_json
 from .output.progress import SweepProgressLine
 from .output.terminal import error_console
-from .run_options import add_options, read_options
+from .run_options import add_options, mesh_of, read_options
 from .running import add_output, interrupted_by_signals
 
 __all__ = ["PARSERS", "SweepReport"]
@@ -36,7 +35,7 @@ _LOOK_S = 0.1
 _SHOWN_FAILURES = 5
 _HERE = "here"
 """`--dask` without an address."""
-_ASKED = ("ssd", "vary", "sampler", "reduce", "no_curves", "processes", "reset", "max_instances", "folder")
+_ASKED = ("ssd", "ssv", "vary", "sampler", "reduce", "no_curves", "processes", "reset", "max_instances", "folder")
 """What the folder of a sweep says."""
 
 
@@ -75,7 +74,7 @@ def _add_sweep(parser: CommandParser) -> None:
         metavar="CONFIG",
         help="the configuration file or package; or the folder of a sweep, to continue it",
     )
-    add_ssd(parser)
+    add_package(parser)
     what = parser.add_argument_group("what varies")
     what.add_argument(
         "--vary",
@@ -201,7 +200,7 @@ def _planned(arguments: argparse.Namespace) -> PlannedSweep:
         max_instances=dict(map(_limit, arguments.max_instances)),
     )
     base = {name: chosen[name] for name in SweepOptions.__annotations__ if name in chosen}
-    return planned_sweep(load(arguments.config, ssd=arguments.ssd), vary, **cast("SweepOptions", {**base, **own}))
+    return planned_sweep(mesh_of(arguments), vary, **cast("SweepOptions", {**base, **own}))
 
 
 @contextmanager

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zipfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
@@ -21,7 +22,7 @@ _PARTS: Final = (".ssv", ".ssm", ".ssb")
 _ARCHIVE: Final = b"PK\x03\x04"
 
 
-def read_configuration(path: Path, ssd: str | None = None) -> PlainConfig:
+def read_configuration(path: Path, ssd: str | None = None, ssv: Sequence[str | Path] = ()) -> PlainConfig:
     """Read the values of a configuration; what they mean is not checked yet.
 
     Example:
@@ -31,6 +32,7 @@ def read_configuration(path: Path, ssd: str | None = None) -> PlainConfig:
     Args:
         path: a YAML file; or an .ssp file, a folder that was one, an .ssd file, or an .ssd inside an .ssp.
         ssd: which description of a package: the name of its file, or the name that it has; None: the default one.
+        ssv: files with values that replace those of a package: in it, or else on the disk.
 
     Raises:
         ConfigurationError: it cannot be read, or it is neither YAML nor a package.
@@ -38,9 +40,9 @@ def read_configuration(path: Path, ssd: str | None = None) -> PlainConfig:
     if (package := named_package(path, ssd)) is not None:
         from .system_reading import read_system  # noqa: PLC0415  it imports FMPy, which is slow
 
-        return read_system(*package)
-    if ssd is not None:
-        raise ConfigurationError(f"--ssd chooses a description in a package of SSP, and '{path}' is no package")
+        return read_system(*package, ssv)
+    for option in (["--ssd"] if ssd is not None else []) + (["--ssv"] if ssv else []):
+        raise ConfigurationError(f"{option} chooses a variant of a package of SSP, and '{path}' is no package")
     archive = files.archive_on_the_way(path)
     if path.suffix.lower() in _PARTS or (archive is not None and names_package(archive)):
         hint = "Name the package: the .ssp, its folder, or an .ssd in it."

@@ -17,6 +17,7 @@ from urllib.parse import unquote
 
 from .. import files
 from ..archives.archive_entries import LIMITS_HINT
+from ..config.mesh import LimitsConfig
 from ..errors import ConfigurationError, LoadFailed
 from ..instances.fmi.archive.archive import OpenFmu, opened
 from ..text import listed, nearest, nearest_file
@@ -115,6 +116,25 @@ class Package:
             return self._container(owner[0]).read(owner[1])
         except LoadFailed as error:
             raise ConfigurationError(error.message, hint=error.hint) from error
+
+    def read_beside(self, path: Path) -> bytes:
+        """The bytes of a file on the disk that somebody names instead of one in the package.
+
+        Raises:
+            ConfigurationError: there is no such file, or it cannot be read.
+        """
+        if not files.is_file(path):
+            near = nearest(str(path), self.names()) or nearest_file(path)
+            hint = f"Did you mean '{near}'?" if near is not None else None
+            raise ConfigurationError(f"'{path}': there is no such file, nor is it in '{self._shown}'", hint=hint)
+        try:
+            size = path.stat().st_size
+            if size > LimitsConfig().description_bytes:
+                text = f"'{path}' has {size} bytes; the limit is {LimitsConfig().description_bytes}"
+                raise ConfigurationError(text, hint="Divide it into several files: `--ssv` is repeatable.")
+            return path.read_bytes()
+        except OSError as error:
+            raise ConfigurationError(f"'{path}' cannot be read: {error.strerror}") from error
 
     def named_by(self, uri: str, base: str, place: FilePlace, problems: Problems) -> str | None:
         """The name of the file that a URI means; None after a finding.

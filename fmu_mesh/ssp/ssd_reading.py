@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import posixpath
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Final, Literal, NamedTuple, TypeVar, cast, get_args
 
 from msgspec.structs import replace
@@ -81,6 +82,25 @@ class _File(NamedTuple):
     def folder(self) -> str:
         """The folder that relative URIs in the file refer to."""
         return posixpath.dirname(self.name)
+
+
+def read_values(package: Package, name: str, problems: Problems) -> Binding | None:
+    """The values of an SSV file as a binding without a mapping; None after a finding.
+
+    Args:
+        package: where the file is looked for first.
+        name: of the file in the package, or else its path on the disk.
+        problems: collects what is wrong in it.
+
+    Raises:
+        ConfigurationError: there is no such file, or it cannot be read.
+    """
+    if package.exists(name):
+        data, shown_name = package.read(name), package.shown(name)
+    else:
+        data, shown_name = package.read_beside(Path(name)), name
+    root = read_xml(data, shown_name, "ssv:ParameterSet", problems)
+    return Binding(parameter_set(root, problems), root.place) if root is not None else None
 
 
 class _Reader:

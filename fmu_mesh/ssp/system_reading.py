@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import posixpath
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Final, Literal
+
+from msgspec.structs import replace
 
 from ..config.loading import PlainConfig, ValueOrigin
 from ..config.mesh import LimitsConfig
@@ -28,7 +30,7 @@ from .own_annotation import ANNOTATION_TYPE, AnnotationRefused, chosen_names, me
 from .package import DEFAULT, Package
 from .parameter_bindings import AppliedValue, changed, resolve_parameters
 from .problems import Problems
-from .ssd_reading import annotations_of, read_structure
+from .ssd_reading import annotations_of, read_structure, read_values
 from .system_structure import FilePlace, Structure, StructureComponent, StructureSystem, components_of
 
 __all__ = ["NEEDED", "read_system"]
@@ -47,7 +49,7 @@ _KINDS: Final[Mapping[str, Kind]] = {
 _KNOWN: Final = {OPEN_MODELICA, OPEN_SIMULATION_PLATFORM, ANNOTATION_TYPE}
 
 
-def read_system(path: Path, ssd: str | None = None) -> PlainConfig:
+def read_system(path: Path, ssd: str | None = None, ssv: Sequence[str | Path] = ()) -> PlainConfig:
     """Read a package as the values of a configuration.
 
     What the configuration means is checked with everything else before a run; so are the findings of the package.
@@ -55,9 +57,10 @@ def read_system(path: Path, ssd: str | None = None) -> PlainConfig:
     Args:
         path: an .ssp file, a folder that was one, or an .ssd file.
         ssd: which description of the package: the name of its file, or the name that it has; None: the default one.
+        ssv: files with values, in the package or else on the disk; each is a last binding of the root system.
 
     Raises:
-        ConfigurationError: there is no such package or description, or it has no system.
+        ConfigurationError: there is no such package, description or file with values, or it has no system.
     """
     problems = Problems()
     with Package(path) as package:
@@ -66,6 +69,9 @@ def read_system(path: Path, ssd: str | None = None) -> PlainConfig:
         if structure is None:
             problems.raise_any(package.shown(name))
         assert structure is not None  # otherwise there is a finding
+        chosen = [read_values(package, str(name), problems) for name in ssv]
+        bindings = (*structure.system.bindings, *(binding for binding in chosen if binding is not None))
+        structure = replace(structure, system=replace(structure.system, bindings=bindings))
         return _Configuration(package, name, structure, problems).plain()
 
 
