@@ -21,7 +21,7 @@ def values_of(mesh: fmu_mesh.Mesh) -> dict[str, tuple[object, str]]:
     plan = mesh.check().plan
     assert plan is not None
     return {
-        f"{one.name}.{name}": (value, f"{Path(one.origins[name].file).name}:{one.origins[name].line}")
+        f"{one.name}.{name}": (value, f"{Path(one.origins[name].file or '').name}:{one.origins[name].line}")
         for one in plan.instances
         for name, value in one.start_values.items()
     }
