@@ -19,7 +19,7 @@ from ..archives.archive_entries import checked_archive, entry_name
 from ..archives.safe_xml import safe_xml
 from ..config.loading import PlainConfig
 from ..config.mesh import LimitsConfig
-from ..errors import Finding
+from ..errors import ConfigurationError, Finding
 from ..files import archive_on_the_way, is_file
 from ..text import listed
 from .grammar import NAMESPACES
@@ -77,6 +77,7 @@ class KeptPackage(NamedTuple):
 
         Raises:
             LoadFailed, OSError: the package cannot be read.
+            ConfigurationError: a link leads out of the folder.
         """
         if is_file(self.root):
             with self.root.open("rb") as file, checked_archive(self.root, file, LimitsConfig(), "package") as archive:
@@ -89,8 +90,16 @@ class KeptPackage(NamedTuple):
             return
         names = self._names_in_folder()
         main = DEFAULT if DEFAULT not in names else self.name
-        others = [PackageEntry(name, self.root / name) for name in names if name != self.name]
+        others = [PackageEntry(name, self._own_file(name)) for name in names if name != self.name]
         yield [PackageEntry(main, document), *others]
+
+    def _own_file(self, name: str) -> Path:
+        """The path of a file of a folder; what is copied is given to others, and so must not be somewhere else."""
+        path = self.root / name
+        if not path.resolve().is_relative_to(self.root.resolve()):
+            text = f"'{path}' is a link out of the folder of the package"
+            raise ConfigurationError(text, hint="Put the file itself in its place.")
+        return path
 
     def lost(self, kept_units: set[str]) -> tuple[Finding, ...]:
         """What a new description does not have, each with its first line.

@@ -188,6 +188,9 @@ class _Configuration:
             result.data["record"] = {**record, "file": RESULT_BESIDE_PACKAGE}
         for path in result.paths:
             self._place(path, self._annotation.place)
+        if "zenoh" in result.paths:
+            found = f"the package says how the mesh connects: {str(result.data['zenoh'])[:200]}"
+            self._problems.warn(self._annotation.place, found, "--connect and --listen, if you do not trust it")
         for gone in result.gone:
             self._problems.warn(self._annotation.place, f"{gone} is not there any more")
         return result.data

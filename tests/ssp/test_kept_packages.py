@@ -229,6 +229,30 @@ def test_a_folder_becomes_a_package_of_the_files_that_belong_to_it(tmp_path: Pat
     assert rows_of(loaded(tmp_path / "copy.ssp"), tmp_path / "b.csv") == rows_of(mesh, tmp_path / "a.csv")
 
 
+def test_a_link_out_of_a_folder_is_not_packed(tmp_path: Path) -> None:
+    folder, secret = tmp_path / "open", tmp_path / "secret.txt"
+    secret.write_text("mine")
+    for name, content in files_of_package().items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(content)
+    (folder / "resources/notes.txt").symlink_to(secret)
+
+    with pytest.raises(fmu_mesh.ConfigurationError, match=r"notes\.txt' is a link out of the folder of the package"):
+        loaded(folder).to_ssp(tmp_path / "copy.ssp")
+
+    assert not (tmp_path / "copy.ssp").exists()
+
+
+def test_where_a_package_connects_is_a_warning(own: Path, tmp_path: Path) -> None:
+    mesh = loaded(own)
+    mesh.configure(zenoh={"listen": ["tcp/127.0.0.1:7447"]})
+    mesh.to_ssp(tmp_path / "open.ssp")
+
+    (warning,) = loaded(tmp_path / "open.ssp").configuration.warnings
+
+    assert warning.found == "the package says how the mesh connects: {'listen': ['tcp/127.0.0.1:7447']}"
+
+
 def test_a_single_description_becomes_the_default_one_of_its_package(tmp_path: Path) -> None:
     for name, content in files_of_package().items():
         if name != MAIN:
@@ -404,6 +428,12 @@ def test_what_our_annotation_says_about_things_that_are_gone_is_a_warning(own: P
         ),
         ('{"version": 1, "instances": {"right": 1}}', "no mapping for the instance 'right'", "a mapping"),
         ('{"version": 1, "connections": [{"factor": 2}]}', "the key 'factor' of a connection", "one of delay"),
+        (
+            '{"version": 1, "record": {"file": "../../rows.csv"}}',
+            "the result file '../../rows.csv'",
+            "a path into the folder of the package",
+        ),
+        ('{"version": 1, "record": [{"file": "/tmp/rows.csv"}]}', "the result file '/tmp/rows.csv'", "a path into"),
         ('{"version": 1, "connections": {}}', "no list of mappings in 'connections'", "a list of mappings"),
         (f'{{"version": 1, "x": {"[" * 100_000}', "no JSON: maximum recursion depth", "the JSON that fmu_mesh"),
     ],
