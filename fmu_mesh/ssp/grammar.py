@@ -6,9 +6,11 @@ Geometry, meta data and annotations are not looked into: they do not change what
 from __future__ import annotations
 
 import re
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, get_args
 
 import msgspec
+
+from .system_structure import ConnectorKind
 
 __all__ = ["GRAMMAR", "NAMESPACES", "PATTERNS", "TYPES", "Attribute", "Rule", "number_of"]
 
@@ -100,17 +102,7 @@ class Rule(msgspec.Struct, frozen=True):
     since: str = "1.0"
 
 
-_KINDS = (
-    "input",
-    "output",
-    "inout",
-    "parameter",
-    "calculatedParameter",
-    "structuralParameter",
-    "constant",
-    "local",
-    "unspecified",
-)
+_KINDS = get_args(ConnectorKind)
 _IMPLEMENTATIONS = ("any", "CoSimulation", "ModelExchange", "ScheduledExecution")
 _BASES = ("SSD", "component")
 
