@@ -241,6 +241,11 @@ NOT_RUN = [
         "somebody kills a process there; tests/faults/test_lost_processes.py does",
     ),
     (
+        "docs/connections.md",
+        "connections:",
+        "the two FMUs are yours; tests/equivalence/test_maps.py runs such connections",
+    ),
+    (
         "docs/dashboard.md",
         "fmu-mesh dashboard",
         "it serves until somebody ends it; tests/equivalence/test_dashboard_page.py opens the page in a browser",

@@ -235,7 +235,7 @@ def test_a_result_file_inside_a_package_is_refused_with_the_way_out(capsys: pyte
         (["launch", "ship.ssp/VarB.ssd", "--ssd", "VarB"], "Name the package, 'ship.ssp', or leave --ssd out."),
         (["inspect", "ship/VarB.ssd", "--ssd", "VarB"], "Name the package, 'ship', or leave --ssd out."),
         (["graph", "DP_ship", "--ssd", "VarB"], "'DP_ship' is no package"),
-        (["graph", "--ssd", "VarB"], "--ssd chooses a description in a package of SSP, and none is named"),
+        (["graph", "--ssd", "VarB"], "--ssd and --ssv choose a variant of a package of SSP, and none is named"),
         (["convert", "ship.ssp", "no/ship.ssp"], "'no/ship.ssp' cannot be written: No such file or directory"),
         (["launch", "ship.ssp", "--ssd", "VarC"], "'ship.ssp' has no description 'VarC'. Did you mean 'VarB'?"),
         (["new", "ship.ssp"], "`fmu-mesh convert ship.ssp mesh.yaml` makes a file to change"),
