@@ -28,11 +28,11 @@ class Problems:
 
     def add(self, place: FilePlace, found: str, expected: str, suggestion: str | None = None) -> None:
         """Add a finding: there is ``found`` instead of ``expected``."""
-        self._add(self.findings, place, found, expected, suggestion)
+        self._add(self.findings, _finding(place, found, expected, suggestion))
 
     def warn(self, place: FilePlace, found: str, expected: str = "") -> None:
         """Add a warning."""
-        self._add(self.warnings, place, found, expected, None)
+        self._add(self.warnings, _finding(place, found, expected))
 
     def warn_once(self, like: Hashable, place: FilePlace, found: str, what: str) -> None:
         """Add a warning, or let the first one of its kind say how many others there are.
@@ -43,7 +43,7 @@ class Problems:
             found: what there is.
             what: the warnings of this kind are about, such as `value`.
         """
-        finding = Finding(place.file, place.element, found, "", None, place.line or None)
+        finding = _finding(place, found)
         index, alike = self._alike.setdefault(like, (len(self.warnings), []))
         if finding in alike:
             return  # an element may be read more than once
@@ -67,8 +67,12 @@ class Problems:
             raise ConfigurationError(text, findings=tuple(ordered))
 
     @staticmethod
-    def _add(found_so_far: list[Finding], place: FilePlace, found: str, expected: str, suggestion: str | None) -> None:
-        near = printable(suggestion) if suggestion is not None else None
-        finding = Finding(place.file, place.element, printable(found), printable(expected), near, place.line or None)
+    def _add(found_so_far: list[Finding], finding: Finding) -> None:
         if finding not in found_so_far:  # an element may be read more than once
             found_so_far.append(finding)
+
+
+def _finding(place: FilePlace, found: str, expected: str = "", suggestion: str | None = None) -> Finding:
+    """A finding whose texts, which may have names of the package in them, are one line each."""
+    near = printable(suggestion) if suggestion is not None else None
+    return Finding(place.file, place.element, printable(found), printable(expected), near, place.line or None)
