@@ -9,8 +9,9 @@ from pathlib import Path
 from .. import files
 from ..api.converting import convert
 from ..errors import ConfigurationError
-from ..ssp.configuration_files import named_package, read_configuration
+from ..ssp.configuration_files import named_package
 from ..ssp.package import DEFAULT, Package
+from ..ssp.system_reading import chosen_description
 from .arguments import CommandParser, Parsers, add_package, add_quiet
 from .output.display import say
 from .run_options import add_options, read_options
@@ -54,9 +55,9 @@ def _launch(source: Path, ssd: str | None, target: Path) -> str:
     """The command that runs what was written."""
     words = ["fmu-mesh", "launch", str(target)]
     named = named_package(source, ssd)
-    is_chosen = named is not None and (named[1] is not None or source.suffix.lower() == ".ssd")
-    if is_chosen and target.suffix.lower() == ".ssp":
-        name = read_configuration(source, ssd).file.name
+    if named is not None and target.suffix.lower() == ".ssp":
+        with Package(named[0]) as package:
+            name = chosen_description(package, named[1])
         with Package(target) as package:
             if name != DEFAULT and name in package.descriptions:
                 words += ["--ssd", name]

@@ -33,7 +33,7 @@ from .problems import Problems
 from .ssd_reading import annotations_of, read_structure, read_values
 from .system_structure import FilePlace, Structure, StructureComponent, StructureSystem, components_of
 
-__all__ = ["NEEDED", "read_system"]
+__all__ = ["NEEDED", "chosen_description", "read_system"]
 
 NEEDED: Final = {
     "simulation.step_size": "`--step-size S`, the communication step size in s",
@@ -64,7 +64,7 @@ def read_system(path: Path, ssd: str | None = None, ssv: Sequence[str | Path] = 
     """
     problems = Problems()
     with Package(path) as package:
-        name = _chosen(package, ssd)
+        name = chosen_description(package, ssd)
         structure = read_structure(package, name, problems)
         if structure is None:
             problems.raise_any(package.shown(name))
@@ -75,7 +75,7 @@ def read_system(path: Path, ssd: str | None = None, ssv: Sequence[str | Path] = 
         return _Configuration(package, name, structure, problems).plain()
 
 
-def _chosen(package: Package, ssd: str | None) -> str:
+def chosen_description(package: Package, ssd: str | None) -> str:
     """The file of the description that is asked for.
 
     Raises:
@@ -291,7 +291,7 @@ class _Configuration:
         hint, base = step_size_hint(component.annotations, self._problems), simulation.get("step_size")
         if hint is None or not isinstance(base, float):
             return None
-        points = max(1, round(hint[0] * 1e9) // max(1, round(base * 1e9)))
+        points = max(1, _nanoseconds(hint[0]) // max(1, _nanoseconds(base)))
         if points * base != hint[0]:
             found = f"the step size {hint[0]:g} s, for which {points * base:.12g} s is taken"
             self._problems.warn(hint[1].place, found, f"a whole multiple of {base:g} s")
@@ -349,6 +349,11 @@ class _Configuration:
             if annotation.type not in _KNOWN:
                 found = "its type is not known: it has no effect"
                 self._problems.warn_once(("annotation", annotation.type), annotation.place, found, "annotation")
+
+
+def _nanoseconds(seconds: float) -> int:
+    """A duration as libcosim has it, in 64 bits."""
+    return round(min(seconds * 1e9, 2.0**62))
 
 
 def _is_known(system: StructureSystem) -> bool:

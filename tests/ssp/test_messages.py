@@ -10,6 +10,7 @@ import pytest
 import fmu_mesh
 from fmu_mesh.cli.main import main
 from tests.ssp.packages import (
+    Files,
     bound,
     component,
     connection,
@@ -136,3 +137,17 @@ def test_the_command_that_runs_a_converted_package_chooses_its_description(
     assert main(["convert", "own.ssp", "copy.ssp", *needed, *options]) == 0
 
     assert capsys.readouterr().out == f"copy.ssp: run it with `fmu-mesh launch {command}`\n"
+
+
+@pytest.mark.parametrize("hint", ["1e300", "1.7e308"])
+def test_a_step_size_that_no_run_can_reach_is_told_and_ends_nothing(hint: str, tmp_path: Path) -> None:
+    def annotation(inside: str) -> str:
+        return element("ssc:Annotation", inside, type="com.opensimulationplatform")
+
+    slow = component("pendulum", "DampedPendulum", annotations=[annotation(f'<StepSizeHint value="{hint}"/>')])
+    root = system("root", slow, annotations=[annotation('<FixedStepAlgorithm baseStepSize="0.125"/>')])
+    package: Files = {SSD: description(root), **fmus("DampedPendulum")}
+
+    warnings = fmu_mesh.load(write_package(tmp_path / "own.ssp", package)).check().warnings
+
+    assert any(f"the step size {float(hint):g} s, for which" in str(warning) for warning in warnings)
