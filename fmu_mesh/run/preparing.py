@@ -102,8 +102,6 @@ def plan_run(
     path: Path,
     options: Options = Options(),  # noqa: B008 a frozen Struct
     tell: Callable[[str], None] = lambda _text: None,
-    *,
-    ssd: str | None = None,
 ) -> RunPlan:
     """Read, check and plan the configuration at ``path``.
 
@@ -111,12 +109,11 @@ def plan_run(
         path: the YAML file, or a package of SSP.
         options: what the command line changes.
         tell: called before something that takes long, such as compiling an FMU.
-        ssd: which description of a package; None: the default one.
 
     Raises:
         ConfigurationError: the configuration or an FMU is wrong; carries all findings.
     """
-    plain = with_needed(with_config_values(read_configuration(path, ssd), options.config_values), options)
+    plain = with_needed(with_config_values(read_configuration(path), options.config_values), options)
     loaded, findings = examine_data(plain, options.start_values)
     return planned(loaded, findings, options, tell)
 

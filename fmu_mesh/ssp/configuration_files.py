@@ -9,17 +9,17 @@ from typing import Final
 
 from .. import files
 from ..config.loading import PlainConfig, read_file
+from ..config.mesh import RecordConfig
 from ..errors import ConfigurationError
-from .package import is_package
+from .package import ARCHIVE, beginning, is_package
 
 __all__ = ["RESULT_BESIDE_PACKAGE", "named_package", "names_package", "read_configuration"]
 
-RESULT_BESIDE_PACKAGE: Final = "../results/{mesh}.csv"
+RESULT_BESIDE_PACKAGE: Final = f"../{RecordConfig().file}"
 """The result file of a package that says none: beside the archive, and not in it."""
 
 _YAML: Final = (".yaml", ".yml", ".json")
 _PARTS: Final = (".ssv", ".ssm", ".ssb")
-_ARCHIVE: Final = b"PK\x03\x04"
 
 
 def read_configuration(path: Path, ssd: str | None = None, ssv: Sequence[str | Path] = ()) -> PlainConfig:
@@ -41,7 +41,8 @@ def read_configuration(path: Path, ssd: str | None = None, ssv: Sequence[str | P
         from .system_reading import read_system  # noqa: PLC0415  it imports FMPy, which is slow
 
         return read_system(*package, ssv)
-    for option in (["--ssd"] if ssd is not None else []) + (["--ssv"] if ssv else []):
+    if ssd is not None or ssv:
+        option = "--ssd" if ssd is not None else "--ssv"
         raise ConfigurationError(f"{option} chooses a variant of a package of SSP, and '{path}' is no package")
     archive = files.archive_on_the_way(path)
     if path.suffix.lower() in _PARTS or (archive is not None and names_package(archive)):
@@ -77,11 +78,10 @@ def names_package(path: Path) -> bool:
         return any(path.glob("*.ssd"))
     if path.suffix.lower() in _YAML or not files.is_file(path):
         return False
+    if beginning(path) != ARCHIVE:
+        return False
     try:
-        with path.open("rb") as file:
-            if file.read(len(_ARCHIVE)) != _ARCHIVE:
-                return False
-            with zipfile.ZipFile(file) as archive:  # only its list of files is read here
-                return any(name.lower().endswith(".ssd") and "/" not in name for name in archive.namelist())
+        with zipfile.ZipFile(path) as archive:  # only its list of files is read here
+            return any(name.lower().endswith(".ssd") and "/" not in name for name in archive.namelist())
     except (OSError, ValueError, zipfile.BadZipFile):
         return False  # whoever reads it says why

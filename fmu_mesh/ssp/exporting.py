@@ -56,9 +56,10 @@ def export(
     if path.suffix.lower() != ".ssp":
         raise ConfigurationError(f"'{path}' is no name of a package", hint="Let it end in '.ssp'.")
     kept = kept_package(plain)
-    as_it_is = kept is not None and (version is None or kept.is_of(version))
-    if kept is not None and as_it_is and _is_unchanged(plain, original := _read_again(kept)):
-        return _write_copy(plain, original, kept, path)
+    if kept is not None and (version is None or kept.is_of(version)):
+        original = _read_again(kept)
+        if _is_unchanged(plain, original):
+            return _write_copy(plain, original, kept, path)
     units = _write_new(plain, resolve, path, version or "1.0")
     return kept.lost(units) if kept is not None else ()
 

@@ -19,6 +19,7 @@ import posixpath
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
+from ..config.mesh import RecordConfig
 from ..text import listed
 
 __all__ = [
@@ -66,9 +67,6 @@ _SECTIONS: Final = (
     "ros",
 )
 """The top-level keys that stand there as they are."""
-
-_DEFAULT_RESULT: Final = "results/{mesh}.csv"
-"""The result file of a package that says none, relative to the folder of the package."""
 
 _KNOWN: Final = ("version", "mesh", "names", "simulation", "instances", "connections", *_SECTIONS)
 _ABSENT: Final = object()
@@ -132,7 +130,7 @@ def written(
     sections = {key: data[key] for key in _SECTIONS if key in data and data[key] != described.get(key, _ABSENT)}
     if "record" in sections:
         record = _with_files(sections.pop("record"), lambda path: _inside(moved(path)))
-        if isinstance(record, dict) and record.get("file") == _DEFAULT_RESULT:
+        if isinstance(record, dict) and record.get("file") == RecordConfig().file:
             del record["file"]
         if record != {}:
             sections["record"] = record

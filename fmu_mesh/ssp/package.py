@@ -24,12 +24,14 @@ from ..text import listed, nearest, nearest_file
 from .problems import Problems
 from .system_structure import FilePlace
 
-__all__ = ["DEFAULT", "Package", "is_package"]
+__all__ = ["ARCHIVE", "DEFAULT", "Package", "beginning", "is_package"]
+
+ARCHIVE: Final = b"PK\x03\x04"
+"""The first bytes of a ZIP archive with at least one file."""
 
 DEFAULT: Final = "SystemStructure.ssd"
 _SCHEME: Final = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):")
 _SUFFIXES: Final = (".ssp", ".ssd")
-_ARCHIVE: Final = b"PK\x03\x04"
 
 
 def is_package(path: Path) -> bool:
@@ -63,7 +65,7 @@ class Package:
         self._containers: dict[str, OpenFmu] = {}
         if is_ssd and not files.is_file(path):
             raise _no_such_file(path)
-        if is_ssd and _beginning(path) == _ARCHIVE:
+        if is_ssd and beginning(path) == ARCHIVE:
             raise ConfigurationError(f"'{path}' is a ZIP archive, and no description", hint="Name it .ssp.")
         self._container("")
 
@@ -128,9 +130,9 @@ class Package:
             hint = f"Did you mean '{near}'?" if near is not None else None
             raise ConfigurationError(f"'{path}': there is no such file, nor is it in '{self._shown}'", hint=hint)
         try:
-            size = path.stat().st_size
-            if size > LimitsConfig().description_bytes:
-                text = f"'{path}' has {size} bytes; the limit is {LimitsConfig().description_bytes}"
+            size, limit = path.stat().st_size, LimitsConfig().description_bytes
+            if size > limit:
+                text = f"'{path}' has {size} bytes; the limit is {limit}"
                 raise ConfigurationError(text, hint="Divide it into several files: `--ssv` is repeatable.")
             return path.read_bytes()
         except OSError as error:
@@ -206,21 +208,21 @@ def _way_out(path: Path, error: LoadFailed) -> str | None:
         return "If you trust it, unpack it, and name the folder instead."
     if error.hint is not None or not files.is_file(path):
         return error.hint
-    match _beginning(path):
+    match beginning(path):
         case b"":
             return "The file is empty."
-        case begin if begin == _ARCHIVE and not zipfile.is_zipfile(path):
+        case begin if begin == ARCHIVE and not zipfile.is_zipfile(path):
             return "It begins like one, and its end is missing: was it copied completely?"
         case begin if begin.startswith((b"<", b"\xef\xbb\xbf<")):
             return "It is XML: name it .ssd if it is a system structure description."
     return None
 
 
-def _beginning(path: Path) -> bytes:
+def beginning(path: Path) -> bytes:
     """The first bytes of a file; empty if it cannot be read."""
     try:
         with path.open("rb") as file:
-            return file.read(len(_ARCHIVE))
+            return file.read(len(ARCHIVE))
     except OSError:
         return b""
 
