@@ -41,14 +41,14 @@ class SharedLibrary(msgspec.Struct, frozen=True):
 
 
 def read_shared_library(file: IO[bytes]) -> SharedLibrary | None:
-    """Read the dynamic section of a library of 64 bits; None if ``file`` is none, is damaged or is linked statically."""
+    """Read the dynamic section of a library of 64 bits; None if ``file`` is none, is damaged or is static."""
     # It takes 30 ms to import, and most runs need none of this.
     from elftools.common.exceptions import ELFError  # noqa: PLC0415
     from elftools.elf.elffile import ELFFile  # noqa: PLC0415
 
     try:
         elf = ELFFile(file)
-        dynamic = next(elf.iter_segments("PT_DYNAMIC"), None)
+        dynamic: Any = next(elf.iter_segments("PT_DYNAMIC"), None)
         if dynamic is None or elf.elfclass != 64 or not elf.little_endian:
             return None
         tags = list(dynamic.iter_tags())
@@ -70,7 +70,7 @@ def read_shared_library(file: IO[bytes]) -> SharedLibrary | None:
     )
 
 
-def _symbols(file: IO[bytes], dynamic: Any) -> list[tuple[str, int, bool]]:  # noqa: ANN401 pyelftools is untyped
+def _symbols(file: IO[bytes], dynamic: Any) -> list[tuple[str, int, bool]]:  # noqa: ANN401 its type has no tags
     """Name, binding and whether it is undefined, of each dynamic symbol; pyelftools takes 100 us for one of them."""
     _, place = dynamic.get_table_offset("DT_SYMTAB")
     _, names_place = dynamic.get_table_offset("DT_STRTAB")
