@@ -16,6 +16,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import IO, Protocol
+from zipfile import ZipInfo
 
 import msgspec
 
@@ -81,6 +82,10 @@ class OpenFmu(Protocol):
 
     def read(self, name: str) -> bytes:
         """The content of one of its files, which must not be larger than a description (`limits.description_bytes`)."""
+        ...
+
+    def read_binary(self, name: str) -> bytes:
+        """The content of one of its libraries, of any size that the limits of an archive allow."""
         ...
 
     def content_sha256(self) -> str:
@@ -197,12 +202,14 @@ class _Archive:
             return Contents(frozenset(entries), {name: self._zip.read(entries[name]) for name in present})
 
     def read(self, name: str) -> bytes:
-        entry = next((one for one in self._zip.infolist() if entry_name(one) == name and not one.is_dir()), None)
-        if entry is None:
-            raise _no_file(self.path, name)
+        entry = self._entry(name)
         _refuse_large_description(self.path, {name: entry.file_size}, self._limits)
         with reading(self.path):
             return self._zip.read(entry)
+
+    def read_binary(self, name: str) -> bytes:
+        with reading(self.path):
+            return self._zip.read(self._entry(name))
 
     def content_sha256(self) -> str:
         with reading(self.path):
@@ -212,6 +219,12 @@ class _Archive:
         with reading(self.path):
             for entry in self._zip.infolist():
                 write_entry(self._zip, entry, folder)
+
+    def _entry(self, name: str) -> ZipInfo:
+        entry = next((one for one in self._zip.infolist() if entry_name(one) == name and not one.is_dir()), None)
+        if entry is None:
+            raise _no_file(self.path, name)
+        return entry
 
     def _sha256(self) -> str:
         if self._digest is None:
@@ -264,10 +277,14 @@ class _Folder:
             raise LoadFailed(f"'{self.path}' cannot be read: {error.strerror}.") from error
 
     def read(self, name: str) -> bytes:
+        if name in _names_in(self.path):
+            _refuse_large_description(self.path, {name: (self.path / name).stat().st_size}, self._limits)
+        return self.read_binary(name)
+
+    def read_binary(self, name: str) -> bytes:
         try:
             if name not in _names_in(self.path):
                 raise _no_file(self.path, name)
-            _refuse_large_description(self.path, {name: (self.path / name).stat().st_size}, self._limits)
             return (self.path / name).read_bytes()
         except OSError as error:
             raise LoadFailed(f"'{self.path}' cannot be read: {error.strerror}.") from error

@@ -6,13 +6,17 @@ process an FMU may call are questions for the callers.
 
 from __future__ import annotations
 
+import hashlib
 import struct
+from io import BytesIO
 from typing import IO, Any, Final
 
 import msgspec
 import numpy as np
 
-__all__ = ["SharedLibrary", "read_shared_library"]
+from .archive import OpenFmu
+
+__all__ = ["SharedLibrary", "libraries_beside", "read_shared_library"]
 
 _GNU_UNIQUE: Final = 10
 """The binding STB_GNU_UNIQUE."""
@@ -26,6 +30,7 @@ class SharedLibrary(msgspec.Struct, frozen=True):
     """A library as the dynamic linker sees it.
 
     Attributes:
+        sha256: of its content.
         soname: the name that a process knows it by; empty if it has none: then that is the name of its file.
         needed: the names of the libraries that it needs.
         run_paths: the folders that it looks for them in, as written (`$ORIGIN` is its own folder).
@@ -33,6 +38,7 @@ class SharedLibrary(msgspec.Struct, frozen=True):
         unique: the symbols that exist once in a process, whoever loads them and however (STB_GNU_UNIQUE).
     """
 
+    sha256: str = ""
     soname: str = ""
     needed: tuple[str, ...] = ()
     run_paths: tuple[str, ...] = ()
@@ -40,12 +46,21 @@ class SharedLibrary(msgspec.Struct, frozen=True):
     unique: frozenset[str] = frozenset()
 
 
-def read_shared_library(file: IO[bytes]) -> SharedLibrary | None:
-    """Read the dynamic section of a library of 64 bits; None if ``file`` is none, is damaged or is static."""
-    # It takes 30 ms to import, and most runs need none of this.
-    from elftools.common.exceptions import ELFError  # noqa: PLC0415
-    from elftools.elf.elffile import ELFFile  # noqa: PLC0415
+def libraries_beside(fmu: OpenFmu, library: str) -> dict[str, SharedLibrary]:
+    """The libraries in the folder of the library that is loaded, itself included, by the names of their files."""
+    folder = library.rpartition("/")[0]
+    names = sorted(name for name in fmu.contents().names if name.rpartition("/")[0] == folder)
+    found = {name.rpartition("/")[2]: read_shared_library(fmu.read_binary(name)) for name in names}
+    return {name: facts for name, facts in found.items() if facts is not None}
 
+
+def read_shared_library(content: bytes) -> SharedLibrary | None:
+    """Read the dynamic section of a library of 64 bits; None if it is none, is damaged or is static."""
+    # It takes 30 ms to import, and most runs need none of this.
+    from elftools.common.exceptions import ELFError  # noqa: PLC0415 see above
+    from elftools.elf.elffile import ELFFile  # noqa: PLC0415 see above
+
+    file = BytesIO(content)
     try:
         elf = ELFFile(file)
         dynamic: Any = next(elf.iter_segments("PT_DYNAMIC"), None)
@@ -57,6 +72,7 @@ def read_shared_library(file: IO[bytes]) -> SharedLibrary | None:
     except (ELFError, ArithmeticError, AttributeError, LookupError, MemoryError, TypeError, ValueError, struct.error):
         return None
     return SharedLibrary(
+        sha256=hashlib.sha256(content).hexdigest(),
         soname=next((tag.soname for tag in tags if tag.entry.d_tag == "DT_SONAME"), ""),
         needed=tuple(tag.needed for tag in tags if tag.entry.d_tag == "DT_NEEDED"),
         run_paths=tuple(
