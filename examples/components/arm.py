@@ -54,8 +54,8 @@ class Arm(fmu_mesh.Component):
     length = Parameter(1.0, unit="m")
     friction = Parameter(0.01, unit="N.m.s/rad")
     torque = Input(unit="N.m")
-    position = Output(0.0, unit="rad")
-    velocity = Output(0.0, unit="rad/s")
+    position = Output(0.0, unit="rad", depends_on=())
+    velocity = Output(0.0, unit="rad/s", depends_on=())
 
     def step(self, time: float, step_size: float) -> None:
         """One step of Euler's method, the position with the new velocity."""

@@ -5,6 +5,7 @@ Owns the texts of `CallRefused` about arguments. Knows nothing of modes and step
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Mapping
 
@@ -17,6 +18,8 @@ from ..variables.value_conversion import ValueRefused, to_value
 from .times import Instant, RosStamp, RosTime, Time, instant_of
 
 __all__ = ["Arguments"]
+
+log = logging.getLogger(__name__)
 
 
 class Arguments:
@@ -85,11 +88,17 @@ class Arguments:
         return float(number)
 
     def step_size(self, value: float | RosTime | None) -> float:
-        """``value``, or else the default experiment's step size, as a number of seconds above 0."""
+        """``value``, or else the FMU's own step size, as a number of seconds above 0; a doubtful one is logged."""
         if value is None:
-            value = self._description.default_experiment.step_size
+            value = self._description.step_size
             if value is None:
                 raise self.refusal("the FMU has no default step size.", "Give one: FMIAdapter(path, step_size).")
+        number = self._above_zero(value)
+        if (doubt := self._description.doubt_about_step(number)) is not None:
+            log.warning("step_size instance=%s: %s", self.instance, doubt)
+        return number
+
+    def _above_zero(self, value: float | RosTime) -> float:
         number = self.seconds(value, "step size")
         if number <= 0.0:
             raise self.refusal(f"the step size is {value!r} s; expected one above 0.")
@@ -97,7 +106,7 @@ class Arguments:
 
     def other_step_size(self, value: float | RosTime, default: float) -> float:
         """``value`` as the size of one step; ``default`` is the usual step size in s."""
-        number = self.step_size(value)
+        number = self._above_zero(value)
         if number != default and not self._description.can_handle_variable_step_size:
             raise self.refusal(
                 f"a step of {value!r} s is not one of {default!r} s, and this FMU takes steps of one size only.",
@@ -121,6 +130,8 @@ class Arguments:
             kind = f"{known.variability} {known.causality}"
             raise self.refusal(f"this {kind} is not {role}.", expected, name)
         near = nearest(str(name), allowed)
+        if (clock := self._description.clock(str(name))) is not None:
+            raise self.refusal(f"{clock}.")
         raise self.refusal(f"there is no variable '{name}'.", f"Did you mean '{near}'?" if near else expected)
 
 

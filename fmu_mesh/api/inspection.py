@@ -88,6 +88,8 @@ class Inspection(msgspec.Struct, frozen=True, omit_defaults=False):
         """
         names = [variable.name for variable in self.description.variables]
         for pattern in variables:
+            if (clock := self.description.clock(pattern)) is not None:
+                raise UnknownName(f"{clock}.", hint="The page without `--variables` lists the clocks.")
             if not matching(pattern, names):
                 near = nearest(pattern, names)
                 hint = f"Did you mean '{near}'?" if near else None

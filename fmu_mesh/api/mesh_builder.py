@@ -147,7 +147,7 @@ class Mesh:
 
             raise with_way_out(error, file) from error
         own_name = name if name is not None else description.model_identifier
-        times = {"step_size": description.default_experiment.step_size, "stop_time": None, **simulation}
+        times = {"step_size": description.step_size, "stop_time": None, **simulation}
         if times["step_size"] is None:
             raise CallRefused(
                 f"'{path}' has no default step size.", hint='Give one, as `simulation={"step_size": ...}`.'

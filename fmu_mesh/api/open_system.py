@@ -357,6 +357,8 @@ class System:
             names = [one.name for one in description.variables]
             near = nearest(rest, names)
             hint = f"Did you mean '{instance}.{near}'?" if near else f"There are {listed(names)}."
+            if (clock := description.clock(rest)) is not None:
+                raise UnknownName(f"{clock}.", instance=instance)
             raise UnknownName(f"there is no variable '{rest}'.", instance=instance, hint=hint)
         return instance, variable
 

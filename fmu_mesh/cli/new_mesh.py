@@ -31,7 +31,7 @@ from ..run.options import Options
 from ..run.preparing import planned
 from ..simtime import steps_between
 from ..ssp.configuration_files import names_package
-from ..system.connections import resolve_connections, unit_warnings
+from ..system.connections import Variables, resolve_connections, unit_warnings
 from ..text import short_number, short_path, shown
 from ..variables.model_description import ModelDescription, Variable
 from .arguments import CommandParser, Parsers, add_quiet
@@ -185,7 +185,7 @@ def configuration_for(models: Sequence[Model], *, mesh: str, file: Path, schema:
 def _simulation(models: Sequence[Model]) -> tuple[float, list[str]]:
     """The step size in s, and the section `simulation`."""
     experiments = [(model.path, model.description.default_experiment) for model in models if model.description]
-    steps = [(one.step_size, path) for path, one in experiments if one.step_size]
+    steps = [(own, model.path) for model in models if model.description and (own := model.description.step_size)]
     stops = [(one.stop_time, path) for path, one in experiments if one.stop_time]
     starts = {one.start_time or 0.0 for _, one in experiments}
     start = starts.pop() if len(starts) == 1 else 0.0
@@ -208,7 +208,7 @@ def _instance(model: Model, base_step: float) -> list[str]:
     if model.description is None:
         return [f"  # {model.name}: {{fmu: {_scalar(model.path)}}}  # cannot run here: {model.problem}"]
     lines = [f"  {model.name}:", f"    fmu: {_scalar(model.path)}"]
-    own = model.description.default_experiment.step_size
+    own = model.description.step_size
     if own and own != base_step:
         whole = steps_between(0.0, own, base_step)
         note = "" if whole else f"  # its default, but no multiple of {short_number(base_step)}"
@@ -262,7 +262,7 @@ def _fits(source: str, target: str, descriptions: Mapping[str, ModelDescription]
     """Whether a connection would be accepted without a finding or a warning about its units."""
     if "->" in source:
         return False
-    variables = {name: {v.name: v for v in own.variables} for name, own in descriptions.items()}
+    variables = Variables(descriptions, descriptions)
     findings = Findings("")
     connections = resolve_connections([ConnectionConfig(source=source, target=target)], variables, findings)
     unit_warnings(connections, descriptions, findings)

@@ -121,6 +121,7 @@ def _variable(name: str, causality: Causality, text: str, start: float | None = 
         description=text,
         minimum=0.0 if name.endswith("_limit") else None,
         dependencies=tuple(_INPUTS) if causality == "output" else (),
+        feedthrough=tuple(_INPUTS) if causality == "output" else (),
     )
 
 

@@ -271,7 +271,8 @@ class Answers:
         kind, name = parts[0], unescape(parts[1])
         variable = runner.instance.description.variable(name)
         if variable is None or kind_of(variable) != kind:
-            raise ValueRefused(f"'{runner.name}' has no variable '{name}' under '{kind}'")
+            clock = runner.instance.description.clock(name)
+            raise ValueRefused(clock or f"'{runner.name}' has no variable '{name}' under '{kind}'")
         try:
             check_settable(runner.plan, variable)
         except ValueRefused as refused:

@@ -25,6 +25,7 @@ from ..ros.bags.scenario_bags import bag_values
 from ..ros.gateway.mapping import resolve as resolve_ros
 from ..ssp.configuration_files import read_configuration
 from ..system.plan import Plan, make_plan
+from ..system.point_loops import warn_of_point_loops
 from ..system.scenario import Scenario
 from ..system.system import build
 from ..text import nearest_file
@@ -151,6 +152,9 @@ def planned(
     sections = loaded.config.instances
     contents = {name: content(Path(own.fmu), sections[name]) for name, own in system.instances.items()}
     plan = make_plan(system, file=str(loaded.file), contents=contents)
+    warnings = loaded.findings()
+    warn_of_point_loops(plan, warnings)
+    plan = replace(plan, system=replace(system, warnings=(*system.warnings, *warnings)))
     return RunPlan(loaded, options, plan, contents)
 
 

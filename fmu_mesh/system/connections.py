@@ -6,7 +6,7 @@ Owns the names of the ends (the first dot ends the instance name), causality, ty
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Literal
 
 import msgspec
@@ -31,8 +31,19 @@ from fmu_mesh.variables.value_types import (
 
 __all__ = ["Connection", "Variables", "resolve_connections", "resolve_variable", "unit_warnings"]
 
-Variables = Mapping[str, Mapping[str, Variable] | None]
-"""The variables of every instance by name; None without a model description."""
+
+class Variables(dict[str, Mapping[str, Variable] | None]):
+    """The variables of every instance by name; None without a model description.
+
+    Args:
+        descriptions: the model descriptions by instance name, arrays in their sizes.
+        names: the instances, in the order of the file.
+    """
+
+    def __init__(self, descriptions: Mapping[str, ModelDescription], names: Iterable[str]) -> None:
+        super().__init__(dict.fromkeys(names))
+        self.descriptions = {name: descriptions[name] for name in self if name in descriptions}
+        self.update({name: {v.name: v for v in own.variables} for name, own in self.descriptions.items()})
 
 
 class Connection(msgspec.Struct, frozen=True):
@@ -157,7 +168,11 @@ def resolve_variable(
             return _element(own[parts[0]], parts[1], path, reference, findings)
         names = [variable.name for variable in own.values() if variable.causality == causality]
         expected = f"one of the {causality}s of '{instance}': {listed(names)}"
-        findings.add(path, f"the unknown variable '{name}' of instance '{instance}'", expected, nearest(name, names))
+        if (clock := variables.descriptions[instance].clock(name)) is not None:
+            findings.add(path, clock, "")
+        else:
+            found = f"the unknown variable '{name}' of instance '{instance}'"
+            findings.add(path, found, expected, nearest(name, names))
         return None
     return own[name], ()
 

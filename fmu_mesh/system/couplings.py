@@ -78,10 +78,7 @@ def driven_inputs(config: Config, descriptions: Mapping[str, ModelDescription]) 
         descriptions: the model descriptions by instance name, arrays in their sizes; some may be missing.
     """
     ignored = Findings("")  # `fmu_mesh.system.system` reports them
-    variables: Variables = {
-        name: {variable.name: variable for variable in descriptions[name].variables} if name in descriptions else None
-        for name in config.instances
-    }
+    variables = Variables(descriptions, config.instances)
     explicit = resolve_connections(config.connections, variables, ignored)
     connections = (*explicit, *coupled_connections(config, variables, explicit, ignored))
     driven = {f"{c.target_instance}.{c.target.name}": _FREE for c in connections}

@@ -225,7 +225,8 @@ def _resolved(
     """As `resolve_variable`; the nearest name is that of any variable where no output is near."""
     instance, _, name = reference.partition(".")
     own = variables.get(instance)
-    if own and name and name not in own and split_element(name) is None:
+    is_clock = own is not None and variables.descriptions[instance].clock(name) is not None
+    if own and name and name not in own and split_element(name) is None and not is_clock:
         outputs = [variable.name for variable in own.values() if variable.causality == "output"]
         near = nearest(name, own) if nearest(name, outputs) is None else None
         if near is not None:

@@ -48,22 +48,24 @@ def sized(name: str, description: ModelDescription, config: InstanceSection, fin
 
 
 def resolve_start_values(
-    name: str, config: InstanceSection, variables: Mapping[str, Variable], findings: Findings
+    name: str, config: InstanceSection, description: ModelDescription, findings: Findings
 ) -> dict[str, Value]:
     """The start values of the instance ``name``, converted to the types of its variables.
 
     Args:
         name: instance name.
         config: its section of the configuration.
-        variables: its variables by name.
+        description: its model description.
         findings: where unknown names and wrong values go; the result does not have them.
     """
-    settable = [variable.name for variable in variables.values() if variable.settable_before_start]
+    settable = [variable.name for variable in description.variables if variable.settable_before_start]
     values: dict[str, Value] = {}
     for variable_name, value in config.start_values.items():
         path = f"instances.{name}.start_values.{variable_name}"
-        variable = variables.get(variable_name)
-        if variable is None:
+        variable = description.variable(variable_name)
+        if (clock := description.clock(variable_name)) is not None:
+            findings.add(path, clock, "")
+        elif variable is None:
             found = f"the unknown variable '{variable_name}' of instance '{name}'"
             findings.add(path, found, f"one of {listed(settable)}", nearest(variable_name, settable))
         elif not (variable.may_take_start_value if config.follows_fmi else variable.settable_before_start):

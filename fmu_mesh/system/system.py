@@ -32,7 +32,7 @@ from fmu_mesh.system.records import RecordPlan, ending_warnings, resolve_records
 from fmu_mesh.system.scenario import ResolvedScenario, Scenario, ScenarioInput, resolve_scenario
 from fmu_mesh.system.schedule import Schedule
 from fmu_mesh.system.start_values import forbidden_start_values, resolve_start_values, sized
-from fmu_mesh.text import nearest_file, shown
+from fmu_mesh.text import listed, nearest_file, short_number, shown
 from fmu_mesh.variables.model_description import ModelDescription, Value
 
 __all__ = ["Connection", "ResolvedSystem", "SystemInstance", "build"]
@@ -125,12 +125,9 @@ def build(
         for name, description in descriptions.items()
         if name in config.instances
     }
-    variables: Variables = {
-        name: {variable.name: variable for variable in descriptions[name].variables} if name in descriptions else None
-        for name in config.instances
-    }
+    variables = Variables(descriptions, config.instances)
     grid = _grid(config, collected)
-    instances = _instances(loaded, descriptions, variables, collected)
+    instances = _instances(loaded, descriptions, collected)
     forbidden_start_values(config, descriptions, collected, strict=True)
     _check_nodes(config, descriptions, collected)
     connections = resolve_connections(config.connections, variables, collected)
@@ -154,7 +151,7 @@ def build(
     unit_warnings(connections, descriptions, warnings)
     _replaced_start_values(config, connections, warnings)
     warnings.merge(prescribed.warnings)
-    _needed_tools(config, descriptions, warnings)
+    _doubts(config, descriptions, warnings)
     ending_warnings(loaded, records, warnings)
     all_warnings = (*loaded.warnings, *warnings)
     return ResolvedSystem(config, grid, instances, connections, records, all_warnings, prescribed.files)
@@ -219,10 +216,7 @@ def _last_point(start: float, stop: float, step: float, findings: Findings) -> i
 
 
 def _instances(
-    loaded: LoadedConfig,
-    descriptions: Mapping[str, ModelDescription],
-    variables: Variables,
-    findings: Findings,
+    loaded: LoadedConfig, descriptions: Mapping[str, ModelDescription], findings: Findings
 ) -> dict[str, SystemInstance]:
     """All instances with a model description."""
     base = loaded.config.simulation.step_size
@@ -231,10 +225,9 @@ def _instances(
         if name == _RESERVED_NAME:
             findings.add(f"instances.{name}", f"the name '{name}'", "another name: it is reserved for the mesh itself")
         step_points = _step_points(name, config, base, findings)
-        own = variables[name]
-        if own is None:
+        if name not in descriptions:
             continue
-        start_values = resolve_start_values(name, config, own, findings)
+        start_values = resolve_start_values(name, config, descriptions[name], findings)
         config.check(f"instances.{name}", descriptions[name], findings)
         instances[name] = SystemInstance(
             name=name,
@@ -303,14 +296,23 @@ def _check_nodes(config: Config, descriptions: Mapping[str, ModelDescription], f
                 findings.add(path, found, "different groups: this FMU allows one instance per process")
 
 
-def _needed_tools(config: Config, descriptions: Mapping[str, ModelDescription], findings: Findings) -> None:
-    """Note which models need a tool that fmu_mesh does not start."""
+def _doubts(config: Config, descriptions: Mapping[str, ModelDescription], findings: Findings) -> None:
+    """Note what models need, or need otherwise, than they get here."""
     for name, section in config.instances.items():
-        if descriptions[name].needs_execution_tool:
-            tool = descriptions[name].generation_tool
+        description, place = descriptions[name], f"instances.{name}.{key_of(section)}"
+        if description.needs_execution_tool:
+            tool = description.generation_tool
             found = f"the FMU of '{name}' needs an execution tool ({tool or 'it does not say which'})"
-            place = f"instances.{name}.{key_of(section)}"
             findings.add(place, found, f"{tool or 'that tool'} on the host that runs it")
+        step = section.step_size or config.simulation.step_size
+        if (doubt := description.doubt_about_step(step)) is not None:
+            fits = short_number(description.step_size or step)
+            expected = f"`step_size: {fits}`, in `simulation` or for '{name}' alone"
+            findings.add(f"instances.{name}.step_size", f"{doubt}; '{name}' may compute wrong values", expected)
+        silent = [clock.name for clock in description.clocks if clock.never_ticks]
+        if silent:
+            found = f"triggered input clocks of '{name}' never tick, because clocks cannot be connected yet"
+            findings.add(place, f"{found}: {listed(silent)}", "")
 
 
 def _replaced_start_values(config: Config, connections: Iterable[Connection], findings: Findings) -> None:

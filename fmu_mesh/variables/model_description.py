@@ -14,6 +14,8 @@ from typing import Literal
 import msgspec
 from msgspec.structs import replace
 
+from ..simtime import steps_between
+from ..text import short_number
 from .units import BaseUnit
 from .value_types import MAX_ELEMENTS, PlainValue, Value, VariableType, element_names, flattened, nested, split_element
 
@@ -51,6 +53,8 @@ class Variable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         max_size: most bytes of a Binary, if known.
         dependencies: names of the knowns an output depends on in Initialization Mode; None if it may depend on all
             (FMI 2.0, 2.2.8, InitialUnknowns). Empty for a variable that is not an initial unknown.
+        feedthrough: names of the knowns that its value at a point directly depends on at this point (FMI 2.0, 2.2.8,
+            Outputs; FMI 3.0, 2.4.8); None if nothing is declared.
         items: item names and values of an Enumeration.
         base_unit: its unit in SI base units, if the model description defines it.
         relative_quantity: whether it is a difference, to which the offset of a unit does not apply.
@@ -68,6 +72,7 @@ class Variable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     minimum: float | None = None
     maximum: float | None = None
     dependencies: tuple[str, ...] | None = None
+    feedthrough: tuple[str, ...] | None = None
     items: tuple[tuple[str, int], ...] = ()
     base_unit: BaseUnit | None = None
     relative_quantity: bool = False
@@ -145,6 +150,16 @@ class Clock(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     interval: float | None = None
     shift: float = 0.0
 
+    @property
+    def refusal(self) -> str:
+        """What is said wherever its name stands for a variable."""
+        return f"'{self.name}' is a clock, and clocks cannot be connected yet, nor set or recorded"
+
+    @property
+    def never_ticks(self) -> bool:
+        """Whether only a connection could make it tick (FMI 3.0, 2.2.8.1), and clocks are not connected."""
+        return self.causality == "input" and self.interval_variability == "triggered"
+
     def __str__(self) -> str:
         """The clock for a person: `tick (input, constant, every 0.4 s from 0.2 s on)`."""
         every = f", every {self.interval:g} s from {self.shift:g} s on" if self.interval is not None else ""
@@ -157,6 +172,7 @@ class ModelDescription(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
     Attributes:
         kind: a `Kind` of FMU, or in one word what the model is: physics_engine, controller, ...
         library: the file of the FMU that is loaded on this platform; None if it is compiled, or nothing is loaded.
+        fixed_step_size: that of its solver in s, if it has a fixed one (FMI 3.0, 4.3.1, fixedInternalStepSize).
     """
 
     model_name: str
@@ -184,6 +200,32 @@ class ModelDescription(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
     kinds: tuple[Kind, ...] = ()
     problems: tuple[str, ...] = ()
     library: str | None = None
+    fixed_step_size: float | None = None
+
+    @property
+    def step_size(self) -> float | None:
+        """The communication step size in s that the model suggests; None if it suggests none."""
+        return self.default_experiment.step_size or self.fixed_step_size
+
+    def doubt_about_step(self, step_size: float) -> str | None:
+        """Why steps of this size (s) may give wrong values, as `steps of 0.015 s, ...`; None if there is no doubt.
+
+        A model-exchange FMU has no steps of its own.
+        """
+        suggested = self.step_size
+        if self.kind != "co_simulation" or suggested is None:
+            return None
+        if self.fixed_step_size is not None:
+            fits = bool(steps_between(0.0, step_size, self.fixed_step_size))
+            why = f"no whole multiple of the {short_number(self.fixed_step_size)} s (fixedInternalStepSize)"
+        else:
+            fits = self.can_handle_variable_step_size or steps_between(0.0, step_size, suggested) == 1
+            why = f"not the {short_number(suggested)} s (stepSize, without canHandleVariableCommunicationStepSize)"
+        return None if fits else f"steps of {short_number(step_size)} s, {why} that the FMU is made for"
+
+    def clock(self, name: str) -> str | None:
+        """The refusal of the clock with this name; None if there is none."""
+        return next((clock.refusal for clock in self.clocks if clock.name == name), None)
 
     def variable(self, name: str) -> Variable | None:
         """The variable with this name, or None."""

@@ -15,7 +15,7 @@ from fmu_mesh.api.plan_page import plan_page
 from fmu_mesh.config.findings import Findings
 from fmu_mesh.config.mesh import ConnectionConfig
 from fmu_mesh.instances.configuration import parse
-from fmu_mesh.system.connections import resolve_connections
+from fmu_mesh.system.connections import Variables, resolve_connections
 from fmu_mesh.system.plan import make_plan
 from fmu_mesh.system.system import build
 from fmu_mesh.variables.model_description import ModelDescription, Variable
@@ -91,7 +91,8 @@ class Counted(dict[str, Variable]):
 
 
 def test_no_connection_that_is_right_looks_through_all_variables() -> None:
-    variables = {name: Counted((v.name, v) for v in description(FEW).variables) for name in "abc"}
+    variables = Variables(dict.fromkeys("abc", description(FEW)), "abc")
+    variables |= {name: Counted((v.name, v) for v in description(FEW).variables) for name in "abc"}
     configs = [ConnectionConfig(source=source, target=target) for source, target in ends(FEW, "a chain")]
     findings = Findings(str(FILE))
     Counted.listed = 0

@@ -228,5 +228,7 @@ def _entry(  # noqa: PLR0913, PLR0917  each is a column of a table
         unit=unit,
         description=text,
         dependencies=(),  # at the first point the engine has not taken a step: nothing depends on an input
+        # Efforts and forces of the same step act on these at once.
+        feedthrough=None if name.endswith((".acceleration", ".effort_applied")) else (),
     )
     return variable, GazeboPlace(where, index)

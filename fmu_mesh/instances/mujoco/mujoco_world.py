@@ -65,6 +65,8 @@ warnings: list[str] = []
 
 _WORLD_BODY = 0
 _WIND = ("wind_x", "wind_y", "wind_z")
+_OF_THE_STEP = (".acceleration", ".effort_applied", ".force")
+"""Ends of the names of outputs that efforts and forces of the same step act on at once."""
 
 
 class MujocoVariable(msgspec.Struct, frozen=True):
@@ -246,6 +248,7 @@ def _input(name: str, where: Where, index: int, unit: str | None, text: str, sta
 
 
 def _variable(name: str, causality: Causality, unit: str | None, text: str, start: float | None) -> Variable:
+    depends_on = _WIND if ".wind_" in name or ".relative_velocity_" in name else ()
     return Variable(
         name=name,
         value_reference=0,
@@ -257,7 +260,8 @@ def _variable(name: str, causality: Causality, unit: str | None, text: str, star
         unit=unit,
         description=text,
         # At the first point the engine has not taken a step: only the current wind has an effect.
-        dependencies=_WIND if ".wind_" in name or ".relative_velocity_" in name else (),
+        dependencies=depends_on,
+        feedthrough=None if name.endswith(_OF_THE_STEP) else depends_on,
     )
 
 

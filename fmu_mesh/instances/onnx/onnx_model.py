@@ -232,6 +232,7 @@ def _tensor(number: int, node: Any, sizes: Sizes, inputs: Sequence[Tensor] | Non
     if inputs is None and is_float(type_):
         type_ = "Float64"
     shape = tuple(itertools.dropwhile(lambda size: size == 1, sizes))
+    depends_on = None if inputs is None else tuple(tensor.variable.name for tensor in inputs)
     variable = Variable(
         name=node.name,
         value_reference=number,
@@ -242,6 +243,7 @@ def _tensor(number: int, node: Any, sizes: Sizes, inputs: Sequence[Tensor] | Non
         start=nested([zero(type_)] * math.prod(shape), shape) if inputs is None else None,
         dimensions=shape,
         shape=shape,
-        dependencies=None if inputs is None else tuple(tensor.variable.name for tensor in inputs),
+        dependencies=depends_on,
+        feedthrough=depends_on,
     )
     return Tensor(variable, dtype, sizes)

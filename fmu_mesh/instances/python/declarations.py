@@ -236,8 +236,9 @@ class Output(Declared[T]):
         start: the value before the component assigns one; default: 0, False or an empty text. Without a start value, an
             output that is not assigned in the first step is an error.
         type: as of an `Input`; so are `shape`, `unit`, `description` and `items`.
-        depends_on: the inputs that its initial value depends on (FMI 2.0, 2.2.8, InitialUnknowns). Default: all inputs,
-            if the component has `initialize`, otherwise none.
+        depends_on: the inputs that its value at a point depends on directly (FMI 2.0, 2.2.8), for the order of the
+            initialization and for warnings of loops at every point. Default: nothing is said; the initial value depends
+            on all inputs if the component has `initialize`, otherwise on none.
 
     Raises:
         CallRefused: there is no such type, or the start value does not fit.
@@ -326,7 +327,7 @@ class Output(Declared[T]):
         super().__init__(start, type, shape, details)
 
     def _more(self) -> dict[str, Any]:
-        return {"initial": "calculated", "dependencies": self.depends_on}
+        return {"initial": "calculated", "dependencies": self.depends_on, "feedthrough": self.depends_on}
 
 
 class Parameter(Declared[T]):

@@ -207,7 +207,10 @@ class Resolver:
         if variable is None and description is not None:
             near = [own.name for own in description.with_causality("output", "input")]
             found = f"the unknown variable '{name}' of instance '{instance}'"
-            self._findings.add(path, found, f"one of {listed(near)}", nearest(name, near))
+            if (clock := description.clock(name)) is not None:
+                self._findings.add(path, clock, "")
+            else:
+                self._findings.add(path, found, f"one of {listed(near)}", nearest(name, near))
         return variable
 
     def _as_port(self, instance: str, variable: Variable, field: str) -> Port:

@@ -271,6 +271,9 @@ class MeshClient:
         meant = [found[full_name] for full_name in matching(reference, [*found])]
         if not meant and instance in names:
             own = [target.variable.name for target in found.values()]
+            for clock in self.instance_info(instance).clocks:
+                if clock.name == name:
+                    raise ConfigurationError(f"{clock.refusal}.")
             raise _unknown(f"instance '{instance}' has no variable '{name}'", name, own)
         if not meant:
             raise _unknown(f"mesh '{self.keys.mesh}' has no variable '{reference}'", reference, [*found])

@@ -11,13 +11,14 @@ import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterable
 
 from fmpy.model_description import ModelDescription as FmpyDescription
-from fmpy.model_description import ModelVariable
+from fmpy.model_description import ModelVariable, Unknown
+from msgspec.structs import replace
 
 from ....variables.model_description import Causality, Initial, Value, Variable, VariableType
 from ....variables.value_types import FMI2_TYPES, INTEGERS, MAX_ELEMENTS, TYPES, nested
 from .declared_units import base_units, with_unit
 
-__all__ = ["variables_of"]
+__all__ = ["states_of", "variables_of"]
 
 _NOT_FINITE = {"NaN": math.nan, "INF": math.inf, "-INF": -math.inf}
 
@@ -38,12 +39,18 @@ def variables_of(source: FmpyDescription, root: ET.Element) -> tuple[Variable, .
     convert: Callable[[ModelVariable, ET.Element, Dependencies], Variable]
     if source.fmiVersion == "1.0":
         convert, dependencies = _fmi1, _direct_dependencies(source, elements.values())
+        feedthrough = dependencies
     else:
         convert = _fmi3 if source.fmiVersion.startswith("3.") else _fmi2
-        dependencies = _initial_unknowns(source)
+        dependencies = _dependencies(source, source.initialUnknowns)
+        feedthrough = _dependencies(source, [*source.derivatives, *source.outputs])
+        feedthrough |= dict.fromkeys(states_of(source), ())  # a state depends on no value of the same point
     units = base_units(source)
     variables = (
-        with_unit(convert(variable, element, dependencies), variable, element, units)
+        replace(
+            with_unit(convert(variable, element, dependencies), variable, element, units),
+            feedthrough=feedthrough.get((variable.alias or variable).name),
+        )
         for variable in source.modelVariables
         if variable.type in FMI2_TYPES or variable.type in TYPES
         for element in (elements[(variable.alias or variable).name],)
@@ -121,8 +128,14 @@ def _variable(source: ModelVariable, type_: VariableType, **more: object) -> Var
     return Variable(name=source.name, value_reference=int(source.valueReference), type=type_, **fields)  # type: ignore[arg-type] # by keyword
 
 
-def _initial_unknowns(source: FmpyDescription) -> Dependencies:
-    """What the initial unknowns depend on, None for all (FMI 2.0, 2.2.8; FMI 3.0, 2.4.8); with aliases of knowns."""
+def states_of(source: FmpyDescription) -> tuple[str, ...]:
+    """The names of the continuous states, in the order of their derivatives; FMI 1.0 does not tell them."""
+    derivatives = (unknown.variable for unknown in source.derivatives if unknown.variable is not None)
+    return tuple(own.derivative.name for own in derivatives if own.derivative is not None)
+
+
+def _dependencies(source: FmpyDescription, unknowns: Iterable[Unknown]) -> Dependencies:
+    """What unknowns depend on, None for all (FMI 2.0, 2.2.8; FMI 3.0, 2.4.8); with aliases of knowns."""
     names: dict[int, list[str]] = {}
     for variable in source.modelVariables:
         names.setdefault(id(variable.alias or variable), []).append(variable.name)
@@ -130,7 +143,7 @@ def _initial_unknowns(source: FmpyDescription) -> Dependencies:
         unknown.variable.name: None
         if unknown.dependencies is None
         else tuple(name for known in unknown.dependencies for name in names.get(id(known), ()))
-        for unknown in source.initialUnknowns
+        for unknown in unknowns
         if unknown.variable is not None
     }
 

@@ -141,6 +141,7 @@ def _convert(
     interface = _interface(source, kind)
     experiment = source.defaultExperiment
     capabilities = root.find("Implementation/*/Capabilities")  # FMPy does not read those of FMI 1.0
+    internal = root.find("CoSimulation[@fixedInternalStepSize]")  # nor this attribute of FMI 3.0
 
     def can(attribute: str) -> bool:
         if capabilities is not None:
@@ -179,6 +180,7 @@ def _convert(
         platforms=platforms,
         kinds=tuple(one for one in _WORDS if _interface(source, one) is not None),
         problems=problems,
+        fixed_step_size=_number(internal.get("fixedInternalStepSize")) if internal is not None else None,
     )
 
 
