@@ -209,7 +209,8 @@ class RecordConfig(Base, frozen=True, kw_only=True):
         Meta(
             description="`instance.variable` of any causality, or patterns: `*` any characters, `?` one, `re:` a "
             "regular expression. A pattern matches outputs; with `in:`, `local:` or `param:` before it, inputs, locals "
-            "or parameters. Default: all outputs but those of type String and Binary.",
+            "or parameters. Default: all outputs but those of type String and Binary; of an instance without outputs "
+            "its continuous states, or else the first 100 locals that change.",
             examples=[["motor.*", "in:motor.*", "arm.angle"]],
         ),
     ] = None

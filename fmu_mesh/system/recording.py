@@ -28,6 +28,7 @@ __all__ = [
     "ResultFile",
     "ResultFormat",
     "has_unknown_ending",
+    "is_in_memory",
     "result_endings",
     "result_format",
     "with_notes",
@@ -244,6 +245,11 @@ def result_format(path: str | Path) -> ResultFormat | None:
 def has_unknown_ending(path: str | Path) -> bool:
     """Whether no installed package writes files with this ending."""
     return plugin(_GROUP, _ending(path)) is None
+
+
+def is_in_memory(path: str | Path) -> bool:
+    """Whether a result of this name is kept in memory and is no file."""
+    return _ending(path) == _IN_MEMORY
 
 
 def result_endings() -> list[str]:

@@ -18,12 +18,12 @@ from ..config.loading import LoadedConfig
 from ..config.mesh import RecordConfig
 from ..simtime import TimeGrid, steps_between
 from ..text import EXPRESSION, expression_of, is_pattern, listed, nearest, short_number, shown
-from ..variables.model_description import Causality, Variable
+from ..variables.model_description import Causality, ModelDescription, Variable
 from ..variables.value_types import element_name, is_text, split_element
 from .connections import Variables, resolve_variable
-from .recording import has_unknown_ending, result_endings, result_format
+from .recording import has_unknown_ending, is_in_memory, result_endings, result_format
 
-__all__ = ["RecordPlan", "ending_warnings", "record_paths", "resolve_records", "union_of"]
+__all__ = ["RecordPlan", "record_paths", "record_warnings", "resolve_records", "union_of"]
 
 _PREFIXES: dict[str, tuple[Causality, ...]] = {
     "out": ("output",),
@@ -32,6 +32,12 @@ _PREFIXES: dict[str, tuple[Causality, ...]] = {
     "param": ("parameter", "calculatedParameter", "structuralParameter"),
 }
 """What a pattern with one of these words and a colon before it matches."""
+
+_MOST_LOCALS = 100
+"""Locals of an instance without outputs and states that are recorded where nothing is chosen."""
+
+_DEFAULT_FILE = f"{RecordConfig().file}"
+"""How the name of a file ends that nobody has chosen."""
 
 _WORDS = {"out": "output", "in": "input", "local": "local variable", "param": "parameter"}
 
@@ -101,16 +107,31 @@ def resolve_records(
         other = first_of.setdefault(file, place)
         if other != place:
             findings.add(f"{place}.file", f"'{section.file}', which is also the file of {other}", "a file of its own")
+        if not chosen and _is_named(loaded, place, section) and None not in variables.values():
+            found = f"'{section.file}', into which nothing is recorded"
+            findings.add(f"{place}.file", found, f"variables in `{place}.variables`, or null to record nothing")
         if chosen:
             records.append(RecordPlan(file, chosen, first, section.every))
     return tuple(records)
 
 
-def ending_warnings(loaded: LoadedConfig, records: Sequence[RecordPlan], warnings: Findings) -> None:
-    """Warn of endings that nobody offers: they still give a CSV, as in version 0.1."""
+def record_warnings(
+    loaded: LoadedConfig, variables: Variables, records: Sequence[RecordPlan], warnings: Findings
+) -> None:
+    """Warn of files without the outputs of an instance, and of endings that nobody offers: they still give a CSV."""
     files = {record.file for record in records}
     for place, section in loaded.config.records.items():
         file = _path(loaded, section)
+        if file is not None and section.variables is None:
+            instead = [(name, words) for name, own in variables.descriptions.items() if (words := _by_default(own)[1])]
+            if instead:
+                found = (
+                    f"no outputs with numbers, so others are recorded: {listed([f'of {n} {w}' for n, w in instead])}"
+                )
+                every = f"local:{instead[0][0]}.*" if len(instead) == 1 else "local:*"
+                warnings.add(f"{place}.variables", found, f"`{every}` in this list for all locals")
+            elif str(file) not in files:
+                warnings.add(place, "nothing is recorded: there are no outputs, states or locals with numbers", "")
         if file is not None and str(file) in files and has_unknown_ending(file):
             found = f"'{section.file}', an ending of no installed format, so the file becomes a CSV"
             endings = " or ".join(result_endings())
@@ -121,6 +142,14 @@ def record_paths(loaded: LoadedConfig) -> dict[str, Path]:
     """The absolute paths of the result files, by the places of their sections in the configuration."""
     sections = loaded.config.records.items()
     return {place: path for place, section in sections if (path := _path(loaded, section)) is not None}
+
+
+def _is_named(loaded: LoadedConfig, place: str, section: RecordConfig) -> bool:
+    """Whether somebody named the file and expects results in it: with `variables: []`, only an option names it."""
+    if section.file is None or is_in_memory(section.file):
+        return False
+    in_file = f"{place}.file" in loaded.lines or not section.file.endswith(_DEFAULT_FILE)
+    return f"{place}.file" in loaded.overrides or (in_file and section.variables is None)
 
 
 def _path(loaded: LoadedConfig, section: RecordConfig) -> Path | None:
@@ -161,11 +190,12 @@ def _first_point(section: RecordConfig, place: str, grid: TimeGrid | None, findi
 
 
 def _chosen(section: RecordConfig, place: str, variables: Variables, findings: Findings) -> tuple[tuple[str, str], ...]:
-    """The columns of a file; by default all outputs but String and Binary."""
+    """The columns of a file."""
     if section.variables is None:
         return tuple(
             (instance, element)
-            for instance, variable in _matched(_Pattern(re.compile(".*", re.DOTALL), ("output",)), variables)
+            for instance, description in variables.descriptions.items()
+            for variable in _by_default(description)[0]
             for element in variable.elements
         )
     columns: dict[tuple[str, str], str | None] = {}  # where a column is named; None: only patterns match it
@@ -173,6 +203,18 @@ def _chosen(section: RecordConfig, place: str, variables: Variables, findings: F
         add = _add_matched if _is_pattern(reference, variables) else _add_named
         add(reference, f"{place}[{index}]", columns, variables, findings)
     return tuple(columns)
+
+
+def _by_default(description: ModelDescription) -> tuple[Sequence[Variable], str]:
+    """What is recorded of an instance where nothing is chosen, and in words what it is if that is not its outputs."""
+    numbers = [variable for variable in description.variables if not is_text(variable.type)]
+    if outputs := [variable for variable in numbers if variable.causality == "output"]:
+        return outputs, ""
+    if states := [variable for variable in numbers if variable.name in description.states]:
+        return states, f"its continuous states ({len(states)})"
+    changing = [variable for variable in numbers if variable.causality == "local" and variable.changes]
+    first = f"the first {_MOST_LOCALS} of " if len(changing) > _MOST_LOCALS else ""
+    return changing[:_MOST_LOCALS], f"{first}its locals that change ({len(changing)})" if changing else ""
 
 
 def _add_matched(

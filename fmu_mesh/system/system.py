@@ -28,7 +28,7 @@ from fmu_mesh.system.connections import (
 from fmu_mesh.system.couplings import coupled_connections
 from fmu_mesh.system.grouping import automatic_nodes
 from fmu_mesh.system.linear_inputs import check_extrapolation
-from fmu_mesh.system.records import RecordPlan, ending_warnings, resolve_records, union_of
+from fmu_mesh.system.records import RecordPlan, record_warnings, resolve_records, union_of
 from fmu_mesh.system.scenario import ResolvedScenario, Scenario, ScenarioInput, resolve_scenario
 from fmu_mesh.system.schedule import Schedule
 from fmu_mesh.system.start_values import forbidden_start_values, resolve_start_values, sized
@@ -152,7 +152,7 @@ def build(
     _replaced_start_values(config, connections, warnings)
     warnings.merge(prescribed.warnings)
     _doubts(config, descriptions, warnings)
-    ending_warnings(loaded, records, warnings)
+    record_warnings(loaded, variables, records, warnings)
     all_warnings = (*loaded.warnings, *warnings)
     return ResolvedSystem(config, grid, instances, connections, records, all_warnings, prescribed.files)
 

@@ -173,6 +173,7 @@ class ModelDescription(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
         kind: a `Kind` of FMU, or in one word what the model is: physics_engine, controller, ...
         library: the file of the FMU that is loaded on this platform; None if it is compiled, or nothing is loaded.
         fixed_step_size: that of its solver in s, if it has a fixed one (FMI 3.0, 4.3.1, fixedInternalStepSize).
+        states: the names of its continuous states, if it declares their derivatives (FMI 2.0, 2.2.8; FMI 3.0, 2.4.8).
     """
 
     model_name: str
@@ -201,6 +202,7 @@ class ModelDescription(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
     problems: tuple[str, ...] = ()
     library: str | None = None
     fixed_step_size: float | None = None
+    states: tuple[str, ...] = ()
 
     @property
     def step_size(self) -> float | None:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import csv
+import re
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from mcap.reader import make_reader
 import fmu_mesh
 from tests.equivalence.test_types import written
 from tests.fmus.helpers import NO_COMPILER
+from tests.fmus.packing import repacked
 from tests.helpers import Place, rows_of, wait_until, write_config
 
 SOURCE = """
@@ -130,6 +132,33 @@ def test_many_runs_with_loaded_models_record_the_same(
             assert [each.file for each in result.all] == [place.folder / "again.csv"]
 
     assert not (place.folder / "slow.csv").exists()
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_the_states_of_fmus_without_outputs_are_recorded_in_every_way_to_run(
+    version: int, place: Place, event_fmu: Callable[..., Path]
+) -> None:
+    source = event_fmu("Oscillator", version)
+    repacked(place.folder / "Silent.fmu", source=source, description=without_outputs)
+    own = "instances:\n  cs: {fmu: Silent.fmu}\n  me: {fmu: Silent.fmu, kind: model_exchange}\n"
+    times = "mesh: silent\nsimulation: {stop_time: 0.3, step_size: 0.01}\n"
+    path = place.folder / "silent.yaml"
+    path.write_text(f"{times}{own}record: {{file: silent.csv}}\n")
+
+    (local,) = files_of(place, path, "--local", names=("silent.csv",))
+    (distributed,) = files_of(place, path, names=("silent.csv",))
+    with fmu_mesh.load(path).repeated() as runs:
+        repeated = runs.run()
+
+    assert local.startswith(b"time,cs.x,cs.y,me.x,me.y\n0.0,2.0,0.0,2.0,0.0\n")
+    assert distributed == local
+    assert repeated["me.y"].tolist() == columns_of(place.folder / "silent.csv")["me.y"]
+
+
+def without_outputs(description: str) -> str:
+    """A model description whose outputs are locals."""
+    text = description.replace('causality="output"', 'causality="local"')
+    return re.sub(r"<Outputs>.*?</Outputs>|<Output [^>]*>", "", text, flags=re.DOTALL)
 
 
 def columns_of(path: Path) -> dict[str, list[float]]:

@@ -17,6 +17,7 @@ from fmu_mesh.run.options import Options, with_options
 from fmu_mesh.system.recording import result_endings
 from fmu_mesh.system.records import RecordPlan
 from fmu_mesh.system.system import build
+from fmu_mesh.variables.model_description import ModelDescription, Variable
 from tests.unit.test_system import ARRAYS, DESCRIPTIONS, FILE, built, findings_of, text
 
 ENDINGS = " or ".join(result_endings())
@@ -240,6 +241,79 @@ def test_of_what_stays_in_memory_there_is_one() -> None:
     loaded = with_options(loaded, Options(output=Path("/run/rows.arrays")), findings)
 
     assert [own.variables for own in build(loaded, DESCRIPTIONS, findings).records] == [(("delay", "y"),)]
+
+
+def without_outputs(count: int, *, states: tuple[str, ...] = ()) -> ModelDescription:
+    """A model with so many locals that change, a constant before them, and a name and an input that are no result."""
+    variables = (
+        Variable("one", 0, "Float64", "local", "constant", start=1.0),
+        *(Variable(f"x{number}", number, "Float64", "local", "continuous") for number in range(count)),
+        Variable("word", 0, "String", "local", "discrete"),
+        Variable("u", 999, "Float64", "input", "continuous", start=0.0),
+    )
+    return ModelDescription("m", "m", "2.0", "co_simulation", "{1}", variables, states=states)
+
+
+def recorded_of(model: ModelDescription, rest: str = "") -> tuple[list[str], list[str]]:
+    """The columns and the warnings of a mesh whose `delay` is this model."""
+    system = build(parse(text(rest=rest), FILE), {"pendulum": DESCRIPTIONS["pendulum"], "delay": model})
+    columns = [".".join(column) for column in system.recorded if column[0] == "delay"]
+    return columns, [str(warning).removeprefix(f"{FILE}:") for warning in system.warnings]
+
+
+def test_the_continuous_states_are_recorded_of_an_instance_without_outputs() -> None:
+    columns, warnings = recorded_of(without_outputs(3, states=("x2", "x0")), "record: {file: a.csv}")
+
+    assert columns == ["delay.x0", "delay.x2"]
+    (warning,) = warnings
+    assert warning == (
+        "7: record.variables: no outputs with numbers, so others are recorded: of delay its continuous states (2); "
+        "expected `local:delay.*` in this list for all locals"
+    )
+
+
+def test_without_states_the_first_hundred_locals_that_change_are_recorded() -> None:
+    columns, warnings = recorded_of(without_outputs(120))
+    few, _ = recorded_of(without_outputs(2))
+
+    assert columns == [f"delay.x{number}" for number in range(100)]
+    assert "of delay the first 100 of its locals that change (120)" in warnings[0]
+    assert few == ["delay.x0", "delay.x1"]
+
+
+def test_a_chosen_list_is_recorded_as_it_is() -> None:
+    columns, warnings = recorded_of(without_outputs(3), "record: {variables: [delay.x1]}")
+
+    assert (columns, warnings) == (["delay.x1"], [])
+
+
+@pytest.mark.parametrize("output", [None, Path("/out.csv")])
+def test_a_named_file_without_columns_is_a_finding(output: Path | None) -> None:
+    loaded, findings = examined("record: {file: a.csv}" if output is None else "record: {variables: []}")
+    loaded = with_options(loaded, Options(output=output), findings)
+    nothing = without_outputs(0)
+
+    with pytest.raises(ConfigurationError, match="into which nothing is recorded; expected variables in"):
+        build(loaded, {"pendulum": nothing, "delay": nothing}, findings)
+
+
+@pytest.mark.parametrize("record", ["", "record: {every: 2}"])
+def test_a_file_that_nobody_named_and_that_gets_nothing_is_a_warning(record: str) -> None:
+    nothing = without_outputs(0)
+
+    system = build(parse(text(rest=record), FILE), {"pendulum": nothing, "delay": nothing})
+
+    assert system.records == ()
+    assert [warning.found for warning in system.warnings] == [
+        "nothing is recorded: there are no outputs, states or locals with numbers"
+    ]
+
+
+def test_what_stays_in_memory_may_be_nothing() -> None:
+    loaded, findings = examined("record: {variables: []}")
+    loaded = with_options(loaded, Options(output=Path("/run/rows.arrays")), findings)
+
+    assert build(loaded, DESCRIPTIONS, findings).records == ()
 
 
 def examined(rest: str) -> tuple[LoadedConfig, Findings]:

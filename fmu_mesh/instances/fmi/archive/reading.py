@@ -22,7 +22,7 @@ from .... import files
 from ....errors import LoadFailed
 from ....variables.model_description import Causality, Clock, DefaultExperiment, Kind, ModelDescription
 from .archive import Contents, OpenFmu, Terms, opened
-from .declared_variables import variables_of
+from .declared_variables import states_of, variables_of
 from .examining import examine, find_library, library_name
 
 __all__ = ["description_of", "read_description"]
@@ -174,6 +174,7 @@ def _convert(
         or root.find("Implementation/CoSimulation_Tool") is not None,
         # FMI 1.0 has no flag for this and always requires the call.
         tell_completed_steps=can("needsCompletedIntegratorStep") or (source.fmiVersion or "").startswith("1."),
+        states=states_of(source),
         continuous_states=int(source.numberOfContinuousStates),
         event_indicators=int(source.numberOfEventIndicators),
         clocks=tuple(map(_clock, root.iterfind("ModelVariables/Clock"))),
