@@ -176,7 +176,7 @@ def configuration_for(models: Sequence[Model], *, mesh: str, file: Path, schema:
         "",
         *_connections({model.name: model.description for model in models if model.description is not None}),
         "",
-        "# All outputs are recorded, except text and binary data. `variables: [instance.variable]` chooses some.",
+        "# All outputs are recorded, except text and binary data. `variables: [instance.variable]` chooses others.",
         'record: {file: "results/{mesh}.csv"}',
     ]
     return "\n".join(lines) + "\n"
