@@ -228,7 +228,7 @@ def _any_plan(mesh: Mesh, base: Options, wanted: Wanted, tell: Callable[[str], N
         mesh: the mesh.
         base: the options of each run.
         wanted: what was asked.
-        tell: called before something that takes long, such as compiling an FMU.
+        tell: called with each warning, and before something that takes long, such as compiling an FMU.
 
     Raises:
         ConfigurationError: neither can run; that of the first.
@@ -238,9 +238,13 @@ def _any_plan(mesh: Mesh, base: Options, wanted: Wanted, tell: Callable[[str], N
         options = options_of_variant(base, mesh.instances, wanted.parameters(number))
         options["record"], options["on_notice"] = "memory", tell
         try:
-            return mesh.plan(**options)
+            plan = mesh.plan(**options)
         except ConfigurationError as error:
             first = first or error
+        else:
+            for warning in plan.plan.system.warnings:
+                tell(f"warning: {warning}")
+            return plan
     assert first is not None
     raise _as_asked(first, wanted.names)
 

@@ -32,7 +32,7 @@ def warn_of_point_loops(plan: Plan, findings: Findings) -> None:
         plan: what would run, with the delays of its connections.
         findings: where the warnings go.
     """
-    declared, assumed = _edges(plan.connections)
+    declared, assumed = _edges(plan.connections) if plan.cycles else ({}, {})
     for loop in _loops(declared):
         walk, more = _walk(loop, declared)
         found = (
@@ -59,20 +59,21 @@ def _edges(connections: Sequence[Connection]) -> tuple[Edges, Edges]:
     """What is connected or declared to depend on each other, and what may do so, since nothing is declared."""
     declared: Edges = {}
     assumed: Edges = {}
-    steady = [c for c in connections if not c.initial_only and c.source.changes]
+    changing = [c for c in connections if not c.initial_only and c.source.changes]
     inputs: dict[str, dict[Vertex, None]] = {}
-    for c in steady:
+    for c in changing:
         target: Vertex = c.target_instance, "input", c.target.name
         inputs.setdefault(c.target_instance, {})[target] = None
         declared.setdefault(((c.source_instance, "output", c.source.name), target), c)
-    for c in steady:
-        source: Vertex = c.source_instance, "output", c.source.name
-        if c.source.feedthrough is not None:
-            known: list[Vertex] = [(c.source_instance, "input", name) for name in c.source.feedthrough]
-            declared |= {(one, source): None for one in known if one in inputs.get(c.source_instance, ())}
-        elif (_any_input(c.source_instance), source) not in assumed:
-            assumed |= {(one, _any_input(c.source_instance)): None for one in inputs.get(c.source_instance, ())}
-            assumed[_any_input(c.source_instance), source] = None
+    for instance, own in {(c.source_instance, c.source.name): (c.source_instance, c.source) for c in changing}.values():
+        source: Vertex = instance, "output", own.name
+        if own.feedthrough is None:
+            assumed[_any_input(instance), source] = None
+        else:
+            known: list[Vertex] = [(instance, "input", name) for name in own.feedthrough]
+            declared |= {(one, source): None for one in known if one in inputs.get(instance, ())}
+    for instance in {source[0]: None for _, source in assumed}:
+        assumed |= {(one, _any_input(instance)): None for one in inputs.get(instance, ())}
     return declared, assumed
 
 

@@ -210,7 +210,8 @@ def _by_default(description: ModelDescription) -> tuple[Sequence[Variable], str]
     numbers = [variable for variable in description.variables if not is_text(variable.type)]
     if outputs := [variable for variable in numbers if variable.causality == "output"]:
         return outputs, ""
-    if states := [variable for variable in numbers if variable.name in description.states]:
+    of_states = {*description.states}
+    if states := [variable for variable in numbers if variable.name in of_states]:
         return states, f"its continuous states ({len(states)})"
     changing = [variable for variable in numbers if variable.causality == "local" and variable.changes]
     first = f"the first {_MOST_LOCALS} of " if len(changing) > _MOST_LOCALS else ""

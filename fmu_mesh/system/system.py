@@ -32,7 +32,7 @@ from fmu_mesh.system.records import RecordPlan, record_warnings, resolve_records
 from fmu_mesh.system.scenario import ResolvedScenario, Scenario, ScenarioInput, resolve_scenario
 from fmu_mesh.system.schedule import Schedule
 from fmu_mesh.system.start_values import forbidden_start_values, resolve_start_values, sized
-from fmu_mesh.text import listed, nearest_file, short_number, shown
+from fmu_mesh.text import listed, nearest_file, shown
 from fmu_mesh.variables.model_description import ModelDescription, Value
 
 __all__ = ["Connection", "ResolvedSystem", "SystemInstance", "build"]
@@ -306,8 +306,7 @@ def _doubts(config: Config, descriptions: Mapping[str, ModelDescription], findin
             findings.add(place, found, f"{tool or 'that tool'} on the host that runs it")
         step = section.step_size or config.simulation.step_size
         if (doubt := description.doubt_about_step(step)) is not None:
-            fits = short_number(description.step_size or step)
-            expected = f"`step_size: {fits}`, in `simulation` or for '{name}' alone"
+            expected = f"`step_size: {description.step_size or step:.12g}`, in `simulation` or for '{name}' alone"
             findings.add(f"instances.{name}.step_size", f"{doubt}; '{name}' may compute wrong values", expected)
         silent = [clock.name for clock in description.clocks if clock.never_ticks]
         if silent:

@@ -15,7 +15,6 @@ import msgspec
 from msgspec.structs import replace
 
 from ..simtime import steps_between
-from ..text import short_number
 from .units import BaseUnit
 from .value_types import MAX_ELEMENTS, PlainValue, Value, VariableType, element_names, flattened, nested, split_element
 
@@ -219,11 +218,11 @@ class ModelDescription(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
             return None
         if self.fixed_step_size is not None:
             fits = bool(steps_between(0.0, step_size, self.fixed_step_size))
-            why = f"no whole multiple of the {short_number(self.fixed_step_size)} s (fixedInternalStepSize)"
+            why = f"no whole multiple of the {self.fixed_step_size:.12g} s (fixedInternalStepSize)"
         else:
             fits = self.can_handle_variable_step_size or steps_between(0.0, step_size, suggested) == 1
-            why = f"not the {short_number(suggested)} s (stepSize, without canHandleVariableCommunicationStepSize)"
-        return None if fits else f"steps of {short_number(step_size)} s, {why} that the FMU is made for"
+            why = f"not the {suggested:.12g} s (stepSize, without canHandleVariableCommunicationStepSize)"
+        return None if fits else f"steps of {step_size:.12g} s, {why} that the FMU is made for"
 
     def clock(self, name: str) -> str | None:
         """The refusal of the clock with this name; None if there is none."""

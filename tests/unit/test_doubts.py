@@ -16,6 +16,7 @@ from fmu_mesh.instances.configuration import parse
 from fmu_mesh.instances.fmi.archive.reading import read_description
 from fmu_mesh.instances.position_pid import describe_pid
 from fmu_mesh.instances.python.component_description import description_of
+from fmu_mesh.sweeps.planned_sweep import planned_sweep
 from fmu_mesh.system.plan import make_plan
 from fmu_mesh.system.point_loops import warn_of_point_loops
 from fmu_mesh.system.system import build
@@ -224,6 +225,18 @@ def test_check_and_launch_tell_of_a_loop_at_every_point(
     assert codes == [0, 0, 0]
     assert out.count("loop at every point: a.y -> b.u, b.y -> a.u.") == 2
     assert err.startswith("fmu-mesh: warning: loop.yaml:6: connections[0]: a loop at every point: a.y -> b.u")
+
+
+def test_a_sweep_tells_of_a_loop_at_every_point_before_it_starts(tmp_path: Path) -> None:
+    (tmp_path / "loop.yaml").write_text(LOOP, encoding="utf-8")
+    told: list[str] = []
+
+    planned_sweep(
+        fmu_mesh.load(tmp_path / "loop.yaml"), {"a.k": [-0.5, -2.0]}, folder=tmp_path / "sweep", on_notice=told.append
+    )
+
+    (warning,) = told
+    assert "a loop at every point: a.y -> b.u, b.y -> a.u." in warning
 
 
 # --- step sizes that an FMU cannot do
