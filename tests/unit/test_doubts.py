@@ -10,12 +10,14 @@ from pathlib import Path
 import pytest
 
 import fmu_mesh
+from fmu_mesh.adapter.argument_checks import Arguments
 from fmu_mesh.cli.main import main
-from fmu_mesh.errors import ConfigurationError
+from fmu_mesh.errors import CallRefused, ConfigurationError, UnknownName
 from fmu_mesh.instances.configuration import parse
 from fmu_mesh.instances.fmi.archive.reading import read_description
 from fmu_mesh.instances.position_pid import describe_pid
 from fmu_mesh.instances.python.component_description import description_of
+from fmu_mesh.ros.gateway.mapping import resolve as resolve_ros
 from fmu_mesh.sweeps.planned_sweep import planned_sweep
 from fmu_mesh.system.plan import make_plan
 from fmu_mesh.system.point_loops import warn_of_point_loops
@@ -336,3 +338,29 @@ def test_the_name_of_a_clock_is_refused_as_that(more: str, tmp_path: Path) -> No
 
     (finding,) = caught.value.findings
     assert str(finding).endswith("'called' is a clock, and clocks cannot be connected yet, nor set or recorded")
+
+
+def test_an_adapter_refuses_the_name_of_a_clock_as_that(tmp_path: Path) -> None:
+    arguments = Arguments("m", described(tmp_path, 3))
+
+    with pytest.raises(CallRefused, match="'called' is a clock, and clocks cannot be connected yet"):
+        arguments.settable("called")
+
+
+def test_inspect_refuses_the_name_of_a_clock_as_that(tmp_path: Path) -> None:
+    described(tmp_path, 3)
+
+    with pytest.raises(UnknownName, match="'called' is a clock, and clocks cannot be connected yet"):
+        fmu_mesh.inspect(tmp_path / "m.fmu").page(variables=["called"])
+
+
+def test_a_topic_of_a_clock_is_refused_as_that(tmp_path: Path) -> None:
+    head = "mesh: m\nsimulation: {stop_time: 1, step_size: 0.01}\ninstances: {a: {fmu: m.fmu}}\n"
+    loaded = parse(f"{head}ros: {{topics: [a.called]}}\n", Path("mesh.yaml"))
+    findings = loaded.findings()
+
+    resolve_ros(loaded, {"a": described(tmp_path, 3)}, findings)
+
+    assert [finding.found for finding in findings] == [
+        "'called' is a clock, and clocks cannot be connected yet, nor set or recorded"
+    ]
