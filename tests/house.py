@@ -267,6 +267,8 @@ ALLOWED: dict[str, dict[str, str]] = {
         "node/engine.py: node.wait_ns": _C_STRUCT,
         "node/engine.py: self._units[node.unit].spent_ns": _C_STRUCT,
         "node/engine.py: self._units[unit].stopped": _C_STRUCT,
+        "instances/fmi/archive/reading.py: variable.sourceline": "FMPy has read a repaired text, with other lines",
+        "instances/fmi/archive/repairing.py: element.tag": "lxml has no other way to rename an element",
         "instances/fmi/model_exchange/model_calls.py: function.errcheck": "ctypes checks a result by this attribute",
         **{
             f"ssp/package_writing.py: info.{name}": _ZIP

@@ -15,7 +15,7 @@ from fmpy.model_description import ModelVariable, Unknown
 from msgspec.structs import replace
 
 from ....variables.model_description import Causality, Initial, Value, Variable, VariableType
-from ....variables.value_types import FMI2_TYPES, INTEGERS, MAX_ELEMENTS, TYPES, nested
+from ....variables.value_types import FMI2_TYPES, INTEGERS, TYPES, nested
 from .declared_units import base_units, with_unit
 
 __all__ = ["states_of", "variables_of"]
@@ -160,8 +160,6 @@ def _direct_dependencies(source: FmpyDescription, elements: Iterable[ET.Element]
 
 def _array_start(type_: VariableType, texts: list[str], shape: tuple[int, ...]) -> Value | None:
     """The start value of a scalar or an array, for which one value stands for all elements (FMI 3.0, 2.4.7)."""
-    if math.prod(shape) > MAX_ELEMENTS:
-        raise ValueError(f"an array of {math.prod(shape)} elements; the limit is {MAX_ELEMENTS}")
     if len(texts) == 1:
         texts *= math.prod(shape)
     values = [_start(type_, text) for text in texts]

@@ -1,15 +1,14 @@
 """The checks of an FMU before FMPy reads it: whether its XML is safe and valid, and whether it can run here.
 
-An FMU that cannot run is refused here, and the error says why. Problems that do not keep it from running are left to
-`reading`, which keeps them in the description. FMPy gets only XML that has passed `safe_xml`, because it resolves
-entities.
+An FMU that cannot run is refused here, and the error says why. Problems that do not keep it from running are returned
+to `reading`, which keeps them in the description. FMPy gets only XML that has passed `safe_xml`, because it resolves
+entities, and `repair`.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Collection, Iterable, Sequence
-from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
@@ -19,28 +18,20 @@ from lxml import etree
 from ....archives.safe_xml import safe_xml
 from ....errors import LoadFailed
 from .archive import Contents, OpenFmu
+from .repairing import repair
 
 __all__ = ["examine", "find_library", "library_name", "source_names"]
 
 _SHOWN: Final = 3
 _SUFFIX: Final = str(fmpy.sharedLibraryExtension)
-_SCHEMA_FILES: Final = {
-    "1": "fmi1/fmiModelDescription.xsd",
-    "2": "fmi2/fmi2ModelDescription.xsd",
-    "3": "fmi3/fmi3ModelDescription.xsd",
-}
-_ILLEGAL: Final = frozenset({"SCHEMAV_CVC_DATATYPE_VALID_1_2_1", "SCHEMAV_CVC_ENUMERATION_VALID"})
-_DECIDING: Final = re.compile(
-    r"valueReference|causality|variability|initial|index|dependencies|dependenciesKind|derivative|previous|reinit"
-    r"|can[A-Z]\w*|needs[A-Z]\w*|has[A-Z]\w*|numberOf\w+|intervalVariability|clocks"
-)
-"""Attributes that decide how an FMU is called; an invalid date or unit is only a problem of the description."""
-
-_ATTRIBUTE = re.compile(r"attribute '([^']+)': (?:\[[^]]*\] )?(.*)")
 
 
-def examine(fmu: OpenFmu) -> Contents:
+def examine(fmu: OpenFmu) -> tuple[Contents, Any, tuple[str, ...]]:
     """Read the descriptions of an FMU; refuse it if they must not be parsed, or if it cannot run anywhere.
+
+    Returns:
+        What is in it, with the XML repaired and in UTF-8; the root of the model description, as lxml has it; and the
+        problems that were found.
 
     Raises:
         LoadFailed: it is not an FMU, or its XML is unsafe or has invalid values.
@@ -54,20 +45,28 @@ def examine(fmu: OpenFmu) -> Contents:
         )
     roots = {name: safe_xml(data, f"the {name} of '{path}'") for name, data in contents.xml.items()}
     root = roots["modelDescription.xml"]
-    version = root.get("fmiVersion") or ""
+    version, tag = (root.get("fmiVersion") or "").strip(), etree.QName(root).localname
     if re.match(r"3\.\d+(\.\d+)?-", version):
         raise LoadFailed(
             f"'{path}' is for FMI {version}, a preliminary version of the standard, which is not supported.",
             hint="Export it for FMI 3.0.",
         )
-    if root.tag != "fmiModelDescription" or version[:1] not in _SCHEMA_FILES:
-        shown = f"FMI '{version}'" if root.tag == "fmiModelDescription" else f"a <{root.tag}>"
+    # Patch versions are in no attribute of FMI 1.0 and 2.0, but some tools write them.
+    version = re.sub(r"^([12])(\.0(\.\d+)?)?$|^3$", rf"{version[:1]}.0", version)
+    if tag != "fmiModelDescription" or not re.fullmatch(r"1\.0|2\.0|3\.0(\.\d+)?", version):
+        shown = f"FMI '{version}'" if tag == "fmiModelDescription" else f"a <{tag}>"
         raise LoadFailed(f"the modelDescription.xml of '{path}' is for {shown}; supported are FMI 1.0, 2.0 and 3.0.")
-    if illegal := list(_illegal_values(root, version[0])):
-        rest = f", and {len(illegal) - _SHOWN} more" if len(illegal) > _SHOWN else ""
-        text = f"the modelDescription.xml of '{path}' has illegal values: {'; '.join(illegal[:_SHOWN])}{rest}."
-        raise LoadFailed(text, hint="Report it to the maker of its tool, or correct the file.")
-    return contents
+    problems: list[str] = []
+    for name, one in roots.items():
+        is_model = name == "modelDescription.xml"
+        repairs = repair(one, version[0] if is_model else "build", version if is_model else "3.0")
+        if illegal := list(repairs.illegal):
+            rest = f", and {len(illegal) - _SHOWN} more" if len(illegal) > _SHOWN else ""
+            text = f"the {name} of '{path}' has illegal values: {'; '.join(illegal[:_SHOWN])}{rest}."
+            raise LoadFailed(text, hint="Report it to the maker of its tool, or correct the file.")
+        problems += repairs.problems
+    xml = {name: etree.tostring(one, encoding="UTF-8", xml_declaration=True) for name, one in roots.items()}
+    return Contents(contents.names, xml), root, tuple(problems)
 
 
 def _what_it_is(path: Path, names: Collection[str]) -> str:
@@ -137,23 +136,3 @@ def find_library(path: Path, names: Collection[str], identifiers: Sequence[str],
         f"{', '.join(platforms) or 'no platform at all'}.",
         hint="Export it for this platform, or with its sources.",
     )
-
-
-@cache
-def _schema(generation: str) -> Any:  # noqa: ANN401 lxml ships no types
-    return etree.XMLSchema(file=str(Path(fmpy.__file__).parent / "schema" / _SCHEMA_FILES[generation]))
-
-
-def _illegal_values(root: Any, generation: str) -> Iterable[str]:  # noqa: ANN401 lxml ships no types
-    """Describe the attributes of `_DECIDING` whose values the schema does not allow."""
-    schema = _schema(generation)
-    schema.validate(root)
-    for error in schema.error_log:
-        match = _ATTRIBUTE.search(error.message)
-        if error.type_name in _ILLEGAL and match is not None and _DECIDING.fullmatch(match[1]):
-            found = root.getroottree().xpath(error.path)
-            element = next(
-                (one for node in found[:1] for one in (node, *node.iterancestors()) if one.get("name")), None
-            )
-            owner = f"variable '{element.get('name')}'" if element is not None else error.path.rpartition("/")[2]
-            yield f"{owner} (line {error.line}): {match[1]}: {match[2].rstrip('.')}"

@@ -14,20 +14,18 @@ from zipfile import ZipFile, ZipInfo
 
 import fmpy
 from fmpy.model_description import ModelDescription as FmpyDescription
-from fmpy.model_description import ValidationError as FmpyValidationError
 from fmpy.model_description import read_model_description
+from fmpy.validation import validate_model_description
 from msgspec.structs import replace
 
-from .... import files
 from ....errors import LoadFailed
 from ....variables.model_description import Causality, Clock, DefaultExperiment, Kind, ModelDescription
 from .archive import Contents, OpenFmu, Terms, opened
 from .declared_variables import states_of, variables_of
 from .examining import examine, find_library, library_name
 
-__all__ = ["description_of", "read_description"]
+__all__ = ["description_of", "parsed", "read_description"]
 
-_VERSIONS = ("1.0", "2.0", "3.0")
 _WORDS: Final[dict[Kind, str]] = {"co_simulation": "co-simulation", "model_exchange": "model exchange"}
 
 
@@ -60,13 +58,16 @@ def read_description(
 
 def description_of(fmu: OpenFmu, kind: Literal["auto"] | Kind = "auto", *, to_run: bool = True) -> ModelDescription:
     """As `read_description`, for an FMU that is open."""
-    path, contents = fmu.path, examine(fmu)
-    source, problems = _parse(path, contents)
+    path = fmu.path
+    contents, root, problems = examine(fmu)
+    source = parsed(path, contents)
     version = source.fmiVersion or ""
-    if not version.startswith(_VERSIONS) or "-" in version:  # 3.0-beta.1 is another interface than 3.0
-        raise LoadFailed(f"'{path}' is an FMI {version} FMU; supported are FMI 1.0, 2.0 and 3.0.")
     kind = _kind(source, kind, path)
-    platforms = tuple(fmpy.supported_platforms(_readable(path, contents)))
+    if kind == "model_exchange" and version != "1.0" and root.find("ModelStructure") is None:
+        raise LoadFailed(
+            f"the modelDescription.xml of '{path}' has no ModelStructure, which has its continuous states."
+        )
+    platforms = tuple(fmpy.supported_platforms(_readable(contents)))
     interfaces = [_interface(source, kind), *(_interface(source, other) for other in _WORDS if other != kind)]
     identifiers = [one.modelIdentifier or "" for one in interfaces if one is not None]
     library = find_library(path, contents.names, identifiers, version) if to_run else None
@@ -75,11 +76,12 @@ def description_of(fmu: OpenFmu, kind: Literal["auto"] | Kind = "auto", *, to_ru
             f"is not named as FMI demands, '{wanted}'" if identifiers[0] else "is all that tells the model identifier"
         )
         problems = (*problems, f"the library '{library}' {what}")
-    root = ET.fromstring(contents.xml["modelDescription.xml"])  # noqa: S314 - `examine` has found it safe
+    for variable, element in zip(source.modelVariables, root.iterfind("ModelVariables/*"), strict=False):
+        variable.sourceline = element.sourceline  # that of the file, which has other lines than the repaired text
     try:
-        description = _convert(source, kind, root, platforms, problems)
+        description = _convert(source, kind, root, platforms, (*problems, *validate_model_description(source)))
     except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
-        raise LoadFailed(f"the modelDescription.xml of '{path}' has an invalid value: {error}") from error
+        raise _unreadable(path) from error
     identifier = identifiers[0] or (PurePosixPath(library).stem if library is not None else "")
     return replace(description, model_identifier=identifier, library=library)
 
@@ -108,10 +110,8 @@ def _interface(source: FmpyDescription, kind: Kind) -> Any:  # noqa: ANN401 FMPy
     return source.coSimulation if kind == "co_simulation" else source.modelExchange
 
 
-def _readable(path: Path, contents: Contents) -> str | BytesIO:
-    """What FMPy reads an FMU from: the folder, or an archive without leading `./`, which FMPy does not understand."""
-    if files.is_folder(path):
-        return str(path)
+def _readable(contents: Contents) -> BytesIO:
+    """What FMPy reads an FMU from: an archive with names and XML as it understands them."""
     archive = BytesIO()
     with ZipFile(archive, "w") as file:
         for name in contents.names:
@@ -120,19 +120,23 @@ def _readable(path: Path, contents: Contents) -> str | BytesIO:
     return archive
 
 
-def _parse(path: Path, contents: Contents) -> tuple[FmpyDescription, tuple[str, ...]]:
-    """FMPy's model description, and the problems that a strict validation finds in it."""
-    source = _readable(path, contents)
+def parsed(path: Path, contents: Contents) -> FmpyDescription:
+    """FMPy's model description of the FMU at ``path``, from what `examine` has returned.
+
+    Raises:
+        LoadFailed: it breaks a rule that `repair` does not know.
+    """
     try:
-        return read_model_description(source, validate=True), ()
-    except FmpyValidationError as error:
-        problems = tuple(str(problem) for problem in error.problems)
-    except Exception as error:  # noqa: BLE001 FMPy and lxml raise whatever the XML provokes in them
-        problems = (str(error),)
-    try:
-        return read_model_description(source, validate=False), problems
-    except Exception as error:
-        raise LoadFailed(f"the modelDescription.xml of '{path}' cannot be read: {error}") from error
+        return read_model_description(_readable(contents), validate=False)
+    except Exception as error:  # FMPy raises whatever the XML provokes in it
+        raise _unreadable(path) from error
+
+
+def _unreadable(path: Path) -> LoadFailed:
+    return LoadFailed(
+        f"the modelDescription.xml of '{path}' breaks a rule of FMI in a way that keeps it from being read.",
+        hint="Report it to the maker of its tool; `--debug` shows where the reading ended.",
+    )
 
 
 def _convert(
@@ -189,7 +193,7 @@ def _clock(element: ET.Element) -> Clock:
     """A clock; an interval given as a fraction is counted in units of its resolution (FMI 3.0, 2.2.8.4)."""
     interval, shift = _number(element.get("intervalDecimal")), _number(element.get("shiftDecimal"))
     counter, resolution = element.get("intervalCounter"), element.get("resolution")
-    if counter is not None and resolution is not None:
+    if counter is not None and resolution is not None and int(resolution):
         interval, shift = int(counter) / int(resolution), int(element.get("shiftCounter", 0)) / int(resolution)
     return Clock(
         name=element.attrib["name"],

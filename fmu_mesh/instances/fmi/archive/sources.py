@@ -24,13 +24,12 @@ from typing import Final, Literal
 import fmpy
 import msgspec
 from fmpy.model_description import ModelDescription as FmpyDescription
-from fmpy.model_description import read_model_description
 
 from ....errors import LoadFailed
 from ....variables.model_description import Kind, ModelDescription
 from .archive import OpenFmu, Terms, opened, unpacked
-from .examining import library_name, source_names
-from .reading import description_of
+from .examining import examine, library_name, source_names
+from .reading import description_of, parsed
 
 __all__ = ["cache_folder", "describe", "extract", "prepare"]
 
@@ -135,7 +134,7 @@ def _extract(fmu: OpenFmu, parent: Path, tell: Callable[[str], None], model: Mod
         if model is not None and model.library is not None:
             _name_library(folder, model, folder / model.library)
         elif model is not None or not _has_binaries(folder):
-            _add_library(fmu.path, folder, model, tell)
+            _add_library(fmu, folder, model, tell)
     return folder.with_suffix("")
 
 
@@ -160,26 +159,26 @@ def _name_library(folder: Path, model: ModelDescription, library: Path) -> None:
         named.symlink_to(library.name)
 
 
-def _add_library(path: Path, folder: Path, model: ModelDescription | None, tell: Callable[[str], None]) -> None:
+def _add_library(fmu: OpenFmu, folder: Path, model: ModelDescription | None, tell: Callable[[str], None]) -> None:
     """Copy the compiled library of an FMU to where FMI expects it."""
     names = [file.relative_to(folder).as_posix() for file in folder.glob("sources/**/*") if file.is_file()]
     if not source_names(names):
         return  # the error of loading it says what is missing
-    description = read_model_description(str(folder), validate=False)
+    path, (contents, root, _) = fmu.path, examine(fmu)
+    description = parsed(path, contents)
     kind = model.kind if model is not None else "co_simulation" if description.coSimulation else "model_exchange"
-    build = _build(path, description, names, kind, _listed_files(folder / "modelDescription.xml", kind))
+    build = _build(path, description, names, kind, _listed_files(root, kind))
     library = _compiled(path, folder / "sources", build, tell)
     target = folder / library_name(build.identifier, description.fmiVersion)
     target.parent.mkdir(parents=True, exist_ok=True)
     shutil.copyfile(library, target)
 
 
-def _listed_files(file: Path, kind: str) -> list[str]:
+def _listed_files(root: ET.Element, kind: str) -> list[str]:
     """The source files that FMI 2.0 lists for a kind, or for the other kind with the same model identifier.
 
     FMPy keeps only one of the two lists.
     """
-    root = ET.parse(file).getroot()  # noqa: S314 `examine` has found it safe
     own, other = ("CoSimulation", "ModelExchange")[:: 1 if kind == "co_simulation" else -1]
     units = [unit for name in (own, other) for unit in root.findall(name)]
     identifiers = [unit.get("modelIdentifier") for unit in units]
