@@ -26,6 +26,9 @@ LIMITS_HINT: Final = "If you trust it, raise `limits` in the configuration."
 _HARMLESS_BYTES: Final = 64 * 2**20
 """An archive with fewer unpacked bytes is not a ZIP bomb, whatever its compression ratio is."""
 
+_UNREAD: Final = ("__macosx/", "documentation/")
+"""Folders, in lower case, that no run reads: of two entries of one name both are left out there, instead of refused."""
+
 _CHUNK: Final = 2**20
 _ENCRYPTED: Final = 0x1
 
@@ -61,6 +64,8 @@ def checked_archive(path: Path, file: IO[bytes], limits: LimitsConfig, otherwise
         raise LoadFailed(f"'{path}' is no ZIP archive, so it is no {otherwise}.")
     with reading(path):
         archive = zipfile.ZipFile(file)
+        for entry in archive.infolist():
+            entry.filename = entry.filename.replace("\\", "/")  # tools for Windows write it, and no name of FMI has one
         _check(path, archive, limits)
     return archive
 
@@ -87,13 +92,10 @@ def _check(path: Path, archive: zipfile.ZipFile, limits: LimitsConfig) -> None:
     entries = archive.infolist()
     if len(entries) > limits.entries:
         raise LoadFailed(f"'{path}' has {len(entries)} entries; the limit is {limits.entries}.", hint=LIMITS_HINT)
-    names: set[str] = set()
+    by_name: dict[str, list[zipfile.ZipInfo]] = {}
     for entry in entries:
         _check_entry(path, entry)
-        name = entry_name(entry)
-        if name in names and not entry.is_dir():
-            raise LoadFailed(f"'{path}' has two entries with one name: '{name}'.")
-        names.add(name)
+        by_name.setdefault(entry_name(entry), []).append(entry)
     unpacked = sum(entry.file_size for entry in entries)
     if unpacked > limits.unpacked_bytes:
         text = f"'{path}' has {unpacked} bytes when it is unpacked; the limit is {limits.unpacked_bytes}."
@@ -102,6 +104,11 @@ def _check(path: Path, archive: zipfile.ZipFile, limits: LimitsConfig) -> None:
     if unpacked > _HARMLESS_BYTES and unpacked > limits.ratio * packed:
         text = f"'{path}' is {unpacked / packed:.0f} times as large when it is unpacked; the limit is {limits.ratio:g}."
         raise LoadFailed(text, hint=LIMITS_HINT)
+    doubled = {name for name, same in by_name.items() if len(same) > 1 and not all(one.is_dir() for one in same)}
+    if read := [name for name in doubled if not name.lower().startswith(_UNREAD)]:
+        raise LoadFailed(f"'{path}' has two entries with one name: '{min(read)}'.")
+    # So nobody reads or unpacks either of two.
+    entries[:] = [entry for entry in entries if entry_name(entry) not in doubled]
 
 
 def _check_entry(path: Path, entry: zipfile.ZipInfo) -> None:
@@ -113,11 +120,6 @@ def _check_entry(path: Path, entry: zipfile.ZipInfo) -> None:
     has_name = bool(relative.parts) or entry.is_dir()
     if not has_name or relative.is_absolute() or ".." in relative.parts or has_drive:
         raise LoadFailed(f"'{path}' has an entry outside its own folder: '{name}'.")
-    if "\\" in name:
-        raise LoadFailed(
-            f"'{path}' has an entry with a backslash in its name: '{name}' (FMI 2.0, 2.3: the separator is '/').",
-            hint="Unpack it with a tool that accepts backslashes, and zip it again.",
-        )
     kind = stat.S_IFMT(entry.external_attr >> 16)
     if kind == stat.S_IFLNK:
         raise LoadFailed(f"'{path}' has a symbolic link inside: '{name}'.")

@@ -57,7 +57,9 @@ HOSTILE: list[object] = [
     pytest.param(entry("C:/evil"), "outside its own folder", id="a drive"),
     pytest.param(entry("./../evil"), "outside its own folder", id="a parent folder of the folder itself"),
     pytest.param(entry("."), "outside its own folder: '.'", id="a file in the place of the folder itself"),
-    pytest.param(entry("resources\\evil"), "Unpack it with a tool that accepts backslashes", id="a backslash"),
+    pytest.param(entry("resources\\..\\..\\evil"), "outside its own folder", id="a parent folder of Windows"),
+    pytest.param(entry("C:\\evil"), "outside its own folder", id="a drive of Windows"),
+    pytest.param(entry("\\\\host\\evil"), "outside its own folder", id="a host of Windows"),
     pytest.param(entry("resources/link", stat.S_IFLNK | 0o777), "a symbolic link inside", id="a link"),
     pytest.param(entry("resources/fifo", stat.S_IFIFO | 0o644), "neither a file nor a folder", id="a fifo"),
     pytest.param(entry("resources/disk", stat.S_IFBLK | 0o644), "neither a file nor a folder", id="a device"),
@@ -102,6 +104,33 @@ def test_an_fmu_whose_tool_wrote_a_dot_as_a_folder_is_the_same_fmu_and_runs(
         instance.exit_initialization()
 
 
+def test_an_fmu_with_backslashes_of_windows_is_the_same_fmu_and_runs(tmp_path: Path) -> None:
+    path = tmp_path / "windows.fmu"
+    with zipfile.ZipFile(GAIN) as old, zipfile.ZipFile(path, "w") as new:
+        new.writestr(entry("binaries\\"), b"")
+        for name in old.namelist():
+            new.writestr(entry(name.replace("/", "\\")), old.read(name))
+
+    description = read_description(path)
+
+    assert description == read_description(GAIN)
+    with closing(open_instance(path, "windows", description, tmp_path)) as instance:
+        instance.enter_initialization(0.0, 1.0, {})
+        instance.exit_initialization()
+
+
+@pytest.mark.filterwarnings("ignore:Duplicate name")
+@pytest.mark.parametrize("name", ["__MACOSX/._Gain.so", "documentation/index.html", "Documentation/a/b.png"])
+def test_two_files_of_one_name_that_nobody_reads_are_left_out(name: str, tmp_path: Path) -> None:
+    path = repacked(tmp_path / "twice.fmu", add={entry(name): b"one", entry(name.replace("/", "\\")): b"other"})
+
+    description, folder = read_description(path), extract(path, tmp_path / "parent")
+
+    assert description == read_description(GAIN)
+    assert not (folder / name).exists()
+    assert (folder / "binaries/linux64/Gain.so").is_file()
+
+
 @pytest.mark.filterwarnings("ignore:Duplicate name")
 def test_two_entries_with_one_name_are_refused(tmp_path: Path) -> None:
     path = repacked(tmp_path / "twice.fmu", add={entry("modelDescription.xml"): b"<another/>"})
@@ -110,10 +139,11 @@ def test_two_entries_with_one_name_are_refused(tmp_path: Path) -> None:
         read_description(path)
 
 
-def test_two_spellings_of_one_name_are_refused_as_well(tmp_path: Path) -> None:
-    path = repacked(tmp_path / "twice.fmu", add={entry("./modelDescription.xml"): b"<another/>"})
+@pytest.mark.parametrize("name", ["./sources/Gain.c", "sources\\Gain.c", ".\\sources\\Gain.c"])
+def test_two_spellings_of_one_name_are_refused_as_well(name: str, tmp_path: Path) -> None:
+    path = repacked(tmp_path / "twice.fmu", add={entry(name): b"another"})
 
-    with pytest.raises(LoadFailed, match=r"two entries with one name: 'modelDescription\.xml'"):
+    with pytest.raises(LoadFailed, match=r"two entries with one name: 'sources/Gain\.c'"):
         read_description(path)
 
 
