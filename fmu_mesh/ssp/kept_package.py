@@ -77,7 +77,7 @@ class KeptPackage(NamedTuple):
 
         Raises:
             LoadFailed, OSError: the package cannot be read.
-            ConfigurationError: a link leads out of the folder.
+            ConfigurationError: a link, or a file that the description names, leads out of the folder.
         """
         if is_file(self.root):
             with self.root.open("rb") as file, checked_archive(self.root, file, LimitsConfig(), "package") as archive:
@@ -88,6 +88,9 @@ class KeptPackage(NamedTuple):
                     for name in [entry_name(entry)]
                 ]
             return
+        if beside := sorted(source for source in _sources(self._tree()) if source.startswith("../")):
+            text = f"'{self.shown}' names '{beside[0]}', which is not in the folder of the package"
+            raise ConfigurationError(text, hint="Copy it into the folder, and name the copy.")
         names = self._names_in_folder()
         main = DEFAULT if DEFAULT not in names else self.name
         others = [PackageEntry(name, self._own_file(name)) for name in names if name != self.name]

@@ -1,6 +1,7 @@
 """The files of a package: an .ssp archive, a folder that somebody has unpacked, or one .ssd and what lies beside it.
 
-Owns how the URIs in a package become paths, and that none leads out of it. The protection against hostile archives is
+Owns how the URIs in a package become paths, and that none leads out of an archive; a folder is its user's own, and its
+descriptions may name files beside it. The protection against hostile archives is
 that of FMUs (`fmu_mesh.instances.fmi.archive`).
 """
 
@@ -115,6 +116,8 @@ class Package:
             hint = f"Did you mean '{near}'?" if near is not None else f"It has {listed(self.names())}."
             raise ConfigurationError(f"'{self._shown}' has no file '{name}'", hint=hint)
         try:
+            if owner[1].startswith("../"):
+                return self.read_beside(self.root / owner[1])
             return self._container(owner[0]).read(owner[1])
         except LoadFailed as error:
             raise ConfigurationError(error.message, hint=error.hint) from error
@@ -145,7 +148,7 @@ class Package:
             uri: as the file has it, without a fragment.
             base: the folder that it is relative to, such as `resources`; empty: the root of the package.
             place: where it is written.
-            problems: gets URIs with a scheme, absolute ones, those out of the package, and files that do not exist.
+            problems: gets URIs with a scheme, absolute ones, those out of an archive, and files that do not exist.
         """
         expected = "a path inside the package, such as resources/model.fmu"
         scheme = _SCHEME.match(uri)
@@ -161,7 +164,8 @@ class Package:
             near = nearest(name.replace("\\", "/"), self.names())
             problems.add(place, f"the source '{uri}' with a backslash", "`/` between folders and files", near)
             return None
-        if text.startswith("/") or name.startswith("../") or name == ".." or "\0" in text:
+        leads_out = name.startswith("../") and not (self.root / base).is_dir()  # out of an archive
+        if text.startswith("/") or leads_out or name == ".." or "\0" in text:
             problems.add(place, f"the source '{uri}', which leads out of the package", expected)
             return None
         if not self.exists(name):
@@ -173,6 +177,13 @@ class Package:
     def _owner(self, name: str) -> tuple[str, str] | None:
         """The container that has a file (empty: the package itself), and the name of the file in it."""
         container, rest = "", name
+        if name.startswith("../"):  # beside the folder of the package
+            parts = PurePosixPath(name).parts
+            whole = ["/".join(parts[: count + 1]) for count in range(len(parts))]
+            container = next((one for one in whole if files.is_file(self.root / one)), "")
+            if container in ("", name):
+                return ("", name) if container else None
+            rest = name[len(container) + 1 :]
         while rest not in self._container(container).contents().names:
             parts = PurePosixPath(rest).parts
             inner = next(

@@ -124,7 +124,6 @@ DAMAGED: dict[str, tuple[str, Callable[[Path], object], str]] = {
     "a description as an archive": ("a.ssp", lambda path: path.write_text(TEXT), "It is XML: name it .ssd"),
     "an archive as a description": ("a.ssd", lambda path: path.write_bytes(b"PK\x03\x04"), "Name it .ssp."),
     "a bomb": ("a.ssp", bomb, "If you trust it, unpack it, and name the folder instead."),
-    "names with backslashes": ("a.ssp", backslashes, "zip it again"),
     "an entry without a name": ("a.ssp", nameless, "is a damaged ZIP archive: it has an entry without a name."),
     "a URI with a backslash": ("a.ssp", uri_with_backslash, "Did you mean 'resources/Gain.fmu'?"),
     "another case": (
@@ -141,6 +140,47 @@ DAMAGED: dict[str, tuple[str, Callable[[Path], object], str]] = {
         "the element include in Elements",
     ),
 }
+
+
+def test_a_package_with_backslashes_of_windows_is_read(tmp_path: Path) -> None:
+    backslashes(tmp_path / "a.ssp")
+
+    assert fmu_mesh.load(tmp_path / "a.ssp").check()
+
+
+def beside(folder: Path, source: str) -> Path:
+    """A package in a folder, whose FMU lies outside of it."""
+    package = write_package(folder / "good.ssp", edited(TEXT.replace("resources/Gain.fmu", source)))
+    with zipfile.ZipFile(package) as archive:
+        archive.extractall(folder / "systems" / "own")
+    (folder / "fmus").mkdir()
+    (folder / "systems/own/resources/Gain.fmu").rename(folder / "fmus/Gain.fmu")
+    return folder / "systems" / "own" / SSD
+
+
+def test_a_description_in_a_folder_may_name_an_fmu_beside_it(tmp_path: Path) -> None:
+    ssd = beside(tmp_path, "../../fmus/Gain.fmu")
+
+    assert fmu_mesh.load(ssd).check()
+    assert fmu_mesh.load(ssd.parent).check()
+
+
+def test_a_missing_file_beside_a_folder_is_told(tmp_path: Path) -> None:
+    ssd = beside(tmp_path, "../../fmus/Gian.fmu")
+
+    [finding] = fmu_mesh.load(ssd).check().findings
+
+    assert "no such file '../../fmus/Gian.fmu'" in finding.found
+
+
+def test_an_archive_in_a_folder_names_nothing_outside_of_itself(tmp_path: Path) -> None:
+    beside(tmp_path, "../../fmus/Gain.fmu")
+    inner = tmp_path / "systems" / "own" / "inner.ssp"
+    (tmp_path / "good.ssp").rename(inner)
+
+    [finding] = fmu_mesh.load(inner).check().findings
+
+    assert "leads out of the package" in finding.found
 
 
 @pytest.mark.parametrize("fault", DAMAGED)
