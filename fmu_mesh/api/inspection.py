@@ -13,7 +13,7 @@ import msgspec
 from .. import files
 from ..config.instance_sections import KIND
 from ..errors import CallRefused, LoadFailed, UnknownName
-from ..instances.fmi import read_description, sha256_of, size_of
+from ..instances.fmi import missing_libraries, read_description, sha256_of, size_of
 from ..instances.registry import KINDS, describe
 from ..ssp.configuration_files import names_package
 from ..text import listed, matching, nearest, nearest_file, short_number, shown
@@ -62,8 +62,8 @@ class Inspection(msgspec.Struct, frozen=True, omit_defaults=False):
         file: the path as it was given.
         sha256: of the archive, as hexadecimal digits; None for a folder.
         bytes: size of the archive; None for a folder.
-        runs_here: whether it can run on this platform.
-        problems: violations and warnings as text; if it cannot run here, the first one says why.
+        runs_here: whether it can run on this system.
+        problems: violations and warnings as text; if it cannot run here, the first ones say why.
         description: the model description.
     """
 
@@ -134,6 +134,7 @@ def inspect(path: str | Path, *, kind: str | None = None) -> Inspection:
         else:
             try:
                 description = read_description(file)
+                reasons = missing_libraries(file, description.library) if description.library else ()
             except LoadFailed as error:
                 description = read_description(file, to_run=False)  # otherwise this says why
                 reasons = (str(error),)

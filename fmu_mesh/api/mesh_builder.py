@@ -374,7 +374,9 @@ class Mesh:
         run, file = None, self._shown_file
         try:
             run = self.plan(**options)
-            check_engines(run.plan.system.config.instances, str(file))
+            system = run.plan.system
+            models = {name: (Path(one.fmu), one.description) for name, one in system.instances.items()}
+            check_engines(system.config.instances, models, system.config.limits, str(file))
         except ConfigurationError as error:
             return Check(str(file), error, run)
         return Check(str(file), run=run)

@@ -96,9 +96,9 @@ class Kind(ABC, Generic[Section]):
     a configuration.
 
     Call sequence, in the process that plans a run: `check_showing` if somebody wants to see the world, then `describe`
-    for each model and `content` for each file; `check_engine` only for `fmu-mesh check`. Then `open` in the process
-    that runs the instance, which may be on another host. Every process that reads a configuration with this key imports
-    the module of the kind, so import slow libraries within the methods.
+    for each model and `content` for each file; `check_engine` and `check_model` only for `fmu-mesh check`. Then `open`
+    in the process that runs the instance, which may be on another host. Every process that reads a configuration with
+    this key imports the module of the kind, so import slow libraries within the methods.
 
     Attributes:
         section: the Struct of the section; its tag is the key of the kind.
@@ -145,6 +145,18 @@ class Kind(ABC, Generic[Section]):
             LoadFailed: it cannot; says why, with a hint what to install.
         """
         return
+
+    def check_model(self, path: Path, description: ModelDescription, limits: LimitsConfig) -> None:
+        """Check that this host has what one model needs; nothing is checked by default.
+
+        Args:
+            path: absolute path of the model.
+            description: what `describe` returned.
+            limits: how large an FMU may be.
+
+        Raises:
+            LoadFailed: it has not; says what is missing.
+        """
 
     def check_showing(self, showing: Showing) -> None:  # noqa: ARG002  for those who can show something
         """Check that this host can show what ``showing`` asks for; called only with `can_be_shown`.

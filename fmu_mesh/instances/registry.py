@@ -7,7 +7,7 @@ are. A kind is imported when a configuration has its key, and what it needs when
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -155,28 +155,50 @@ def can_be_shown(section: InstanceSection) -> bool:
     return _kind_of(section).can_be_shown
 
 
-def check_engines(sections: Mapping[str, InstanceSection], file: str) -> None:
-    """Check that this host has the engines of all instances that no `host` is named for.
+def check_engines(
+    sections: Mapping[str, InstanceSection],
+    models: Mapping[str, tuple[Path, ModelDescription]],
+    limits: LimitsConfig,
+    file: str,
+) -> None:
+    """Check that this host has what all instances need that no `host` is named for: engines, and libraries of a system.
+
+    Args:
+        sections: the sections of a configuration, by instance.
+        models: the absolute path and the description of the model of each.
+        limits: how large an FMU may be.
+        file: the configuration.
 
     Raises:
-        ConfigurationError: it does not; with a finding for each of these instances in the configuration ``file``.
+        ConfigurationError: it has not; with a finding for each of these instances.
     """
     findings = Findings(file)
-    reasons: dict[str, LoadFailed | None] = {}
+    reasons: dict[object, LoadFailed | None] = {}
     for name, section in sections.items():
         if section.host is not None:
             continue
-        key = key_of(section)
-        if key not in reasons:
-            reasons[key] = None
-            try:
-                _kind_of(section).check_engine()
-            except LoadFailed as error:
-                reasons[key] = error
-        if (reason := reasons[key]) is not None:
-            expected = f"an engine that runs here, or the `host` of the instance. {reason.hint}"
-            findings.add(f"instances.{name}.{key}", reason.message, expected)
+        key, kind, (path, description) = key_of(section), _kind_of(section), models[name]
+        asked: dict[object, Callable[[], None]] = {
+            key: kind.check_engine,
+            (key, path): partial(kind.check_model, path, description, limits),
+        }
+        for what, check in asked.items():
+            if what not in reasons:
+                reasons[what] = _refusal(check)
+            if (reason := reasons[what]) is not None:
+                needed = "an engine that runs here" if what == key else "a system that has all libraries"
+                expected = f"{needed}, or the `host` of the instance. {reason.hint or ''}".rstrip()
+                findings.add(f"instances.{name}.{key}", reason.message, expected)
+                break
     findings.raise_any()
+
+
+def _refusal(check: Callable[[], None]) -> LoadFailed | None:
+    try:
+        check()
+    except LoadFailed as error:
+        return error
+    return None
 
 
 def check_showing(sections: Mapping[str, InstanceSection], showing: Showing) -> None:

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from .archive.archive import Terms, content_of, sha256_of, size_of
     from .archive.reading import read_description
     from .archive.sources import describe
+    from .archive.system_libraries import missing_libraries
     from .co_simulation.fmi1 import Fmi1Instance
     from .co_simulation.fmi2 import Fmi2Instance
     from .co_simulation.fmi3 import Fmi3Instance
@@ -27,6 +28,7 @@ __all__ = [
     "Terms",
     "content_of",
     "describe",
+    "missing_libraries",
     "open_instance",
     "read_description",
     "sha256_of",
@@ -43,6 +45,7 @@ _MODULES = {
     "Terms": ".archive.archive",
     "content_of": ".archive.archive",
     "describe": ".archive.sources",
+    "missing_libraries": ".archive.system_libraries",
     "open_instance": ".opening",
     "read_description": ".archive.reading",
     "sha256_of": ".archive.archive",

@@ -21,6 +21,7 @@ from ...variables.value_types import Value
 from ..contract import LogMessage
 from ..kept_models import KeptModels
 from .archive.archive import Terms
+from .archive.system_libraries import missing_libraries
 from .calls import pointer
 from .fmu_values import OK, FmuValues, status_name
 from .loaded_fmu import FmuFunctions, FmuToLoad, LoadedFmu, quietly
@@ -89,8 +90,11 @@ class FmuInstance(KeepsFmuState, FmuValues):
             self._live = True
         except Exception as error:
             self._state = "failed"
+            library = description.library if self._model.calls is None else None
             self.close()
-            raise LoadFailed(f"'{path}' cannot be instantiated: {error}{self._message()}", instance=name) from error
+            missing = missing_libraries(path, library, terms) if library else ()
+            text = "; ".join(missing) or str(error)
+            raise LoadFailed(f"'{path}' cannot be instantiated: {text}{self._message()}", instance=name) from error
 
     @property
     def description(self) -> ModelDescription:

@@ -17,6 +17,7 @@ from ...config.base import POSITIVE, Base, Sha256
 from ...config.findings import Findings
 from ...config.instance_sections import KIND, Group, Host, InstanceSection, StartValues, StepSize
 from ...config.mesh import LimitsConfig
+from ...errors import LoadFailed
 from ...variables.model_description import ModelDescription
 from ..contract import Instance, Kind, Opening
 from .step_options import SolverSettings, StepOptions
@@ -165,6 +166,14 @@ class FmuKind(Kind[FmuConfig]):
         from .archive.sources import describe  # noqa: PLC0415  as above
 
         return describe(path, Terms(limits, section.sha256), section.kind, tell)
+
+    def check_model(self, path: Path, description: ModelDescription, limits: LimitsConfig) -> None:
+        """Look for the libraries of the system that the FMU needs."""
+        from .archive.archive import Terms  # noqa: PLC0415  as above
+        from .archive.system_libraries import missing_libraries  # noqa: PLC0415  as above
+
+        if description.library and (missing := missing_libraries(path, description.library, Terms(limits))):
+            raise LoadFailed("; ".join(missing))
 
     def content(self, path: Path) -> str:
         """A SHA-256 of the archive, or of all files of an unpacked FMU."""

@@ -36,6 +36,9 @@ class SharedLibrary(msgspec.Struct, frozen=True):
         run_paths: the folders that it looks for them in, as written (`$ORIGIN` is its own folder).
         imports: the functions and variables that others have to define.
         unique: the symbols that exist once in a process, whoever loads them and however (STB_GNU_UNIQUE).
+        machine: two bytes of its header that tell processors apart: the class and the machine.
+        versions: the versions of its symbols, such as `GLIBC_2.38` for the library of C.
+        needed_versions: the versions that it needs, by the names of libraries.
     """
 
     sha256: str = ""
@@ -44,6 +47,9 @@ class SharedLibrary(msgspec.Struct, frozen=True):
     run_paths: tuple[str, ...] = ()
     imports: frozenset[str] = frozenset()
     unique: frozenset[str] = frozenset()
+    machine: bytes = b""
+    versions: frozenset[str] = frozenset()
+    needed_versions: dict[str, frozenset[str]] = {}
 
 
 def libraries_beside(fmu: OpenFmu, library: str) -> dict[str, SharedLibrary]:
@@ -68,6 +74,7 @@ def read_shared_library(content: bytes) -> SharedLibrary | None:
             return None
         tags = list(dynamic.iter_tags())
         symbols = _symbols(file, dynamic)
+        versions, needed_versions = _versions(elf)
     # Files of other people: pyelftools raises what the damage provokes.
     except (ELFError, ArithmeticError, AttributeError, LookupError, MemoryError, TypeError, ValueError, struct.error):
         return None
@@ -83,6 +90,21 @@ def read_shared_library(content: bytes) -> SharedLibrary | None:
         ),
         imports=frozenset(name for name, _, undefined in symbols if undefined and name),
         unique=frozenset(name for name, binding, undefined in symbols if binding == _GNU_UNIQUE and not undefined),
+        machine=content[4:20:14],
+        versions=versions,
+        needed_versions=needed_versions,
+    )
+
+
+def _versions(elf: Any) -> tuple[frozenset[str], dict[str, frozenset[str]]]:  # noqa: ANN401 as in `_symbols`
+    """The versions of symbols that a library has, and those that it cannot do without (VER_FLG_WEAK is 2)."""
+    own, needed = elf.get_section_by_name(".gnu.version_d"), elf.get_section_by_name(".gnu.version_r")
+    return (
+        frozenset(one.name for _, names in (own.iter_versions() if own else ()) for one in names),
+        {
+            library.name: frozenset(one.name for one in names if not one.entry.vna_flags & 2)
+            for library, names in (needed.iter_versions() if needed else ())
+        },
     )
 
 
