@@ -52,6 +52,7 @@ def test_a_missing_library_is_named_with_its_package_before_and_after_a_run(tmp_
     path = fmu_of(tmp_path / "gain.fmu", built(tmp_path, "Gain.so", "libgfortran.so.4", "libnobody_has.so.7"))
     mesh = fmu_mesh.Mesh("one", step_size=0.1, stop_time=1.0)
     mesh.add("gain", fmu=path)
+    before = Path.cwd()
 
     inspection = fmu_mesh.inspect(path)
     [finding] = mesh.check().findings
@@ -60,6 +61,7 @@ def test_a_missing_library_is_named_with_its_package_before_and_after_a_run(tmp_
 
     package = f"this system has no libgfortran.so.4, which '{LIBRARY}' needs; on Debian and Ubuntu it is in the package"
     other = f"this system has no libnobody_has.so.7, which '{LIBRARY}' needs"
+    assert Path.cwd() == before
     assert not inspection.runs_here
     assert inspection.problems == (f"{package} libgfortran4", other)
     assert (finding.path, finding.found) == ("instances.gain.fmu", f"{package} libgfortran4; {other}")

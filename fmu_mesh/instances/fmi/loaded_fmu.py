@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Hashable, Mapping
+from contextlib import chdir
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, cast
 
@@ -104,7 +105,7 @@ class LoadedFmu:
         if self.calls is not None:
             return
         functions, description = self._fmu.functions, self._fmu.description
-        with FOLDER:  # FMPy loads a library from its own folder
+        with FOLDER, chdir("."):  # FMPy loads a library from its own folder, and stays there if that fails
             loaded = functions.library(
                 guid=description.guid,
                 modelIdentifier=description.model_identifier,
