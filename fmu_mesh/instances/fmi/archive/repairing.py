@@ -182,7 +182,8 @@ def _on_attribute(error: Xml, element: Xml, found: Repairs) -> str:
     if error.type_name in _ILLEGAL and _DECIDING.fullmatch(name):
         found.illegal[f"{_owner(element)}: {name}: {rule.rstrip('.')}"] = None
         return ""
-    if element.getparent() is not None and ("DATATYPE_VALID" in error.type_name or "is not allowed" in rule):
+    # One that FMI does not know may be known to FMPy, such as a stepSize in FMI 1.0: it stays.
+    if element.getparent() is not None and "DATATYPE_VALID" in error.type_name:
         del element.attrib[name]
         return "it is left out"
     return ""
