@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 import zipfile
+from collections.abc import Mapping
 from contextlib import closing
 from pathlib import Path
 from typing import Literal
@@ -108,21 +109,80 @@ def test_an_unpacked_folder_runs_and_stays_as_it_is(tmp_path: Path) -> None:
 
 def test_functions_with_a_prefix_get_their_plain_names_in_the_library(tmp_path: Path) -> None:
     """Sources may define FMI2_FUNCTION_PREFIX, for linking them statically (FMI 2.0, 2.1.1)."""
+    name = "sources/fmi2Functions.h"
     sources = without_binaries(tmp_path / "sources.fmu")
     with zipfile.ZipFile(sources) as archive:
-        text = archive.read("sources/instance.h").decode()
-    prefixed = repacked(
-        tmp_path / "prefixed.fmu",
-        source=sources,
-        keep=lambda name: name != "sources/instance.h",
-        add={"sources/instance.h": text.replace("#define INSTANCE_H", "#define FMI2_FUNCTION_PREFIX Gain_").encode()},
-    )
+        header = b"#define FMI2_FUNCTION_PREFIX Gain_\n" + archive.read(name)
+    fmu = repacked(tmp_path / "prefixed.fmu", source=sources, keep=lambda one: one != name, add={name: header})
 
-    folder = extract(prefixed, tmp_path / "parent")
+    assert main(["launch", "--local", str(config_with(fmu))]) == 0
 
-    library = (folder / "binaries/linux64/Gain.so").read_bytes()
-    assert b"\0fmi2DoStep\0" in library
-    assert b"Gain_fmi2DoStep" not in library
+    assert (tmp_path / "one.csv").read_text().splitlines()[-1] == "1.0,0.30000000000000004"
+
+
+def with_gain_of(text: str, target: Path, add: Mapping[str, str] = {}) -> Path:
+    """The source FMU of `Gain`, with ``text`` before its first line, and `gain()` in the place of its parameter."""
+    sources = without_binaries(target.with_name("sources.fmu"))
+    with zipfile.ZipFile(sources) as archive:
+        source = archive.read("sources/Gain.c").decode()
+    assert "s->k * s->u" in source
+    changed = text + source.replace("s->k * s->u", "gain() * s->u")
+    members: dict[str | zipfile.ZipInfo, bytes] = {"sources/Gain.c": changed.encode()}
+    members.update({name: content.encode() for name, content in add.items()})
+    return repacked(target, source=sources, keep=lambda name: name != "sources/Gain.c", add=members)
+
+
+STRTOD_L = """#define _GNU_SOURCE
+#include <locale.h>
+#include <stdlib.h>
+static double gain(void) { return strtod_l("2.5", NULL, newlocale(LC_ALL_MASK, "C", NULL)); }
+"""
+
+
+def test_a_feature_macro_in_the_first_line_of_a_source_counts(tmp_path: Path) -> None:
+    fmu = with_gain_of(STRTOD_L, tmp_path / "gain.fmu")
+
+    assert main(["launch", "--local", str(config_with(fmu))]) == 0
+
+    assert (tmp_path / "one.csv").read_text().splitlines()[-1] == "1.0,7.5"
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        (STRTOD_L.replace("#define _GNU_SOURCE\n", ""), "strtod_l.* C would take a function without a declaration"),
+        ("static double gain(void) { char *p = 5; return *p; }\n", "do not compile: .*from .int. "),
+    ],
+    ids=["a function without a declaration", "an int as a pointer"],
+)
+def test_sources_that_would_compute_something_else_do_not_compile(text: str, says: str, tmp_path: Path) -> None:
+    fmu = with_gain_of(text, tmp_path / "gain.fmu")
+
+    with pytest.raises(LoadFailed) as caught:
+        extract(fmu, tmp_path / "parent")
+
+    assert re.search(says, str(caught.value))
+
+
+def test_old_c_still_compiles(tmp_path: Path) -> None:
+    text = "static three() { return 3; }\nstatic double gain(void) { double d = three(); int *p = &d; return *p; }\n"
+
+    assert (extract(with_gain_of(text, tmp_path / "gain.fmu"), tmp_path / "p") / "binaries/linux64/Gain.so").is_file()
+
+
+def test_headers_in_folders_below_the_sources_are_found(tmp_path: Path) -> None:
+    included = '#include "factor.h"\n#include <offset.h>\n#include <stdio.h>\n'
+    text = included + "static double gain(void) { return FACTOR + OFFSET + EOF; }\n"
+    headers = {
+        "sources/deep/er/factor.h": "#define FACTOR 2.5\n",
+        "sources/other/offset.h": "#define OFFSET 1\n",
+        "sources/other/stdio.h": "#error this is not that of the system\n",
+    }
+    fmu = with_gain_of(text, tmp_path / "gain.fmu", headers)
+
+    assert main(["launch", "--local", str(config_with(fmu))]) == 0
+
+    assert (tmp_path / "one.csv").read_text().splitlines()[-1] == "1.0,7.5"
 
 
 def test_without_a_list_all_sources_at_the_root_are_compiled(tmp_path: Path) -> None:

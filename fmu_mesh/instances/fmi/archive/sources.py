@@ -39,11 +39,22 @@ COMPILE_S: Final = 600.0
 """How long a compiler may take, in s."""
 
 _SHOWN_LINES: Final = 12
+_HEADER_SUFFIXES: Final = (".h", ".hh", ".hpp", ".hxx", ".inc")
+_MAKES: Final = b"fmi2Instantiate"
 _SUFFIX = str(fmpy.sharedLibraryExtension)
 _HEADERS = Path(fmpy.__file__).parent / "c-code"
 _OWN_HEADERS = Path(__file__).parent / "headers"
 """The headers of FMI 1.0."""
-_FLAGS: Final = ("-O2", "-fPIC", "-ffp-contract=off", "-w")
+_FLAGS: Final = ("-O2", "-fPIC", "-ffp-contract=off")
+# C takes a function without a declaration for one that returns int: it compiles, and computes something else. Nothing
+# disables warnings here (-w), because that would make these two harmless again; old C has the other two.
+_FLAGS_OF_C: Final = (
+    "-std=gnu17",
+    "-Werror=implicit-function-declaration",
+    "-Werror=int-conversion",
+    "-Wno-error=incompatible-pointer-types",
+    "-Wno-error=implicit-int",
+)
 # -Bsymbolic: calls go to the FMU's own functions, even if the C library or Python has one with the same name.
 _LINK_FLAGS: Final = ("-shared", "-Wl,--no-undefined", "-Wl,-Bsymbolic", "-lm", "-ldl", "-lpthread")
 
@@ -207,10 +218,8 @@ def _build(path: Path, description: FmpyDescription, names: Sequence[str], kind:
         raise LoadFailed(f"'{path}' lists the source '{missing[0]}', but does not contain it.")
     defined = [one for file_set in sets for one in file_set.preprocessorDefinitions if not one.optional]
     options = [f"-D{one.name}={one.value}" if one.value else f"-D{one.name}" for one in defined]
-    # A shared library exports the names without the prefix that static linking would need.
-    if description.fmiVersion.startswith("2"):
-        options += ["-include", str(_HEADERS / "fmi2Functions.h")]
-    elif description.fmiVersion.startswith("3"):
+    # A shared library exports the names without the prefix that static linking would need; for FMI 2.0 see `_prefixed`.
+    if description.fmiVersion.startswith("3"):
         options += ["-DFMI3_OVERRIDE_FUNCTION_PREFIX"]
     languages = {one.language for one in sets if one.language}
     if len(languages) == 1:
@@ -232,7 +241,7 @@ def _compiled(path: Path, sources: Path, build: _Build, tell: Callable[[str], No
     """The library of these sources: that in the cache, or a new one."""
     plus = any(not name.endswith(".c") for name in build.sources)
     compiler = _compiler(path, plus=plus)
-    own = [*compiler, *_FLAGS, *build.options]
+    own = [*compiler, *_FLAGS, *(() if plus else _FLAGS_OF_C), *build.options]
     target = cache_folder() / "sources" / _key(sources, build, own) / f"{build.identifier}{fmpy.sharedLibraryExtension}"
     if target.is_file():
         return target
@@ -242,9 +251,12 @@ def _compiled(path: Path, sources: Path, build: _Build, tell: Callable[[str], No
         with tempfile.TemporaryDirectory(prefix="build-", dir=target.parent) as scratch:
             draft = Path(scratch) / target.name
             folders = [sources, *(sources / name for name in build.includes), _OWN_HEADERS, _HEADERS]
+            searched = [f"-I{folder}" for folder in folders] + _other_folders(sources)
             files = [str(sources / name) for name in build.sources]
-            command = [*own, *(f"-I{folder}" for folder in folders), "-o", str(draft), *files, *_LINK_FLAGS]
+            command = [*own, *searched, "-o", str(draft), *files, *_LINK_FLAGS]
             _run(path, command, Path(scratch))
+            if prefixed := _prefixed(draft.read_bytes()):
+                _run(path, [*command, *prefixed], Path(scratch))
             draft.chmod(0o600)
             draft.replace(target)
     except OSError as error:
@@ -253,6 +265,31 @@ def _compiled(path: Path, sources: Path, build: _Build, tell: Callable[[str], No
             hint="Set FMU_MESH_CACHE_DIR to a folder that can be written.",
         ) from error
     return target
+
+
+def _other_folders(sources: Path) -> list[str]:
+    """The options for all folders below `sources` that have headers, which some tools list nowhere.
+
+    Their headers must not replace those of the system in `#include <...>`.
+    """
+    headers = (file for file in sources.rglob("*") if file.suffix in _HEADER_SUFFIXES)
+    folders = {str(file.parent) for file in headers if file.parent != sources}
+    found = sorted(folders, key=lambda folder: (folder.count("/"), folder))
+    return [option for folder in found for option in ("-iquote", folder, "-idirafter", folder)]
+
+
+def _prefixed(library: bytes) -> list[str]:
+    """The options that also give the functions of a library of FMI 2.0 their plain names (FMI 2.0, 2.1.1).
+
+    A header in front of the sources could do this as well. But it would include headers of the system, and a source may
+    define in its first line what these headers have to offer, such as `_GNU_SOURCE`.
+    """
+    names = set(re.findall(rb"(?<=\0)\w*fmi2[A-Z]\w+(?=\0)", library))
+    prefix = next((name.removesuffix(_MAKES) for name in names if name.endswith(_MAKES)), b"")
+    if not prefix or _MAKES in names:
+        return []
+    own = sorted(name.decode() for name in names if name.startswith(prefix + b"fmi2"))
+    return [f"-Wl,--defsym={name.removeprefix(prefix.decode())}={name}" for name in own]
 
 
 def _run(path: Path, command: Sequence[str], folder: Path) -> None:
@@ -264,10 +301,14 @@ def _run(path: Path, command: Sequence[str], folder: Path) -> None:
         raise LoadFailed(f"the sources of '{path}' were not compiled within {COMPILE_S:g} s.") from error
     if done.returncode != 0:
         lines = done.stderr.decode(errors="replace").replace(f"{folder}/", "").splitlines()
-        said = " | ".join(line.strip() for line in lines if "error" in line or "undefined" in line) or " | ".join(lines)
+        errors = [line.strip() for line in lines if re.search(r"\berror: |undefined", line)]
+        said = " | ".join(errors) or " | ".join(lines)
+        hint = "Export it with a binary for this platform."
+        if "-Wimplicit-function-declaration" in said.replace("-Werror=", "-W"):
+            hint = f"C would take a function without a declaration for one that returns int. {hint}"
         raise LoadFailed(
             f"the sources of '{path}' do not compile: {said[: _SHOWN_LINES * 80] or 'the compiler gave no message'}",
-            hint="Export it with a binary for this platform.",
+            hint=hint,
         )
 
 
