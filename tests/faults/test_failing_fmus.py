@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import json
+import re
 import signal
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import pytest
 
 from fmu_mesh.instances.fmi.co_simulation.discarded_steps import RETRY
 from fmu_mesh.rings.library import LIBRARY_VARIABLE
-from tests.fmus.helpers import find_fmu
+from tests.fmus import event_fmus
+from tests.fmus.helpers import NO_COMPILER, find_fmu
 from tests.helpers import Place, row_count, rows_of, wait_until, write_config
 
 
@@ -311,3 +313,39 @@ def test_a_number_beyond_the_type_of_its_input_ends_the_run_with_both_ends(
     if first == 1:
         assert len(rows_of(config.with_suffix(".csv"))) == 4
     place.assert_nothing_left()
+
+
+FATAL_IN = {
+    "fmi1 initialize": (1, "model_exchange", "fmiInitialize"),
+    "fmi1 derivatives": (1, "model_exchange", "fmiGetDerivatives"),
+    "fmi2 exit": (2, "co_simulation", "fmi2ExitInitializationMode"),
+    "fmi2 step": (2, "co_simulation", "fmi2DoStep"),
+    "fmi2 derivatives": (2, "model_exchange", "fmi2GetDerivatives"),
+    "fmi2 terminate": (2, "co_simulation", "fmi2Terminate"),
+    "fmi3 exit": (3, "co_simulation", "fmi3ExitInitializationMode"),
+    "fmi3 step": (3, "co_simulation", "fmi3DoStep"),
+    "fmi3 derivatives": (3, "model_exchange", "fmi3GetContinuousStateDerivatives"),
+}
+
+
+@pytest.mark.skipif(NO_COMPILER is not None, reason=str(NO_COMPILER))
+@pytest.mark.parametrize(("version", "kind", "function"), FATAL_IN.values(), ids=FATAL_IN)
+def test_after_fatal_no_function_of_an_instance_is_called(
+    place: Place, version: Literal[1, 2, 3], kind: str, function: str
+) -> None:
+    """This FMU aborts at a call that its state forbids, and after fatal it has none, so that all are forbidden."""
+    name = f"fmi{version}.c"
+    source = (event_fmus.SOURCES / name).read_text(encoding="utf-8")
+    head, body = re.split(rf"(?<=\n)(?=fmi\dStatus (?:EXPORT\()?{function}\b)", source)
+    body = body.replace("{\n", "{\n    ((Instance *)" + f"c)->mode = 0;\n    return fmi{version}Fatal;\n", 1)
+    fmu = place.folder / "ball.fmu"
+    event_fmus.event_source_fmu("Ball", version, fmu, add={f"sources/{name}": head + body})
+    config = write_config(
+        place.folder, instances={"ball": {"fmu": str(fmu), "kind": kind}}, connections=[], stop_time=0.01
+    )
+
+    launched = place.run("launch", config, "--local")
+
+    assert launched.wait() == (0 if function == "fmi2Terminate" else 3)
+    assert "ended its process" not in launched.errors
+    assert (f"{function} returned fatal" in launched.errors) is (function != "fmi2Terminate")

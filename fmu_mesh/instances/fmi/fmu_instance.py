@@ -13,7 +13,7 @@ from typing import Literal
 
 from fmpy.fmi1 import FMICallException
 
-from ...errors import InitializationFailed, LoadFailed, StepFailed
+from ...errors import FmuError, InitializationFailed, LoadFailed, StepFailed
 from ...rings.native import Said
 from ...variables.model_description import ModelDescription
 from ...variables.value_conversion import to_value
@@ -23,8 +23,8 @@ from ..kept_models import KeptModels
 from .archive.archive import Terms
 from .archive.system_libraries import missing_libraries
 from .calls import pointer
-from .fmu_values import OK, FmuValues, status_name
-from .loaded_fmu import FmuFunctions, FmuToLoad, LoadedFmu, quietly
+from .fmu_values import FATAL, OK, FmuValues, status_name
+from .loaded_fmu import FmuFunctions, FmuToLoad, LoadedFmu
 from .state import Bookkeeping, KeepsFmuState
 from .step_options import StepOptions
 
@@ -136,7 +136,7 @@ class FmuInstance(KeepsFmuState, FmuValues):
         if self._live and self._state == "stepping":
             was_reset = self._end_run(resets=self._kept is not None and (self._kept.resets or self._only_once))
         elif self._live:
-            quietly(self._release)
+            self._quietly(self._release)
         self._leave_model(was_reset=was_reset)
         self._live = False
         self._state = "closed"
@@ -186,9 +186,19 @@ class FmuInstance(KeepsFmuState, FmuValues):
 
     def _end_run(self, *, resets: bool) -> bool:
         """End the simulation; with ``resets`` also reset the instance, and return whether that was done."""
-        quietly(self._terminate)
-        quietly(self._release)
-        return resets and self._model.reset()
+        self._quietly(self._terminate)
+        self._quietly(self._release)
+        return resets and not self._model.is_lost and self._model.reset()
+
+    def _quietly(self, call: Callable[[], object]) -> None:
+        """Call a function at the end, where a failure has no consequence, but that of fatal."""
+        try:
+            if not self._model.is_lost:
+                call()
+        except FMICallException as error:
+            self._note(error.status)
+        except OSError:
+            return
 
     def _leave_model(self, *, was_reset: bool) -> None:
         """Leave the FMU to the next instance of this name; after a failure nothing of it is used again.
@@ -196,7 +206,13 @@ class FmuInstance(KeepsFmuState, FmuValues):
         A library that allows one instance is unloaded with it.
         """
         model = self._model
-        if self._kept is None or not self._live or self._state == "failed" or (self._only_once and not was_reset):
+        if (
+            self._kept is None
+            or not self._live
+            or self._state == "failed"
+            or model.is_lost
+            or (self._only_once and not was_reset)
+        ):
             model.close()
             return
         if not was_reset:
@@ -224,6 +240,8 @@ class FmuInstance(KeepsFmuState, FmuValues):
         self._variables = {variable.name: variable for variable in description.variables}
 
     def _check_live(self) -> None:
+        if self._model.is_lost:
+            raise FmuError("the FMU has returned fatal: no function of it may be called any more", instance=self.name)
         if not self._live:
             msg = f"instance '{self.name}' is closed"
             raise ValueError(msg)
@@ -232,15 +250,19 @@ class FmuInstance(KeepsFmuState, FmuValues):
         try:
             call()
         except FMICallException as error:
-            raise self._not_initialized(function, error.status) from error
+            raise self._failed(function, status=error.status) from error
 
-    def _not_initialized(self, function: str, status: int) -> InitializationFailed:
-        self._state = "failed"
-        return InitializationFailed(f"{function} returned {status_name(status)}{self._message()}", instance=self.name)
+    def _note(self, status: int) -> None:
+        """After fatal, no function of the instance is called, not even to free it (FMI 2.0, 2.1.3; 3.0, 2.2.3)."""
+        if status == FATAL:
+            self._model.lose()
 
     def _failed(
-        self, what: str, variable: str | None = None, hint: str | None = None
+        self, what: str, variable: str | None = None, hint: str | None = None, status: int | None = None
     ) -> StepFailed | InitializationFailed:
+        if status is not None:
+            what = f"{what} returned {status_name(status)}"
+            self._note(status)
         kind = StepFailed if self._state == "stepping" else InitializationFailed
         self._state = "failed"
         return kind(f"{what}{self._message()}", instance=self.name, variable=variable, hint=hint)

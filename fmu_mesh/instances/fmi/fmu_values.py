@@ -24,10 +24,11 @@ from ..call_guard import call_named, doing
 from .buffers import Buffer
 from .calls import Function, Pointer, RowPointers, address_of, cffi_function, memory
 
-__all__ = ["OK", "WARNING", "FmuValues", "PartCall", "Verb", "status_name"]
+__all__ = ["FATAL", "OK", "WARNING", "FmuValues", "PartCall", "Verb", "status_name"]
 
 OK: Final = 0
 WARNING: Final = 1
+FATAL: Final = 4
 _STATUS_NAMES: Final = ("ok", "warning", "discard", "error", "fatal", "pending")
 
 Verb = Literal["Get", "Set"]
@@ -166,9 +167,9 @@ class FmuValues(ABC):
 
     @abstractmethod
     def _failed(
-        self, what: str, variable: str | None = None, hint: str | None = None
+        self, what: str, variable: str | None = None, hint: str | None = None, status: int | None = None
     ) -> StepFailed | InitializationFailed:
-        """The error for a failed call; only `close` is allowed after it."""
+        """The error for a failed call, which may have returned ``status``; only `close` is allowed after it."""
 
     # --- shared by all versions
 
@@ -230,7 +231,7 @@ class FmuValues(ABC):
     def _part_failed(self, verb: Verb, part: PartCall, status: int) -> StepFailed | InitializationFailed:
         """The error for a getter or setter of a row that has returned a status above warning."""
         if part.buffer is None:
-            return self._failed(f"{_DOING[verb]} returned {status_name(status)}")
+            return self._failed(_DOING[verb], status=status)
         return self._transfer_failed(verb, part.type, part.variables, status)
 
     def _transfer(self, verb: Verb, type_: VariableType, variables: Sequence[Variable], buffer: Buffer) -> None:
@@ -250,8 +251,8 @@ class FmuValues(ABC):
         hint = None
         if odd is not None:
             hint = f"FMI does not allow setting '{odd.name}', {odd.role}: leave its start value out."
-        what = f"{self._function_name(verb, type_)} of {', '.join(names)} returned {status_name(status)}"
-        return self._failed(what, variable=names[0] if len(names) == 1 else None, hint=hint)
+        what = f"{self._function_name(verb, type_)} of {', '.join(names)}"
+        return self._failed(what, status=status, variable=names[0] if len(names) == 1 else None, hint=hint)
 
     def _load(self, buffer: Buffer, elements: Any, names: Sequence[str]) -> None:  # noqa: ANN401 a list or an array
         try:

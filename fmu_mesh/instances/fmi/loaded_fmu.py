@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Hashable, Mapping
-from contextlib import chdir
+from contextlib import chdir, suppress
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, cast
 
@@ -19,8 +19,9 @@ from ..kept_models import KeptModels
 from .archive.archive import Terms
 from .archive.sources import extract
 from .calls import FmpyCalls
+from .fmu_values import FATAL
 
-__all__ = ["FmuFunctions", "LoadedFmu", "quietly"]
+__all__ = ["FmuFunctions", "LoadedFmu"]
 
 
 class FmuFunctions(NamedTuple):
@@ -82,6 +83,7 @@ class LoadedFmu:
         key: what it was made from.
         calls: FMPy's object, once it is loaded.
         has_instance: whether the FMU is instantiated.
+        is_lost: whether it has returned fatal.
 
     Raises:
         LoadFailed: the FMU cannot be extracted.
@@ -90,7 +92,7 @@ class LoadedFmu:
     def __init__(self, fmu: FmuToLoad, folder: Path) -> None:
         self.key = fmu.key
         self.calls: Any = None
-        self.has_instance = False
+        self.has_instance = self.is_lost = False
         self._fmu = fmu
         self._folder = extract(fmu.path, folder, fmu.terms, model=fmu.description)
         self._user: Logs | None = None
@@ -136,9 +138,17 @@ class LoadedFmu:
         """Reset the instance, so that it is as a new one; False if the FMU refuses, or this version of FMI cannot."""
         try:
             self.calls.reset()
-        except (AttributeError, FMICallException, OSError):
+        except (AttributeError, OSError):
+            return False
+        except FMICallException as error:
+            if error.status == FATAL:
+                self.lose()
             return False
         return True
+
+    def lose(self) -> None:
+        """The FMU has returned fatal: nothing of it is called any more, and its library stays as it is."""
+        self.is_lost, self.has_instance = True, False
 
     def leave(self) -> None:
         """The user needs the FMU no more."""
@@ -148,25 +158,19 @@ class LoadedFmu:
         """Free the instance; the library stays."""
         if self.has_instance:
             self.has_instance = False
-            quietly(lambda: getattr(self.calls, self._fmu.functions.free)(self.calls.component))
+            with suppress(FMICallException, OSError):
+                getattr(self.calls, self._fmu.functions.free)(self.calls.component)
 
     def close(self) -> None:
         """Free the instance, unload the library and remove the files. Never raises; may be called twice."""
         self.free()
         self.leave()
-        if self.calls is not None:
-            quietly(self.calls.freeLibrary)
-            self.calls = None
+        if self.calls is not None and not self.is_lost:
+            with suppress(FMICallException, OSError):
+                self.calls.freeLibrary()
+        self.calls = None
         self.remove_files()
 
     def remove_files(self) -> None:
         """From any thread, when the process is about to be ended: remove the extracted files."""
         shutil.rmtree(self._folder, ignore_errors=True)
-
-
-def quietly(call: Callable[[], object]) -> None:
-    """Call a function of an FMU at the end, where a failure has no consequence."""
-    try:
-        call()
-    except (FMICallException, OSError):
-        return

@@ -94,6 +94,14 @@ class KeepsFmuState:
         return FmuState(self._on_state(lambda: self._fmu.deserializeFMUState(rest)), kept)
 
     @abstractmethod
+    def _check_live(self) -> None:
+        """Raise an error if no function of the FMU may be called any more."""
+
+    @abstractmethod
+    def _note(self, status: int) -> None:
+        """Take note of a status above warning."""
+
+    @abstractmethod
     def _bookkeeping(self) -> Bookkeeping:
         """Our own part of the state now."""
 
@@ -106,7 +114,9 @@ class KeepsFmuState:
             raise FmuError(f"the FMU cannot {what}, as its model description says", instance=self.name)
 
     def _on_state(self, call: Callable[[], T]) -> T:
+        self._check_live()
         try:
             return call()
         except FMICallException as error:
+            self._note(error.status)
             raise StepFailed(f"{error.function} failed with status {error.status}", instance=self.name) from error

@@ -15,7 +15,7 @@ from fmpy.fmi1 import FMICallException
 
 from ....simtime import step_within
 from ..calls import Function, Pointer
-from ..fmu_values import WARNING, status_name
+from ..fmu_values import WARNING
 
 __all__ = [
     "DISCARD",
@@ -103,7 +103,7 @@ class RetriedSteps:
         do_step: Function,
         waited: Callable[[], int],
         asks_to_end: Callable[[], bool],
-        failed: Callable[[str], Exception],
+        failed: Callable[..., Exception],
     ) -> None:
         self.ends = False
         self._fmu = fmu
@@ -133,7 +133,7 @@ class RetriedSteps:
             if status == DISCARD:
                 status = take_sub_steps(attempt, time, step_size)
         except FMICallException as error:
-            raise self._failed(f"{error.function} returned {status_name(error.status)}") from error
+            raise self._failed(error.function, status=error.status) from error
         return DISCARD if self.ends else status
 
     def free(self) -> None:

@@ -8,13 +8,13 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Mapping
 
-from fmpy.fmi1 import FMU1Slave
+from fmpy.fmi1 import FMICallException, FMU1Slave
 
 from ....rings.native import StepKind
 from ...call_guard import call_named
 from ..calls import cffi_function
 from ..fmi_versions import Fmi1Values
-from ..fmu_values import WARNING, status_name
+from ..fmu_values import WARNING
 from ..loaded_fmu import FmuFunctions
 from .discarded_steps import DISCARD, PENDING, SMALLER_STEPS, SMALLEST, StepStatus, discarded, take_sub_steps
 from .native_instance import NativeInstance
@@ -85,7 +85,7 @@ class Fmi1Instance(NativeInstance, Fmi1Values):
         if status <= WARNING:
             return
         if status != DISCARD:
-            raise self._failed(f"fmiDoStep returned {status_name(status)}")
+            raise self._failed("fmiDoStep", status=status)
         messages = self._last_messages
         last_time = self._step_status.last_successful_time()
         self._last_messages = messages  # a message about this question is not the reason of the failure
@@ -120,7 +120,7 @@ class Fmi1Instance(NativeInstance, Fmi1Values):
         function = _SET_DERIVATIVES((self._symbol("SetRealInputDerivatives"), self._fmu.dll))
         status = function(self._component, references, count, orders, (ctypes.c_double * count)(*signed))
         if status > WARNING:
-            raise self._failed(f"fmiSetRealInputDerivatives returned {status_name(status)}")
+            raise self._failed("fmiSetRealInputDerivatives", status=status)
 
     def _initialize(self, start_time: float, stop_time: float | None) -> None:
         """FmiInitializeSlave (FMI 1.0 CS, 3.3)."""
@@ -129,7 +129,10 @@ class Fmi1Instance(NativeInstance, Fmi1Values):
         stop_time_defined = b"\x00" if stop_time is None else b"\x01"
         status = call_named(name, function, self._component, start_time, stop_time_defined, stop_time or 0.0)
         if status > WARNING:
-            raise self._not_initialized(name, status)
+            raise self._failed(name, status=status)
 
     def _terminate_initialized(self) -> None:
-        call_named("fmiTerminateSlave", _TERMINATE((self._symbol("TerminateSlave"), self._fmu.dll)), self._component)
+        function = _TERMINATE((self._symbol("TerminateSlave"), self._fmu.dll))
+        status = call_named("fmiTerminateSlave", function, self._component)
+        if status > WARNING:
+            raise FMICallException(function="fmiTerminateSlave", status=status)

@@ -14,7 +14,7 @@ from ....rings.native import StepKind
 from ....variables.value_types import Value
 from ..calls import cffi_function
 from ..fmi_versions import FMI2_NAMES, Fmi2Values
-from ..fmu_values import WARNING, status_name
+from ..fmu_values import WARNING
 from ..loaded_fmu import FmuFunctions
 from ..model_exchange.solver import resolvable
 from ..state import Bookkeeping
@@ -84,7 +84,7 @@ class Fmi2Instance(NativeInstance, Fmi2Values):
         try:
             self._fmu.setRealInputDerivatives(references, [1] * len(references), list(derivatives.values()))
         except FMICallException as error:
-            raise self._failed(f"{error.function} returned {status_name(error.status)}") from error
+            raise self._failed(error.function, status=error.status) from error
 
     def _finish(self, status: int, end: float) -> None:
         """Complete a step to ``end`` (s) whose ``status`` is above warning (FMI 2.0, 4.2.1).
@@ -98,7 +98,7 @@ class Fmi2Instance(NativeInstance, Fmi2Values):
         if status <= WARNING:
             return
         if status != DISCARD:
-            raise self._failed(f"fmi2DoStep returned {status_name(status)}")
+            raise self._failed("fmi2DoStep", status=status)
         messages = self._last_messages
         if self._asks_to_end() if self._retrying is None else self._retrying.ends:
             # The outputs are those of the last successful time: a row, if this is the end of the step.

@@ -21,7 +21,7 @@ from ....simtime import TimeGrid
 from ....variables.value_types import Value
 from ..calls import Pointer, cffi_function
 from ..fmi_versions import Fmi3Values
-from ..fmu_values import PartCall, Verb, status_name
+from ..fmu_values import PartCall, Verb
 from ..loaded_fmu import FmuFunctions
 from ..model_exchange.solver import SolverFailed, resolvable
 from ..state import Bookkeeping
@@ -137,7 +137,7 @@ class Fmi3Instance(NativeInstance, Fmi3Values):
     def _failure(self, error: FMICallException | SolverFailed) -> FmuError:
         if isinstance(error, SolverFailed):
             return self._failed(str(error))
-        return self._failed(f"{error.function} returned {status_name(error.status)}")
+        return self._failed(error.function, status=error.status)
 
     def _bookkeeping(self) -> Bookkeeping:
         next_event, event_time = self._steps.place

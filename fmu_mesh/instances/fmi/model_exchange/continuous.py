@@ -22,7 +22,7 @@ from ....variables.value_types import Value
 from ..calls import cffi_function, memory
 from ..clocks import NO_CLOCKS, Clocks
 from ..fmu_instance import FmuInstance
-from ..fmu_values import WARNING, status_name
+from ..fmu_values import WARNING
 from ..state import Bookkeeping
 from .model_calls import ModelCalls
 from .model_exchange import EventLoop
@@ -195,6 +195,6 @@ class ContinuousInstance(FmuInstance):
         try:
             return call()
         except FMICallException as error:
-            raise self._failed(f"{error.function} returned {status_name(error.status)}") from error
+            raise self._failed(error.function, status=error.status) from error
         except SolverFailed as error:
             raise self._failed(f"solver {self._options.solver.name}: {error}") from error
