@@ -14,6 +14,10 @@ def main() -> int:
         from .wire.last_exit import LastExit  # noqa: PLC0415 as above
 
         last_exit = LastExit()
+        if sys.argv[1:2] in (["launch"], ["node"]):  # it may have instances
+            from .instances.process_end import ends_with_run  # noqa: PLC0415 as above
+
+            ends_with_run(lambda: last_exit.code or 0)
         if (problem := address_space_problem(FEWEST_MIB)) is not None:
             print(f"fmu-mesh: {problem}", file=sys.stderr)
             return problem.exit_code

@@ -54,12 +54,24 @@ class RepeatedMesh:
         mesh: the mesh.
         reset: reset the instances of FMUs between two runs, and do not make new ones.
         on_hang: called on another thread if an FMU does not return in time.
+        before_close: called with the result of a run, or why it failed, before its instances are closed. With it,
+            ``on_hang`` is also called if an FMU crashes then; the thread of the runs never goes on.
     """
 
-    def __init__(self, mesh: Mesh, *, reset: bool, on_hang: Callable[[FmuError], None]) -> None:
+    def __init__(
+        self,
+        mesh: Mesh,
+        *,
+        reset: bool,
+        on_hang: Callable[[FmuError], None],
+        before_close: Callable[[Result | BaseException], None] | None = None,
+    ) -> None:
         self._mesh = mesh.from_configuration(mesh.configuration, keeps_code=True)
         self._thread = threading.get_ident()
-        self._make = partial(RepeatedRuns, on_hang=on_hang, reset=reset)
+        self._before_close = before_close
+        self._rows: _CollectedRows | None = None
+        told = self._tell_end if before_close is not None else None
+        self._make = partial(RepeatedRuns, on_hang=on_hang, reset=reset, before_close=told)
         self._loaded: list[tuple[RepeatedRuns, Path]] = []
         self._release = weakref.finalize(self, _release, self._loaded, self._thread)
 
@@ -90,7 +102,8 @@ class RepeatedMesh:
         if options.get("output") is None:
             options["record"] = "memory"
         plan = self._mesh.plan(**options)
-        rows, runs = _CollectedRows(plan), self._runs(plan.mesh)
+        self._rows = rows = _CollectedRows(plan)
+        runs = self._runs(plan.mesh)
         try:
             outcome = runs.run(plan, rows)
         except FmuMeshError as error:
@@ -102,6 +115,11 @@ class RepeatedMesh:
     def close(self) -> None:
         """Free all models, and remove their files. May be called twice."""
         self._release()
+
+    def _tell_end(self, end: Outcome | BaseException) -> None:
+        assert self._rows is not None
+        assert self._before_close is not None
+        self._before_close(self._rows.result(end) if isinstance(end, Outcome) else end)
 
     def _runs(self, mesh: str) -> RepeatedRuns:
         """What runs a plan; made for the first one, whose configuration is right."""

@@ -149,6 +149,11 @@ class Result(Mapping[str, NDArray[Any]]):
         early = self.outcome.ended_by or self.outcome.error
         return summary_of(self.outcome, self._step_size) + (f"; {early.message}" if early is not None else "")
 
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What went wrong in the run although the result is complete."""
+        return self.outcome.warnings if self.outcome is not None else ()
+
     def to_pandas(self) -> pd.DataFrame:
         """The result as a data frame: one column per variable, with the time in s as the index.
 

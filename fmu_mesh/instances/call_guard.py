@@ -16,7 +16,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import Any, Final, TypeVar
 
 import msgspec
@@ -30,6 +30,7 @@ from ..text import short_path
 from ..variables.model_description import Value
 from .contract import Instance
 from .instance_wrapper import AroundNativeSteps
+from .process_end import surviving
 
 __all__ = [
     "DEFAULT_MODE",
@@ -156,16 +157,19 @@ class CallWatch:
     Args:
         on_overrun: called with the error, which says the instance, the call and the point. The watched thread is still
             in the call.
+        survives: whether ``on_overrun`` is also called after a crash at the end; see `surviving`.
     """
 
-    def __init__(self, on_overrun: Callable[[FmuError], None]) -> None:
+    def __init__(self, on_overrun: Callable[[FmuError], None], *, survives: bool = False) -> None:
         self._on_overrun = on_overrun
+        self._survives = survives
         self._caller = threading.get_ident()
         self._changed = threading.Condition()
         self._call: _Call | None = None
         self._position: Callable[[], tuple[str, int, str]] | None = None
         self._step_limit_s = 0.0
         self._closed = False
+        self._crash: FmuError | None = None
         self._thread = threading.Thread(target=self._run, name="call watch", daemon=True)
         self._thread.start()
 
@@ -179,6 +183,17 @@ class CallWatch:
                 yield
         finally:
             self._call = None  # the watching thread reads this when it wakes up
+
+    def surviving(self, instance: str) -> AbstractContextManager[None]:
+        """Around the last call of an FMU: a crash is reported as a call that does not return."""
+
+        def crashed(how: str) -> None:
+            function = current_function(self._caller) or "its last call"
+            self._crash = FmuError(f"the FMU ended its process in {function} ({how})", instance=instance)
+            self._call = _Call(instance, FmuError, "terminate", 0.0, time.monotonic())  # whose deadline is now
+            self._notify()
+
+        return surviving(crashed) if self._survives else nullcontext()
 
     @contextmanager
     def stepping(self, position: Callable[[], tuple[str, int, str]], limit_s: float) -> Iterator[None]:
@@ -237,7 +252,7 @@ class CallWatch:
         return _LOOK_S if position is not None else None
 
     def _overrun(self, call: _Call, now: float, otherwise: str) -> FmuError:
-        return call.kind(
+        return self._crash or call.kind(
             not_returned(self._caller, now - call.started, otherwise),
             instance=call.instance,
             hint=f"If it needs that long, raise `timeouts.{call.setting}` in the configuration.",
@@ -262,6 +277,10 @@ class Unwatched:
         finally:
             if floating_point_changed():
                 restore_floating_point()
+
+    def surviving(self, _instance: str) -> AbstractContextManager[None]:
+        """The process goes on after the last call, so a crash is one."""
+        return nullcontext()
 
 
 def current_function(thread: int) -> str | None:
@@ -351,7 +370,8 @@ class Guarded(AroundNativeSteps):
 
     def close(self) -> None:
         """Terminate if allowed, free the instance and remove its files; one deadline for all of it."""
-        with self._watch.calling(self._name, FmuError, "terminate", self._timeouts.terminate):
+        watch = self._watch
+        with watch.calling(self._name, FmuError, "terminate", self._timeouts.terminate), watch.surviving(self._name):
             self._instance.close()
 
     def _forward(self, call: Callable[..., Result], *arguments: Any) -> Result:  # noqa: ANN401 those of any method

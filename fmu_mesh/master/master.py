@@ -33,7 +33,7 @@ from ..errors import (
     from_report,
 )
 from ..rings.host_memory import HostMemory, can_share
-from ..system.plan import MASTER, Plan
+from ..system.plan import MASTER, RECORDER, Plan
 from ..wire.inbox import Inbox
 from ..wire.keys import Keys, RunKeys
 from ..wire.messages import FINISH, GRANT, PROGRESS, NodeReport, decode_json
@@ -84,6 +84,7 @@ class Master:
     Attributes:
         ended_by: why the simulation ended before its last point without a failure: an FMU asked for it, or there was a
             `stop` and no stop time.
+        warnings: nodes that failed or were lost after their last step.
 
     Call `claim`, then `run` once, from the main thread, then `wait_for_followers` if it went well, then `close`.
     """
@@ -110,6 +111,7 @@ class Master:
         self._reports: dict[str, NodeReport] = {}
         self._failure: FmuMeshError | None = None
         self.ended_by: TerminationRequested | None = None
+        self.warnings: list[str] = []
         self._state: MeshState = "starting"
         self._hold: int | None = None
         self._watch = GrantWatch() if settings.profile else None
@@ -355,26 +357,28 @@ class Master:
         else:
             self._reports[node] = report
             if error is not None:
-                self._fail(error)
+                self._end_of(node, error)
         query.reply(query.key_expr, b"")
         query.drop()
 
     def _lose(self, node: str) -> None:
-        """The process of a node is gone; this is an error unless the node has reported its end."""
+        """The process of a node is gone, which matters unless the node has reported its end."""
         if node in self._reports:
             return
+        loss, why = self._router.loss(), f"{spoken(node)} was lost: its process does not answer any more"
+        why = why if loss is None else f"{loss}, and {spoken(node)} with it"
         point = max(self._granting.progress[node], 0)
-        loss = self._router.loss()
-        self._fail(
-            MeshLost(
-                f"{loss}, and {spoken(node)} with it"
-                if loss is not None
-                else f"{spoken(node)} was lost: its process does not answer any more",
-                instance=self._granting.instances_of(node),
-                point=point,
-                time=self._plan.grid.time(point),
-            )
-        )
+        error = MeshLost(why, instance=self._granting.instances_of(node))
+        self._end_of(node, error.at(point, self._plan.grid.time(point)))
+
+    def _end_of(self, node: str, error: FmuMeshError) -> None:
+        """A node has failed or is lost. If all rows are recorded, the run is done, and this is a warning."""
+        if self._granting.slowest < self._last_point or node == RECORDER:
+            self._fail(error)
+        else:
+            self._reports.setdefault(node, NodeReport(node, self._last_point))
+            hint = "Its FMU was in terminate or freeInstance. " if isinstance(error, MeshLost) else ""
+            self.warnings.append(str(error.with_hint(f"{hint}All rows are recorded.")))
 
     def _command(self, query: zenoh.Query) -> None:
         """Handle pause, resume, step N and stop, which only change the grant."""

@@ -91,6 +91,7 @@ class Node:
         engine: makes the engine, as `make_engine` does.
 
     Attributes:
+        finished: whether all nodes have done all points: what an FMU does then changes no result.
         failure_is_known: whether others know what ended the run: the master knows it, or is gone.
 
     Call `run` once, from the main thread.
@@ -111,7 +112,7 @@ class Node:
         self._session = session
         self._open_instance = open_instance
         self._make_engine = engine
-        self._finished = False
+        self.finished = False
         self._token_went = False
         self.failure_is_known = False
         self._heard = time.monotonic()
@@ -143,9 +144,9 @@ class Node:
             self._load()
             self._connect(self._meet())
             self._step_to_the_end(self._initialize())
-            self.server.close()  # the last samples, while the master is there to route them to clients
             for runner in self._runners.values():
-                runner.instance.close()  # before the report, so that the report can contain its error
+                runner.instance.close()  # before the report, because afterwards nobody would get its log messages
+            self.server.close()  # the last samples, while the master is there to route them to clients
             self._tell_end(None, self._plan.timeouts.stop)
         except FmuMeshError as error:
             located = self._located(error)
@@ -254,7 +255,7 @@ class Node:
         eager = any(link.has_frames for runner in self._runners.values() for link in runner.out_links)
         if self._profiler is not None:
             self._profiler.start(engine)
-        while not self._finished:
+        while not self.finished:
             try:
                 stepped = engine.run(_LOOK_S, eager=eager)
             except TerminationRequested as asked:
@@ -326,7 +327,7 @@ class Node:
                 )
             self._memory.grant.raise_to(min(point, self._plan.grid.last_point))
         elif kind == FINISH:
-            self._finished = True
+            self.finished = True
         elif kind == ABORT:
             raise _Aborted(from_report(decode_abort(data)))
         else:
@@ -352,7 +353,7 @@ class Node:
 
     def _master_token_went(self) -> None:
         """On a thread of Zenoh: the token of the master is gone, or a token with its key from another process."""
-        if not self._finished:
+        if not self.finished:
             self._token_went = True
             self._inbox.post(self._end_without_master)
 
@@ -366,10 +367,10 @@ class Node:
             return
         error = self._membership.without_master()
         deadline = time.monotonic() + _LAST_WORD_S
-        while not self._finished and (left := deadline - time.monotonic()) > 0:
+        while not self.finished and (left := deadline - time.monotonic()) > 0:
             if (message := self._inbox.wait(left)) is not None:
                 self._sort_in(message)
-        if not self._finished:
+        if not self.finished:
             raise error
 
     def _located(self, error: FmuMeshError) -> FmuMeshError:

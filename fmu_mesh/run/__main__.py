@@ -23,9 +23,11 @@ def main() -> int:
     from ..errors import Interrupted  # noqa: PLC0415 an interrupt must find us here
 
     try:
+        from ..instances.process_end import ends_with_run  # noqa: PLC0415 as above
         from ..wire.last_exit import LastExit  # noqa: PLC0415 as above
 
         last_exit = LastExit()
+        ends_with_run(lambda: last_exit.code or 0)
         from .limits import RUN_MIB  # noqa: PLC0415 as above
         from .program import exit_code_of  # noqa: PLC0415 as above
 

@@ -3,18 +3,25 @@
 Neither signal handlers nor the process as a whole are touched, so a program can have several such runs. A call into an
 FMU that does not return cannot be ended from within a process: then the run is over for whoever waits for it, what was
 recorded is kept, and the thread is left.
+
+A process that ends with its run, as that of `launch --local`, closes the instances after it has printed everything.
 """
 
 from __future__ import annotations
 
+import atexit
+import os
+import sys
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 from ..errors import FmuError, FmuMeshError, Interrupted
 from ..instances.call_guard import ENDED
 from ..instances.contract import LogMessage
+from ..instances.process_end import end_process, process_ends
 from ..wire.runtime import remove_run_folder, remove_stale_folders, run_folder, run_name
 from ..wire.views import LogLine, MeshStatus
 from .events import Event, Log, Status
@@ -92,11 +99,30 @@ class InProcessRun:
             )
             if self._interrupted:
                 mesh.interrupt("interrupted")
-            self.outcome = mesh.run()
+            self.outcome = mesh.run(closes=not process_ends())
         except BaseException as error:  # noqa: BLE001 `run` raises it on the thread of the caller
             self._error = self._error or error
-        finally:
-            self._leave()
+        if process_ends() and self._mesh is not None and not self._over.is_set():
+            self._close_at_exit(self._mesh)
+        self._leave()
+
+    def _close_at_exit(self, mesh: LocalMesh) -> None:
+        """Close the instances on this thread, when the process is about to end."""
+        ending, closed = threading.Event(), threading.Event()
+
+        def end() -> None:
+            with suppress(OSError):  # nobody reads it
+                sys.stdout.flush()
+            os.dup2(2, 1)  # standard output is for results, and not for what an FMU prints
+            ending.set()
+            closed.wait()  # each call has its deadline
+
+        atexit.register(end)
+        self._over.set()
+        ending.wait()
+        mesh.close()
+        self._leave()
+        closed.set()
 
     def _give_up(self) -> None:
         if not self._over.wait(_GRACE_S) and self._mesh is not None:
@@ -107,6 +133,10 @@ class InProcessRun:
         """From another thread: the thread of the run does not return from an FMU."""
         assert self._mesh is not None
         self._mesh.clean_up()
+        if self._over.is_set():  # the outcome is printed
+            self._leave()
+            sys.stderr.write(f"fmu-mesh: warning: {error}\n")
+            end_process()
         self._error = error.saying(error.message.removesuffix(ENDED))  # here, the process goes on
         self._leave()
 

@@ -53,6 +53,7 @@ _SILENCE_S = 10.0
 """The master sends an event ten times per second. After this time without one, it counts as lost."""
 
 _TURN_S = 0.25
+_SILENT = "does not answer any more"
 _UNTOLD = "has ended; the fork server, which knows how, does not answer"
 
 
@@ -84,6 +85,7 @@ class Launcher:
         self._files: tuple[tuple[str, int], ...] | None = None
         self._point: int | None = None
         self._starting = True
+        self._stopping = False  # after that, the loss of a node is a warning of the master
         self._stop_watch = StopWatch(LEASE_MS / 1000, _TURN_S)
         self._heard = time.monotonic()
         self._quiet = False
@@ -180,7 +182,7 @@ class Launcher:
                 write_note(self._folder, MeshNote(self._run.mesh, prefix, endpoints, os.getpid(), file))
             case Status(status):
                 self._point = status.point
-                self._starting = status.state == "starting"
+                self._starting, self._stopping = status.state == "starting", status.state == "stopping"
                 ended = self._gateway_ended
                 if status.state in GOING_ON and ended is not None and self._heard - ended > _GATEWAY_S:
                     self._gateway_ended = None
@@ -209,7 +211,7 @@ class Launcher:
             self._how.setdefault(name, how_it_ended(code))
         if self._ending:
             return
-        if self._outcome is None and (code != 0 or name == _MASTER):
+        if self._outcome is None and (name == _MASTER or (code != 0 and not self._stopping)):
             self._lost.append((name, code, time.monotonic()))
         elif name == _GATEWAY:
             self._gateway_ended = time.monotonic()
@@ -308,7 +310,7 @@ class Launcher:
         if outcome is None or unknown:
             error = self._own_account()
         elif outcome.error is None:
-            self.outcome = outcome
+            self.outcome = outcome = replace(outcome, warnings=tuple(map(self._with_how, outcome.warnings)))
             return outcome
         else:
             error = self._with_cause(from_report(outcome.error), outcome)
@@ -347,12 +349,19 @@ class Launcher:
         instances = ", ".join(item.name for item in self._plan.nodes[name].instances)
         return MeshLost(f"node '{name}' was lost: its process {self._how[name]}", instance=instances)
 
+    def _with_how(self, warning: str) -> str:
+        """Add how the process of a lost node ended to a warning of the master."""
+        for name, how in self._how.items():
+            lost = f"node '{name}' was lost: its process "
+            warning = warning.replace(lost + _SILENT, lost + how)
+        return warning
+
     def _with_cause(self, error: FmuMeshError, outcome: Outcome) -> FmuMeshError:
         """Add how the process of a lost node ended, or who interrupted the run; only this process knows it."""
         if isinstance(error, MeshLost) and error.instance is not None:
             for name, how in self._how.items():
                 lost = error.message.startswith(f"node '{name}' was lost")
-                if lost and error.message.endswith("does not answer any more"):  # otherwise the node has said why
+                if lost and error.message.endswith(_SILENT):  # otherwise the node has said why
                     error.saying(f"node '{name}' was lost: its process {how}")
         elif isinstance(error, Interrupted) and self._interrupted_at is not None:
             error.saying("interrupted").at(outcome.point, outcome.time)

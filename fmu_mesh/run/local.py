@@ -12,7 +12,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Mapping
-from contextlib import closing, suppress
+from contextlib import ExitStack, closing, suppress
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
@@ -21,6 +21,7 @@ from ..config.loading import LoadedConfig
 from ..errors import FmuError, FmuMeshError, Interrupted, TerminationRequested
 from ..instances.call_guard import CallWatch, Guarded
 from ..instances.contract import Instance, LogMessage, Showing
+from ..instances.process_end import process_ends
 from ..instances.registry import open_instance
 from ..master.pacing import Pacer
 from ..recorder.row_buffer import RowBuffer
@@ -74,6 +75,7 @@ class LocalMesh:
         loaded: LoadedConfig | None = None,
         contents: Mapping[str, str] = MappingProxyType({}),
     ) -> None:
+        self._stack = ExitStack()
         self._seconds = 0.0
         self._begun = False
         self._ended_by: TerminationRequested | None = None
@@ -109,8 +111,11 @@ class LocalMesh:
         if self._folder is not None:
             shutil.rmtree(self._folder, ignore_errors=True)
 
-    def run(self) -> Outcome:
+    def run(self, *, closes: bool = True) -> Outcome:
         """Run from the first to the last point.
+
+        Args:
+            closes: whether the instances are closed at the end; otherwise the caller calls `close` on this thread.
 
         Raises:
             FmuMeshError: an FMU failed, the run was interrupted, or this system cannot run in one process. The rows
@@ -123,6 +128,9 @@ class LocalMesh:
         except FmuMeshError as error:
             error.with_hint(self._kept())
             raise
+        finally:
+            if closes:
+                self.close()
         ended_by = self._ended_by.report() if self._ended_by is not None else None
         return Outcome(
             state="done",
@@ -135,6 +143,10 @@ class LocalMesh:
             files=self.files,
         )
 
+    def close(self) -> None:
+        """Close the instances and remove their files. May be called twice."""
+        self._stack.close()
+
     def _kept(self) -> str | None:
         return what_is_kept(self.files)
 
@@ -142,23 +154,23 @@ class LocalMesh:
         plan, system = self._plan, self._system
         layouts = {name: Layout.of(i.description.variables) for name, i in plan.system.instances.items()}
         types = [layouts[instance].column(name).type for instance, name in plan.system.recorded]
-        watch = CallWatch(self._take_hang)
-        with tempfile.TemporaryDirectory(prefix="fmu_mesh-", dir=self._parent) as folder, closing(watch):
-            self._folder = Path(folder)
-            files = open_results(self._loaded, plan.system, digest=plan.digest, contents=self._contents)
-            self._buffer = rows = RowBuffer(files, plan.grid, plan.system.records, types)
+        enter = self._stack.enter_context
+        self._folder = Path(enter(tempfile.TemporaryDirectory(prefix="fmu_mesh-", dir=self._parent)))
+        watch = enter(closing(CallWatch(self._take_hang, survives=process_ends())))
+        files = open_results(self._loaded, plan.system, digest=plan.digest, contents=self._contents)
+        self._buffer = rows = RowBuffer(files, plan.grid, plan.system.records, types)
+        self._stack.callback(system.close)
+        try:
+            system.start(partial(self._guarded, folder=self._folder, watch=watch))
+            started = time.perf_counter()
+            self._begun = True
             try:
-                system.start(partial(self._guarded, folder=self._folder, watch=watch))
-                started = time.perf_counter()
-                self._begun = True
-                try:
-                    with watch.stepping(self._position, plan.system.config.timeouts.step):
-                        self._loop(rows)
-                finally:
-                    self._seconds = time.perf_counter() - started
+                with watch.stepping(self._position, plan.system.config.timeouts.step):
+                    self._loop(rows)
             finally:
-                self._save()
-                system.close()
+                self._seconds = time.perf_counter() - started
+        finally:
+            self._save()
 
     def _guarded(self, name: str, folder: Path, watch: CallWatch) -> Guarded:
         return Guarded(name, lambda: self._open(name, folder), watch, self._plan.system.config.timeouts)

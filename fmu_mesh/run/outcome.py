@@ -27,6 +27,7 @@ class Outcome(msgspec.Struct, frozen=True, tag="end"):
         profile: where the time went, if that was asked for.
         signal: name of the signal by which the process of the master was asked to end, if it was.
         files: each result file, and the number of its rows.
+        warnings: what went wrong although the result is complete.
     """
 
     state: Literal["done", "failed"]
@@ -40,3 +41,4 @@ class Outcome(msgspec.Struct, frozen=True, tag="end"):
     profile: MeshProfile | None = None
     signal: str | None = None
     files: tuple[tuple[str, int], ...] = ()
+    warnings: tuple[str, ...] = ()

@@ -75,19 +75,23 @@ class RepeatedRuns:
         on_hang: called on another thread if a model does not return in time. All complete rows are in the result file.
             The thread that is inside the model cannot be stopped, so the caller has to end the process.
         reset: whether instances stay between runs and are reset, where their models can be reset.
+        before_close: called with how a run has ended, before its instances are closed. With it, ``on_hang`` is also
+            called if a model crashes while it is closed; the thread of the runs never goes on then.
         open_instance: opens an instance by name, instead of the model of the plan; it is closed here.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913  what a caller may want to hear of
         self,
         folder: Path,
         *,
         log: Callable[[LogMessage], None] = lambda _message: None,
         on_hang: Callable[[FmuError], None] = lambda error: log.error("%s", error),
         reset: bool = False,
+        before_close: Callable[[Outcome | BaseException], None] | None = None,
         open_instance: Callable[[str], Instance] | None = None,
     ) -> None:
-        self._around = _Surroundings(folder / _SCRATCH, KeptModels(folder, resets=reset), log, open_instance)
+        models = KeptModels(folder, resets=reset)
+        self._around = _Surroundings(folder / _SCRATCH, models, log, open_instance, before_close)
         self._on_hang = on_hang
         self._threads = LimitedThreads()
         self._watch: CallWatch | None = None
@@ -161,7 +165,8 @@ class RepeatedRuns:
         if self._watch is None or self._thread != threading.get_ident():
             if self._watch is not None:
                 self._watch.close()
-            self._watch, self._thread = CallWatch(self._take_hang), threading.get_ident()
+            survives = self._around.before_close is not None
+            self._watch, self._thread = CallWatch(self._take_hang, survives=survives), threading.get_ident()
         return self._watch
 
     def _take_hang(self, error: FmuError) -> None:
@@ -183,6 +188,7 @@ class _Surroundings(NamedTuple):
     models: KeptModels
     log: Callable[[LogMessage], None]
     open_instance: Callable[[str], Instance] | None
+    before_close: Callable[[Outcome | BaseException], None] | None
 
 
 class _Run:
@@ -202,6 +208,7 @@ class _Run:
         self.writer = writer
         self._around = surroundings
         self._stop: str | None = None
+        self._seconds = 0.0
         self._runners: dict[str, Runner] = {}
         self._engine: Engine | None = None
         self._first: tuple[tuple[int, int], FmuError | TerminationRequested] | None = None
@@ -223,6 +230,7 @@ class _Run:
             memory = HostMemory.private(self._node.memory, _NODE)
             threads.limit()
             self._open(memory, watch, stack)
+            stack.push(self._tell_end)
             threads.limit()  # with the libraries that a component has imported
             stack.callback(self.writer.close)  # before the instances are closed
             engine = self._initialize(memory)
@@ -231,15 +239,21 @@ class _Run:
             started = time.perf_counter()
             with watch.stepping(self._position, self._node.timeouts.step):
                 self._step_to_the_end(engine, memory)
-            seconds = time.perf_counter() - started
-        event = self._first[1] if self._first is not None else None
-        if isinstance(event, FmuError):
-            raise event
-        plan, writer = self._plan, self.writer
-        ended_by = event.report() if event is not None else None
-        time_s = plan.grid.time(self.point)
+            self._seconds = time.perf_counter() - started
+            if self._first is not None and isinstance(self._first[1], FmuError):
+                raise self._first[1]
+        return self._outcome()
+
+    def _outcome(self) -> Outcome:
+        """How a run ended that did not fail."""
+        time_s, writer = self._plan.grid.time(self.point), self.writer
+        ended_by = self._first[1].report() if self._first is not None else None
         rows, file, files = writer.rows, writer.file, writer.counted
-        return Outcome("done", self.point, time_s, seconds, rows, file, ended_by=ended_by, files=files)
+        return Outcome("done", self.point, time_s, self._seconds, rows, file, ended_by=ended_by, files=files)
+
+    def _tell_end(self, _kind: type[BaseException] | None, error: BaseException | None, _trace: object) -> None:
+        if self._around.before_close is not None:
+            self._around.before_close(error or self._outcome())
 
     def interrupt(self, reason: str) -> None:
         """From any thread: see `RepeatedRuns.interrupt`."""

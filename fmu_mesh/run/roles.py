@@ -71,7 +71,7 @@ class _NodeProcess:
         process.take_place(plan.node, f"node '{plan.node}' of mesh '{plan.mesh}'")
         session = open_session(wiring(run.zenoh, run.config_file, process.folder, plan.node, plan.peers()))
         process.stack.callback(close_session, session)
-        self._watch = process.stack.enter_context(closing(CallWatch(self._take_hang)))
+        self._watch = process.stack.enter_context(closing(CallWatch(self._take_hang, survives=True)))
         process.stack.callback(self._close_instances)
         router = RouterLink(session, run.zenoh.connect)
         self._node = node = Node(
@@ -113,11 +113,11 @@ class _NodeProcess:
                 instance.remove_files()
 
     def _take_hang(self, error: FmuError) -> None:
-        """From a watching thread: an FMU has not returned in time, so the process has to end."""
+        """From a watching thread: an FMU has not returned, or has crashed at the end, so the process has to end."""
         known = self._node is not None and self._node.report_hang(error)
         if not (self._process.is_child and known):
             log.error("%s", error)
-        self._process.end_now(StepFailed.exit_code)
+        self._process.end_now(0 if self._node is not None and self._node.finished else StepFailed.exit_code)
 
 
 def _opening(
@@ -231,6 +231,7 @@ def _outcome_of(
         profile=master.profile(),
         signal=signal,
         files=files,
+        warnings=tuple(master.warnings),
     )
 
 

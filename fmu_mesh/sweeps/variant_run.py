@@ -25,6 +25,7 @@ from msgspec.structs import asdict
 from .. import __version__
 from ..api.mesh_builder import Mesh
 from ..api.plan_options import PlanOptions, texts_of
+from ..api.repeated_mesh import RepeatedMesh
 from ..api.result import Result
 from ..config.loading import PlainConfig
 from ..config.yaml_text import Plain
@@ -72,11 +73,12 @@ class Row(msgspec.Struct, frozen=True):
     Attributes:
         id: SHA-256 of the configuration, the parameters, and the files of all models.
         exit_code: 0, or that of `launch` for the same error.
-        message: why it failed; empty if it did not.
+        message: why it failed, or how an FMU did while it was closed; empty if none did.
         values: by the name of the column, what was calculated from its curves; None where there is nothing.
         seconds: wall-clock time of the run in s, with its planning.
         worker: host and process id of the worker.
-        stuck: whether an FMU has not returned, so that the worker has a thread less.
+        stuck: whether an FMU has not returned, or has crashed while it was closed, so that the worker has a thread
+            less.
     """
 
     id: str
@@ -134,7 +136,7 @@ def run_variant(task: bytes, functions: OwnReductions, identity: str, parameters
     return Row(
         id=identity,
         exit_code=error.exit_code if error is not None else 0,
-        message=_line(error) if error is not None else "",
+        message=_line(error) if error is not None else own.hung.warning,
         values=values,
         seconds=time.perf_counter() - started,
         worker=f"{socket.gethostname()}:{os.getpid()}",
@@ -167,8 +169,8 @@ class _Loaded:
         self._reductions = [read_reduction(text) for text in self._task.reductions]
         self._mesh = Mesh.from_configuration(PlainConfig(_with_one_record(self._task.data), self._task.file))
         self._jobs: SimpleQueue[_Job | None] = SimpleQueue()
-        self._hung = _Hung()
-        arguments = self._mesh, self._jobs, self._hung
+        self.hung = _Hung()
+        arguments = self._mesh, self._jobs, self.hung
         threading.Thread(
             target=_work, args=arguments, kwargs={"reset": self._task.reset}, name="variants", daemon=True
         ).start()
@@ -177,7 +179,7 @@ class _Loaded:
     @property
     def stuck(self) -> bool:
         """Whether its thread is inside an FMU that does not return."""
-        return self._hung.stuck
+        return self.hung.stuck
 
     def run(self, functions: OwnReductions, identity: str, parameters: Parameters) -> dict[str, Cell]:
         """Run a variant; returns the values of its row.
@@ -221,25 +223,37 @@ class _Hung:
     Attributes:
         ended: the run under way.
         stuck: whether it has not returned.
+        warning: why, if the run was over before.
     """
 
     def __init__(self) -> None:
         self.ended: Future[Result] = Future()
         self.stuck = False
+        self.warning = ""
+        self._end: Result | BaseException | None = None
 
     def begin(self, ended: Future[Result]) -> None:
         """A run begins."""
-        self.ended = ended
+        self.ended, self._end = ended, None
+
+    def over(self, end: Result | BaseException) -> None:
+        """The run is over, and its instances are closed now."""
+        self._end = end
 
     def tell(self, error: FmuError) -> None:
-        """An FMU has not returned in time."""
+        """An FMU has not returned in time, or has crashed while it was closed; the row of a complete run stays."""
         self.stuck = True
-        self.ended.set_exception(error)
+        end = self._end if self._end is not None else error
+        if isinstance(end, BaseException):
+            self.ended.set_exception(end)
+        else:
+            self.warning = _line(error.report())
+            self.ended.set_result(end)
 
 
 def _work(mesh: Mesh, jobs: SimpleQueue[_Job | None], hung: _Hung, *, reset: bool) -> None:
     """Run variants in this process, until there is none; on a thread of its own."""
-    with mesh.repeated(reset=reset, on_hang=hung.tell) as runs:
+    with RepeatedMesh(mesh, reset=reset, on_hang=hung.tell, before_close=hung.over) as runs:
         while (job := jobs.get()) is not None:
             hung.begin(job.ended)
             try:

@@ -27,21 +27,24 @@ class LastExit:
     last_exit = LastExit()
     sys.exit(last_exit.with_code(command()))
     ```
+
+    Attributes:
+        code: the exit code; None before `with_code`.
     """
 
     def __init__(self) -> None:
-        self._code: int | None = None
+        self.code: int | None = None
         atexit.register(self._exit)
 
     def with_code(self, code: int) -> int:
         """Set the exit code; returns it. Without a call the process ends as any other."""
-        self._code = code
+        self.code = code
         return code
 
     def _exit(self) -> None:
-        if self._code is None or "zenoh" not in sys.modules:
+        if self.code is None or "zenoh" not in sys.modules:
             return
-        code = self._code
+        code = self.code
         try:
             for stream in (sys.stdout, sys.stderr):
                 if stream is not None:

@@ -20,7 +20,7 @@ LOCAL = pytest.mark.parametrize("options", [(), ("--local",)], ids=["distributed
 PACED = {"real_time_factor": 1.0, "step_size": 0.01}
 FIELDS = {
     "mesh", "state", "exit_code", "point", "time", "seconds", "rows", "file", "restarts", "error", "ended_by",
-    "files",
+    "files", "warnings",
 }  # fmt: skip
 
 
@@ -53,6 +53,7 @@ def test_a_launch_for_programs_prints_its_outcome_and_nothing_else(place: Place,
         "error": None,
         "ended_by": None,
         "files": [{"file": str(place.folder / "pair.csv"), "rows": 1001}],
+        "warnings": [],
     }
 
 

@@ -15,6 +15,7 @@ from typing import Any
 import psutil
 import pytest
 
+import fmu_mesh
 from fmu_mesh.run.child import Child
 from tests.fmus.helpers import NO_COMPILER, built_once
 from tests.helpers import DEADLINE_S, Place, row_count, rows_of, wait_until, write_config
@@ -56,18 +57,16 @@ def mesh_of(place: Place, hostile: Path, names: Sequence[str], *, group: str | N
 HANGS = [
     ("fmi2Instantiate", "fmi2Instantiate", "call", ""),
     ("fmi2ExitInitializationMode", "fmi2ExitInitializationMode", "call", ""),
-    ("fmi2Terminate", "fmi2Terminate", "terminate", ", point 10, t = 0.01 s"),
-    ("fmi2FreeInstance", "fmi2FreeInstance", "terminate", ", point 10, t = 0.01 s"),
     ("fmi2DoStep", "doStep", "step", ", point 4, t = 0.004 s"),
     ("fmi2GetReal", "reading the outputs", "step", ", point 4, t = 0.004 s"),
     ("fmi2SetReal", "setting the inputs", "step", ", point 5, t = 0.005 s"),
 ]
 
 
-# A step that hangs in a node is in `test_failing_fmus`; freeing is guarded as terminating is.
+# A step that hangs in a node is in `test_failing_fmus`.
 @pytest.mark.parametrize(
     ("options", "hang"),
-    [*(((), hang) for hang in (*HANGS[:3], *HANGS[5:])), *((("--local",), hang) for hang in HANGS)],
+    [*(((), hang) for hang in (*HANGS[:2], *HANGS[3:])), *((("--local",), hang) for hang in HANGS)],
     ids=lambda value: value[0] if value else "distributed",
 )
 def test_an_fmu_that_hangs_in_a_call_is_ended_with_its_name_the_call_and_the_point(
@@ -83,9 +82,81 @@ def test_an_fmu_that_hangs_in_a_call_is_ended_with_its_name_the_call_and_the_poi
     assert launched.message.startswith(f"fmu-mesh: instance {name}{point}: the FMU has not returned for ")
     assert f" s from {said}{'' if options else '; its process is ended'}. " in launched.message
     assert f"`timeouts.{setting}`" in launched.message
-    if setting == "terminate":
-        assert len(rows_of(config.with_suffix(".csv"))) == 11
     place.assert_nothing_left()
+
+
+@pytest.mark.parametrize("options", [(), ("--local",)], ids=["distributed", "local"])
+@pytest.mark.parametrize(
+    ("fault", "says"),
+    [
+        ("segfault_fmi2FreeInstance", ": the FMU ended its process in fmi2FreeInstance (SIGSEGV)"),
+        ("abort_fmi2Terminate", ": the FMU ended its process in fmi2Terminate (SIGABRT)"),
+        ("exit_fmi2FreeInstance", ": the FMU ended its process in fmi2FreeInstance (exit)"),
+        ("hang_fmi2Terminate", "s from fmi2Terminate"),
+    ],
+)
+def test_how_an_fmu_ends_after_the_last_row_is_a_warning(
+    place: Place, hostile: Path, fault: str, says: str, options: tuple[str, ...]
+) -> None:
+    config = mesh_of(place, hostile, ["first", fault], timeouts=SHORT)
+
+    launched = place.run("launch", config, *options)
+
+    assert launched.wait() == 0
+    assert f"warning: instance {fault}, point 10, t = 0.01 s: the FMU " in launched.output + launched.errors
+    assert says in launched.output + launched.errors
+    assert launched.output.splitlines()[-1].startswith("10 points in ")
+    assert len(rows_of(config.with_suffix(".csv"))) == 11
+    place.assert_nothing_left()
+
+
+def test_a_node_that_is_lost_after_the_last_row_is_a_warning(place: Place, hostile: Path) -> None:
+    config = mesh_of(place, hostile, ["kill_fmi2Terminate"])
+
+    launched = place.run("launch", config)
+
+    assert launched.wait() == 0
+    assert (
+        "warning: instance kill_fmi2Terminate, point 10, t = 0.01 s: node 'kill_fmi2Terminate' was lost: its process "
+        "was ended by SIGKILL. Its FMU was in terminate or freeInstance. All rows are recorded."
+    ) in launched.output
+    assert len(rows_of(config.with_suffix(".csv"))) == 11
+    place.assert_nothing_left()
+
+
+@pytest.mark.parametrize("options", [(), ("--local",)], ids=["distributed", "local"])
+def test_a_thread_that_an_fmu_leaves_behind_costs_nothing(
+    place: Place, hostile: Path, options: tuple[str, ...]
+) -> None:
+    launched = place.run("launch", mesh_of(place, hostile, ["thread_fmi2Instantiate"]), *options)
+
+    assert launched.wait() == 0
+    assert "warning" not in launched.output + launched.errors
+
+
+@pytest.mark.parametrize("options", [(), ("--local",)], ids=["distributed", "local"])
+def test_what_an_fmu_says_in_terminate_is_shown(place: Place, hostile: Path, options: tuple[str, ...]) -> None:
+    launched = place.run("launch", mesh_of(place, hostile, ["talker"]), *options)
+
+    assert launched.wait() == 0
+    assert "talker at point 10: farewell" in launched.errors
+
+
+def test_an_fmu_that_crashes_at_its_end_costs_no_run_of_a_sweep(
+    place: Place, hostile: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("FMU_MESH_RUNTIME_DIR", str(place.folder / "run"))
+    fault = "segfault_fmi2FreeInstance"
+    config = mesh_of(place, hostile, [fault], timeouts=SHORT)
+
+    with fmu_mesh.sweep(config, [{f"{fault}.u": float(k)} for k in range(4)], workers=1) as running:
+        result = running.wait(DEADLINE_S)
+
+    assert [row.exit_code for row in result] == [0] * 4
+    assert {row.message for row in result} == {
+        f"instance {fault}, point 10, t = 0.01 s: the FMU ended its process in fmi2FreeInstance (SIGSEGV)"
+    }
+    assert [float(result.curves(k)[f"{fault}.third"][-1]) for k in range(4)] == [k / 3.0 for k in range(4)]
 
 
 def test_an_fmu_that_takes_its_time_to_initialize_makes_no_other_node_believe_that_the_master_is_gone(
@@ -183,7 +254,6 @@ def test_a_step_that_the_wall_clock_was_waited_for_has_its_whole_time(place: Pla
     [
         ("segfault_fmi2DoStep", "was ended by SIGSEGV"),
         ("segfault_fmi2Instantiate", "was ended by SIGSEGV"),
-        ("abort_fmi2Terminate", "was ended by SIGABRT"),
         ("exit_fmi2DoStep", "ended with exit code 0"),
     ],
 )

@@ -57,6 +57,7 @@ class Display:
         self._waits_for_nodes = waits_for_nodes
         self._times: Counter[tuple[str, str]] = Counter()
         self._held: deque[LogLine] = deque()
+        self._over = False
         self._endpoints: Sequence[str] = ()
 
     def __enter__(self) -> Self:
@@ -67,6 +68,7 @@ class Display:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._progress.stop()
+        self._over = True  # what an FMU of this process says now is said in its last functions
         self.flush(str(error or ""))
         for (instance, message), times in self._times.items():
             if times > _SHOWN_TIMES:
@@ -125,7 +127,7 @@ class Display:
         """
         if self._quiet and line.status not in _ERRORS:
             return
-        if line.status == "ok":
+        if line.status == "ok" or self._over:
             self._show(line)
             return
         self._held.append(line)
@@ -210,6 +212,7 @@ def stdout_as_stderr() -> Iterator[None]:
 
 def summary(plan: Plan, outcome: Outcome) -> list[str]:
     """The closing lines of a run; the last one is `20000 points in 1.234 s: 16207 points/s, real-time factor 32.4`."""
-    lines = [f"result: {short_path(file)} ({rows} rows)" for file, rows in outcome.files]
+    lines = [f"warning: {warning}" for warning in outcome.warnings]
+    lines += [f"result: {short_path(file)} ({rows} rows)" for file, rows in outcome.files]
     lines.append(summary_of(outcome, plan.grid.step_size))
     return lines

@@ -45,6 +45,7 @@ class RunReport(msgspec.Struct, frozen=True):
         error: why it failed.
         ended_by: what ended the simulation before its last point although nothing failed.
         files: all result files, each with its number of rows.
+        warnings: what went wrong although the result is complete.
     """
 
     mesh: str | None
@@ -59,6 +60,7 @@ class RunReport(msgspec.Struct, frozen=True):
     error: Failure | None = None
     ended_by: ErrorReport | None = None
     files: tuple[ReportedFile, ...] = ()
+    warnings: tuple[str, ...] = ()
 
 
 class RunReporter:
@@ -119,4 +121,5 @@ class RunReporter:
             error=failure,
             ended_by=outcome.ended_by,
             files=tuple(ReportedFile(*own) for own in outcome.files),
+            warnings=outcome.warnings,
         )

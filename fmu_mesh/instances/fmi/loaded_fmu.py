@@ -16,6 +16,7 @@ from fmpy.fmi1 import FMICallException
 from ...variables.model_description import ModelDescription
 from ..call_guard import FOLDER
 from ..kept_models import KeptModels
+from ..process_end import process_ends
 from .archive.archive import Terms
 from .archive.sources import extract
 from .calls import FmpyCalls
@@ -162,10 +163,13 @@ class LoadedFmu:
                 getattr(self.calls, self._fmu.functions.free)(self.calls.component)
 
     def close(self) -> None:
-        """Free the instance, unload the library and remove the files. Never raises; may be called twice."""
+        """Free the instance, unload the library and remove the files. Never raises; may be called twice.
+
+        A process that ends anyway unloads nothing: the FMU may have left a thread or a timer, which needs the library.
+        """
         self.free()
         self.leave()
-        if self.calls is not None and not self.is_lost:
+        if self.calls is not None and not self.is_lost and not process_ends():
             with suppress(FMICallException, OSError):
                 self.calls.freeLibrary()
         self.calls = None

@@ -9,6 +9,7 @@
 #define _GNU_SOURCE
 #include <fenv.h>
 #include <locale.h>
+#include <pthread.h>
 #include <signal.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -35,6 +36,7 @@ typedef struct {
     char name[64];
     double values[COUNT];
     int late; /* a step has ended after the time of the fault */
+    const fmi2CallbackFunctions *callbacks;
 } Hostile;
 
 static void flood(void)
@@ -76,6 +78,22 @@ static void install_handlers(void)
     sigaction(SIGTERM, &ignore, NULL);
 }
 
+/* A thread that needs the library, and does not end. */
+static volatile double busy;
+
+static void *compute(void *nothing)
+{
+    for (;;) busy = busy * 1.0000001 + 1.0;
+    return nothing;
+}
+
+static void leave_thread(void)
+{
+    pthread_t thread;
+
+    if (pthread_create(&thread, NULL, compute, NULL) == 0) pthread_detach(thread);
+}
+
 /* A process that outlives this one, and keeps its standard output open. */
 static void leave_orphan(int in_own_session)
 {
@@ -95,6 +113,8 @@ static void misbehave(const char *what)
     if (strcmp(what, "segfault") == 0) *nowhere = 1;
     if (strcmp(what, "abort") == 0) abort();
     if (strcmp(what, "exit") == 0) exit(0);
+    if (strcmp(what, "kill") == 0) raise(SIGKILL);
+    if (strcmp(what, "thread") == 0) leave_thread();
     if (strcmp(what, "leak") == 0) leak();
     if (strcmp(what, "flood") == 0) flood();
     if (strcmp(what, "chdir") == 0 && chdir("/") != 0) abort();
@@ -145,9 +165,10 @@ fmi2Component fmi2Instantiate(fmi2String instanceName, fmi2Type fmuType, fmi2Str
 {
     Hostile *hostile = calloc(1, sizeof *hostile);
 
-    (void)fmuType, (void)fmuResourceLocation, (void)functions, (void)visible, (void)loggingOn;
+    (void)fmuType, (void)fmuResourceLocation, (void)visible, (void)loggingOn;
     if (hostile == NULL || strcmp(fmuGUID, FMU_GUID) != 0) return NULL;
     hostile->values[U] = 1.0;
+    hostile->callbacks = functions;
     snprintf(hostile->name, sizeof hostile->name, "%s", instanceName);
     CALLED(hostile);
     return hostile;
@@ -182,6 +203,10 @@ fmi2Status fmi2ExitInitializationMode(fmi2Component c)
 
 fmi2Status fmi2Terminate(fmi2Component c)
 {
+    Hostile *hostile = c;
+
+    if (strcmp(hostile->name, "talker") == 0)
+        hostile->callbacks->logger(hostile->callbacks->componentEnvironment, hostile->name, fmi2Warning, "end", "farewell");
     CALLED(c);
     return fmi2OK;
 }

@@ -1,0 +1,103 @@
+"""The end of a process that ends with its run: what an FMU does then is a warning, not a failure.
+
+An FMU may have left a thread or a timer that needs its library, and it may crash in its last functions or call `exit`.
+So such a process unloads no library, and leaves without the destructors of libraries. Whoever closes an instance inside
+`surviving` is told of a crash, and ends the process in order, on another thread.
+
+A handler of Python's `signal` would run after the call into the FMU, and a crash never returns. So the handler is a C
+function that ctypes makes. It runs Python on the thread that has crashed, and this thread never leaves it. A runtime
+that an FMU brings may have handlers of its own and need them, as that of Java does: these stay.
+"""
+
+from __future__ import annotations
+
+import atexit
+import ctypes
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import cache
+from typing import Final
+
+__all__ = ["end_process", "ends_with_run", "process_ends", "surviving"]
+
+_SIGNALS: Final = (signal.SIGSEGV, signal.SIGBUS, signal.SIGFPE, signal.SIGILL, signal.SIGABRT)
+_ACTION_BYTES: Final = 512
+"""More than the size of `struct sigaction` on any platform; the handler is its first field."""
+
+_libc = ctypes.CDLL(None)
+_exit_codes: list[Callable[[], int]] = []
+"""Returns the exit code of this process; empty if the process goes on after its runs."""
+
+_closing: dict[int, tuple[int, Callable[[str], None]]] = {}
+"""By the identifier of the thread that closes an instance: the process, and what is called after a crash."""
+
+
+_handled: set[int] = set()
+"""The signals that have the handler of this module."""
+
+
+def ends_with_run(exit_code: Callable[[], int]) -> None:
+    """Note that this process ends with its run, and with the code that ``exit_code`` returns then."""
+    _exit_codes.append(exit_code)
+
+
+def process_ends() -> bool:
+    """Whether this process ends with its run."""
+    return bool(_exit_codes)
+
+
+def end_process() -> None:
+    """From any thread: end this process with its exit code, without any destructor."""
+    for stream in (sys.stdout, sys.stderr):
+        stream.flush()
+    os._exit(_exit_codes[-1]())
+
+
+@contextmanager
+def surviving(on_crash: Callable[[str], None]) -> Iterator[None]:
+    """Inside, a crash or `exit` of an FMU calls ``on_crash`` with its name, on the thread that never goes on.
+
+    It must not do more than wake another thread: `exit` has destroyed what other libraries keep for this one.
+    """
+    _handle_exit()
+    for number in _SIGNALS:
+        action = ctypes.create_string_buffer(_ACTION_BYTES)
+        _libc.sigaction(number, None, action)
+        if ctypes.c_void_p.from_buffer(action).value is None:  # the default
+            _libc.signal(number, _handler)
+            _handled.add(number)
+    _closing[threading.get_ident()] = os.getpid(), on_crash
+    try:
+        yield
+    finally:
+        del _closing[threading.get_ident()]
+        while _handled and not _closing:
+            _libc.signal(_handled.pop(), None)
+
+
+def _crashed(number: int) -> None:
+    """Called by the C library at a signal, and with 0 in `exit`."""
+    closing = _closing.get(threading.get_ident()) or next(iter(_closing.values()), None)
+    if closing is None:  # another call than the last one: a crash comes again, and is one
+        if number:
+            _libc.signal(number, None)
+        return
+    process, on_crash = closing
+    if process != os.getpid():  # the FMU has forked it
+        os._exit(128 + number)
+    on_crash(signal.Signals(number).name if number else "exit")
+    threading.Event().wait()
+
+
+_handler = ctypes.CFUNCTYPE(None, ctypes.c_int)(_crashed)
+
+
+@cache
+def _handle_exit() -> None:
+    """Call the handler in `exit`, which glibc offers to other languages than C++ by no other name."""
+    _libc["__cxa_atexit"](_handler, None, _handler)
+    atexit.register(_libc["__cxa_finalize"], _handler)  # not after Python has finalized itself
