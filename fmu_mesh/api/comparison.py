@@ -88,6 +88,7 @@ class Comparison(msgspec.Struct, frozen=True):
         compared: the variables that were compared.
         only_here: variables that only this result has; ``only_there``: only the other one.
         rows_only_here: rows before or after all rows of the other result; ``rows_only_there`` likewise.
+        note: why the machines may have calculated other last digits; empty if there is no reason.
     """
 
     here: str
@@ -103,6 +104,7 @@ class Comparison(msgspec.Struct, frozen=True):
     only_there: tuple[str, ...] = ()
     rows_only_here: int = 0
     rows_only_there: int = 0
+    note: str = ""
     drawn: Callable[[Sequence[str]], Figure] | None = None
 
     @property
@@ -130,6 +132,7 @@ class Comparison(msgspec.Struct, frozen=True):
             first = self.first
             values = f"{_shown(first.here)} in {self.here}, {_shown(first.there)} in {self.there}"
             lines.append(f"first at t = {short_number(first.time)} s, point {first.point}: {first.variable}: {values}")
+        lines += [f"calculated on other machines: {self.note}"] if self.note else []
         lines += self._rows_text()
         if self.differences:
             order = sorted(self.differences, key=lambda name: -self.differences[name].rows)

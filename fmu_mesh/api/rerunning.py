@@ -20,7 +20,7 @@ from .. import __version__
 from ..config.loading import PlainConfig
 from ..errors import CallRefused, ConfigurationError, Finding, FmuMeshError, MeshLost
 from ..run.run_plan import RunPlan
-from ..system.run_metadata import RunMetadata, scenario_files
+from ..system.run_metadata import RunMetadata, machine, machine_difference, scenario_files
 from ..text import listed
 from ..variables.value_types import PlainValue
 from ..wire.client.mesh_client import MeshClient
@@ -158,6 +158,8 @@ def planned_rerun(
     _check_models(path, metadata, plan)
     if (version := metadata.versions.get("fmu_mesh")) != __version__:
         on_notice(f"'{path}' was made by fmu_mesh {version}, and this is {__version__}")
+    if differs := machine_difference(metadata.versions, machine()):
+        on_notice(f"'{path}' was made on another machine than this, so last digits may differ: {differs}")
     return PlannedRerun(plan, values, last_point, first)
 
 

@@ -16,6 +16,7 @@ from ..errors import CallRefused, ConfigurationError, UnknownName
 from ..instances.python.unit_names import base_unit_of
 from ..run.outcome import Outcome
 from ..run.run_plan import RunPlan
+from ..system.run_metadata import machine_difference
 from ..system.system import ResolvedSystem
 from ..text import listed, short_path
 from ..variables.model_description import Variable
@@ -253,7 +254,8 @@ class Result(Mapping[str, NDArray[Any]]):
             here, there = here._replace(title="this result"), there._replace(title="the other one")
         names = chosen_names(f"{here.title}' or '{there.title}", [*dict.fromkeys([*self, *other])], variables)
         comparison = compared(here, there, names, rtol=rtol, atol=atol)
-        return replace(comparison, drawn=lambda chosen: self.plot(*chosen, others=(other,), difference=True))
+        note = machine_difference(self.metadata.get("versions", {}), other.metadata.get("versions", {}))
+        return replace(comparison, note=note, drawn=lambda chosen: self.plot(*chosen, others=(other,), difference=True))
 
     def __getitem__(self, name: str) -> NDArray[Any]:
         """The values of one variable, one per row; elements of arrays are variables of their own, such as `a.y[1,2]`.

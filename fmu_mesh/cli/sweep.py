@@ -274,6 +274,8 @@ def _show(sweep: Sweep) -> None:
         say(f"variant {row.variant} ({values}) failed: {row.message}")
     if len(failed) > _SHOWN_FAILURES:
         say(f"and {len(failed) - _SHOWN_FAILURES} more, which the table has")
+    for warning in sweep.result.warnings:
+        say(f"warning: {warning}")
     table = sweep.result.table
     if table.is_file():
         print(f"table: {short_path(table)}")

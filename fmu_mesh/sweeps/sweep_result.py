@@ -147,6 +147,14 @@ class SweepResult(Sequence[SweepRow]):
         total, failed = len(self._wanted.variants), sum(1 for _, row in self._found if row.exit_code)
         return f"{len(self)} of {total} runs, {failed} failed"
 
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Why the rows may differ from those of one machine: the last digits of results depend on it."""
+        machines = sorted({row.machine for _, row in self._found} - {""})
+        if len(machines) < 2:
+            return ()
+        return (f"the runs were on machines whose results may differ in the last digits: {'; '.join(machines)}",)
+
     def to_pandas(self) -> pd.DataFrame:
         """The table as a data frame, with the columns of the CSV.
 

@@ -31,6 +31,7 @@ from ..config.loading import PlainConfig
 from ..config.yaml_text import Plain
 from ..errors import ConfigurationError, ErrorReport, FmuError, FmuMeshError, from_report
 from ..run.options import Options
+from ..system.run_metadata import machine
 from .reductions import read_reduction, reduced_value
 from .variants import Parameters
 
@@ -79,6 +80,7 @@ class Row(msgspec.Struct, frozen=True):
         worker: host and process id of the worker.
         stuck: whether an FMU has not returned, or has crashed while it was closed, so that the worker has a thread
             less.
+        machine: what the last digits of results depend on, on the host of the worker.
     """
 
     id: str
@@ -88,6 +90,7 @@ class Row(msgspec.Struct, frozen=True):
     seconds: float
     worker: str
     stuck: bool = False
+    machine: str = ""
 
 
 def encoded_task(task: SweepTask) -> bytes:
@@ -141,6 +144,7 @@ def run_variant(task: bytes, functions: OwnReductions, identity: str, parameters
         seconds=time.perf_counter() - started,
         worker=f"{socket.gethostname()}:{os.getpid()}",
         stuck=own.stuck,
+        machine=", ".join(machine().values()),
     )
 
 

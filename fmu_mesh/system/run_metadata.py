@@ -6,15 +6,19 @@ them, and `fmu-mesh rerun` starts from them.
 
 from __future__ import annotations
 
+import os
 import platform
 import socket
 from collections.abc import Mapping
+from contextlib import suppress
 from datetime import UTC, datetime
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
-from typing import Any
+from pathlib import Path
+from typing import Any, Final
 
 import msgspec
+import numpy as np
 
 from .. import __version__
 from ..config.instance_sections import KIND
@@ -31,12 +35,20 @@ __all__ = [
     "RecordedVariable",
     "RunMetadata",
     "configuration_of",
+    "machine",
+    "machine_difference",
     "metadata_of",
     "scenario_files",
     "versions",
 ]
 
 _FORMAT = 1
+_FEATURES: Final = ("asimd", "avx", "avx2", "avx512f", "fma", "fma4", "sve")
+"""Features of a processor for which mathematical libraries have functions of their own, with other last digits."""
+
+_CPUINFO_BYTES: Final = 8192
+"""The first processor; a host can have hundreds."""
+
 _PACKAGES = {"fmpy": "fmpy", "zenoh": "eclipse-zenoh", "numpy": "numpy"}
 
 
@@ -75,7 +87,8 @@ class RunMetadata(msgspec.Struct, frozen=True):
 
     Attributes:
         format: the version of these entries.
-        versions: versions of fmu_mesh, of the packages that take part in the numbers, of Python and of the system.
+        versions: versions of fmu_mesh, of the packages that take part in the numbers, of Python and of the system, and
+            the `machine`.
         mesh: name of the mesh.
         digest: the digest of the mesh: version, configuration and models.
         configuration: the values of a configuration file: that of the run, with everything that options replaced.
@@ -206,7 +219,7 @@ def _recorded(system: ResolvedSystem, instance: str, name: str) -> RecordedVaria
 
 @cache
 def versions() -> dict[str, str]:
-    """The versions of fmu_mesh, of the packages that take part in the numbers, of Python and of the system.
+    """The versions of fmu_mesh, of the packages that take part in the numbers, of Python and of the system; `machine`.
 
     The first call imports what reads metadata of packages, which takes some milliseconds.
     """
@@ -216,4 +229,33 @@ def versions() -> dict[str, str]:
             found[name] = version(package)
         except PackageNotFoundError:
             found[name] = "unknown"  # built into something else
-    return {**found, "python": platform.python_version(), "platform": platform.platform()}
+    return {**found, "python": platform.python_version(), "platform": platform.platform(), **machine()}
+
+
+@cache
+def machine() -> dict[str, str]:
+    """What the last digits of results depend on: the features of the processor, the C library, and BLAS of numpy."""
+    words: set[str] = set()
+    with suppress(OSError), Path("/proc/cpuinfo").open(encoding="utf-8", errors="replace") as file:
+        words.update(file.read(_CPUINFO_BYTES).split())
+    libc = "unknown"
+    with suppress(ValueError, OSError):  # a C library that is not that of GNU
+        libc = os.confstr("CS_GNU_LIBC_VERSION") or libc
+    configuration: Any = np.show_config(mode="dicts")
+    blas = configuration.get("Build Dependencies", {}).get("blas", {})
+    return {
+        "processor": " ".join(feature for feature in _FEATURES if feature in words),
+        "libc": libc,
+        "blas": f"{blas.get('name', 'unknown')} {blas.get('version', '')}".strip(),
+    }
+
+
+def machine_difference(here: Mapping[str, str], there: Mapping[str, str]) -> str:
+    """In words why two machines may calculate other last digits; empty if there is no reason, or it is not known.
+
+    Args:
+        here: the `machine` of one result, perhaps among `versions`.
+        there: that of the other one.
+    """
+    keys = [key for key in machine() if key in here and key in there and here[key] != there[key]]
+    return ", ".join(f"{key} '{here[key]}' and '{there[key]}'" for key in keys)

@@ -134,6 +134,24 @@ def test_a_value_of_an_unknown_program_is_noted_under_its_key(place: Place, fold
     ]
 
 
+def test_a_rerun_and_a_comparison_name_what_other_machines_calculate_with(folder: Path) -> None:
+    first = fmu_mesh.load(write_config(folder, record={"file": "pair.csv"})).run(stop_time=0.1)
+    assert first.compare(first).note == ""
+    found = metadata_of(folder / "pair.csv")
+    found["versions"] |= {"processor": "an older one", "libc": "glibc 1.0"}
+    (folder / "pair.csv.json").write_text(json.dumps(found), encoding="utf-8")
+    notices: list[str] = []
+
+    again = fmu_mesh.rerun(folder / "pair.csv", on_notice=notices.append)
+    comparison = fmu_mesh.Result.read(folder / "pair.csv").compare(again)
+
+    assert comparison.equal
+    assert comparison.note.startswith("processor 'an older one' and '")
+    assert f"calculated on other machines: {comparison.note}" in comparison.text
+    assert "so last digits may differ: processor 'an older one' and '" in notices[0]
+    assert ", libc 'glibc 1.0' and '" in notices[0]
+
+
 def test_the_metadata_say_how_the_result_was_made(folder: Path) -> None:
     mesh = fmu_mesh.load(write_config(folder, record={"file": "pair.csv", "variables": ["pendulum.a", "delay.y"]}))
     mesh.run(start_values={"pendulum.a": 0.1 + 2**-53})
@@ -142,7 +160,7 @@ def test_the_metadata_say_how_the_result_was_made(folder: Path) -> None:
 
     assert found["mesh"] == "pair"
     assert found["versions"]["fmu_mesh"] == fmu_mesh.__version__
-    assert {"fmpy", "zenoh", "numpy", "python", "platform"} < found["versions"].keys()
+    assert {"fmpy", "zenoh", "numpy", "python", "platform", "processor", "libc", "blas"} < found["versions"].keys()
     assert found["models"]["pendulum"]["path"] == str(FMUS / "DampedPendulum.fmu")
     assert len(found["models"]["pendulum"]["sha256"]) == 64
     assert found["start_values"]["pendulum"]["a"] == 0.1 + 2**-53

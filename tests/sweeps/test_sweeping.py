@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import threading
@@ -237,6 +238,23 @@ def test_resume_runs_what_is_missing_and_the_table_is_the_same(config: Path, tmp
     with fmu_mesh.sweep(config, VARY, reduce=[*REDUCE, "min(delay.y)"], folder=folder.path, resume=True) as running:
         running.wait(DEADLINE_S)
     assert running.ran == 12  # a new column needs all runs
+
+
+def test_rows_of_other_machines_are_told(config: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "sweep"
+    with fmu_mesh.sweep(config, {"pendulum.d": [0.1]}, folder=folder) as running:
+        assert running.wait(DEADLINE_S).warnings == ()
+    rows = folder / "rows.jsonl"
+    row = json.loads(rows.read_text(encoding="utf-8"))
+    rows.write_text(json.dumps(row | {"machine": "an older one"}) + "\n", encoding="utf-8")
+
+    with fmu_mesh.sweep(config, {"pendulum.d": [0.1, 0.2]}, folder=folder, resume=True) as running:
+        (warning,) = running.wait(DEADLINE_S).warnings
+
+    assert running.ran == 1
+    assert "may differ in the last digits" in warning
+    assert "an older one" in warning
+    assert row["machine"] in warning
 
 
 def test_a_sweep_is_not_mixed_up_with_another_one(config: Path, tmp_path: Path) -> None:
