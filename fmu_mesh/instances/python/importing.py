@@ -1,7 +1,8 @@
 """Importing the class of a component: from a file, from an installed module, or as the program that is running has it.
 
-A file is imported anew for each instance, under a name of its own. So two instances share no global variables, whether
-they run in one process or in two.
+A file is imported anew for each instance, under a name of its own, and so are the modules of its folder
+(`fmu_mesh.instances.python.own_modules`). So two instances share no global variables, whether they run in one process
+or in two.
 """
 
 from __future__ import annotations
@@ -9,7 +10,6 @@ from __future__ import annotations
 import hashlib
 import importlib
 import importlib.util
-import itertools
 import sys
 import traceback
 from collections.abc import Iterator
@@ -26,6 +26,7 @@ from ...text import listed, nearest, short_path
 from ...variables.model_description import ModelDescription
 from .component import Component
 from .component_description import description_of
+from .own_modules import OwnModules
 from .python_section import ClassPlace
 
 __all__ = ["ImportedComponent", "being_imported", "component_section"]
@@ -33,7 +34,6 @@ __all__ = ["ImportedComponent", "being_imported", "component_section"]
 _OWN = Path(__file__).resolve().parents[2]
 _TEXT_CHARACTERS = 500
 _importing: ContextVar[str | None] = ContextVar("importing", default=None)
-_numbers = itertools.count(1)
 
 
 def being_imported() -> str | None:
@@ -59,12 +59,13 @@ class ImportedComponent:
     Attributes:
         cls: the class; call `load` first.
         description: its model description.
+        modules: those of its folder; call `forget_names` after each call into the component.
     """
 
     def __init__(self, path: Path, target: ClassPlace) -> None:
         self._path = path
         self._target = target
-        self._folder = str(path.parent) if target.file else None
+        self.modules = OwnModules(path.parent)
         self._module = target.module
         self._file = path if target.file else None
         self.cls: type[Component] = Component
@@ -77,13 +78,11 @@ class ImportedComponent:
 
     def load(self) -> ModelDescription:
         """Import the class; returns its description. See the class for what is raised."""
-        target, folder = self._target, self._folder
+        target = self._target
         place = target.file or target.module
         if not target.name.isidentifier():
             wanted = f"`{place}:Controller`, if the class is called Controller"
             raise CallRefused(f"'{place}' names no class at the top of the module, expected {wanted}")
-        if folder is not None:
-            sys.path.append(folder)  # at the end: a file of the user replaces no module of a library
         with _marked(place):
             module, data = self._from_file() if self._file is not None else self._from_module()
         found = getattr(module, target.name, None)
@@ -119,23 +118,17 @@ class ImportedComponent:
         return f"{short_path(file)}:{line}: {text}{deeper}"
 
     def close(self) -> None:
-        """Forget the module, and take the folder from the path for modules."""
-        if self._folder is not None and self._folder in sys.path:
-            sys.path.reverse()
-            sys.path.remove(self._folder)
-            sys.path.reverse()
-            self._folder = None
-        if self._file is not None and self._target.file:
-            sys.modules.pop(self._module, None)
+        """Forget the module, and those of its folder."""
+        self.modules.close()
 
     def _from_file(self) -> tuple[ModuleType, bytes]:
         assert self._file is not None
-        self._module = f"{self._file.stem.replace('.', '_')}@{next(_numbers)}"
-        loader = _SourceFile(self._module, str(self._file))
-        spec = importlib.util.spec_from_file_location(self._module, self._file, loader=loader)
+        name = self.modules.name_of(self._file.stem.replace(".", "_"))
+        loader = _SourceFile(name, str(self._file))
+        spec = importlib.util.spec_from_file_location(name, self._file, loader=loader)
         assert spec is not None
-        module = importlib.util.module_from_spec(spec)
-        sys.modules[self._module] = module
+        module = self.modules.adopted(importlib.util.module_from_spec(spec))
+        sys.modules[name] = module
         loader.exec_module(module)
         return module, loader.data
 

@@ -73,6 +73,7 @@ class PythonInstance:
             raise
         self._declared = declared_variables(self._imported.cls)
         self._step_component = self._component.step
+        self._lent = self._imported.modules.lent
         self._values: dict[str, Any] = vars(self._component)
 
     @property
@@ -147,6 +148,8 @@ class PythonInstance:
             self._step_component(time, self._step_size)
         except (Exception, SystemExit) as error:
             raise self._failed(error) from error
+        if self._lent:
+            self._imported.modules.forget_names()
         slot = (step + 1) & self._output_mask
         for name, write in self._writes:
             try:
@@ -247,6 +250,8 @@ class PythonInstance:
             return call()
         except (Exception, SystemExit) as error:
             raise self._failed(error) from error
+        finally:
+            self._imported.modules.forget_names()
 
     def _failed(self, error: BaseException) -> FmuMeshError:
         """The error for an exception of the code of the user."""
