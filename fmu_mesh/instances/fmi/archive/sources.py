@@ -29,6 +29,7 @@ from ....errors import LoadFailed
 from ....variables.model_description import Kind, ModelDescription
 from .archive import OpenFmu, Terms, opened, unpacked
 from .examining import examine, library_name, source_names
+from .library_names import rename_libraries
 from .reading import description_of, parsed
 
 __all__ = ["cache_folder", "describe", "extract", "prepare"]
@@ -55,6 +56,7 @@ _FLAGS_OF_C: Final = (
     "-Wno-error=incompatible-pointer-types",
     "-Wno-error=implicit-int",
 )
+_FLAGS_OF_CPP: Final = ("-fno-gnu-unique",)  # its variables are its own, also of templates and of inline functions
 # -Bsymbolic: calls go to the FMU's own functions, even if the C library or Python has one with the same name.
 _LINK_FLAGS: Final = ("-shared", "-Wl,--no-undefined", "-Wl,-Bsymbolic", "-lm", "-ldl", "-lpthread")
 
@@ -93,9 +95,12 @@ def extract(
             behind.
     """
     if model is not None and (prepared := _prepared.get((path, terms, model.model_identifier, model.kind))) is not None:
-        return _copied(path, prepared, parent)
-    with opened(path, terms) as fmu:
-        return _extract(fmu, parent, tell, model)
+        folder = _copied(path, prepared, parent)
+    else:
+        with opened(path, terms) as fmu:
+            folder = _extract(fmu, parent, tell, model)
+    rename_libraries(folder)
+    return folder
 
 
 def prepare(path: Path, parent: Path, terms: Terms, model: ModelDescription) -> None:
@@ -241,7 +246,7 @@ def _compiled(path: Path, sources: Path, build: _Build, tell: Callable[[str], No
     """The library of these sources: that in the cache, or a new one."""
     plus = any(not name.endswith(".c") for name in build.sources)
     compiler = _compiler(path, plus=plus)
-    own = [*compiler, *_FLAGS, *(() if plus else _FLAGS_OF_C), *build.options]
+    own = [*compiler, *_FLAGS, *(_FLAGS_OF_CPP if plus else _FLAGS_OF_C), *build.options]
     target = cache_folder() / "sources" / _key(sources, build, own) / f"{build.identifier}{fmpy.sharedLibraryExtension}"
     if target.is_file():
         return target
