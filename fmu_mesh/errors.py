@@ -3,6 +3,7 @@
 ```
 FmuMeshError                     1   an internal error
 ├── ConfigurationError           2   a file, an option or a command is wrong; carries all findings
+│   └── NotInOneProcess              instances of the mesh cannot share one process
 ├── CallRefused                  2   a program called the library wrongly; also a ValueError
 │   └── UnknownName                  there is no such name; also a KeyError
 ├── FmuError                     3   an FMU failed
@@ -46,6 +47,7 @@ __all__ = [
     "LoopNotConverged",
     "MeshLost",
     "MessageRefused",
+    "NotInOneProcess",
     "ProtocolBroken",
     "StepFailed",
     "TerminationRequested",
@@ -224,6 +226,10 @@ class ConfigurationError(FmuMeshError):
         return "\n".join([super().__str__(), *(f"  - {finding}" for finding in listed)])
 
 
+class NotInOneProcess(ConfigurationError):
+    """Instances of the mesh cannot share one process: together they would compute other numbers than apart."""
+
+
 class CallRefused(FmuMeshError, ValueError):
     """The library was called in the wrong mode, or with a wrong name, type or time. The call had no effect."""
 
@@ -317,8 +323,9 @@ _BY_KIND: dict[str, type[FmuMeshError]] = {
 
 def from_report(report: ErrorReport) -> FmuMeshError:
     """Convert the report of another process back to an exception of the same class."""
-    if report.kind == ConfigurationError.__name__:
-        return ConfigurationError(report.message, hint=report.hint)
+    for kind in (ConfigurationError, NotInOneProcess):
+        if report.kind == kind.__name__:
+            return kind(report.message, hint=report.hint)
     return _BY_KIND.get(report.kind, FmuMeshError)(
         report.message,
         instance=report.instance,

@@ -26,7 +26,8 @@ from ..errors import CallRefused, ErrorReport, FmuError, TerminationRequested, U
 from ..instances.call_guard import Guarded, Unwatched
 from ..instances.contract import LogMessage
 from ..instances.registry import open_instance
-from ..run.local_system import LocalSystem, SavedSystem, check_one_process, opening_of
+from ..run.local_system import LocalSystem, SavedSystem, opening_of
+from ..run.one_process import OneProcess
 from ..run.run_plan import RunPlan
 from ..simtime import ENDLESS
 from ..system.settable import check_settable
@@ -70,13 +71,13 @@ class System:
         run: the plan of the run.
 
     Raises:
-        ConfigurationError: two instances need a process of their own each.
+        NotInOneProcess: two instances cannot share a process.
         FmuError: an FMU cannot be opened or initialized. Nothing is left behind.
     """
 
     def __init__(self, run: RunPlan) -> None:
         plan = run.plan
-        check_one_process(plan)
+        OneProcess().check(plan, run.contents)
         self._run = run
         self._grid = plan.grid
         self._thread = threading.get_ident()

@@ -7,6 +7,7 @@ from pathlib import Path
 from ..config.findings import ValueOrigin
 from ..config.loading import LoadedConfig
 from ..rings.library import library_missed, why_no_library
+from ..run.one_process import apart, claims_in
 from ..system.grouping import automatic_nodes
 from ..system.initialization_plan import Loop
 from ..system.plan import Plan
@@ -192,10 +193,10 @@ def _order(plan: Plan) -> list[str]:
 
 
 def _groups(plan: Plan) -> list[str]:
-    """For each cycle, what `group: auto` does or would do, and why."""
+    """For each cycle, what `group: auto` does or would do, and why; and what cannot share a process."""
     config, instances = plan.system.config, plan.system.instances
     edges = [(c.source_instance, c.target_instance) for c in plan.connections if not c.initial_only]
-    automatic = automatic_nodes(config, edges, {name: own.description for name, own in instances.items()})
+    automatic = automatic_nodes(config, edges, claims_in(plan))
     lines = []
     for cycle in plan.cycles:
         names = ", ".join(sorted(cycle, key=[*instances].index))
@@ -206,13 +207,13 @@ def _groups(plan: Plan) -> list[str]:
             lines.append(f"  {cost}; {_remedy(len(now), len(would))}")
         elif config.group == "auto" and any(name in automatic for name in cycle):
             lines.append(f"  {names} form a cycle: together in '{now.pop()}', each point costs no round trip")
-    return lines
+    return [*lines, *(f"  {why}" for why in apart(plan))]
 
 
 def _remedy(nodes: int, automatic: int) -> str:
     if automatic == 1:
         return "`group: auto` would put them into one"
-    apart = "groups, hosts, or FMUs that allow one instance per process keep them apart"
+    apart = "groups, hosts, or what cannot share a process keep them apart"
     return apart if automatic >= nodes else f"`group: auto` would put them into {automatic}, since {apart}"
 
 

@@ -19,6 +19,7 @@ from ..rings.native import NativeStep
 from ..rings.ring import Ring
 from ..simtime import TimeGrid
 from ..system.linear_inputs import LinearInput
+from ..system.process_sharing import Claims
 from ..variables.model_description import ModelDescription, Value
 from .kept_models import KeptModels
 
@@ -137,6 +138,22 @@ class Kind(ABC, Generic[Section]):
         Raises:
             OSError, LoadFailed: a file cannot be read.
         """
+
+    def claims(
+        self,
+        path: Path,  # noqa: ARG002  for those who claim something
+        section: Section,  # noqa: ARG002  as above
+        description: ModelDescription,  # noqa: ARG002  as above
+        limits: LimitsConfig,  # noqa: ARG002  as above
+    ) -> Claims:
+        """What such an instance uses of which a process has only one; nothing by default.
+
+        Called only where instances are to share a process: what is slow is done here.
+
+        Raises:
+            LoadFailed: the model cannot be read.
+        """
+        return {}
 
     def check_engine(self) -> None:
         """Check that this host can run such instances; nothing is checked by default.

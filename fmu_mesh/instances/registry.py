@@ -19,6 +19,7 @@ from ..config.instance_sections import KIND, InstanceSection, key_of
 from ..config.mesh import LimitsConfig
 from ..errors import ConfigurationError, LoadFailed
 from ..plugins import own_plugin_names, plugin, plugin_names
+from ..system.process_sharing import Claims
 from ..text import listed
 from ..variables.model_description import ModelDescription
 from .contract import Instance, Kind, Opening, Showing
@@ -29,6 +30,7 @@ __all__ = [
     "can_be_shown",
     "check_engines",
     "check_showing",
+    "claims",
     "content",
     "decode_section",
     "describe",
@@ -115,6 +117,20 @@ def content(path: Path, section: InstanceSection) -> str:
         return _kind_of(section).content(path)
     except OSError as error:
         raise LoadFailed(f"'{path}' cannot be read: {error.strerror or error}.") from error
+
+
+def claims(path: Path, section: InstanceSection, description: ModelDescription, limits: LimitsConfig) -> Claims:
+    """What an instance claims of its process; see `Kind.claims`.
+
+    Raises:
+        LoadFailed: the model cannot be read.
+    """
+    only_once = {f"the FMU {description.guid} allows one instance per process": ""}
+    try:
+        claimed = _kind_of(section).claims(path, section, description, limits)
+    except OSError as error:
+        raise LoadFailed(f"'{path}' cannot be read: {error.strerror or error}.") from error
+    return {**claimed, **only_once} if description.only_once_per_process else claimed
 
 
 def expected_model(section: InstanceSection) -> str:

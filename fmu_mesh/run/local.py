@@ -27,7 +27,8 @@ from ..master.pacing import Pacer
 from ..recorder.row_buffer import RowBuffer
 from ..system.layout import Layout
 from ..system.plan import Plan
-from .local_system import LocalSystem, check_one_process, opening_of
+from .local_system import LocalSystem, opening_of
+from .one_process import OneProcess
 from .outcome import Outcome
 from .results import open_results, what_is_kept
 
@@ -122,7 +123,7 @@ class LocalMesh:
                 that were recorded before are kept.
         """
         if self._open_instance is None:
-            check_one_process(self._plan)
+            OneProcess().check(self._plan, self._contents)
         try:
             self._run()
         except FmuMeshError as error:

@@ -14,7 +14,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-from ..errors import ConfigurationError, FmuError, InitializationFailed, TerminationRequested
+from ..errors import FmuError, InitializationFailed, TerminationRequested
 from ..instances.call_guard import Guarded, doing, floating_point_changed, restore_floating_point
 from ..instances.contract import LogMessage, Opening, Showing
 from ..rings.array_elements import element_of, scaled
@@ -29,10 +29,9 @@ from ..system.plan import InstancePlan, Plan
 from ..system.schedule import Course
 from ..system.series_files import courses_of
 from ..variables.value_types import Value
-from .child import is_other_python
 from .threads import one_thread_meanwhile
 
-__all__ = ["LocalSystem", "SavedSystem", "check_one_process", "opening_of"]
+__all__ = ["LocalSystem", "SavedSystem", "opening_of"]
 
 
 class LocalSystem:
@@ -382,25 +381,6 @@ class _Feed(NamedTuple):
     lead: int
     change: Callable[[Value], Value] | None
     write: Callable[[int, Value], None]
-
-
-def check_one_process(plan: Plan) -> None:
-    """Refuse what cannot run in one process; groups do not matter here.
-
-    Raises:
-        ConfigurationError: a component needs another Python, or there are two instances of an FMU that allows one.
-    """
-    for node in plan.nodes.values():
-        if node.interpreter is not None and is_other_python(node.interpreter):
-            text = f"'{node.node}' needs the Python '{node.interpreter}', and this process is another one"
-            raise ConfigurationError(text, hint="Run the mesh in processes: `fmu-mesh launch` without --local.")
-    first_of: dict[str, str] = {}
-    for name, instance in plan.system.instances.items():
-        if instance.description.only_once_per_process:
-            first = first_of.setdefault(instance.description.guid, name)
-            if first != name:
-                text = f"'{first}' and '{name}' cannot run in one process: their FMU allows one instance per process"
-                raise ConfigurationError(text, hint="Run the mesh in processes: `fmu-mesh launch` without --local.")
 
 
 def opening_of(

@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from contextlib import suppress
 from pathlib import Path
+from typing import TypeVar, cast
 
 import msgspec
 from msgspec.structs import replace
@@ -20,12 +21,13 @@ from ..config.mesh import LimitsConfig
 from ..errors import ConfigurationError, Finding, LoadFailed
 from ..instances.configuration import examine_data
 from ..instances.python.unit_names import base_unit_of
-from ..instances.registry import check_showing, content, describe, expected_model
+from ..instances.registry import check_showing, claims, content, describe, expected_model
 from ..ros.bags.scenario_bags import bag_values
 from ..ros.gateway.mapping import resolve as resolve_ros
 from ..ssp.configuration_files import read_configuration
 from ..system.plan import Plan, make_plan
 from ..system.point_loops import warn_of_point_loops
+from ..system.process_sharing import Claims
 from ..system.scenario import Scenario
 from ..system.system import build
 from ..text import nearest_file
@@ -37,6 +39,7 @@ from .run_plan import RunPlan
 __all__ = ["KnownModels", "plan_run", "planned", "prepare"]
 
 _MOST_KNOWN = 256
+T = TypeVar("T")
 _PACKAGE = ".ssd"
 """The suffix of the file of a configuration that comes from a package."""
 
@@ -60,7 +63,7 @@ class KnownModels:
 
     def __init__(self, *, keeps_code: bool = False) -> None:
         self._keeps_code = keeps_code
-        self._models: dict[tuple[str, bytes], tuple[str, ModelDescription]] = {}
+        self._models: dict[tuple[str, str, bytes], tuple[str, object]] = {}
 
     def describe(
         self,
@@ -76,18 +79,31 @@ class KnownModels:
         """
         if section.names_code and not self._keeps_code:
             return describe(path, section, limits, tell)
-        model = os.path.realpath(path), msgspec.json.encode((section, limits))
+        return self._known("description", path, section, limits, lambda: describe(path, section, limits, tell))
+
+    def claims(
+        self, path: Path, section: InstanceSection, description: ModelDescription, limits: LimitsConfig
+    ) -> Claims:
+        """What an instance claims of its process; see `fmu_mesh.instances.registry.claims`.
+
+        Raises:
+            LoadFailed: the model cannot be read.
+        """
+        return self._known("claims", path, section, limits, lambda: claims(path, section, description, limits))
+
+    def _known(self, what: str, path: Path, section: InstanceSection, limits: LimitsConfig, read: Callable[[], T]) -> T:
+        model = what, os.path.realpath(path), msgspec.json.encode((section, limits))
         if model in self._models:
-            version, description = self._models[model]
-            with suppress(LoadFailed):  # `describe` says why
+            version, known = self._models[model]
+            with suppress(LoadFailed):  # `read` says why
                 if content(path, section) == version:
-                    return description
-        description = describe(path, section, limits, tell)
+                    return cast("T", known)
+        found = read()
         with suppress(LoadFailed):  # whoever needs its content says why
-            self._models[model] = content(path, section), description
+            self._models[model] = content(path, section), found
         if len(self._models) > _MOST_KNOWN:
             del self._models[next(iter(self._models))]
-        return description
+        return found
 
 
 def prepare(
@@ -143,13 +159,20 @@ def planned(
         _check_owner(loaded, findings)
     if not len(findings):  # otherwise the world may be what is wrong
         check_showing(loaded.config.instances, options.showing)
-    descriptions, unreadable = _descriptions(loaded, findings.places, tell, known or KnownModels())
+    known = known or KnownModels()
+    descriptions, unreadable = _descriptions(loaded, findings.places, tell, known)
     findings.merge(unreadable)
     resolve_ros(loaded, descriptions, findings)
     scenario = _scenario(loaded, descriptions, findings)
-    system = build(loaded, descriptions, tuple(findings), scenario)
-    check_results(loaded, system)
     sections = loaded.config.instances
+
+    def claimed(name: str) -> Claims:
+        own = placed(sections[name])
+        path = loaded.resolve(own.path) if own.path else Path()
+        return known.claims(path, own, descriptions[name], loaded.config.limits)
+
+    system = build(loaded, descriptions, tuple(findings), scenario, claimed)
+    check_results(loaded, system)
     contents = {name: content(Path(own.fmu), sections[name]) for name, own in system.instances.items()}
     plan = make_plan(system, file=str(loaded.file), contents=contents)
     warnings = loaded.findings()

@@ -35,7 +35,8 @@ from ..rings import native
 from ..rings.host_memory import HostMemory
 from ..system.plan import Plan, make_plan
 from ..system.recording import ResultFile
-from .local_system import check_one_process, opening_of
+from .local_system import opening_of
+from .one_process import OneProcess
 from .outcome import Outcome
 from .row_writer import RowWriter
 from .run_plan import RunPlan
@@ -94,6 +95,7 @@ class RepeatedRuns:
         self._around = _Surroundings(folder / _SCRATCH, models, log, open_instance, before_close)
         self._on_hang = on_hang
         self._threads = LimitedThreads()
+        self._process = OneProcess()
         self._watch: CallWatch | None = None
         self._thread = 0
         self._run: _Run | None = None
@@ -113,7 +115,7 @@ class RepeatedRuns:
         writer = RowWriter(result)
         try:
             if self._around.open_instance is None:
-                check_one_process(run.plan)
+                self._process.check(run.plan, run.contents)
             self._run = current = _Run(run, writer, self._around)
             if self._stop is not None:
                 current.interrupt(self._stop)

@@ -21,6 +21,7 @@ from ..api.result import Result, types_of
 from ..config.loading import PlainConfig
 from ..config.mesh import Config
 from ..errors import ConfigurationError, Finding, FmuError
+from ..run.one_process import apart
 from ..run.options import Options
 from ..run.run_plan import RunPlan
 from ..text import listed, nearest
@@ -52,7 +53,7 @@ class SweepOptions(TypedDict, total=False):
         curves: whether the recorded variables of each run are kept as a CSV (True).
         resume: keep the runs that are in the folder already, and run what is missing.
         processes: start the processes of the mesh for each run, as `Mesh.run` does; by default each run takes place in
-            one process.
+            one process, unless its instances cannot share one.
         reset: reset the instances of FMUs between two runs, and do not make new ones (fmi2Reset; FMI 2.0, 2.1.6).
         max_instances: by the file name of a model, how many instances of it may exist at a time: a licence server may
             allow no more.
@@ -146,7 +147,11 @@ def planned_sweep(
         reset=options.get("reset", False),
         most_instances=dict(options.get("max_instances", {})),
     )
-    plan = _any_plan(own, base, wanted, options.get("on_notice", log.info))
+    tell = options.get("on_notice", log.info)
+    plan = _any_plan(own, base, wanted, tell)
+    if not wanted.processes and (why := apart(plan.plan)):
+        tell(f"each run of the sweep starts processes, because {why[0]}")
+        wanted = replace(wanted, processes=True)
     recorded = types_of(plan.plan.system) or {}
     asked = reductions or [f"last({name})" for name in recorded]
     texts = [one for one in asked if isinstance(one, str)]

@@ -14,6 +14,7 @@ import time
 import weakref
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
+from contextlib import suppress
 from pathlib import Path
 from queue import SimpleQueue
 from typing import Any, NamedTuple, cast
@@ -29,7 +30,7 @@ from ..api.repeated_mesh import RepeatedMesh
 from ..api.result import Result
 from ..config.loading import PlainConfig
 from ..config.yaml_text import Plain
-from ..errors import ConfigurationError, ErrorReport, FmuError, FmuMeshError, from_report
+from ..errors import ConfigurationError, ErrorReport, FmuError, FmuMeshError, NotInOneProcess, from_report
 from ..run.options import Options
 from ..system.run_metadata import machine
 from .reductions import read_reduction, reduced_value
@@ -199,11 +200,12 @@ class _Loaded:
             options["output"] = curves_of(task.curves, identity)
         else:
             options["record"] = "memory"
-        if task.processes:
-            return self._values(self._mesh.run(**options), functions)
-        ended: Future[Result] = Future()
-        self._jobs.put(_Job(options, ended))
-        return self._values(ended.result(), functions)
+        if not task.processes:
+            ended: Future[Result] = Future()
+            self._jobs.put(_Job(options, ended))
+            with suppress(NotInOneProcess):  # a parameter may be the path of a model
+                return self._values(ended.result(), functions)
+        return self._values(self._mesh.run(**options), functions)
 
     def _values(self, result: Result, functions: OwnReductions) -> dict[str, Cell]:
         values = {one.text: _cell(reduced_value(one, result)) for one in self._reductions}

@@ -7,36 +7,35 @@ parallel nodes are faster. So each cycle gets one node, and every other instance
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
+from functools import partial
 
 from ..config.mesh import Config
-from ..variables.model_description import ModelDescription
 from .graph import strongly_connected
+from .process_sharing import ClaimsOf, SharedProcess
 
 __all__ = ["automatic_nodes"]
 
 _SUFFIX = "-cycle"
 
 
-def automatic_nodes(
-    config: Config, edges: Iterable[tuple[str, str]], descriptions: Mapping[str, ModelDescription]
-) -> dict[str, str]:
+def automatic_nodes(config: Config, edges: Iterable[tuple[str, str]], claims: ClaimsOf) -> dict[str, str]:
     """The names of the nodes that several instances of a cycle share, by instance. Other instances are not in it.
 
     An instance with a ``group`` of its own stays there. Instances with different hosts or interpreters never share a
-    node, nor do two of an FMU that allows one instance per process.
+    node, nor do two that cannot share a process (`fmu_mesh.system.process_sharing`).
 
     Args:
         config: the configuration, whatever its own ``group`` says.
         edges: (source instance, target instance) of every connection.
-        descriptions: model descriptions by instance name.
+        claims: what the instances claim of a process.
     """
     position = {name: place for place, name in enumerate(config.instances)}
     taken = {*config.instances, *(instance.group for instance in config.instances.values() if instance.group)}
     nodes: dict[str, str] = {}
     cycles = [sorted(part, key=position.__getitem__) for part in strongly_connected(config.instances, edges)]
     for cycle in sorted(cycles, key=lambda members: position[members[0]]):
-        for members in _together(config, [n for n in cycle if config.instances[n].group is None], descriptions):
+        for members in _together(config, [n for n in cycle if config.instances[n].group is None], claims):
             if len(members) > 1:
                 name = _free_name(members[0], taken)
                 taken.add(name)
@@ -44,21 +43,17 @@ def automatic_nodes(
     return nodes
 
 
-def _together(
-    config: Config, cycle: Sequence[str], descriptions: Mapping[str, ModelDescription]
-) -> Iterable[list[str]]:
-    """The members of a cycle in as few nodes as hosts and FMUs allow."""
-    parts: list[tuple[tuple[str | None, str | None], set[str], list[str]]] = []
+def _together(config: Config, cycle: Sequence[str], claims: ClaimsOf) -> Iterable[list[str]]:
+    """The members of a cycle in as few nodes as hosts, interpreters and claims allow."""
+    parts: list[tuple[tuple[str | None, str | None], SharedProcess, list[str]]] = []
     for name in cycle:
-        section, description = config.instances[name], descriptions[name]
-        where = (section.host, section.interpreter)
-        guid = description.guid if description.only_once_per_process else ""
-        part = next((part for part in parts if part[0] == where and guid not in part[1]), None)
+        where = (config.instances[name].host, config.instances[name].interpreter)
+        own = partial(claims, name)
+        part = next((part for part in parts if part[0] == where and part[1].refusal(name, own) is None), None)
         if part is None:
-            part = (where, set(), [])
+            part = (where, SharedProcess(), [])
+            part[1].refusal(name, own)
             parts.append(part)
-        if guid:
-            part[1].add(guid)
         part[2].append(name)
     return [members for _, _, members in parts]
 

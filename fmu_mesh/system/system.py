@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
+from functools import partial
 
 import msgspec
 from msgspec.structs import replace
@@ -29,6 +30,7 @@ from fmu_mesh.system.couplings import coupled_connections
 from fmu_mesh.system.grouping import automatic_nodes
 from fmu_mesh.system.linear_inputs import check_extrapolation
 from fmu_mesh.system.records import RecordPlan, record_warnings, resolve_records, union_of
+from fmu_mesh.system.process_sharing import ClaimsOf, SharedProcess
 from fmu_mesh.system.scenario import ResolvedScenario, Scenario, ScenarioInput, resolve_scenario
 from fmu_mesh.system.schedule import Schedule
 from fmu_mesh.system.start_values import forbidden_start_values, resolve_start_values, sized
@@ -104,6 +106,7 @@ def build(
     descriptions: Mapping[str, ModelDescription],
     findings: Iterable[Finding] = (),
     scenario: Scenario | None = None,
+    claims: ClaimsOf = lambda _name: {},
 ) -> ResolvedSystem:
     """Resolve every name of a configuration.
 
@@ -113,6 +116,7 @@ def build(
             then ``findings`` must say why, and checks that need it are left out.
         findings: earlier findings; the error has them, too.
         scenario: the scenario, if there is one.
+        claims: what an instance claims of its process.
 
     Raises:
         ConfigurationError: there are findings; it has all of them.
@@ -129,7 +133,7 @@ def build(
     grid = _grid(config, collected)
     instances = _instances(loaded, descriptions, collected)
     forbidden_start_values(config, descriptions, collected, strict=True)
-    _check_nodes(config, descriptions, collected)
+    _check_nodes(config, descriptions, claims, collected)
     connections = resolve_connections(config.connections, variables, collected)
     check_extrapolation(connections, config.instances, descriptions, collected)
     connections += coupled_connections(config, variables, connections, collected)
@@ -143,7 +147,7 @@ def build(
     collected.raise_any()
     if config.group == "auto":
         edges = [(c.source_instance, c.target_instance) for c in connections if not c.initial_only]
-        nodes = automatic_nodes(config, edges, descriptions)
+        nodes = automatic_nodes(config, edges, claims)
         instances = {name: replace(own, node=nodes.get(name, own.node)) for name, own in instances.items()}
     instances = {name: _with_scenario(own, prescribed) for name, own in instances.items()}
     warnings = loaded.findings()
@@ -260,11 +264,13 @@ def _step_points(name: str, config: InstanceSection, base: float, findings: Find
     return points
 
 
-def _check_nodes(config: Config, descriptions: Mapping[str, ModelDescription], findings: Findings) -> None:
+def _check_nodes(
+    config: Config, descriptions: Mapping[str, ModelDescription], claims: ClaimsOf, findings: Findings
+) -> None:
     """Check that the instances of each group can share one node."""
     first_of: dict[str, str] = {}
     first_with_code: dict[str, str] = {}
-    only_once: dict[tuple[str, str], str] = {}
+    processes: dict[str, SharedProcess] = {}
     for name, instance in config.instances.items():
         group = instance.group
         if group is None:
@@ -288,12 +294,10 @@ def _check_nodes(config: Config, descriptions: Mapping[str, ModelDescription], f
                 )
                 expected = f"one interpreter for all components of the group '{group}'"
                 findings.add(f"instances.{name}.interpreter", found, expected)
-        description = descriptions.get(name)
-        if description is not None and description.only_once_per_process:
-            other = only_once.setdefault((group, description.guid), name)
-            if other != name:
-                found = f"'{name}' in one process with '{other}'"
-                findings.add(path, found, "different groups: this FMU allows one instance per process")
+        if name in descriptions:
+            process = processes.setdefault(group, SharedProcess())
+            if (why := process.refusal(name, partial(claims, name))) is not None:
+                findings.add(path, why, "different groups")
 
 
 def _doubts(config: Config, descriptions: Mapping[str, ModelDescription], findings: Findings) -> None:

@@ -7,14 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from msgspec.structs import replace
 
 from fmu_mesh.api.plan_page import plan_page
 from fmu_mesh.instances.configuration import load
 from fmu_mesh.run.preparing import prepare
 from fmu_mesh.system.grouping import automatic_nodes
 from fmu_mesh.system.plan import RECORDER, Plan
-from fmu_mesh.variables.model_description import ModelDescription
 from tests.helpers import Place, rows_of, write_config
 
 ADDER = {"fmu": "Adder"}
@@ -81,7 +79,7 @@ def groups_section(plan: Plan) -> list[str]:
     return [line.strip() for line in page[start : page.index("", start)]]
 
 
-APART = "groups, hosts, or FMUs that allow one instance per process keep them apart"
+APART = "groups, hosts, or what cannot share a process keep them apart"
 
 
 def over(nodes: int) -> str:
@@ -153,13 +151,10 @@ def test_the_name_of_a_node_collides_with_no_other(tmp_path: Path) -> None:
 
 def test_two_instances_of_an_fmu_that_allows_one_per_process_get_two_nodes(tmp_path: Path) -> None:
     plan = prepare(written(tmp_path))
-    descriptions: dict[str, ModelDescription] = {
-        name: replace(own.description, only_once_per_process=own.description.model_name == "Integrator")
-        for name, own in plan.system.instances.items()
-    }
+    once = {name for name, own in plan.system.instances.items() if own.description.model_name == "Integrator"}
     edges = [(c.source_instance, c.target_instance) for c in plan.connections]
 
-    nodes = automatic_nodes(load(written(tmp_path)).config, edges, descriptions)
+    nodes = automatic_nodes(load(written(tmp_path)).config, edges, lambda name: {"once": ""} if name in once else {})
 
     assert nodes == {"sum": "sum-cycle", "loop": "sum-cycle", "position": "position-cycle", "brake": "position-cycle"}
 

@@ -462,14 +462,14 @@ def test_a_group_may_have_the_name_of_an_instance_inside_it() -> None:
 
 
 @pytest.mark.parametrize("group", ["g", "h"])
-def test_an_fmu_for_one_instance_per_process_is_once_in_a_group(group: str) -> None:
+def test_instances_that_cannot_share_a_process_cannot_share_a_group(group: str) -> None:
     loaded = parse(text(pendulum="fmu: a.fmu, group: g", delay=f"fmu: a.fmu, group: {group}"), FILE)
-    model = description(only_once=True)
+    models = dict.fromkeys(("pendulum", "delay"), description())
     if group == "h":
-        assert len(build(loaded, {"pendulum": model, "delay": model}).instances) == 2
+        assert len(build(loaded, models, claims=lambda _name: {"why": ""}).instances) == 2
         return
-    with pytest.raises(ConfigurationError, match=r"instances\.delay\.group: 'delay' in one process with 'pendulum'"):
-        build(loaded, {"pendulum": model, "delay": model})
+    with pytest.raises(ConfigurationError, match=r"group: 'pendulum' and 'delay' cannot run in one process: why"):
+        build(loaded, models, claims=lambda _name: {"why": ""})
 
 
 def test_mesh_is_no_instance_name() -> None:

@@ -18,6 +18,7 @@ from ...config.findings import Findings
 from ...config.instance_sections import KIND, Group, Host, InstanceSection, StartValues, StepSize
 from ...config.mesh import LimitsConfig
 from ...errors import LoadFailed
+from ...system.process_sharing import Claims
 from ...variables.model_description import ModelDescription
 from ..contract import Instance, Kind, Opening
 from .step_options import SolverSettings, StepOptions
@@ -180,6 +181,16 @@ class FmuKind(Kind[FmuConfig]):
         from .archive.archive import content_of  # noqa: PLC0415  as above
 
         return content_of(path)
+
+    def claims(self, path: Path, section: FmuConfig, description: ModelDescription, limits: LimitsConfig) -> Claims:
+        """What the libraries of the FMU have that a process has only once; nothing of those that are compiled here."""
+        from .archive.archive import Terms, opened  # noqa: PLC0415  as above
+        from .archive.process_claims import claims_of  # noqa: PLC0415  as above
+
+        if description.library is None:
+            return {}
+        with opened(path, Terms(limits, section.sha256)) as fmu:
+            return claims_of(fmu, description.library)
 
     def preload(self) -> None:
         """Import FMPy, and all that calls FMUs."""

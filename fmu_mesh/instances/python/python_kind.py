@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable
+from importlib.machinery import EXTENSION_SUFFIXES
 from pathlib import Path
 
 from ...config.mesh import LimitsConfig
+from ...files import sha256_of
+from ...system.process_sharing import BOTH_USE_PYTHON, Claims
 from ...variables.model_description import ModelDescription
 from ..contract import Instance, Kind, Opening
 from .python_section import PythonConfig
@@ -35,6 +38,21 @@ class PythonKind(Kind[PythonConfig]):
     def content(self, path: Path) -> str:
         """A SHA-256 of the file; empty for a module, whose content is in the description."""
         return hashlib.sha256(path.read_bytes()).hexdigest() if path != Path() else ""
+
+    def claims(
+        self,
+        path: Path,
+        section: PythonConfig,  # noqa: ARG002  the file says everything
+        description: ModelDescription,  # noqa: ARG002  as above
+        limits: LimitsConfig,  # noqa: ARG002  for FMUs
+    ) -> Claims:
+        """The interpreter, and the modules of its folder that cannot be imported for one instance alone."""
+        claims: dict[str, str] = {BOTH_USE_PYTHON: "components"}
+        for file in path.parent.iterdir() if path != Path() else ():
+            if file.name.endswith((*EXTENSION_SUFFIXES, ".pyc")):
+                name = file.name.partition(".")[0]
+                claims[f"both may import a module '{name}', of which a process has one"] = sha256_of(file)
+        return claims
 
     def open(self, opening: Opening[PythonConfig]) -> Instance:
         """Import the class in this process, and make a component."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import struct
 from io import BytesIO
-from typing import IO, Any, Final
+from typing import IO, Any, Final, NamedTuple
 
 import msgspec
 import numpy as np
@@ -20,6 +20,8 @@ __all__ = ["SharedLibrary", "libraries_beside", "read_shared_library"]
 
 _GNU_UNIQUE: Final = 10
 """The binding STB_GNU_UNIQUE."""
+_WRITABLE: Final = 2
+"""The flag PF_W of a segment."""
 _SYMBOL: Final = np.dtype(
     [("name", "<u4"), ("info", "u1"), ("other", "u1"), ("section", "<u2"), ("value", "<u8"), ("size", "<u8")]
 )
@@ -35,7 +37,8 @@ class SharedLibrary(msgspec.Struct, frozen=True):
         needed: the names of the libraries that it needs.
         run_paths: the folders that it looks for them in, as written (`$ORIGIN` is its own folder).
         imports: the functions and variables that others have to define.
-        unique: the symbols that exist once in a process, whoever loads them and however (STB_GNU_UNIQUE).
+        unique: the symbols that exist once in a process, whoever loads them and however (STB_GNU_UNIQUE): the bytes
+            of a constant, None for a variable.
         machine: two bytes of its header that tell processors apart: the class and the machine.
         versions: the versions of its symbols, such as `GLIBC_2.38` for the library of C.
         needed_versions: the versions that it needs, by the names of libraries.
@@ -46,7 +49,7 @@ class SharedLibrary(msgspec.Struct, frozen=True):
     needed: tuple[str, ...] = ()
     run_paths: tuple[str, ...] = ()
     imports: frozenset[str] = frozenset()
-    unique: frozenset[str] = frozenset()
+    unique: dict[str, bytes | None] = {}
     machine: bytes = b""
     versions: frozenset[str] = frozenset()
     needed_versions: dict[str, frozenset[str]] = {}
@@ -75,6 +78,7 @@ def read_shared_library(content: bytes) -> SharedLibrary | None:
         tags = list(dynamic.iter_tags())
         symbols = _symbols(file, dynamic)
         versions, needed_versions = _versions(elf)
+        constants = [part.header for part in elf.iter_segments("PT_LOAD") if not part.header.p_flags & _WRITABLE]
     # Files of other people: pyelftools raises what the damage provokes.
     except (ELFError, ArithmeticError, AttributeError, LookupError, MemoryError, TypeError, ValueError, struct.error):
         return None
@@ -88,8 +92,12 @@ def read_shared_library(content: bytes) -> SharedLibrary | None:
             if tag.entry.d_tag in ("DT_RPATH", "DT_RUNPATH")
             for folder in (tag.rpath if tag.entry.d_tag == "DT_RPATH" else tag.runpath).split(":")
         ),
-        imports=frozenset(name for name, _, undefined in symbols if undefined and name),
-        unique=frozenset(name for name, binding, undefined in symbols if binding == _GNU_UNIQUE and not undefined),
+        imports=frozenset(symbol.name for symbol in symbols if symbol.undefined and symbol.name),
+        unique={
+            symbol.name: _constant(symbol, constants, content)
+            for symbol in symbols
+            if symbol.binding == _GNU_UNIQUE and not symbol.undefined
+        },
         machine=content[4:20:14],
         versions=versions,
         needed_versions=needed_versions,
@@ -108,8 +116,16 @@ def _versions(elf: Any) -> tuple[frozenset[str], dict[str, frozenset[str]]]:  # 
     )
 
 
-def _symbols(file: IO[bytes], dynamic: Any) -> list[tuple[str, int, bool]]:  # noqa: ANN401 its type has no tags
-    """Name, binding and whether it is undefined, of each dynamic symbol; pyelftools takes 100 us for one of them."""
+class _Symbol(NamedTuple):
+    name: str
+    binding: int
+    undefined: bool
+    value: int
+    size: int
+
+
+def _symbols(file: IO[bytes], dynamic: Any) -> list[_Symbol]:  # noqa: ANN401 its type has no tags
+    """The dynamic symbols; pyelftools takes 100 us for one of them."""
     _, place = dynamic.get_table_offset("DT_SYMTAB")
     _, names_place = dynamic.get_table_offset("DT_STRTAB")
     count, names_size = dynamic.num_symbols(), next(dynamic.iter_tags("DT_STRSZ")).entry.d_val
@@ -118,6 +134,15 @@ def _symbols(file: IO[bytes], dynamic: Any) -> list[tuple[str, int, bool]]:  # n
     file.seek(names_place)
     names = file.read(names_size)
     return [
-        (names[start : names.index(b"\0", start)].decode(errors="replace"), info >> 4, section == 0)
-        for start, info, section in zip(*(table[key].tolist() for key in ("name", "info", "section")), strict=True)
+        _Symbol(names[start : names.index(b"\0", start)].decode(errors="replace"), info >> 4, section == 0, value, size)
+        for start, info, _, section, value, size in table.tolist()
     ]
+
+
+def _constant(symbol: _Symbol, segments: list[Any], content: bytes) -> bytes | None:
+    """The bytes of a symbol, if it is in one of these segments."""
+    for segment in segments:
+        start = symbol.value - segment.p_vaddr
+        if 0 <= start < segment.p_filesz:
+            return content[segment.p_offset + start : segment.p_offset + start + symbol.size]
+    return None

@@ -56,7 +56,8 @@ _FLAGS_OF_C: Final = (
     "-Wno-error=incompatible-pointer-types",
     "-Wno-error=implicit-int",
 )
-_FLAGS_OF_CPP: Final = ("-fno-gnu-unique",)  # its variables are its own, also of templates and of inline functions
+_OWN_VARIABLES: Final = "-fno-gnu-unique"
+"""For g++: variables of templates and of inline functions belong to the FMU. With clang++ they do, and it has no such flag."""
 # -Bsymbolic: calls go to the FMU's own functions, even if the C library or Python has one with the same name.
 _LINK_FLAGS: Final = ("-shared", "-Wl,--no-undefined", "-Wl,-Bsymbolic", "-lm", "-ldl", "-lpthread")
 
@@ -246,7 +247,7 @@ def _compiled(path: Path, sources: Path, build: _Build, tell: Callable[[str], No
     """The library of these sources: that in the cache, or a new one."""
     plus = any(not name.endswith(".c") for name in build.sources)
     compiler = _compiler(path, plus=plus)
-    own = [*compiler, *_FLAGS, *(_FLAGS_OF_CPP if plus else _FLAGS_OF_C), *build.options]
+    own = [*compiler, *_FLAGS, *(_flags_of_cpp(compiler) if plus else _FLAGS_OF_C), *build.options]
     target = cache_folder() / "sources" / _key(sources, build, own) / f"{build.identifier}{fmpy.sharedLibraryExtension}"
     if target.is_file():
         return target
@@ -295,6 +296,12 @@ def _prefixed(library: bytes) -> list[str]:
         return []
     own = sorted(name.decode() for name in names if name.startswith(prefix + b"fmi2"))
     return [f"-Wl,--defsym={name.removeprefix(prefix.decode())}={name}" for name in own]
+
+
+def _flags_of_cpp(compiler: Sequence[str]) -> list[str]:
+    asked = [*compiler, _OWN_VARIABLES, "-x", "c++", "-E", os.devnull]
+    done = subprocess.run(asked, stdin=subprocess.DEVNULL, capture_output=True, check=False, timeout=COMPILE_S)
+    return [_OWN_VARIABLES] if done.returncode == 0 else []
 
 
 def _run(path: Path, command: Sequence[str], folder: Path) -> None:

@@ -1,0 +1,64 @@
+"""Whether a plan can run in one process: asked by all that run it so, and by what can start processes instead."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+
+from ..errors import NotInOneProcess
+from ..instances.registry import claims
+from ..system.plan import Plan
+from ..system.process_sharing import Claims, ClaimsOf, SharedProcess
+from .child import is_other_python
+
+__all__ = ["OneProcess", "apart", "claims_in"]
+
+
+class OneProcess:
+    """A process that runs plans, one after another, and what it has loaded for them."""
+
+    def __init__(self) -> None:
+        self._process = SharedProcess()
+        self._members: set[tuple[str, str]] = set()
+
+    def check(self, plan: Plan, contents: Mapping[str, str]) -> None:
+        """Refuse what cannot run in this process; groups do not matter here.
+
+        Args:
+            plan: the plan.
+            contents: the SHA-256 of the model of each instance: what ran once can run again.
+
+        Raises:
+            NotInOneProcess: a component needs another Python, or two instances cannot share a process.
+        """
+        hint = "Run the mesh in processes: `fmu-mesh launch` without --local, `Mesh.run` with processes=True."
+        for node in plan.nodes.values():
+            if node.interpreter is not None and is_other_python(node.interpreter):
+                text = f"'{node.node}' needs the Python '{node.interpreter}', and this process is another one"
+                raise NotInOneProcess(text, hint=hint)
+        claims_of = claims_in(plan)
+        for name in plan.system.instances:
+            member = name, contents.get(name, "")
+            if member not in self._members:
+                if (why := self._process.refusal(name, partial(claims_of, name))) is not None:
+                    raise NotInOneProcess(why, hint=hint)
+                self._members.add(member)
+
+
+def apart(plan: Plan) -> list[str]:
+    """Why a plan cannot run in one process: a sentence for each instance that another one keeps out."""
+    process, claims_of = SharedProcess(), claims_in(plan)
+    refusals = (process.refusal(name, partial(claims_of, name)) for name in plan.system.instances)
+    return [why for why in refusals if why is not None]
+
+
+def claims_in(plan: Plan) -> ClaimsOf:
+    """What the instances of a plan claim of their process."""
+    system = plan.system
+
+    def claimed(name: str) -> Claims:
+        own = system.instances[name]
+        return claims(Path(own.fmu), system.config.instances[name], own.description, system.config.limits)
+
+    return claimed
