@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -164,3 +165,16 @@ def test_an_object_of_a_module_of_the_folder_can_be_pickled(tmp_path: Path) -> N
 
     with stepping(file) as (step,):
         assert step()
+
+
+@pytest.mark.parametrize("step", ["import os; os.chdir('/')", "return 0.0"])
+def test_a_module_that_may_change_the_process_is_known(tmp_path: Path, step: str) -> None:
+    file = folder_with(tmp_path / "a", 2.0, "import package.part", "return package.part.gain()")
+    (tmp_path / "a" / "package" / "part.py").write_text(f"def gain():\n    {step}\n", encoding="utf-8")
+
+    imported = ImportedComponent(file, class_place_of("component.py:C"))
+    imported.load()
+    mentions = imported.modules.mention(re.compile(rb"\bchdir\b"))
+    imported.close()
+
+    assert mentions == ("chdir" in step)

@@ -20,6 +20,7 @@ import builtins
 import importlib
 import inspect
 import itertools
+import re
 import sys
 from collections.abc import Mapping, Sequence
 from importlib.abc import Loader, MetaPathFinder
@@ -67,12 +68,20 @@ class OwnModules(MetaPathFinder):
         while self.lent:
             sys.modules.pop(self.lent.pop(), None)
 
+    def mention(self, words: re.Pattern[bytes]) -> bool:
+        """Whether one of the words is in the source of a module that is imported."""
+        files = [getattr(sys.modules[name], "__file__", None) for name in self._imported()]
+        return any(words.search(Path(file).read_bytes()) for file in files if file is not None)
+
+    def _imported(self) -> list[str]:
+        return [name for name in sys.modules if name.partition(".")[0].endswith(self._suffix)]
+
     def close(self) -> None:
         """Forget all modules of the instance. May be called twice."""
         self.forget_names()
         if self in sys.meta_path:
             sys.meta_path.remove(self)
-        for name in [name for name in sys.modules if name.partition(".")[0].endswith(self._suffix)]:
+        for name in self._imported():
             del sys.modules[name]
 
     def find_spec(

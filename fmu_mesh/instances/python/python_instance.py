@@ -7,6 +7,7 @@ What the code of the user raises ends the instance, with the line of that code i
 from __future__ import annotations
 
 import copy
+import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final, Literal, NamedTuple
 
@@ -29,6 +30,7 @@ __all__ = ["PythonInstance"]
 
 
 _ERRORS: Final = {"loading": LoadFailed, "initialization": InitializationFailed, "stepping": StepFailed}
+_CHANGING: Final = re.compile(rb"\b(f?chdir|setlocale|umask|environ|(un)?setenv|putenv|signal|pthread_sigmask)\b")
 
 
 class _State(NamedTuple):
@@ -75,6 +77,11 @@ class PythonInstance:
         self._step_component = self._component.step
         self._lent = self._imported.modules.lent
         self._values: dict[str, Any] = vars(self._component)
+
+    @property
+    def changes_process(self) -> bool:
+        """Whether its code may change the state of the process in a step, such as the working directory."""
+        return self._imported.modules.mention(_CHANGING)
 
     @property
     def description(self) -> ModelDescription:
