@@ -57,7 +57,7 @@ _FLAGS_OF_C: Final = (
     "-Wno-error=implicit-int",
 )
 _OWN_VARIABLES: Final = "-fno-gnu-unique"
-"""For g++: variables of templates and of inline functions belong to the FMU. With clang++ they do, and it has no such flag."""
+"""For g++: variables of templates and inline functions belong to the FMU, as they do with clang++, without a flag."""
 # -Bsymbolic: calls go to the FMU's own functions, even if the C library or Python has one with the same name.
 _LINK_FLAGS: Final = ("-shared", "-Wl,--no-undefined", "-Wl,-Bsymbolic", "-lm", "-ldl", "-lpthread")
 
