@@ -11,14 +11,20 @@ from ..config.instance_sections import InstanceSection
 from ..variables.model_description import ModelDescription
 from .connections import Connection
 
-__all__ = ["LinearInput", "check_extrapolation", "linear_inputs"]
+__all__ = ["LinearInput", "check_extrapolation"]
 
 
 class LinearInput(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """An input that changes linearly within a step, and the delay of its connection (0 or 1)."""
+    """An input that changes linearly within a step.
+
+    Attributes:
+        delay: that of its connection: 0 or 1.
+        source_points: base points per step of its source.
+    """
 
     name: str
     delay: int
+    source_points: int = 1
 
 
 def check_extrapolation(
@@ -35,15 +41,6 @@ def check_extrapolation(
             if reason is not None:
                 found = f"linear for {connection}, but {reason}"
                 findings.add(f"{connection.path}.extrapolation", found, "hold")
-
-
-def linear_inputs(connections: Sequence[Connection], name: str) -> tuple[LinearInput, ...]:
-    """The linear inputs of an instance. The delays of all connections must be known."""
-    return tuple(
-        LinearInput(connection.target.name, connection.delay or 0)
-        for connection in connections
-        if connection.target_instance == name and connection.extrapolation == "linear"
-    )
 
 
 def _cannot_extrapolate(connection: Connection, description: ModelDescription, *, retries: bool) -> str | None:

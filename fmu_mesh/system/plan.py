@@ -21,7 +21,7 @@ from .execution_order import execution_order
 from .feeds import Feed, feeds_of
 from .initialization_plan import InitializationPlan, Loop, check_loops, plan_initialization
 from .layout import Layout, row_bytes, rows_for
-from .linear_inputs import LinearInput, linear_inputs
+from .linear_inputs import LinearInput
 from .memory_map import MASTER, RECORDER, MemoryMap, RingPlace, map_memory
 from .records import RecordPlan, union_of
 from .schedule import Schedule, row_of
@@ -348,7 +348,11 @@ def _instance_plan(plan: Plan, instance: SystemInstance, outputs: Layout) -> Ins
         feeds=feeds_of(stepped),
         initialization={variable: level for (owner, variable), level in levels.items() if owner == instance.name},
         section=placed(plan.system.config.instances[instance.name]),
-        linear_inputs=linear_inputs(plan.connections, instance.name),
+        linear_inputs=tuple(
+            LinearInput(c.target.name, c.delay or 0, plan.system.instances[c.source_instance].step_points)
+            for c in stepped
+            if c.extrapolation == "linear"
+        ),
         scenario=instance.scenario,
         row=row_of(instance.description, instance.scenario, connected),
         parameters=feeds_of(initial),

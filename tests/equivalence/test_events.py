@@ -83,6 +83,7 @@ def test_linear_inputs_give_the_same_floats(algorithm: str, place: Place, event_
     kinds: Kinds = {**ALL_3, "integral": (2, "co_simulation")}
     content = system(event_fmu, kinds, extrapolation="linear")
     content["simulation"] |= {"algorithm": algorithm, "window": 7}
+    content["instances"]["ball"]["step_size"] = 0.03  # a line over three steps of its target
 
     launched, local = both_ways(place, content)
 

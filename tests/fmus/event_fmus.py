@@ -70,6 +70,7 @@ MODELS = {
             Var("e", "tunable", 0.7),
             Var("last_bounce", output=True, continuous=False),
             Var("z"),
+            Var("u", "continuous", 0.0),
         ),
         integers=(Var("bounces", output=True), Var("events"), Var("completed_steps"), Var("resting")),
     ),

@@ -204,7 +204,7 @@ def test_a_call_about_a_state_has_a_deadline() -> None:
 
 @pytest.mark.parametrize("row", [(b"\x00\xff",), (["text", ""],), ([b"\x00", b"bytes"],)])
 def test_the_inputs_of_the_last_event_come_back_as_they_were(row: tuple[Any, ...]) -> None:
-    kept = Bookkeeping(3, 0.1, row=row, ticks=(None, 2.0), is_linear=True)
+    kept = Bookkeeping(3, 0.1, row=row, ticks=(None, 2.0))
 
     assert unpacked(packed(kept, b"of the FMU"), Bookkeeping, "m") == (kept, b"of the FMU")
 
@@ -220,8 +220,9 @@ def linear(fmu: Path, folder: Path, ring: Ring) -> tuple[FmuInstance, Any]:
     return inner, instance
 
 
-def test_a_line_that_began_after_a_state_is_forgotten_with_it(event_fmu: EventFmu, tmp_path: Path) -> None:
-    fmu = event_fmu("Integral", 2)
+@pytest.mark.parametrize("model", ["Integral", "Oscillator", "Ball"])
+def test_a_line_that_began_after_a_state_is_forgotten_with_it(model: str, event_fmu: EventFmu, tmp_path: Path) -> None:
+    fmu = event_fmu(model, 2)
     ring = Ring(Layout.of(read_description(fmu).with_causality("input")), 32)
     for row in range(32):
         ring.put(row, "u", 1.0 if row < 8 else math.sin(row))

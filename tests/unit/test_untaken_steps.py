@@ -16,6 +16,7 @@ from fmu_mesh.instances.fmi.co_simulation.extrapolation import TakesDerivatives
 from fmu_mesh.instances.fmi.step_options import StepOptions
 from fmu_mesh.rings.ring import Ring
 from fmu_mesh.simtime import TimeGrid
+from fmu_mesh.system.coupling_rule import CouplingRule
 from fmu_mesh.system.layout import Layout
 from fmu_mesh.system.linear_inputs import LinearInput
 from tests.fmus.helpers import find_fmu
@@ -165,6 +166,37 @@ def test_an_input_is_linear_within_a_step(
     # Of delay 0 a row is the value at the end of its step; of delay 1 that at its start, from where it goes on.
     expected = [0.0, 0.5, 1.0, 1.5] if delay == 0 else [0.0, 1.0, 1.5, 2.0]
     assert [outputs.value(step, "y") for step in range(1, 5)] == [sign * value for value in expected]
+
+
+@pytest.mark.parametrize(
+    ("delay", "source_points", "points", "expected"),
+    [
+        (1, 4, 1, [0.0, 0.0, 0.0, 0.0, 1.25, 1.5, 1.75, 2.0, 2.25]),
+        (0, 4, 1, [0.0, 0.0, 0.0, 1.0, 1.25, 1.5, 1.75, 2.0, 2.25]),
+        (1, 2, 3, [0.0, 3.0, 4.5, 6.0]),
+        (0, 2, 3, [1.5, 3.0, 4.5, 6.0]),
+        (1, 1, 4, [0.0, 8.0, 12.0]),
+        (0, 1, 4, [4.0, 8.0, 12.0]),
+    ],
+)
+def test_a_line_follows_the_steps_of_its_source(
+    delay: int, source_points: int, points: int, expected: list[float], steps: Steps, tmp_path: Path
+) -> None:
+    options = StepOptions(linear_inputs=(LinearInput("u", delay, source_points),))
+    rule = CouplingRule(delay, source_points, points)
+    inputs, outputs = Ring(Layout.of([("u", "Float64")]), 1), Ring(Layout.of([("y", "Float64")]), 1)
+    found = []
+    with closing(open_instance(steps(2), "m", read_description(steps(2)), tmp_path, options=options)) as inner:
+        instance = stepped(inner, options)
+        instance.enter_initialization(0.0, None, {})
+        instance.exit_initialization()
+        instance.bind(inputs, (outputs,), TimeGrid(0.0, 0.25, 100), points)
+        for step in range(len(expected)):
+            inputs.put(0, "u", float(rule.row_for(step)))  # the source grows by 1 in each of its own steps
+            instance.do_step(step)
+            found.append(outputs.value(0, "y"))
+
+    assert found == expected
 
 
 @pytest.mark.parametrize("version", VERSIONS)

@@ -24,10 +24,11 @@ from ..call_guard import call_named, doing
 from .buffers import Buffer
 from .calls import Function, Pointer, RowPointers, address_of, cffi_function, memory
 
-__all__ = ["FATAL", "OK", "WARNING", "FmuValues", "PartCall", "Verb", "status_name"]
+__all__ = ["DISCARD", "FATAL", "OK", "WARNING", "FmuValues", "PartCall", "Verb", "status_name"]
 
 OK: Final = 0
 WARNING: Final = 1
+DISCARD: Final = 2
 FATAL: Final = 4
 _STATUS_NAMES: Final = ("ok", "warning", "discard", "error", "fatal", "pending")
 

@@ -28,10 +28,9 @@ class Bookkeeping(msgspec.Struct, frozen=True):
         step: own steps done; -1 in or before Initialization Mode.
         time: the time of the FMU in s, where it does not follow from the step.
         next_event: time of its next time event in s; None if there is none.
-        row: the inputs of its last event mode.
+        row: its held inputs.
         ticks: the clocks; see `Clocks.place`.
         last_event: time of its last event mode in s, where the steps depend on it; None if there was none.
-        is_linear: whether inputs changed within its last step.
     """
 
     step: int
@@ -40,7 +39,6 @@ class Bookkeeping(msgspec.Struct, frozen=True):
     row: tuple[bytes | list[Any], ...] = ()
     ticks: tuple[float | None, ...] = ()
     last_event: float | None = None
-    is_linear: bool = False
 
 
 class FmuState(NamedTuple):

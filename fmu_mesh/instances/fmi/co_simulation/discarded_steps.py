@@ -15,10 +15,9 @@ from fmpy.fmi1 import FMICallException
 
 from ....simtime import step_within
 from ..calls import Function, Pointer
-from ..fmu_values import WARNING
+from ..fmu_values import DISCARD, WARNING
 
 __all__ = [
-    "DISCARD",
     "PENDING",
     "RETRY",
     "SMALLER_STEPS",
@@ -29,7 +28,6 @@ __all__ = [
     "take_sub_steps",
 ]
 
-DISCARD: Final = 2
 PENDING: Final = 5
 SMALLEST: Final = 1024
 """The smallest sub-step is this part of the communication step; if it is discarded, the step fails."""

@@ -1,18 +1,17 @@
 """Inputs that change linearly within a communication step (`extrapolation: linear` of a connection).
 
-Owns the derivative of an input. It follows from two neighbouring rows only, so it is the same in every process. A
-connection with delay 1 gives the value at the start of a step: the input is extrapolated with the derivative of the
-step before. A connection with delay 0 gives the value at the end: the input is interpolated. `TakesDerivatives` says
-how an FMU gets a derivative.
+Owns the line of an input: the one through the last two rows of its source that the instance has got, at the points to
+which they belong. It follows from rows and points only, so it is the same in every process. A connection with delay 1
+gives a row of the start of a step or earlier: the input is extrapolated. One with delay 0 gives the row of the end of
+a step, if the source has one there: the input is interpolated. `TakesDerivatives` says how an FMU gets a derivative.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol, cast
 
 import msgspec
-import numpy as np
 
 from ....rings.ring import Ring
 from ....simtime import TimeGrid
@@ -27,8 +26,13 @@ __all__ = ["LinearInputs", "TakesDerivatives"]
 class TakesDerivatives(Instance, KeepsState, Protocol):
     """An instance of an FMU whose Real inputs may change linearly within a step."""
 
-    def set_input_derivatives(self, derivatives: Mapping[str, float]) -> None:
-        """Time derivatives (1/s) of inputs for the next step; see FMI 2.0, 4.2.1, fmi2SetRealInputDerivatives."""
+    def set_input_derivatives(self, derivatives: Mapping[str, float], *, continuous: bool = False) -> None:
+        """Set the slopes of inputs within the next step (FMI 2.0, 4.2.1, fmi2SetRealInputDerivatives).
+
+        Args:
+            derivatives: time derivatives in 1/s.
+            continuous: whether no input jumps at the start of the step, apart from the error of an extrapolation.
+        """
         ...
 
     def remove_files(self) -> None:
@@ -46,14 +50,13 @@ class LinearInputs(AroundInstance[TakesDerivatives]):
 
     def __init__(self, instance: TakesDerivatives, inputs: Sequence[LinearInput]) -> None:
         super().__init__(instance)
-        self._names = [item.name for item in inputs]
-        self._at_end = np.array([item.delay == 0 for item in inputs])
-        self._previous: np.ndarray[Any, np.dtype[np.float64]] = np.zeros(0)
-        self._stepped = False
+        self._inputs = inputs
+        self._lines: list[_Line] = []
         self._outer = Ring(Layout(), 1)
         self._inner = self._outer
-        self._columns = np.zeros(0, dtype=np.intp)
-        self._step_size = 0.0
+        self._columns: list[int] = []
+        self._points = 1
+        self._base_step_size = 0.0
 
     def remove_files(self) -> None:
         """See `KeepsFiles`."""
@@ -61,13 +64,15 @@ class LinearInputs(AroundInstance[TakesDerivatives]):
 
     def bind(self, inputs: Ring, outputs: Sequence[Ring], grid: TimeGrid, points: int, step: int = 0) -> None:
         """See `Instance`."""
-        if not self._previous.size:
+        names = [item.name for item in self._inputs]
+        if not self._lines:
             # Before the first step, the FMU has the inputs of Initialization Mode.
-            self._previous = np.array(self._instance.get_values(self._names), dtype=np.float64)
+            values = cast("list[float]", self._instance.get_values(names))  # only Float64 is linear
+            self._lines = [_Line(value) for value in values]
         self._outer = inputs
         self._inner = Ring(inputs.layout, 1)
-        self._columns = np.array([inputs.layout.place(name).first for name in self._names])
-        self._step_size = points * grid.step_size
+        self._columns = [inputs.layout.place(name).first for name in names]
+        self._points, self._base_step_size = points, grid.step_size
         self._instance.bind(self._inner, outputs, grid, points, step)
 
     def do_step(self, step: int) -> None:
@@ -75,27 +80,32 @@ class LinearInputs(AroundInstance[TakesDerivatives]):
         slot = step & self._outer.mask
         for own, part in zip(self._inner.parts, self._outer.parts, strict=True):
             own[0] = part[slot]
-        reals = self._inner.part("Float64")
-        given, previous = reals[0, self._columns], self._previous
-        slopes = (given - previous) / self._step_size
-        if not self._stepped:
-            slopes[~self._at_end] = 0.0  # there is no step before that has a derivative
-            self._stepped = True
-        reals[0, self._columns] = np.where(self._at_end, previous, given)
-        self._previous = given
-        self._instance.set_input_derivatives(dict(zip(self._names, slopes.tolist(), strict=True)))
+        row = self._inner.part("Float64")[0]
+        begin = step * self._points
+        continuous = True
+        slopes = {}
+        for number, item in enumerate(self._inputs):
+            column, before = self._columns[number], self._lines[number]
+            latest = begin if item.delay else begin + self._points
+            line = before.through(float(row[column]), latest - latest % item.source_points)  # as in `CouplingRule`
+            row[column] = value = line.at(begin)
+            # An extrapolation of a smooth source is wrong by less than what it changes in a step of its own.
+            allowed = 0.5 * max(abs(before.change), abs(line.change))
+            continuous = continuous and abs(value - before.at(begin)) <= allowed
+            slopes[item.name] = line.change / (line.distance * self._base_step_size)
+            self._lines[number] = line
+        self._instance.set_input_derivatives(slopes, continuous=continuous)
         self._instance.do_step(step)
 
     def get_state(self) -> object:
         """See `KeepsState`."""
-        return _LinearState(super().get_state(), _Slopes(self._previous.tolist(), self._stepped))
+        return _LinearState(super().get_state(), _Lines(tuple(self._lines)))
 
     def set_state(self, state: object) -> None:
         """See `KeepsState`."""
         own = of_kind(_LinearState, state)
         super().set_state(own.inner)
-        self._previous = np.array(own.slopes.previous, dtype=np.float64)
-        self._stepped = own.slopes.stepped
+        self._lines = [*own.own.lines]
 
     def free_state(self, state: object) -> None:
         """See `KeepsState`."""
@@ -104,7 +114,7 @@ class LinearInputs(AroundInstance[TakesDerivatives]):
     def serialize_state(self, state: object) -> bytes:
         """See `KeepsState`."""
         own = of_kind(_LinearState, state)
-        return packed(own.slopes, super().serialize_state(own.inner))
+        return packed(own.own, super().serialize_state(own.inner))
 
     def deserialize_state(self, data: bytes) -> object:
         """See `KeepsState`.
@@ -112,19 +122,44 @@ class LinearInputs(AroundInstance[TakesDerivatives]):
         Raises:
             FmuMeshError: ``data`` is no state of an instance with linear inputs.
         """
-        slopes, rest = unpacked(data, _Slopes, None)
-        return _LinearState(super().deserialize_state(rest), slopes)
+        lines, rest = unpacked(data, _Lines, None)
+        return _LinearState(super().deserialize_state(rest), lines)
 
 
-class _Slopes(msgspec.Struct, frozen=True):
-    """The slopes of the next step follow from this: the last values, and whether there was a step."""
+class _Line(msgspec.Struct, frozen=True):
+    """The line through the last two rows of a source.
 
-    previous: list[float]
-    stepped: bool
+    Attributes:
+        value: the last value.
+        point: the point of the last value.
+        change: the last value minus the one before; 0 as long as there is only one.
+        distance: points between the two.
+    """
+
+    value: float
+    point: int = 0
+    change: float = 0.0
+    distance: int = 1
+
+    def through(self, value: float, point: int) -> _Line:
+        """The line with the value of this point, which may be the last one again."""
+        if point == self.point:
+            return _Line(value, point, self.change, self.distance)
+        return _Line(value, point, value - self.value, point - self.point)
+
+    def at(self, point: int) -> float:
+        """The value at a point."""
+        return self.value + self.change * ((point - self.point) / self.distance)
+
+
+class _Lines(msgspec.Struct, frozen=True):
+    """Our own part of a state."""
+
+    lines: tuple[_Line, ...]
 
 
 class _LinearState(NamedTuple):
-    """A state of the inner instance, and the slopes."""
+    """A state of the inner instance, and the lines."""
 
     inner: object
-    slopes: _Slopes
+    own: _Lines

@@ -14,9 +14,9 @@ from ....rings.native import StepKind
 from ...call_guard import call_named
 from ..calls import cffi_function
 from ..fmi_versions import Fmi1Values
-from ..fmu_values import WARNING
+from ..fmu_values import DISCARD, WARNING
 from ..loaded_fmu import FmuFunctions
-from .discarded_steps import DISCARD, PENDING, SMALLER_STEPS, SMALLEST, StepStatus, discarded, take_sub_steps
+from .discarded_steps import PENDING, SMALLER_STEPS, SMALLEST, StepStatus, discarded, take_sub_steps
 from .native_instance import NativeInstance
 
 __all__ = ["Fmi1Instance"]
@@ -51,7 +51,12 @@ class Fmi1Instance(NativeInstance, Fmi1Values):
         if status > WARNING:
             self._finish(time, step_size, status)
 
-    def set_input_derivatives(self, derivatives: Mapping[str, float]) -> None:
+    def set_input_derivatives(
+        self,
+        derivatives: Mapping[str, float],
+        *,
+        continuous: bool = False,  # noqa: ARG002 for model exchange
+    ) -> None:
         """First time derivatives (1/s) of Real inputs for the next step (FMI 1.0 CS, 3.3)."""
         self._derivatives = derivatives  # the FMU gets them after the values of these inputs
 

@@ -14,11 +14,11 @@ from ....rings.native import StepKind
 from ....variables.value_types import Value
 from ..calls import cffi_function
 from ..fmi_versions import FMI2_NAMES, Fmi2Values
-from ..fmu_values import WARNING
+from ..fmu_values import DISCARD, WARNING
 from ..loaded_fmu import FmuFunctions
 from ..model_exchange.solver import resolvable
 from ..state import Bookkeeping
-from .discarded_steps import DISCARD, PENDING, RETRY, SMALLER_STEPS, SMALLEST, RetriedSteps, StepStatus, discarded
+from .discarded_steps import PENDING, RETRY, SMALLER_STEPS, SMALLEST, RetriedSteps, StepStatus, discarded
 from .native_instance import NativeInstance
 
 __all__ = ["Fmi2Instance"]
@@ -50,7 +50,12 @@ class Fmi2Instance(NativeInstance, Fmi2Values):
         if not self._terminated:
             super().set_values(values)
 
-    def set_input_derivatives(self, derivatives: Mapping[str, float]) -> None:
+    def set_input_derivatives(
+        self,
+        derivatives: Mapping[str, float],
+        *,
+        continuous: bool = False,  # noqa: ARG002 for model exchange
+    ) -> None:
         """First time derivatives (1/s) of Real inputs for the next step (FMI 2.0, 4.2.1)."""
         self._derivatives = derivatives  # the FMU gets them after the values of these inputs
 

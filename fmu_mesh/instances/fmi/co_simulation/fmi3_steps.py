@@ -24,9 +24,9 @@ from ....simtime import step_within
 from ....variables.model_description import ModelDescription
 from ..calls import Function, pointer
 from ..clocks import Clocks
-from ..fmu_values import WARNING
+from ..fmu_values import DISCARD, WARNING
 from ..model_exchange.solver import SolverFailed, resolvable
-from .discarded_steps import DISCARD, SMALLEST
+from .discarded_steps import SMALLEST
 
 __all__ = ["Fmi3Steps"]
 

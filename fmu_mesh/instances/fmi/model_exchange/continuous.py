@@ -1,7 +1,8 @@
 """A model-exchange FMU as an instance that is stepped like one for co-simulation.
 
-Owns inputs and outputs of a model: a changed input is an event at a communication point (FMI 2.0, 3.1), and within a
-step inputs are constant, or linear where a connection says so. The way from one communication point to the next is
+Owns inputs and outputs of a model: an input that jumps is an event at a communication point (FMI 2.0, 3.1). Within a
+step inputs are constant, or linear where a connection says so; where the next line goes on from there, there is no
+event. The way from one communication point to the next is
 `fmu_mesh.instances.fmi.model_exchange.model_exchange`; the versions of FMI are in `model_instances`.
 """
 
@@ -13,7 +14,9 @@ from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
 
+import numpy as np
 from fmpy.fmi1 import FMICallException
+from numpy.typing import NDArray
 
 from ....errors import TerminationRequested
 from ....rings.ring import Ring
@@ -41,9 +44,12 @@ class ContinuousInstance(FmuInstance):
     _inputs: Ring | None = None
     _clocks: Clocks = NO_CLOCKS
     _row: _RowBytes = ()
+    """The inputs of the last step that are held."""
+    _linear_columns: NDArray[np.intp] = np.zeros(0, dtype=np.intp)
+    """The columns of the other ones among those of type Float64."""
     _slopes: Mapping[str, float] = {}
-    _is_linear = False
-    """Whether inputs changed within the last step."""
+    _goes_on = False
+    """Whether the linear inputs begin where the last step has left them."""
     _time_of_start = 0.0
     _stop_time = math.inf
 
@@ -67,17 +73,17 @@ class ContinuousInstance(FmuInstance):
         self._advance(time + step_size)
 
     def set_values(self, values: Mapping[str, Value]) -> None:
-        """Set variables by name; between two steps that is an event."""
+        """Set variables by name; between two steps that is an event, if a value changes."""
         if self._state != "stepping":
             super().set_values(values)
             return
         loop, set_values = self._event_loop(), super().set_values
-        if not loop.terminated:
+        if not loop.terminated and repr(self.get_values(list(values))) != repr([*values.values()]):
             self._checked(lambda: loop.event(lambda: set_values(values)))
 
-    def set_input_derivatives(self, derivatives: Mapping[str, float]) -> None:
-        """Let inputs change linearly during the next step; derivatives in 1/s."""
-        self._slopes = derivatives
+    def set_input_derivatives(self, derivatives: Mapping[str, float], *, continuous: bool = False) -> None:
+        """See `TakesDerivatives`."""
+        self._slopes, self._goes_on = derivatives, continuous
 
     def bind(self, inputs: Ring, outputs: Sequence[Ring], grid: TimeGrid, points: int, step: int = 0) -> None:
         """See `Instance`."""
@@ -85,6 +91,8 @@ class ContinuousInstance(FmuInstance):
         if self._inputs is None and any(part.size for part in inputs.parts):
             self._row = (b"not set yet",)
         self._inputs = inputs
+        linear = [inputs.layout.place(item.name).first for item in self._options.linear_inputs]
+        self._linear_columns = np.array(linear, dtype=np.intp)
 
     def close(self) -> None:
         """See `Instance`."""
@@ -112,12 +120,11 @@ class ContinuousInstance(FmuInstance):
             next_event if math.isfinite(next_event) else None,
             self._row,
             self._clocks.place,
-            is_linear=self._is_linear,
         )
 
     def _restore(self, kept: Bookkeeping) -> None:
         super()._restore(kept)
-        self._row, self._is_linear = kept.row, kept.is_linear
+        self._row = kept.row
         self._clocks.resume(kept.ticks)
         next_event = math.inf if kept.next_event is None else kept.next_event
         self._checked(lambda: (self._loop or self._make_loop()).resume(kept.time or 0.0, next_event))
@@ -153,23 +160,36 @@ class ContinuousInstance(FmuInstance):
             raise TerminationRequested("the FMU asked to end the simulation", instance=self.name)
 
     def _take_inputs(self, step: int, time: float) -> None:
-        """Set the inputs of row ``step`` in event mode, if they have changed or change within a step."""
-        slot = step & self._input_mask
+        """Set the inputs of row ``step``: in event mode if a held one has changed, or a linear one jumps.
+
+        Linear inputs that go on are no event: they may be set in continuous-time mode (FMI 2.0, 3.2.1).
+        """
         loop = self._event_loop()
-        assert self._inputs is not None
-        row: _RowBytes = tuple(
-            part[slot].tolist() if part.dtype.hasobject else part[slot].tobytes() for part in self._inputs.parts
-        )
-        if loop.terminated or (row == self._row and not self._is_linear and not any(self._slopes.values())):
+        if loop.terminated:
             return
-        self._row = row
-        line = self._line(slot, time)
-        self._is_linear = line is not None
-        loop.set_inputs(lambda: self._set_inputs(step), line)
+        slot = step & self._input_mask
+        row, line = self._held(slot), self._line(slot, time)
+        if row != self._row or (line is not None and not self._goes_on):
+            self._row = row
+            loop.set_inputs(lambda: self._set_inputs(step), line)
+        elif line is not None:
+            loop.follow(line)
+
+    def _held(self, slot: int) -> _RowBytes:
+        """A row of inputs, with 0 in the place of the linear ones."""
+        assert self._inputs is not None
+        held: list[bytes | list[Any]] = []
+        for part, row in zip(self._inputs.layout.parts, self._inputs.parts, strict=True):
+            values = row[slot]
+            if part.type == "Float64" and self._linear_columns.size:
+                values = values.copy()
+                values[self._linear_columns] = 0.0
+            held.append(values.tolist() if row.dtype.hasobject else values.tobytes())
+        return tuple(held)
 
     def _line(self, slot: int, start: float) -> Callable[[float], None] | None:
-        """Sets the linear inputs at a time within the step that starts at ``start`` (s); None if no input changes."""
-        slopes = {name: slope for name, slope in self._slopes.items() if slope != 0.0}
+        """Sets the linear inputs at a time within the step that starts at ``start`` (s); None if there are none."""
+        slopes = self._slopes
         if not slopes:
             return None
         assert self._inputs is not None

@@ -18,6 +18,8 @@ import math
 from collections.abc import Callable
 from typing import Final
 
+import numpy as np
+
 from ..clocks import NO_CLOCKS, Clocks
 from ..step_options import SolverSettings
 from .cvode import CVodeSolver
@@ -93,6 +95,21 @@ class EventLoop:
         self.event(set_values)
         self._equations.follow(line)
 
+    def follow(self, line: Callable[[float], None]) -> None:
+        """Continue with inputs that change continuously: no event, and the solver goes on (FMI 2.0, 3.2.1).
+
+        If the small jump of an extrapolated input takes an event indicator over 0, that is an `event`.
+
+        Args:
+            line: see `set_inputs`.
+        """
+        above = self._above_zero()
+        line(self._time)
+        if self._above_zero() == above:
+            self._equations.follow(line)
+        else:
+            self.set_inputs(lambda: line(self._time), line)
+
     def advance(self, end: float) -> bool:
         """Advance to the time ``end`` in s; False if the FMU asked to end the simulation before."""
         while resolvable(self._time, end):
@@ -141,6 +158,13 @@ class EventLoop:
             self._count_events()
             self._calls.enter_event_mode()
             self._update()
+
+    def _above_zero(self) -> list[bool]:
+        """Whether each event indicator is above 0."""
+        indicators = np.zeros(self._calls.n_indicators)
+        if indicators.size:
+            self._calls.get_indicators(indicators.ctypes.data)
+        return [*(indicators > 0.0)]
 
     def _count_events(self) -> None:
         self._events_there = self._events_there + 1 if self._time == self._event_time else 0

@@ -1,13 +1,13 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * A bouncing ball: h' = v, v' = -g; where h becomes 0 the velocity is turned and multiplied by e, and below 0.05 m/s
+ * A bouncing ball: h' = v, v' = -g + u; where h becomes 0 the velocity is turned and multiplied by e, and below 0.05 m/s
  * the ball stays on the ground.
  */
 #include <float.h>
 
 #include "model.h"
 
-enum { H, V, DER_H, DER_V, G, E, LAST, Z };
+enum { H, V, DER_H, DER_V, G, E, LAST, Z, U };
 enum { BOUNCES, EVENTS, COMPLETED, RESTING };
 
 void model_start(Model *m)
@@ -22,7 +22,7 @@ void model_initialize(Model *m) { (void)m; }
 void model_equations(Model *m)
 {
     m->r[DER_H] = m->r[V];
-    m->r[DER_V] = m->i[RESTING] ? 0.0 : -m->r[G];
+    m->r[DER_V] = m->i[RESTING] ? 0.0 : -m->r[G] + m->r[U];
     m->r[Z] = m->r[H];
 }
 
