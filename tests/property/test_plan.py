@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from itertools import pairwise
 
@@ -11,7 +12,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fmu_mesh.instances.registry import decode_section
-from fmu_mesh.system.graph import cycle_through, feedback_edges, strongly_connected, topological_order
+from fmu_mesh.system.graph import (
+    cycle_through,
+    feedback_edges,
+    fewest_feedback_edges,
+    strongly_connected,
+    topological_order,
+)
 from fmu_mesh.system.plan import RECORDER, NodePlan
 from tests.property.test_random_systems import Drawn, planned, systems
 
@@ -90,6 +97,43 @@ def test_feedback_edges_leave_no_cycle_and_none_is_taken_without_need(
         for index in taken:
             assert has_cycle([*left, given_edges[index][:2]])
     assert taken == feedback_edges(names, given_edges)
+
+
+def fewest(given_edges: Sequence[tuple[int, int, bool]]) -> list[int]:
+    """The best choice by trying all of them: as few edges as possible, and of these choices the last ones."""
+    free = [index for index, edge in enumerate(given_edges) if edge[2]]
+    for count in range(len(free) + 1):
+        choices = [
+            chosen
+            for chosen in itertools.combinations(free, count)
+            if not has_cycle([edge[:2] for index, edge in enumerate(given_edges) if index not in chosen])
+        ]
+        if choices:
+            return list(max(choices))
+    return []
+
+
+@given(vertices, st.lists(st.tuples(st.integers(0, 4), st.integers(0, 4), st.booleans()), max_size=8))
+def test_as_few_edges_as_possible_are_taken_and_the_last_of_these(
+    names: list[int], given_edges: list[tuple[int, int, bool]]
+) -> None:
+    if not has_cycle([(a, b) for a, b, free in given_edges if not free]):
+        assert fewest_feedback_edges(names, given_edges) == fewest(given_edges)
+
+
+many_edges = st.lists(st.tuples(st.integers(0, 19), st.integers(0, 19), st.just(value=True)), max_size=80)
+
+
+@given(many_edges)
+def test_large_graphs_lose_no_more_edges_than_by_their_order(
+    given_edges: list[tuple[int, int, bool]],
+) -> None:
+    taken = fewest_feedback_edges(range(20), given_edges)
+
+    assert len(taken) <= len(feedback_edges(range(20), given_edges))
+    left = [edge[:2] for index, edge in enumerate(given_edges) if index not in taken]
+    assert all(len(part) == 1 for part in strongly_connected(range(20), left))
+    assert all(a != b for a, b in left)
 
 
 @given(vertices, edges)

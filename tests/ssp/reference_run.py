@@ -1,8 +1,9 @@
 """A plain loop over the FMUs of a flat system with FMPy, as its users write it; it imports nothing of the package.
 
 The step of an FMU from point k to k + 1 uses the values of its sources at point k (delay 1) or k + 1 (delay 0). With
-jacobi every delay is 1. With gauss_seidel a delay is 0, except that of a connection that closes a cycle of the ones in
-front of it. Before the first point, outputs are read in the order in which they depend on one another (docs/adr/0013).
+jacobi every delay is 1. With gauss_seidel a delay is 0, except in as few connections as necessary for an order of the
+FMUs, and of two choices in the connections that come later. Before the first point, outputs are read in the order in
+which they depend on one another (docs/adr/0013).
 
     python -m tests.ssp.reference_run system.ssp rows.csv --step-size 0.01 --stop-time 1.0 [--algorithm gauss_seidel]
 """
@@ -16,6 +17,8 @@ import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from ctypes import byref, c_double, c_int, c_void_p
+from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -52,6 +55,7 @@ def run_system(
     outputs = [(path, name) for path, fmu in system.fmus.items() for name in _outputs_of(fmu)]
     times = _Times(system.start_time, step_size, round((stop_time - system.start_time) / step_size), stop_time)
     points = {path: round((fmu.step_size or step_size) / step_size) for path, fmu in system.fmus.items()}
+    system = _in_mesh_order(system)
     delays = _delays(system, algorithm)
     order = _order(system, delays)
     with _opened(system, times, points) as running:
@@ -100,11 +104,25 @@ class _Times:
 def _delays(system: FlatSystem, algorithm: str) -> dict[End, int]:
     if algorithm == "jacobi":
         return dict.fromkeys((flow.target for flow in system.flows), 1)
-    delays: dict[End, int] = {}
+    flows = system.flows
+    for count in range(len(flows) + 1):
+        for delayed in sorted(combinations(range(len(flows)), count), reverse=True):
+            edges = [(f.source[0], f.target[0]) for number, f in enumerate(flows) if number not in delayed]
+            if not any(source in _reached(target, edges) for source, target in edges):
+                return {flow.target: int(number in delayed) for number, flow in enumerate(flows)}
+    raise AssertionError
+
+
+def _in_mesh_order(system: FlatSystem) -> FlatSystem:
+    """The connections that gauss_seidel delays are last, if more of them closed a cycle of those in front."""
+    fewest = _delays(system, "gauss_seidel")
+    kept: list[tuple[Path_, Path_]] = []
     for flow in system.flows:
-        edges = [(f.source[0], f.target[0]) for f in system.flows if delays.get(f.target) == 0]
-        delays[flow.target] = int(flow.source[0] in _reached(flow.target[0], edges))
-    return delays
+        if flow.source[0] not in _reached(flow.target[0], kept):
+            kept.append((flow.source[0], flow.target[0]))
+    if len(kept) + sum(fewest.values()) == len(system.flows):
+        return system
+    return replace(system, flows=sorted(system.flows, key=lambda flow: fewest[flow.target]))
 
 
 def _order(system: FlatSystem, delays: Mapping[End, int]) -> list[Path_]:

@@ -372,6 +372,29 @@ def _cycle(*, first: str) -> Make:
     return lambda _folder: {SSD: description(root), **fmus("DampedPendulum", "Gain", "Adder")}
 
 
+def _two_cycles(_folder: Path) -> dict[str, str | bytes]:
+    """Two cycles, of which the document has two other connections last than one that both of them have."""
+    half = bound(parameter_set(parameter("k", 0.5)))
+    inputs = connector("u1", "input"), connector("u2", "input")
+    root = system(
+        "root",
+        pendulum(),
+        component("sum", "Adder", *inputs, Y),
+        gain("one", bindings=[half]),
+        gain("two", bindings=[half]),
+        component("both", "Adder", *inputs, Y),
+        connections=[
+            connection("pendulum.a", "sum.u1"),
+            connection("both.y", "sum.u2"),
+            connection("sum.y", "one.u"),
+            connection("one.y", "two.u"),
+            connection("two.y", "both.u2"),
+            connection("one.y", "both.u1"),
+        ],
+    )
+    return {SSD: description(root), **fmus("DampedPendulum", "Gain", "Adder")}
+
+
 def _units(_folder: Path) -> dict[str, str | bytes]:
     def sized(name: str, unit_of_u: str | None, unit_of_y: str | None) -> str:
         return component(
@@ -686,6 +709,20 @@ SUPPORTED = (
         "nested systems, written backwards",
         _nested,
         ("pendulum.a -> middle-deep-gain.u", "middle-deep-gain.y -> sum.u1", "pendulum.a -> sum.u2"),
+        algorithms=("jacobi", "gauss_seidel"),
+    ),
+    Supported(
+        "two cycles that share a connection",
+        _two_cycles,
+        (
+            "pendulum.a -> sum.u1",
+            "both.y -> sum.u2",
+            "one.y -> two.u",
+            "two.y -> both.u2",
+            "one.y -> both.u1",
+            "sum.y -> one.u",
+        ),
+        {"one.k": Start(0.5, 'name="k"'), "two.k": Start(0.5, 'name="k"')},
         algorithms=("jacobi", "gauss_seidel"),
     ),
     *(

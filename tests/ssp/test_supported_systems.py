@@ -102,3 +102,12 @@ def test_a_run_in_processes_is_the_run_in_one_process(own: Supported, algorithm:
 
     assert len(here.read_text().splitlines()) == 1 + 9
     assert apart.read_bytes() == here.read_bytes()
+
+
+def test_one_connection_is_delayed_where_two_cycles_share_it(tmp_path: Path) -> None:
+    [own] = [own for own in SUPPORTED if own.name == "two cycles that share a connection"]
+
+    check = fmu_mesh.load(package_of(own, tmp_path)).check(**options_of(own, "gauss_seidel"))
+
+    assert check.plan is not None
+    assert [one.target for one in check.plan.connections if one.closes_cycle] == ["one.u"]
