@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import ctypes
+import sys
 from collections.abc import Callable
 from typing import Any, Final, NoReturn
 
 import numpy as np
 from fmpy.fmi1 import FMICallException
 
+from ..fmu_values import DISCARD
 from .solver import Equations, SolverFailed, resolvable
 
 __all__ = ["CVodeSolver"]
 
-_DISCARD: Final = 2
 _RHS = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_double, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p)
 _ROOT = _RHS
 _HANDLER = ctypes.CFUNCTYPE(
@@ -29,6 +30,8 @@ _HANDLER = ctypes.CFUNCTYPE(
 _CV_BDF: Final = 2
 _CV_ONE_STEP: Final = 2
 _CV_ROOT_RETURN: Final = 2
+_FAILED_TESTS: Final = (-3, -4)
+"""CV_ERR_FAILURE, CV_CONV_FAILURE: too many failures in one step, of the error test or of the corrector."""
 _RETRY_SMALLER: Final = 1
 _GIVE_UP: Final = -1
 _MOST_STALLED: Final = 100
@@ -57,6 +60,8 @@ class CVodeSolver:
         self._rhs = _RHS(self._on_rhs)
         self._root = _ROOT(self._on_root)
         self._handler = _HANDLER(self._on_error)
+        self._is_new = True
+        """Whether CVode begins anew in its next step."""
         self._started = False
         self._stalled = 0
         self._context = ctypes.c_void_p()
@@ -73,8 +78,9 @@ class CVodeSolver:
         self._memory = ctypes.c_void_p(api.CVodeCreate(_CV_BDF, self._context))
         self._maximum = maximum_step_size
 
-    def restart(self, time: float) -> None:
+    def restart(self, time: float) -> None:  # noqa: ARG002 the Protocol
         """See `Solver.restart`."""
+        self._is_new = True
         if self._equations.n_states:
             self._equations.get_states(self._x_data)
             self._equations.get_nominals(self._nominals.ctypes.data)
@@ -84,6 +90,10 @@ class CVodeSolver:
         np.abs(self._nominals, out=self._nominals)
         self._nominals[self._nominals == 0.0] = 1.0
         self._nominals *= self._relative_tolerance
+
+    def _begin(self, time: float) -> None:
+        """Let CVode begin anew."""
+        self._is_new = False
         api = self._api
         if self._started:
             self._check(api.CVodeReInit(self._memory, time, self._x))
@@ -102,10 +112,13 @@ class CVodeSolver:
 
     def step(self, time: float, stop: float) -> tuple[float, bool]:
         """See `Solver.step`."""
+        was_new, states = self._is_new, self._states.copy()
         reached = ctypes.c_double()
-        self._failure = None
-        self._check(self._api.CVodeSetStopTime(self._memory, stop))
-        flag = self._api.CVode(self._memory, stop, self._x, ctypes.byref(reached), _CV_ONE_STEP)
+        flag = self._call(time, stop, reached)
+        if flag in _FAILED_TESTS and not was_new:
+            # The line of an input has turned too much for the history.
+            self._is_new, self._states[:] = True, states
+            flag = self._call(time, stop, reached)
         if flag < 0:
             self._give_up(self._said or f"CVode returned {flag}")
         self._stalled = 0 if resolvable(time, reached.value) else self._stalled + 1
@@ -125,6 +138,14 @@ class CVodeSolver:
         self._api.N_VDestroy(self._tolerances)
         self._api.SUNContext_Free(ctypes.byref(self._context))
         self._memory = ctypes.c_void_p()
+
+    def _call(self, time: float, stop: float, reached: ctypes.c_double) -> int:
+        """Call CVode for one of its steps; its result, which is negative after a failure."""
+        self._failure = None
+        if self._is_new:
+            self._begin(time)
+        self._check(self._api.CVodeSetStopTime(self._memory, stop))
+        return int(self._api.CVode(self._memory, stop, self._x, ctypes.byref(reached), _CV_ONE_STEP))
 
     def _give_up(self, why: str) -> NoReturn:
         """End with what the model failed with during this step, or else with ``why``."""
@@ -147,6 +168,10 @@ class CVodeSolver:
     def _indicators(self, time: float, x: int, z: int) -> None:
         self._equations.set_point(time, x)
         self._equations.get_indicators(z)
+        # An event is a change between "above 0" and "not above 0" (FMI 2.0, 3.1). CVode would stop at exactly 0, before
+        # an indicator is above it, and from there it would not see it rise.
+        values = _view(z, self._equations.n_indicators)
+        values[values == 0.0] = -sys.float_info.min
 
     def _guarded(self, evaluate: Callable[[float, int, int], None], time: float, x: int, result: int) -> int:
         """Evaluate the model from C: nothing may be raised there. Discard asks for a smaller step (FMI 2.0, 2.1.3)."""
@@ -154,7 +179,7 @@ class CVodeSolver:
             evaluate(time, x, result)
         except FMICallException as error:
             self._failure = error
-            return _RETRY_SMALLER if error.status == _DISCARD else _GIVE_UP
+            return _RETRY_SMALLER if error.status == DISCARD else _GIVE_UP
         except BaseException as error:  # noqa: BLE001 it is raised again as soon as CVode has returned
             self._failure = error
             return _GIVE_UP
