@@ -10,7 +10,8 @@ FmuMeshError                     1   an internal error
 │   ├── LoadFailed                   it cannot be extracted, loaded or instantiated
 │   ├── InitializationFailed         a call in or around Initialization Mode failed
 │   │   └── LoopNotConverged         an algebraic loop has no consistent values at the start
-│   └── StepFailed                   fmi2DoStep, or a get or set at a point, failed
+│   ├── StepFailed                   fmi2DoStep, or a get or set at a point, failed
+│   └── NotFinite                    an output is NaN or infinite
 ├── MeshLost                     4   a node, the master or the recorder has ended or does not answer
 │   ├── DeadlineExceeded             what a process waited for did not come in time
 │   ├── FrameGap                     a point is missing, or came twice with other values
@@ -47,6 +48,7 @@ __all__ = [
     "LoopNotConverged",
     "MeshLost",
     "MessageRefused",
+    "NotFinite",
     "NotInOneProcess",
     "ProtocolBroken",
     "StepFailed",
@@ -100,6 +102,7 @@ class FmuMeshError(Exception):
     """
 
     exit_code: ClassVar[int] = 1
+    _message_has_variable: ClassVar[bool] = False
 
     def __init__(  # noqa: PLR0913  each is a field of its own that the reader of an error needs
         self,
@@ -124,8 +127,8 @@ class FmuMeshError(Exception):
     def __str__(self) -> str:
         where = []
         if self.instance is not None:
-            name = f"{self.instance}.{self.variable}" if self.variable is not None else self.instance
-            where.append(f"instance {name}")
+            variable = self.variable if not self._message_has_variable else None
+            where.append(f"instance {self.instance}" + (f".{variable}" if variable is not None else ""))
         elif self.variable is not None:
             where.append(f"variable {self.variable}")
         if self.point is not None:
@@ -262,6 +265,20 @@ class StepFailed(FmuError):
     """`fmi2DoStep`, or a get or set at a point, failed. Afterwards the instance can only be closed."""
 
 
+class NotFinite(FmuError):
+    """An output is NaN or infinite at `point`: the run ends with the point before, which all instances reach.
+
+    The message has the input that was not finite, if there is one, and its source.
+    """
+
+    _message_has_variable = True
+
+    @property
+    def last_point(self) -> int | None:
+        """The last point of the run; None if it ends at once."""
+        return self.point - 1 if self.point else None
+
+
 class MeshLost(FmuMeshError):
     """A node, the master or the recorder has ended or does not answer."""
 
@@ -302,6 +319,11 @@ class TerminationRequested(FmuMeshError):
 
     exit_code = 0
 
+    @property
+    def last_point(self) -> int | None:
+        """The last point of the run."""
+        return self.point
+
 
 _BY_KIND: dict[str, type[FmuMeshError]] = {
     kind.__name__: kind
@@ -311,6 +333,7 @@ _BY_KIND: dict[str, type[FmuMeshError]] = {
         InitializationFailed,
         LoopNotConverged,
         StepFailed,
+        NotFinite,
         MeshLost,
         DeadlineExceeded,
         FrameGap,

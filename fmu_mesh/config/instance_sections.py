@@ -33,6 +33,7 @@ __all__ = [
     "Host",
     "InstanceSection",
     "Kinds",
+    "NotFinitePolicy",
     "PhysicsSection",
     "StartValues",
     "StepSize",
@@ -59,6 +60,13 @@ StepSize = Annotated[
     ),
 ]
 Group = Annotated[Name | None, Meta(description="Instances of one group share one node (one process).")]
+NotFinitePolicy = Annotated[
+    Literal["stop", "record"] | None,
+    Meta(
+        description="stop: an output that is NaN or infinite ends the run at its point; record: it is recorded as it "
+        "is, and may be set; null: as `simulation` says."
+    ),
+]
 Host = Annotated[str | None, Meta(description="Host the node is meant to run on; `launch` starts those without.")]
 
 
@@ -69,7 +77,7 @@ class InstanceSection:
     """Base class of the sections of instances.
 
     A kind derives its section from `Base` and from this class. The field that has the same name as the kind is the path
-    of the model, unless the section overrides `path` and `agreed`. The section has those of the four common keys that
+    of the model, unless the section overrides `path` and `agreed`. The section has those of the five common keys that
     make sense for its kind::
 
         class TableConfig(Base, InstanceSection, frozen=True, kw_only=True, tag_field=KIND, tag="table"):
@@ -77,12 +85,14 @@ class InstanceSection:
             step_size: StepSize = None
             group: Group = None
             host: Host = None
+            not_finite: NotFinitePolicy = None
 
     Attributes:
         start_values: by variable name, as written in the file.
         step_size: of the instance in s; None: the base step size.
         group: the group that shares one node; None: none.
         host: the host that the node is meant to run on; None: the one of `launch`.
+        not_finite: what an output that is NaN or infinite means; None: what the simulation says.
         interpolation: how a timed value for an unconnected input is used; None: its time is ignored.
         strict: whether what FMI forbids is an error for this instance; None: as the whole configuration says.
         follows_fmi: whether the rules of FMI apply to the model. If so, a start value that FMI forbids is a warning, or
@@ -97,6 +107,7 @@ class InstanceSection:
     step_size: float | None = None
     group: str | None = None
     host: str | None = None
+    not_finite: Literal["stop", "record"] | None = None
     interpolation: Literal["hold", "linear"] | None = None
     strict: bool | None = None
     follows_fmi: ClassVar[bool] = False
@@ -148,9 +159,16 @@ def keys_of(section: type[InstanceSection]) -> tuple[str, ...]:
     return cast("type[msgspec.Struct]", section).__struct_fields__
 
 
-def placed(section: InstanceSection) -> InstanceSection:
-    """A section without the common keys; a plan has what they mean in fields of its own."""
-    return _replaced(section, {"start_values": {}, "step_size": None, "group": None, "host": None})
+def placed(section: InstanceSection, not_finite: Literal["stop", "record"] | None = None) -> InstanceSection:
+    """A section without the common keys, which a plan has in fields of its own, but with what ``not_finite`` means."""
+    common: dict[str, Any] = {
+        "start_values": {},
+        "step_size": None,
+        "group": None,
+        "host": None,
+        "not_finite": not_finite,
+    }
+    return _replaced(section, common)
 
 
 def _replaced(section: Section, values: Mapping[str, Any]) -> Section:

@@ -86,6 +86,13 @@ class SimulationConfig(Base, frozen=True, kw_only=True):
             "auto: up to 32768 points, fewer for many instances or large rows."
         ),
     ] = "auto"
+    not_finite: Annotated[
+        Literal["stop", "record"],
+        Meta(
+            description="stop: an output that is NaN or infinite ends the run at its point, and no such value may be "
+            "set; record: it is recorded as it is. An instance can have its own `not_finite`."
+        ),
+    ] = "stop"
     real_time_factor: Annotated[
         float,
         Meta(
@@ -347,6 +354,10 @@ class Config(Base, frozen=True, kw_only=True):
         if isinstance(self.record, RecordConfig):
             return {"record": self.record}
         return {f"record[{index}]": section for index, section in enumerate(self.record)}
+
+    def not_finite(self, section: InstanceSection) -> Literal["stop", "record"]:
+        """What an output that is NaN or infinite means for an instance of this mesh."""
+        return section.not_finite or self.simulation.not_finite
 
     def is_strict(self, section: InstanceSection) -> bool:
         """Whether a violation of FMI is an error, and not a warning, for an instance of this mesh."""

@@ -101,7 +101,9 @@ def _with_models(section: Plain, sections: Mapping[str, type[InstanceSection]]) 
         try:
             msgspec.convert(with_path, sections[key])
         except msgspec.ValidationError:  # a kind without a file, or one that misses something else
-            shared: dict[str, Plain] = {key: given[key] for key in ("step_size", "group", "host") if key in given}
+            shared: dict[str, Plain] = {
+                key: given[key] for key in ("step_size", "group", "host", "not_finite") if key in given
+            }
             with_path = {KIND: usual, usual: "", **shared}
         written[name] = with_path
     return written

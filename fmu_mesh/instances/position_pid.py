@@ -16,7 +16,7 @@ import msgspec
 from msgspec import Meta
 
 from ..config.base import Base
-from ..config.instance_sections import KIND, Group, Host, InstanceSection, StartValues, StepSize
+from ..config.instance_sections import KIND, Group, Host, InstanceSection, NotFinitePolicy, StartValues, StepSize
 from ..config.mesh import LimitsConfig
 from ..errors import StepFailed
 from ..rings.ring import Ring
@@ -51,6 +51,7 @@ class PidConfig(Base, InstanceSection, frozen=True, kw_only=True, tag_field=KIND
     step_size: StepSize = None
     group: Group = None
     host: Host = None
+    not_finite: NotFinitePolicy = None
 
     @property
     def path(self) -> str:

@@ -29,6 +29,7 @@ from ..errors import (
     Interrupted,
     MeshLost,
     MessageRefused,
+    NotFinite,
     TerminationRequested,
     from_report,
 )
@@ -82,8 +83,8 @@ class Master:
         router: the link to the router that connects the nodes, if there is one.
 
     Attributes:
-        ended_by: why the simulation ended before its last point without a failure: an FMU asked for it, or there was a
-            `stop` and no stop time.
+        ended_by: why the simulation ends before its last point, and not at once: an FMU asked for it, an output is not
+            finite, or there was a `stop` and no stop time.
         warnings: nodes that failed or were lost after their last step.
 
     Call `claim`, then `run` once, from the main thread, then `wait_for_followers` if it went well, then `close`.
@@ -110,7 +111,7 @@ class Master:
         self._most_instances = max(len(node.instances) for node in plan.nodes.values())
         self._reports: dict[str, NodeReport] = {}
         self._failure: FmuMeshError | None = None
-        self.ended_by: TerminationRequested | None = None
+        self.ended_by: TerminationRequested | NotFinite | None = None
         self.warnings: list[str] = []
         self._state: MeshState = "starting"
         self._hold: int | None = None
@@ -166,6 +167,8 @@ class Master:
                 lambda: self._granting.slowest >= 0, self._timeouts.initialize, "Initialization Mode is not over in"
             )
             self._grant_to_the_end()
+            if isinstance(self.ended_by, NotFinite):
+                raise self.ended_by
             self._enter("stopping")
             self._members.send(FINISH, 0)
             self._wait_for(
@@ -284,7 +287,7 @@ class Master:
     @property
     def _last_point(self) -> int:
         """The last point, or the one at which the simulation ends early."""
-        ended = self.ended_by.point if self.ended_by is not None else None
+        ended = self.ended_by.last_point if self.ended_by is not None else None
         return self._plan.grid.last_point if ended is None else ended
 
     def _wait_for(self, reached: Callable[[], bool], timeout_s: float, what: str) -> None:
@@ -346,11 +349,12 @@ class Master:
         if report.node != node or not self._members.is_admitted(node):
             raise MessageRefused("its sender has not registered")
         error = from_report(report.error) if report.error is not None else None
-        if isinstance(error, TerminationRequested):
-            # Its node continues with its other instances, and reports this again at the end.
-            if error.point is None or not granting.may_be_at(node, error.point, ended=self.ended_by is not None):
-                self._fail(granting.broken(node, f"has an FMU that ends the simulation at point {error.point}"))
-            elif error.point < self._last_point:
+        if isinstance(error, TerminationRequested) or (isinstance(error, NotFinite) and error.point):
+            # Its node continues with its other instances, and reports again at the end.
+            last = error.last_point
+            if last is None or not granting.may_be_at(node, last, ended=self.ended_by is not None):
+                self._fail(granting.broken(node, f"has an FMU that ends the simulation at point {last}"))
+            elif last < self._last_point:
                 self.ended_by = error
         elif error is None and self._state in GOING_ON:
             self._fail(granting.broken(node, f"has ended at point {report.point}"))

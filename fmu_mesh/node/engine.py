@@ -15,7 +15,7 @@ from threading import Lock
 from time import perf_counter
 from typing import Final, cast
 
-from ..errors import FmuMeshError, ProtocolBroken, TerminationRequested
+from ..errors import FmuMeshError, ProtocolBroken, StepFailed, TerminationRequested
 from ..instances.call_guard import floating_point_changed, restore_floating_point
 from ..instances.contract import StepsNatively
 from ..rings import native
@@ -160,6 +160,9 @@ class BurstEngine(Engine):
             runner, member = self._at(node.unit, node.member)
             if result == BurstEnd.FORGED:
                 raise self._forged(runner)
+            if result == BurstEnd.NOT_FINITE:
+                self._units[node.unit].stopped, member.stage = 1, Stage.WAITING
+                raise runner.is_finite.error(member.step + 1, runner.grid)
             began = perf_counter()
             self._complete(node.unit, runner, member, result)
             self._units[node.unit].spent_ns += int((perf_counter() - began) * 1e9)
@@ -239,6 +242,8 @@ class BurstEngine(Engine):
             step_size=points * grid.step_size,
             points=points,
             every=points // self.tick_points(self.units[unit]),
+            finite=table(native.Span, runner.is_finite.spans),
+            n_finite=len(runner.is_finite.spans),
             last_step=runner.last_step,
             outputs=(native.OutputTable * 2)(*rings),
             counter=runner.counter.address,
@@ -284,6 +289,8 @@ class BurstEngine(Engine):
                 cast("StepsNatively", runner.instance).finish(step, member.outcome)
         except FmuMeshError as error:
             self._units[unit].stopped = 1
+            if isinstance(error, StepFailed):
+                runner.is_finite.explain(error)
             if isinstance(error, TerminationRequested):
                 member.stage = Stage.WAITING
             raise
@@ -436,8 +443,12 @@ class PlainEngine(Engine):
                 source.transfer.step(step)
             position.enter(Stage.IN_PYTHON)
             runner.instance.do_step(step)
-        except FmuMeshError:
+            if not runner.is_finite(step + 1):
+                raise runner.is_finite.error(step + 1, runner.grid)
+        except FmuMeshError as error:
             self._stopped.add(number)
+            if isinstance(error, StepFailed):
+                runner.is_finite.explain(error)
             raise
         finally:
             position.enter(Stage.WAITING)

@@ -28,6 +28,7 @@ from ..errors import (
     Interrupted,
     MeshLost,
     MessageRefused,
+    NotFinite,
     ProtocolBroken,
     StepFailed,
     TerminationRequested,
@@ -258,7 +259,7 @@ class Node:
         while not self.finished:
             try:
                 stepped = engine.run(_LOOK_S, eager=eager)
-            except TerminationRequested as asked:
+            except (TerminationRequested, NotFinite) as asked:
                 stepped = True
                 self._end_early(asked)
             if self._profiler is not None:
@@ -275,13 +276,15 @@ class Node:
                 text = f"the master has said nothing for {now - self._heard:.1f} s"
                 raise DeadlineExceeded(text, hint="Is its process stopped, or its host gone?")
 
-    def _end_early(self, asked: TerminationRequested) -> None:
-        """An FMU asks to end the simulation: its unit stops stepping, and the master ends the run at its point."""
+    def _end_early(self, asked: TerminationRequested | NotFinite) -> None:
+        """An FMU ends the simulation: its unit stops stepping, and the master ends the run at its point."""
         assert self._engine is not None
         runner = self._runners[asked.instance or ""]
         point = runner.covered
         # The master has to know it before the progress of this node, which is beyond the grant then.
-        self._tell_end(asked.at(point, self._plan.grid.time(point)), self._plan.timeouts.stop)
+        if isinstance(asked, TerminationRequested):
+            asked.at(point, self._plan.grid.time(point))
+        self._tell_end(asked, self._plan.timeouts.stop)
         for member in next(unit for unit in self._engine.units if runner in unit):
             member.stop()
             member.flush()

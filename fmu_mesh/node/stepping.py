@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 from ..instances.contract import Instance
 from ..rings.array_elements import fill_unconnected
+from ..rings.finite import FiniteRows
 from ..rings.host_memory import Counter
 from ..rings.ring import Ring
 from ..rings.transfer import Transfer
@@ -74,6 +75,7 @@ class Runner:
         sources: where its inputs come from.
         out_links: send its rows to those who do not read its ring.
         watched: a ring with further outputs, which somebody watches.
+        is_finite: checks a row of outputs.
     """
 
     def __init__(self, plan: InstancePlan, instance: Instance, grid: TimeGrid, outputs: Ring, counter: Counter) -> None:
@@ -88,6 +90,7 @@ class Runner:
         self.watched: Ring | None = None
         self.last_step = grid.last_point // plan.step_points
         self.grid = grid
+        self.is_finite = FiniteRows(plan, outputs, self.inputs, instance.get_values)
         self._position = Position()
 
     def bind(self) -> None:
@@ -106,7 +109,13 @@ class Runner:
         self._position.refit()
 
     def begin(self) -> None:
-        """The outputs after Initialization Mode are complete: row 0."""
+        """The outputs after Initialization Mode are complete: row 0.
+
+        Raises:
+            NotFinite: one is not finite.
+        """
+        if not self.is_finite(0):
+            raise self.is_finite.error(0, self.grid)
         self.outputs.stamp(0)
         self.counter.raise_to(1)
 

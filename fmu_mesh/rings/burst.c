@@ -112,6 +112,12 @@ typedef struct {
   int64_t mask;
 } Output;
 
+typedef struct { /* floats of a row that have to be finite */
+  int64_t place; /* in the row */
+  int64_t count;
+  int64_t type; /* F64 or F32 */
+} Span;
+
 typedef struct { /* what a model says in a step besides its status, and how far it is: Python looks at it between steps */
   uint8_t event_needed, terminate, early; /* FMI 3.0: not 0 if it is so */
   int32_t call;       /* the getter or setter that returned a status above warning */
@@ -152,6 +158,8 @@ typedef struct {
   Track *tracks;
   int64_t n_tracks;
   int64_t tracks_from; /* the own step of their first values */
+  Span *finite;
+  int64_t n_finite;
   Output outputs[2]; /* the own ring; and outputs that somebody watches */
   Counter *counter;  /* rows of the own ring */
   char **bases;      /* room for the rows of the gates */
@@ -204,7 +212,7 @@ typedef struct {
   _Atomic int64_t attention; /* Python has something to do */
 } Node;
 
-enum { SLICE, DONE, ATTENTION, BLOCKED, PYTHON, STATUS, FORGED }; /* results of run */
+enum { SLICE, DONE, ATTENTION, BLOCKED, PYTHON, STATUS, FORGED, NOT_FINITE }; /* results of run */
 
 /* ---- waiting */
 
@@ -723,6 +731,34 @@ static inline int gates_held(const Member *member) {
   return 1;
 }
 
+/* Whether the floats of the row that a step has written are finite, whoever took the step. Integers are compared: a model
+ * may have changed the floating-point mode, and let operations with NaN trap. With all bits of the exponent set, one more
+ * is carried into the bit of the sign. */
+static inline int is_finite(const Member *member) {
+  const Output *own = &member->outputs[0];
+  const char *row = own->rows + ((member->step + 1) & own->mask) * own->stride;
+  for (int64_t i = 0; i < member->n_finite; i++) {
+    const Span *span = &member->finite[i];
+    const char *from = row + span->place;
+    if (span->type == F64) {
+      uint64_t bits, carried = 0;
+      for (int64_t j = 0; j < span->count; j++) {
+        memcpy(&bits, from + 8 * j, 8);
+        carried |= (bits & 0x7ff0000000000000) + 0x0010000000000000;
+      }
+      if (carried >> 63) return 0;
+    } else {
+      uint32_t bits, carried = 0;
+      for (int64_t j = 0; j < span->count; j++) {
+        memcpy(&bits, from + 4 * j, 4);
+        carried |= (bits & 0x7f800000) + 0x00800000;
+      }
+      if (carried >> 31) return 0;
+    }
+  }
+  return 1;
+}
+
 static inline void commit(Node *node, Member *member) {
   stamp(member, member->step + 1, member->step + 2);
   member->step++;
@@ -774,6 +810,10 @@ static int advance(Node *node, Unit *unit, int64_t *ticks) {
           result = STATUS;
           goto out;
         }
+      }
+      if (!is_finite(member)) {
+        result = NOT_FINITE;
+        goto out;
       }
       commit(node, member);
     }
@@ -884,7 +924,7 @@ PUBLIC void node_attended(Node *node) { atomic_store(&node->attention, 0); }
 PUBLIC int64_t structure_sizes(int64_t *sizes) {
   const int64_t own[] = {sizeof(Place), sizeof(Gate), sizeof(Move), sizeof(Call), sizeof(Output),
                          sizeof(Member), sizeof(Unit), sizeof(Peer), sizeof(Node), sizeof(Wish), sizeof(Said),
-                         sizeof(Track), sizeof(Entry), sizeof(Lookup)};
+                         sizeof(Track), sizeof(Entry), sizeof(Lookup), sizeof(Span)};
   memcpy(sizes, own, sizeof own);
   return sizeof own / sizeof own[0];
 }

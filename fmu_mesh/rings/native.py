@@ -35,6 +35,7 @@ __all__ = [
     "Peer",
     "RowBase",
     "Said",
+    "Span",
     "Stage",
     "StepKind",
     "Track",
@@ -98,6 +99,7 @@ class BurstEnd(IntEnum):
     PYTHON = 4
     STATUS = 5
     FORGED = 6
+    NOT_FINITE = 7
 
 
 NUMBER_TYPES: Final[dict[VariableType, int]] = {
@@ -249,6 +251,12 @@ class Track(Structure):
     _fields_ = (("values", c_void_p), ("to", c_void_p))
 
 
+class Span(Structure):
+    """Floats of a row that have to be finite: ``place`` in bytes, ``type`` as in `NUMBER_TYPES`."""
+
+    _fields_ = (("place", c_int64), ("count", c_int64), ("type", c_int64))
+
+
 class MemberTable(Structure):
     """One instance: how it gets its inputs, steps, and gives its outputs."""
 
@@ -277,6 +285,8 @@ class MemberTable(Structure):
         ("tracks", POINTER(Track)),
         ("n_tracks", c_int64),
         ("tracks_from", c_int64),
+        ("finite", POINTER(Span)),
+        ("n_finite", c_int64),
         ("outputs", OutputTable * 2),
         ("counter", c_void_p),
         ("bases", POINTER(c_void_p)),
@@ -396,6 +406,7 @@ _STRUCTURES: Final = (
     Track,
     Entry,
     Lookup,
+    Span,
 )
 
 

@@ -88,6 +88,10 @@ class Ring:
             return self.parts[self._types.index(type_)]
         return np.zeros((self.rows, 0), dtype=DTYPES[type_])
 
+    def floats(self, type_: VariableType) -> memoryview:
+        """The memory of all rows as numbers of a float type."""
+        return memoryview(self._flat.view(DTYPES[type_]).data)
+
     def value(self, row: int, name: str) -> Value:
         """The value of a column of ``row``, or of one element of it, as a Python object."""
         part, first, size, shape = self._place(name)

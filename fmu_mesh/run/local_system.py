@@ -14,10 +14,11 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-from ..errors import FmuError, InitializationFailed, TerminationRequested
+from ..errors import FmuError, InitializationFailed, NotFinite, TerminationRequested
 from ..instances.call_guard import Guarded, doing, floating_point_changed, restore_floating_point
 from ..instances.contract import LogMessage, Opening, Showing
 from ..rings.array_elements import element_of, scaled
+from ..rings.finite import FiniteRows
 from ..rings.ring import Ring, Rows
 from ..rings.value_change import ValueChange
 from ..simtime import TimeGrid
@@ -86,7 +87,9 @@ class LocalSystem:
             for self.stepping, step_from in steps:
                 step_from(point)
         except FmuError as error:
-            error.at(self.begun_at, self._grid.time(self.begun_at))
+            if not isinstance(error, NotFinite):
+                error.at(self.begun_at, self._grid.time(self.begun_at))
+                self._members[self.stepping].is_finite.explain(error)
             raise
         except TerminationRequested as asked:
             asked.at(point, self._grid.time(point))
@@ -230,6 +233,7 @@ class _Member:
 
     Attributes:
         settled: inputs that keep the values of the iteration of a loop at the start.
+        is_finite: checks a row of outputs.
     """
 
     def __init__(self, plan: Plan, name: str, instance: Guarded) -> None:
@@ -241,6 +245,7 @@ class _Member:
         # A slower instance reads values that are as old as its own step.
         oldest = max(instance.step_points for instance in plan.system.instances.values())
         self._outputs = Ring(self.plan.outputs, 1 << (2 * oldest).bit_length())
+        self.is_finite = FiniteRows(self.plan, self._outputs, self._inputs, instance.get_values)
         self._points = self.plan.step_points
         self._feeds: list[_Feed] = []
         self._set_at = -1
@@ -292,6 +297,8 @@ class _Member:
         for name, value in zip(names, self.instance.get_values(names) if names else [], strict=True):
             self._inputs.put(0, name, value)  # elements that are not connected keep it
         self.instance.bind(self._inputs, (self._outputs,), grid, self.plan.step_points)
+        self._grid = grid
+        self._check_row(0)
         for c in self.connections:
             if c.initial_only:
                 continue
@@ -325,7 +332,12 @@ class _Member:
         self._do_step(step)
         if floating_point_changed():
             restore_floating_point()
+        self._check_row(step + 1)
         self.step = step + 1
+
+    def _check_row(self, row: int) -> None:
+        if not self.is_finite(row):
+            raise self.is_finite.error(row, self._grid)
 
     def getter(self, name: str) -> Callable[[int], Value]:
         """See `LocalSystem.getter`: from the row of the point, or from the model if something was set since then."""

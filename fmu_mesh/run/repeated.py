@@ -20,7 +20,7 @@ from typing import NamedTuple
 from msgspec.structs import replace
 
 from ..config.mesh import TimeoutsConfig
-from ..errors import FmuError, FmuMeshError, Interrupted, ProtocolBroken, TerminationRequested
+from ..errors import FmuError, FmuMeshError, Interrupted, NotFinite, ProtocolBroken, TerminationRequested
 from ..instances.call_guard import CallWatch, Guarded, doing
 from ..instances.contract import Instance, LogMessage
 from ..instances.kept_models import KeptModels
@@ -328,8 +328,9 @@ class _Run:
         if runner is None:
             raise event
         point = runner.covered
-        begun = runner.point if isinstance(event, FmuError) else point
-        event.at(begun, self._node.grid.time(begun))
+        if not isinstance(event, NotFinite):
+            begun = runner.point if isinstance(event, FmuError) else point
+            event.at(begun, self._node.grid.time(begun))
         for member in next(unit for unit in engine.units if runner in unit):
             member.stop()
         place = point, self._plan.order.index(runner.name)

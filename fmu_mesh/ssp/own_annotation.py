@@ -45,6 +45,7 @@ _INSTANCE_KEYS: Final = (
     "group",
     "host",
     "interpolation",
+    "not_finite",
     "retry_discarded_steps",
     "sha256",
     "solver",

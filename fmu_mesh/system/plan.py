@@ -15,7 +15,7 @@ from ..config.instance_sections import InstanceSection, placed
 from ..config.mesh import InitializationConfig, LimitsConfig, TimeoutsConfig
 from ..simtime import TimeGrid
 from ..variables.value_conversion import to_plain
-from ..variables.value_types import PlainValue
+from ..variables.value_types import PlainValue, is_float
 from .digest import digest_of
 from .execution_order import execution_order
 from .feeds import Feed, feeds_of
@@ -47,6 +47,7 @@ class InstancePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         parameters: the connections to parameters, whose values are transferred in Initialization Mode only.
         initial_inputs: what is set in Initialization Mode: ``inputs``, and the connected parameters.
         initial_outputs: what is read in Initialization Mode only.
+        finite: those of ``outputs`` that end the run where they are not finite.
     """
 
     name: str
@@ -64,6 +65,7 @@ class InstancePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     parameters: tuple[Feed, ...] = ()
     initial_inputs: Layout = Layout()
     initial_outputs: Layout = Layout()
+    finite: tuple[str, ...] = ()
 
     @property
     def input_row(self) -> Layout:
@@ -338,6 +340,9 @@ def _instance_plan(plan: Plan, instance: SystemInstance, outputs: Layout) -> Ins
     connected, parameters = {c.target.name for c in stepped}, {c.target.name for c in initial}
     read = {c.source.name for c in plan.connections if c.source_instance == instance.name} - {*outputs.names}
     levels = plan.initialization.levels
+    own = plan.system.config.instances[instance.name]
+    not_finite = plan.system.config.not_finite(own)
+    given = {variable.name for variable in instance.description.with_causality("output")}
     return InstancePlan(
         name=instance.name,
         fmu=instance.fmu,
@@ -347,7 +352,7 @@ def _instance_plan(plan: Plan, instance: SystemInstance, outputs: Layout) -> Ins
         inputs=Layout.of(v for v in instance.description.variables if v.name in connected),
         feeds=feeds_of(stepped),
         initialization={variable: level for (owner, variable), level in levels.items() if owner == instance.name},
-        section=placed(plan.system.config.instances[instance.name]),
+        section=placed(own, not_finite),
         linear_inputs=tuple(
             LinearInput(c.target.name, c.delay or 0, plan.system.instances[c.source_instance].step_points)
             for c in stepped
@@ -358,6 +363,9 @@ def _instance_plan(plan: Plan, instance: SystemInstance, outputs: Layout) -> Ins
         parameters=feeds_of(initial),
         initial_inputs=Layout.of(v for v in instance.description.variables if v.name in connected | parameters),
         initial_outputs=Layout.of(v for v in instance.description.variables if v.name in read),
+        finite=tuple(c.name for c in outputs.columns if is_float(c.type) and c.name in given)
+        if not_finite == "stop"
+        else (),
     )
 
 

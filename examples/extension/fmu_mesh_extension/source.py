@@ -16,7 +16,7 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from fmu_mesh.config.base import Base
-from fmu_mesh.config.instance_sections import KIND, Group, Host, InstanceSection, StartValues, StepSize
+from fmu_mesh.config.instance_sections import KIND, Group, Host, InstanceSection, NotFinitePolicy, StartValues, StepSize
 from fmu_mesh.config.mesh import LimitsConfig
 from fmu_mesh.errors import LoadFailed
 from fmu_mesh.instances.contract import Instance, Kind, Opening
@@ -41,6 +41,7 @@ class TableConfig(Base, InstanceSection, frozen=True, kw_only=True, tag_field=KI
     step_size: StepSize = None
     group: Group = None
     host: Host = None
+    not_finite: NotFinitePolicy = None
 
 
 class TableKind(Kind[TableConfig]):

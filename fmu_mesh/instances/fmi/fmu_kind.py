@@ -15,7 +15,7 @@ from msgspec.structs import replace
 
 from ...config.base import POSITIVE, Base, Sha256
 from ...config.findings import Findings
-from ...config.instance_sections import KIND, Group, Host, InstanceSection, StartValues, StepSize
+from ...config.instance_sections import KIND, Group, Host, InstanceSection, NotFinitePolicy, StartValues, StepSize
 from ...config.mesh import LimitsConfig
 from ...errors import LoadFailed
 from ...system.process_sharing import Claims
@@ -92,6 +92,7 @@ class FmuConfig(Base, InstanceSection, frozen=True, kw_only=True, tag_field=KIND
     step_size: StepSize = None
     group: Group = None
     host: Host = None
+    not_finite: NotFinitePolicy = None
     interpolation: Annotated[
         Literal["hold", "linear"] | None,
         Meta(

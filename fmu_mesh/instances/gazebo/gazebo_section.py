@@ -14,6 +14,7 @@ from ...config.instance_sections import (
     FluidDynamics,
     Group,
     Host,
+    NotFinitePolicy,
     PhysicsSection,
     StartValues,
     StepSize,
@@ -40,3 +41,4 @@ class GazeboClassicConfig(Base, PhysicsSection, frozen=True, kw_only=True, tag_f
     step_size: StepSize = None
     group: Group = None
     host: Host = None
+    not_finite: NotFinitePolicy = None

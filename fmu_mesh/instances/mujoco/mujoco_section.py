@@ -14,6 +14,7 @@ from ...config.instance_sections import (
     FluidDynamics,
     Group,
     Host,
+    NotFinitePolicy,
     PhysicsSection,
     StartValues,
     StepSize,
@@ -41,3 +42,4 @@ class MujocoConfig(Base, PhysicsSection, frozen=True, kw_only=True, tag_field=KI
     step_size: StepSize = None
     group: Group = None
     host: Host = None
+    not_finite: NotFinitePolicy = None

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import msgspec
 import numpy as np
@@ -37,10 +37,12 @@ class OnnxInstance:
     Args:
         name: instance name.
         model: what is computed.
+        not_finite: whether NaN is an error.
     """
 
-    def __init__(self, name: str, model: OnnxModel) -> None:
+    def __init__(self, name: str, model: OnnxModel, not_finite: Literal["stop", "record"] | None = None) -> None:
         self.name = name
+        self._takes_nan = not_finite == "record"
         self._model = model
         self._variables = {variable.name: variable for variable in model.description.variables}
         self._values = Ring(Layout.of(model.description.variables), 1)
@@ -182,7 +184,7 @@ class OnnxInstance:
                     text = f"the output has {output.size} elements now and had {values.size} for inputs of 0"
                     raise self._failed(text, variable.name)
                 values[:] = output.ravel()
-            if any(
+            if not self._takes_nan and any(
                 math.isnan(numbers.dot(numbers)) for numbers in self._numbers
             ):  # only NaN makes a sum of squares NaN
                 raise self._not_a_number()

@@ -14,7 +14,7 @@ from msgspec import Meta
 
 from ... import files
 from ...config.base import Base
-from ...config.instance_sections import KIND, Group, Host, InstanceSection, StartValues, StepSize
+from ...config.instance_sections import KIND, Group, Host, InstanceSection, NotFinitePolicy, StartValues, StepSize
 from ...config.mesh import LimitsConfig
 from ...errors import LoadFailed
 from ...variables.model_description import ModelDescription
@@ -31,6 +31,7 @@ class OnnxConfig(Base, InstanceSection, frozen=True, kw_only=True, tag_field=KIN
     step_size: StepSize = None
     group: Group = None
     host: Host = None
+    not_finite: NotFinitePolicy = None
 
 
 class OnnxKind(Kind[OnnxConfig]):
@@ -64,7 +65,7 @@ class OnnxKind(Kind[OnnxConfig]):
             model = OnnxModel(opening.path, opening.limits, opening.content)
         except LoadFailed as error:
             raise LoadFailed(error.message, instance=opening.name, hint=error.hint) from error
-        return OnnxInstance(opening.name, model)
+        return OnnxInstance(opening.name, model, opening.section.not_finite)
 
 
 KIND_OF_ONNX_MODELS = OnnxKind()

@@ -10,7 +10,7 @@ from msgspec import Meta
 from msgspec.structs import replace
 
 from ...config.base import Base
-from ...config.instance_sections import KIND, Group, Host, InstanceSection, StartValues, StepSize
+from ...config.instance_sections import KIND, Group, Host, InstanceSection, NotFinitePolicy, StartValues, StepSize
 from ...variables.model_description import ModelDescription
 from ...variables.value_types import PlainValue
 
@@ -69,6 +69,7 @@ class PythonConfig(Base, InstanceSection, frozen=True, kw_only=True, tag_field=K
     step_size: StepSize = None
     group: Group = None
     host: Host = None
+    not_finite: NotFinitePolicy = None
 
     names_code = True
 
