@@ -86,13 +86,6 @@ class SimulationConfig(Base, frozen=True, kw_only=True):
             "auto: up to 32768 points, fewer for many instances or large rows."
         ),
     ] = "auto"
-    not_finite: Annotated[
-        Literal["stop", "record"],
-        Meta(
-            description="stop: an output that is NaN or infinite ends the run at its point, and no such value may be "
-            "set; record: it is recorded as it is. An instance can have its own `not_finite`."
-        ),
-    ] = "stop"
     real_time_factor: Annotated[
         float,
         Meta(
@@ -115,6 +108,13 @@ class SimulationConfig(Base, frozen=True, kw_only=True):
             "counted as overruns; null: no limit."
         ),
     ] = None
+    not_finite: Annotated[
+        Literal["stop", "record"],
+        Meta(
+            description="stop: an output that is NaN or infinite ends the run at its point, and no such value may be "
+            "set; record: it is recorded as it is. An instance can have its own `not_finite`."
+        ),
+    ] = "stop"
 
 
 class LimitsConfig(Base, frozen=True, kw_only=True):

@@ -15,7 +15,7 @@ from threading import Lock
 from time import perf_counter
 from typing import Final, cast
 
-from ..errors import FmuMeshError, ProtocolBroken, StepFailed, TerminationRequested
+from ..errors import FmuMeshError, ProtocolBroken, TerminationRequested
 from ..instances.call_guard import floating_point_changed, restore_floating_point
 from ..instances.contract import StepsNatively
 from ..rings import native
@@ -23,7 +23,7 @@ from ..rings.host_memory import HostMemory
 from ..rings.native import NEVER, OUT_OF_RANGE, STAGE_BITS, BurstEnd, RowBase, Stage, StepKind, table
 from ..system.plan import NodePlan
 from .inputs import TimedInputs
-from .stepping import Position, Runner, Source
+from .stepping import Position, Runner
 
 __all__ = ["BurstEngine", "Engine", "PlainEngine", "make_engine"]
 
@@ -160,9 +160,6 @@ class BurstEngine(Engine):
             runner, member = self._at(node.unit, node.member)
             if result == BurstEnd.FORGED:
                 raise self._forged(runner)
-            if result == BurstEnd.NOT_FINITE:
-                self._units[node.unit].stopped, member.stage = 1, Stage.WAITING
-                raise runner.is_finite.error(member.step + 1, runner.grid)
             began = perf_counter()
             self._complete(node.unit, runner, member, result)
             self._units[node.unit].spent_ns += int((perf_counter() - began) * 1e9)
@@ -214,7 +211,7 @@ class BurstEngine(Engine):
             own = None
         gates, loads = [], []
         for number, source in enumerate(runner.sources):
-            gates.append(_gate(source))
+            gates.append(source.gate)
             loads += source.transfer.moves(RowBase.FIRST_GATE + number)
         loads += own.loads if own is not None else ()
         setters, getters, stores = (own.setters, own.getters, own.stores) if own is not None else ((), (), ())
@@ -275,6 +272,8 @@ class BurstEngine(Engine):
         """Let Python take a step, or complete one that returned something unusual."""
         step = member.step
         try:
+            if result == BurstEnd.NOT_FINITE:
+                raise runner.is_finite.error(step + 1, runner.grid)
             if result == BurstEnd.PYTHON:
                 for source in runner.sources:
                     source.transfer.step_text(step)
@@ -289,8 +288,7 @@ class BurstEngine(Engine):
                 cast("StepsNatively", runner.instance).finish(step, member.outcome)
         except FmuMeshError as error:
             self._units[unit].stopped = 1
-            if isinstance(error, StepFailed):
-                runner.is_finite.explain(error)
+            runner.is_finite.explain(error)
             if isinstance(error, TerminationRequested):
                 member.stage = Stage.WAITING
             raise
@@ -336,18 +334,6 @@ class _InTable(Position):
     def refit(self) -> None:
         """See `Position`."""
         self._fill()
-
-
-def _gate(source: Source) -> native.Gate:
-    ring, rule = source.transfer.source, source.transfer.rule
-    return native.Gate(
-        counter=source.counter.address,
-        rows=ring.address,
-        stride=ring.stride,
-        mask=ring.mask,
-        lead=rule.lead,
-        points=rule.source_points,
-    )
 
 
 class PlainEngine(Engine):
@@ -447,8 +433,7 @@ class PlainEngine(Engine):
                 raise runner.is_finite.error(step + 1, runner.grid)
         except FmuMeshError as error:
             self._stopped.add(number)
-            if isinstance(error, StepFailed):
-                runner.is_finite.explain(error)
+            runner.is_finite.explain(error)
             raise
         finally:
             position.enter(Stage.WAITING)

@@ -280,10 +280,9 @@ class Node:
         """An FMU ends the simulation: its unit stops stepping, and the master ends the run at its point."""
         assert self._engine is not None
         runner = self._runners[asked.instance or ""]
-        point = runner.covered
         # The master has to know it before the progress of this node, which is beyond the grant then.
         if isinstance(asked, TerminationRequested):
-            asked.at(point, self._plan.grid.time(point))
+            asked.at(runner.covered, self._plan.grid.time(runner.covered))
         self._tell_end(asked, self._plan.timeouts.stop)
         for member in next(unit for unit in self._engine.units if runner in unit):
             member.stop()

@@ -12,6 +12,7 @@ from ..instances.contract import Instance
 from ..rings.array_elements import fill_unconnected
 from ..rings.finite import FiniteRows
 from ..rings.host_memory import Counter
+from ..rings.native import Gate
 from ..rings.ring import Ring
 from ..rings.transfer import Transfer
 from ..simtime import TimeGrid
@@ -38,6 +39,19 @@ class Source(NamedTuple):
     def has(self, step: int) -> bool:
         """Whether the row for own step ``step`` of the runner is there."""
         return self.counter.value > self.transfer.rule.row_for(step)
+
+    @property
+    def gate(self) -> Gate:
+        """Its rows as the burst sees them."""
+        ring, rule = self.transfer.source, self.transfer.rule
+        return Gate(
+            counter=self.counter.address,
+            rows=ring.address,
+            stride=ring.stride,
+            mask=ring.mask,
+            lead=rule.lead,
+            points=rule.source_points,
+        )
 
 
 class Position:
@@ -90,7 +104,7 @@ class Runner:
         self.watched: Ring | None = None
         self.last_step = grid.last_point // plan.step_points
         self.grid = grid
-        self.is_finite = FiniteRows(plan, outputs, self.inputs, instance.get_values)
+        self.is_finite = FiniteRows(plan, outputs, self.inputs)
         self._position = Position()
 
     def bind(self) -> None:
@@ -115,7 +129,9 @@ class Runner:
             NotFinite: one is not finite.
         """
         if not self.is_finite(0):
-            raise self.is_finite.error(0, self.grid)
+            error = self.is_finite.error(0, self.grid)
+            self.is_finite.explain(error, self.instance.get_values)
+            raise error
         self.outputs.stamp(0)
         self.counter.raise_to(1)
 

@@ -8,15 +8,17 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 
-from ..errors import FmuError, NotFinite
+from ..errors import FmuError, FmuMeshError, NotFinite
 from ..simtime import TimeGrid
 from ..system.plan import InstancePlan
-from ..variables.value_types import Value, flattened
+from ..variables.value_types import Value, VariableType
 from .array_elements import element_of
 from .native import NUMBER_TYPES, Span
 from .ring import Ring
 
 __all__ = ["FiniteRows"]
+
+Get = Callable[[Sequence[str]], list[Value]]
 
 
 class FiniteRows:
@@ -26,32 +28,31 @@ class FiniteRows:
         plan: says which outputs have to be finite.
         outputs: the rows.
         inputs: the row of inputs.
-        get: reads variables of the instance.
 
     Attributes:
         spans: where these outputs are in a row, for the burst.
     """
 
-    def __init__(
-        self, plan: InstancePlan, outputs: Ring, inputs: Ring, get: Callable[[Sequence[str]], list[Value]]
-    ) -> None:
+    def __init__(self, plan: InstancePlan, outputs: Ring, inputs: Ring) -> None:
         self._plan = plan
         self._outputs = outputs
         self._inputs = inputs
-        self._get = get
-        self.spans: list[Span] = []
-        self._runs: list[tuple[memoryview, int, int, int]] = []
-        end = -1
+        runs: list[tuple[VariableType, int, int, int]] = []  # type, place in bytes, size in bytes, count
         for name in plan.finite:
             place, type_ = outputs.layout.place(name), outputs.layout.column(name).type
-            start, size = outputs.place_in_row(place.part, place.first), outputs.parts[place.part].itemsize
-            if start == end and self.spans[-1].type == NUMBER_TYPES[type_]:
-                self.spans[-1].count += place.size
-                self._runs[-1] = (*self._runs[-1][:3], self.spans[-1].count)
-            else:
-                self.spans.append(Span(start, place.size, NUMBER_TYPES[type_]))
-                self._runs.append((outputs.floats(type_), outputs.stride // size, start // size, place.size))
-            end = start + place.size * size
+            start, size, count = (
+                outputs.place_in_row(place.part, place.first),
+                8 if type_ == "Float64" else 4,
+                place.size,
+            )
+            if runs and runs[-1][0] == type_ and runs[-1][1] + size * runs[-1][3] == start:
+                _, start, _, before = runs.pop()
+                count += before
+            runs.append((type_, start, size, count))
+        self.spans = [Span(start, count, NUMBER_TYPES[type_]) for type_, start, _, count in runs]
+        self._runs = [
+            (outputs.floats(type_), outputs.stride // size, start // size, count) for type_, start, size, count in runs
+        ]
 
     def __call__(self, row: int) -> bool:
         """Whether a row is finite."""
@@ -63,53 +64,55 @@ class FiniteRows:
         return True
 
     def error(self, row: int, grid: TimeGrid) -> NotFinite:
-        """The error for a row that is not finite."""
-        plan, point = self._plan, row * self._plan.step_points
-        columns = (self._outputs.layout.column(name) for name in plan.finite)
+        """The error for a row that is not finite; `explain` adds the cause."""
+        plan, outputs, point = self._plan, self._outputs, row * self._plan.step_points
         output, value = next(
             (element, value)
-            for column in columns
-            for element, value in zip(
-                column.elements, flattened(self._outputs.value(row, column.name), len(column.shape)), strict=True
-            )
+            for column in map(outputs.layout.column, plan.finite)
+            for element, value in zip(column.elements, _elements(outputs.value(row, column.name)), strict=True)
             if not math.isfinite(value)
         )
-        error = NotFinite(
-            f"output {output} is {_shown(value)}",
-            instance=plan.name,
-            variable=output,
-            hint=f"If {plan.name}.{output} may be so, write `not_finite: record` for '{plan.name}'.",
-        )
-        self.explain(error, initial=row == 0)
-        if "came as" not in error.message:
-            error.saying(f"{error.message}; its inputs were finite")
-        return error.at(point, grid.time(point))
+        hint = f"If {plan.name}.{output} may be so, write `not_finite: record` for '{plan.name}'."
+        text = f"output {output} is {_shown(value)}"
+        return NotFinite(text, instance=plan.name, variable=output, point=point, time=grid.time(point), hint=hint)
 
-    def explain(self, error: FmuError, *, initial: bool = False) -> None:
-        """Add to a failure of the instance which input was not finite, and its source, if there is one."""
-        for name, value, source in self._given(initial=initial):
-            wrong = next(
-                (v for v in flattened(value, _rank(value)) if isinstance(v, float) and not math.isfinite(v)), 0
-            )
-            if wrong:
-                error.saying(f"{error.message.rstrip('.')}; its input {name} came as {_shown(wrong)} from {source}")
+    def explain(self, error: FmuMeshError, get: Get | None = None) -> None:
+        """Add to a failure of the instance the first input that was not finite, and its source.
+
+        Args:
+            error: the failure; nothing is added to other errors.
+            get: reads the inputs after Initialization Mode; None: they are those of the last step.
+        """
+        if not isinstance(error, FmuError):
+            return
+        for name, value, source in self._given(get):
+            if wrong := [element for element in _elements(value) if not math.isfinite(element)]:
+                text = error.message.rstrip(".")
+                error.saying(f"{text}; its input {name} came as {_shown(wrong[0])} from {source}")
                 return
+        if isinstance(error, NotFinite):
+            error.saying(f"{error.message}; its inputs were finite")
 
-    def _given(self, *, initial: bool) -> Iterator[tuple[str, Value, str]]:
-        """Each connected input, its value in the last step or in Initialization Mode, and the output it came from."""
+    def _given(self, get: Get | None) -> Iterator[tuple[str, Value, str]]:
+        """Each connected input, its value, and the output that it came from."""
         plan = self._plan
-        for feed in (*plan.feeds, *plan.parameters) if initial else plan.feeds:
+        for feed in (*plan.feeds, *plan.parameters) if get is not None else plan.feeds:
             for own in feed.columns:
-                if initial:
+                if get is not None:
                     column = plan.initial_inputs.column(own.target)
-                    value = element_of(self._get([column.name])[0], column, own.target)
+                    value = element_of(get([column.name])[0], column, own.target)
                 else:
                     value = self._inputs.value(0, own.target)
                 yield own.target, value, f"{feed.source}.{own.source}"
 
 
-def _rank(value: Value) -> int:
-    return 1 + _rank(value[0]) if isinstance(value, list) and value else int(isinstance(value, list))
+def _elements(value: Value) -> Iterator[float]:
+    """The numbers of a scalar or an array; none of text."""
+    if isinstance(value, list):
+        for row in value:
+            yield from _elements(row)
+    elif isinstance(value, float | int):
+        yield value
 
 
 def _shown(value: float) -> str:

@@ -89,7 +89,7 @@ class LocalSystem:
         except FmuError as error:
             if not isinstance(error, NotFinite):
                 error.at(self.begun_at, self._grid.time(self.begun_at))
-                self._members[self.stepping].is_finite.explain(error)
+            self._members[self.stepping].is_finite.explain(error)
             raise
         except TerminationRequested as asked:
             asked.at(point, self._grid.time(point))
@@ -245,7 +245,7 @@ class _Member:
         # A slower instance reads values that are as old as its own step.
         oldest = max(instance.step_points for instance in plan.system.instances.values())
         self._outputs = Ring(self.plan.outputs, 1 << (2 * oldest).bit_length())
-        self.is_finite = FiniteRows(self.plan, self._outputs, self._inputs, instance.get_values)
+        self.is_finite = FiniteRows(self.plan, self._outputs, self._inputs)
         self._points = self.plan.step_points
         self._feeds: list[_Feed] = []
         self._set_at = -1
@@ -298,7 +298,10 @@ class _Member:
             self._inputs.put(0, name, value)  # elements that are not connected keep it
         self.instance.bind(self._inputs, (self._outputs,), grid, self.plan.step_points)
         self._grid = grid
-        self._check_row(0)
+        if not self.is_finite(0):
+            error = self.is_finite.error(0, grid)
+            self.is_finite.explain(error, self.instance.get_values)
+            raise error
         for c in self.connections:
             if c.initial_only:
                 continue
@@ -332,12 +335,9 @@ class _Member:
         self._do_step(step)
         if floating_point_changed():
             restore_floating_point()
-        self._check_row(step + 1)
+        if not self.is_finite(step + 1):
+            raise self.is_finite.error(step + 1, self._grid)
         self.step = step + 1
-
-    def _check_row(self, row: int) -> None:
-        if not self.is_finite(row):
-            raise self.is_finite.error(row, self._grid)
 
     def getter(self, name: str) -> Callable[[int], Value]:
         """See `LocalSystem.getter`: from the row of the point, or from the model if something was set since then."""

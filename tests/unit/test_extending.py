@@ -118,7 +118,7 @@ def test_an_unknown_field_in_the_section_of_another_package_has_the_usual_findin
     changed(mesh, "between: linear", "between_: linear")
     assert (
         "mesh.yaml:4: instances.wave.between_: an unknown key; expected one of table, between, start_values, "
-        "step_size, group, host. Did you mean 'between'?"
+        "step_size, group, host, not_finite. Did you mean 'between'?"
     ) in findings(place.run("check", mesh))
 
 

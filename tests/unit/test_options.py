@@ -18,6 +18,7 @@ from fmu_mesh.errors import ConfigurationError
 from fmu_mesh.instances.configuration import installed_config, parse
 from fmu_mesh.run.options import Options, option_fields, with_config_values, with_options
 from fmu_mesh.run.preparing import prepare
+from fmu_mesh.text import listed
 from tests.helpers import FMUS
 
 TEXT = """\
@@ -161,7 +162,7 @@ def test_a_replaced_value_is_checked_like_the_file(tmp_path: Path) -> None:
             prepare(file, Options(**options))
         return [str(finding).removeprefix(f"{file}: ") for finding in raised.value.findings]
 
-    keys = ", ".join(SimulationConfig.__struct_fields__)
+    keys = listed(SimulationConfig.__struct_fields__)
     assert findings(config_values=("simulation.windw=3", "zenoh={mode: pear}", "timeouts.step=0")) == [
         f"--set-config simulation.windw=3: an unknown key; expected one of {keys}. Did you mean 'window'?",
         "--set-config zenoh={mode: pear}: 'pear'; expected client or peer. Did you mean 'peer'?",
