@@ -215,13 +215,13 @@ class System:
         """
         self._demand("set")
         instance, variable = self._found(name)
-        node = self._run.plan.nodes[self._run.plan.node_of(instance)]
+        own = self._run.plan.nodes[self._run.plan.node_of(instance)].instance(instance)
         try:
-            check_settable(node.instance(instance), variable)
+            check_settable(own, variable)
         except ValueRefused as refused:
             raise CallRefused(f"it {refused}.", instance=instance, variable=variable.name) from refused
         try:
-            checked = checked_value(value, variable, shown(value))
+            checked = checked_value(value, variable, shown(value), finite=own.not_finite == "stop")
         except ValueRefused as refused:
             raise CallRefused(f"{refused}.", instance=instance, variable=variable.name) from refused
         with self._changing():

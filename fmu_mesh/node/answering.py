@@ -279,7 +279,8 @@ class Answers:
             raise ValueRefused(f"'{runner.name}.{name}' {refused}") from refused
         try:
             origin = decode_origin(attachment.to_bytes()) if attachment is not None else NO_ORIGIN
-            return name, decode_value(payload.to_bytes() if payload is not None else b"", variable), origin
+            data, finite = payload.to_bytes() if payload is not None else b"", runner.plan.not_finite == "stop"
+            return name, decode_value(data, variable, finite=finite), origin
         except ValueRefused as refused:
             raise ValueRefused(f"'{runner.name}.{name}': {refused}") from refused
 

@@ -7,6 +7,7 @@ Owns the synchronization model (docs/architecture.md) as data. The plan is a pur
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Literal
 
 import msgspec
 from msgspec.structs import replace
@@ -48,6 +49,7 @@ class InstancePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         initial_inputs: what is set in Initialization Mode: ``inputs``, and the connected parameters.
         initial_outputs: what is read in Initialization Mode only.
         finite: those of ``outputs`` that end the run where they are not finite.
+        not_finite: what it means; `record` also allows to set such values.
     """
 
     name: str
@@ -66,6 +68,7 @@ class InstancePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     initial_inputs: Layout = Layout()
     initial_outputs: Layout = Layout()
     finite: tuple[str, ...] = ()
+    not_finite: Literal["stop", "record"] = "stop"
 
     @property
     def input_row(self) -> Layout:
@@ -340,8 +343,6 @@ def _instance_plan(plan: Plan, instance: SystemInstance, outputs: Layout) -> Ins
     connected, parameters = {c.target.name for c in stepped}, {c.target.name for c in initial}
     read = {c.source.name for c in plan.connections if c.source_instance == instance.name} - {*outputs.names}
     levels = plan.initialization.levels
-    own = plan.system.config.instances[instance.name]
-    not_finite = plan.system.config.not_finite(own)
     given = {variable.name for variable in instance.description.with_causality("output")}
     return InstancePlan(
         name=instance.name,
@@ -352,7 +353,7 @@ def _instance_plan(plan: Plan, instance: SystemInstance, outputs: Layout) -> Ins
         inputs=Layout.of(v for v in instance.description.variables if v.name in connected),
         feeds=feeds_of(stepped),
         initialization={variable: level for (owner, variable), level in levels.items() if owner == instance.name},
-        section=placed(own, not_finite),
+        section=placed(plan.system.config.instances[instance.name], instance.not_finite),
         linear_inputs=tuple(
             LinearInput(c.target.name, c.delay or 0, plan.system.instances[c.source_instance].step_points)
             for c in stepped
@@ -364,8 +365,9 @@ def _instance_plan(plan: Plan, instance: SystemInstance, outputs: Layout) -> Ins
         initial_inputs=Layout.of(v for v in instance.description.variables if v.name in connected | parameters),
         initial_outputs=Layout.of(v for v in instance.description.variables if v.name in read),
         finite=tuple(c.name for c in outputs.columns if is_float(c.type) and c.name in given)
-        if not_finite == "stop"
+        if instance.not_finite == "stop"
         else (),
+        not_finite=instance.not_finite,
     )
 
 

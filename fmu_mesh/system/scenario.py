@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import msgspec
 from msgspec.structs import replace
@@ -20,7 +20,7 @@ from ..simtime import TimeGrid
 from ..text import shown
 from ..variables.model_description import Value, Variable
 from ..variables.units import BaseUnit, Linear, conversion
-from ..variables.value_conversion import ValueRefused, to_plain, to_value
+from ..variables.value_conversion import FINITE, ValueRefused, to_plain, to_value
 from ..variables.value_types import PlainValue, is_float
 from .connections import Connection, Variables, resolve_variable
 from .schedule import Course, Schedule, SeriesFile
@@ -71,10 +71,11 @@ class Scenario(NamedTuple):
 
 
 class ScenarioInput(NamedTuple):
-    """One instance, as far as a scenario needs it: its start values and its points per own step."""
+    """One instance, as far as a scenario needs it: its start values, its points per own step, and what NaN means."""
 
     start_values: Mapping[str, Value]
     step_points: int
+    not_finite: Literal["stop", "record"] = "stop"
 
 
 class ResolvedScenario(msgspec.Struct, frozen=True):
@@ -383,11 +384,18 @@ class _Resolving:
     # --- the run
 
     def _course(self, entry: _Entry) -> Course | None:
+        own = self._instances[entry.instance]
         try:
-            return course_of(entry.schedule, entry.variable, self._grid, self._instances[entry.instance].step_points)
+            course = course_of(entry.schedule, entry.variable, self._grid, own.step_points)
         except SeriesRefused as refused:
             self._findings.add(f"{entry.path}.{refused.key}", str(refused), refused.expected)
             return None
+        time = course.not_finite_at if own.not_finite == "stop" else None
+        if time is not None:
+            found = f"a value of '{entry.instance}.{entry.variable.name}' at {time:.9g} s that is not finite"
+            self._findings.add(entry.path, found, FINITE)
+            return None
+        return course
 
     def _check_end(self, entry: _Entry, course: Course) -> None:
         """Warn of what comes after the last step: most likely the stop time, or the unit of a time, is wrong."""

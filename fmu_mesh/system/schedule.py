@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from ..simtime import ENDLESS, TimeGrid
 from ..variables.model_description import ModelDescription, Value
+from ..variables.value_conversion import is_finite
 from ..variables.value_types import PlainValue
 from .layout import Layout
 
@@ -122,6 +123,12 @@ class Course:
                 self._times.append(time)
                 self._values.append(value)
                 self._steps.append(step)
+
+    @property
+    def not_finite_at(self) -> float | None:
+        """The first time in s at which the value is not finite."""
+        pairs = zip(self._times, self._values, strict=True)
+        return next((time for time, value in pairs if not is_finite(value)), None)
 
     def value(self, step: int) -> Value | None:
         """The prescribed value for an own step; None before the first one."""

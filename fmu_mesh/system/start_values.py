@@ -48,7 +48,7 @@ def sized(name: str, description: ModelDescription, config: InstanceSection, fin
 
 
 def resolve_start_values(
-    name: str, config: InstanceSection, description: ModelDescription, findings: Findings
+    name: str, config: InstanceSection, description: ModelDescription, findings: Findings, *, finite: bool = False
 ) -> dict[str, Value]:
     """The start values of the instance ``name``, converted to the types of its variables.
 
@@ -57,6 +57,7 @@ def resolve_start_values(
         config: its section of the configuration.
         description: its model description.
         findings: where unknown names and wrong values go; the result does not have them.
+        finite: whether NaN and infinity are refused.
     """
     settable = [variable.name for variable in description.variables if variable.settable_before_start]
     values: dict[str, Value] = {}
@@ -73,7 +74,7 @@ def resolve_start_values(
             findings.add(path, found, f"one of {listed(settable)}")
         else:
             try:
-                values[variable_name] = to_value(value, variable)
+                values[variable_name] = to_value(value, variable, finite=finite)
             except ValueRefused as refused:
                 found = f"{shown(value)} for the {variable.type_name} '{variable_name}'"
                 if refused.out_of_range:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from functools import partial
+from typing import Literal
 
 import msgspec
 from msgspec.structs import replace
@@ -53,6 +54,7 @@ class SystemInstance(msgspec.Struct, frozen=True):
         step_points: its step size as a multiple of the base step size; 1 or more.
         node: name of its node (process): its group, that of its cycle (`group: auto`), or its own name.
         scenario: what a scenario prescribes for its variables.
+        not_finite: what an output that is NaN or infinite means.
     """
 
     name: str
@@ -62,6 +64,7 @@ class SystemInstance(msgspec.Struct, frozen=True):
     step_points: int
     node: str
     scenario: tuple[Schedule, ...] = ()
+    not_finite: Literal["stop", "record"] = "stop"
 
 
 class ResolvedSystem(msgspec.Struct, frozen=True):
@@ -172,7 +175,7 @@ def _prescribed(  # noqa: PLR0913, PLR0917  what a scenario refers to
     """What the scenario prescribes; nothing without a time grid, for which there is a finding."""
     if scenario is None or grid is None:
         return ResolvedScenario()
-    inputs = {name: ScenarioInput(own.start_values, own.step_points) for name, own in instances.items()}
+    inputs = {name: ScenarioInput(own.start_values, own.step_points, own.not_finite) for name, own in instances.items()}
     if scenario.source.prefix:
         return resolve_scenario(scenario, variables, inputs, connections, grid, findings)
     own = scenario.source.findings()
@@ -231,7 +234,8 @@ def _instances(
         step_points = _step_points(name, config, base, findings)
         if name not in descriptions:
             continue
-        start_values = resolve_start_values(name, config, descriptions[name], findings)
+        not_finite = loaded.config.not_finite(config)
+        start_values = resolve_start_values(name, config, descriptions[name], findings, finite=not_finite == "stop")
         config.check(f"instances.{name}", descriptions[name], findings)
         instances[name] = SystemInstance(
             name=name,
@@ -240,6 +244,7 @@ def _instances(
             start_values=start_values,
             step_points=step_points,
             node=config.group or name,
+            not_finite=not_finite,
         )
     return instances
 

@@ -17,10 +17,23 @@ from ..text import listed, nearest
 from .model_description import Variable
 from .value_types import DTYPES, INTEGERS, PlainValue, Value, VariableType, flattened, nested
 
-__all__ = ["MAX_TEXT_SIZE", "ValueRefused", "checked_value", "from_plain", "range_of", "to_plain", "to_value"]
+__all__ = [
+    "FINITE",
+    "MAX_TEXT_SIZE",
+    "ValueRefused",
+    "checked_value",
+    "from_plain",
+    "is_finite",
+    "range_of",
+    "to_plain",
+    "to_value",
+]
 
 MAX_TEXT_SIZE = 16 * 2**20
 """Largest size of a String or Binary in bytes."""
+
+FINITE = "a finite number, or `not_finite: record` for its instance"
+"""What is expected where a value that is NaN or infinite is refused."""
 
 _NOT_FINITE = {"NaN": math.nan, "INF": math.inf, "-INF": -math.inf}
 _FLOAT32_MAX = float(np.finfo(np.float32).max)
@@ -45,33 +58,48 @@ class ValueRefused(ValueError):
         self.out_of_range = out_of_range
 
 
-def to_value(plain: object, variable: Variable) -> Value:
+def to_value(plain: object, variable: Variable, *, finite: bool = False) -> Value:
     """Convert a plain value, or a Python or numpy value, to the value of a variable.
 
     A floating-point number may be given as a whole number, or as `NaN`, `INF` or `-INF` (FMI 3.0, 2.4.8); an
     Enumeration by the name or the number of an item; Binary as bytes or as base64; an array as nested lists by rows.
+
+    Args:
+        plain: the value that somebody gave.
+        variable: what it is for.
+        finite: whether `NaN`, `INF` and `-INF` are refused.
 
     Raises:
         ValueRefused: it is no value of the variable's type and shape, or out of its range.
     """
     plain = plain.tolist() if isinstance(plain, np.ndarray | np.generic) else plain
     values = [_element(element, variable) for element in _elements(plain, variable, variable.shape)]
+    if finite and not is_finite(values):
+        raise ValueRefused(f"{plain!r} is not finite", expected=FINITE)
     return nested(values, variable.shape)
 
 
-def checked_value(plain: object, variable: Variable, said: str) -> Value:
+def is_finite(value: Value) -> bool:
+    """Whether neither a value nor one of its elements is NaN or infinite."""
+    if isinstance(value, list):
+        return all(map(is_finite, value))
+    return not isinstance(value, float) or math.isfinite(value)
+
+
+def checked_value(plain: object, variable: Variable, said: str, *, finite: bool = False) -> Value:
     """As `to_value`, with a whole sentence as the message of the error.
 
     Args:
         plain: the value that somebody gave.
         variable: what it is for.
         said: the value as the sentence shows it.
+        finite: see `to_value`.
 
     Raises:
         ValueRefused: it is no value of the variable's type and shape, or out of its range.
     """
     try:
-        return to_value(plain, variable)
+        return to_value(plain, variable, finite=finite)
     except ValueRefused as refused:
         what = "is out of its range" if refused.out_of_range else f"is no {variable.type_name} value for it"
         near = f" (did you mean '{refused.suggestion}'?)" if refused.suggestion else ""

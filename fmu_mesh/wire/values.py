@@ -89,8 +89,8 @@ def encode_value(value: Value) -> bytes:
     return msgspec.json.encode(to_plain(value))
 
 
-def decode_value(data: bytes, variable: Variable) -> Value:
-    """The value that JSON ``data`` gives for ``variable``.
+def decode_value(data: bytes, variable: Variable, *, finite: bool = False) -> Value:
+    """The value that JSON ``data`` gives for ``variable``; ``finite``: see `to_value`.
 
     Raises:
         ValueRefused: it is not JSON, or has a wrong type, shape or range.
@@ -101,4 +101,4 @@ def decode_value(data: bytes, variable: Variable) -> Value:
         value: Any = decode_json(data, object)
     except MessageRefused as error:
         raise ValueRefused(f"it is no JSON value ({error})") from error
-    return checked_value(value, variable, data[:80].decode(errors="replace"))
+    return checked_value(value, variable, data[:80].decode(errors="replace"), finite=finite)

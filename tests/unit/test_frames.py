@@ -213,7 +213,7 @@ def test_rows_for_the_recorder_wait_for_more_rows_unless_no_more_will_come(step:
     map_, places = map_memory(["left", MASTER], {"source": ("left", 1, LAYOUT)}, 16)
     memory, place = HostMemory.private(map_, "left"), places["source"]
     ring, messages = memory.ring(place), list[bytes]()
-    plan = SimpleNamespace(name="source", step_points=1, inputs=Layout(), input_row=Layout())
+    plan = SimpleNamespace(name="source", step_points=1, inputs=Layout(), input_row=Layout(), finite=())
     runner = Runner(cast("Any", plan), cast("Any", None), TimeGrid(0.0, 0.1, 10), ring, memory.counter(place.counter))
     position = Position()
     runner.follow(position)
