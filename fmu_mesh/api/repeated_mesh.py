@@ -108,7 +108,8 @@ class RepeatedMesh:
             outcome = runs.run(plan, rows)
         except FmuMeshError as error:
             point = runs.point
-            outcome = Outcome("failed", point, plan.plan.grid.time(point), 0.0, rows.rows, None, error.report())
+            time, warnings = plan.plan.grid.time(point), runs.warnings
+            outcome = Outcome("failed", point, time, 0.0, rows.rows, None, error.report(), warnings=warnings)
             raise error.with_result(rows.result(outcome)) from error.__cause__
         return rows.result(outcome)
 

@@ -56,6 +56,7 @@ class Result(Mapping[str, NDArray[Any]]):
         file: the result file; None if the rows are only in memory, or if nothing was recorded.
         all: this result and those of the other files of the run, in the order of the configuration.
         outcome: how the run ended; None for a file that was read.
+        warnings: what is wrong although nothing failed, such as a value that grows without a limit.
         names: the recorded variables, in order.
         units: the unit of each, as FMI writes it; None without one.
     """
@@ -143,17 +144,23 @@ class Result(Mapping[str, NDArray[Any]]):
         return tuple(self if number == self._record else self._of_file(number) for number in range(len(files)))
 
     @property
+    def warnings(self) -> tuple[str, ...]:
+        """What is wrong although nothing failed, such as a value that grows without a limit; empty for a file.
+
+        Example:
+            >>> import fmu_mesh
+            >>> fmu_mesh.load("configs/pendulum_delay.yaml").run(stop_time=1.0, record="memory").warnings
+            ()
+        """
+        return self.outcome.warnings if self.outcome is not None else ()
+
+    @property
     def summary(self) -> str:
         """One line: points, wall-clock time, speed, and why the run ended early if it did."""
         if self.outcome is None:
             return f"{len(self.times)} rows of {listed(self.names)}"
         early = self.outcome.ended_by or self.outcome.error
         return summary_of(self.outcome, self._step_size) + (f"; {early.message}" if early is not None else "")
-
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """What went wrong in the run although the result is complete."""
-        return self.outcome.warnings if self.outcome is not None else ()
 
     def to_pandas(self) -> pd.DataFrame:
         """The result as a data frame: one column per variable, with the time in s as the index.

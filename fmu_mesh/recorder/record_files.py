@@ -8,17 +8,13 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from numpy.typing import NDArray
-
 from ..files import unwritable
 from ..simtime import TimeGrid
 from ..system.recording import ResultFile
 from ..system.records import RecordPlan
+from .growth import GrowthWatch, ReadColumn
 
 __all__ = ["ReadColumn", "RecordFiles"]
-
-ReadColumn = Callable[[int, int], NDArray[Any]]
-"""Returns the values of a variable at the points first to end - 1."""
 
 
 class RecordFiles:
@@ -29,15 +25,22 @@ class RecordFiles:
 
     Args:
         files: the files, in the order of their plans.
+        growth: looks at all rows.
     """
 
-    def __init__(self, files: Sequence[ResultFile]) -> None:
+    def __init__(self, files: Sequence[ResultFile], growth: GrowthWatch | None = None) -> None:
+        self._growth = growth
         self._files = [_RecordFile(file) for file in files]
 
     @property
     def rows(self) -> int:
         """Number of rows of the first file, written so far; after `close`, of those in the file."""
         return self._files[0].file.rows if self._files else 0
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What the rows so far warn of."""
+        return self._growth.warnings if self._growth is not None else ()
 
     @property
     def counted(self) -> tuple[tuple[str, int], ...]:
@@ -58,6 +61,8 @@ class RecordFiles:
                 if key not in columns:
                     columns[key] = column_of(*key)
             own.begin(grid, record, [columns[key] for key in record.variables])
+        if self._growth is not None:
+            self._growth.begin(columns)
 
     def write(self, first: int, end: int) -> None:
         """Write the rows of the points first to end - 1, as far as they are not written yet.
@@ -65,6 +70,8 @@ class RecordFiles:
         Raises:
             ConfigurationError: a file cannot be written; the others have their rows.
         """
+        if self._growth is not None:
+            self._growth.look(first, end)
         self._each(lambda own: own.write(first, end))
 
     def note(self, entry: Mapping[str, Any]) -> None:

@@ -39,7 +39,8 @@ from ..wire.messages import (
     SetValue,
     decode_json,
 )
-from .record_files import ReadColumn, RecordFiles
+from .growth import GrowthWatch, ReadColumn
+from .record_files import RecordFiles
 
 __all__ = ["RecordedSource", "Recorder"]
 
@@ -66,6 +67,7 @@ class Recorder:
         session: the session of this process; the caller closes it.
         files: the result files, in the order of the plan; closed by the recorder.
         has_begun: whether all instances have reached point 0; nothing is written before.
+        growth: looks at all rows.
         launch: the launcher that started this process; None if it was started manually.
         memory: the shared memory of this host; None if nothing is shared.
 
@@ -79,6 +81,7 @@ class Recorder:
         files: Sequence[ResultFile],
         has_begun: Callable[[], bool] = lambda: True,
         *,
+        growth: GrowthWatch | None = None,
         launch: str | None = None,
         memory: HostMemory | None = None,
     ) -> None:
@@ -87,7 +90,7 @@ class Recorder:
         self._memory = memory if memory is not None else self._own_memory
         self._sources: dict[int, RecordedSource] = {}
         self._rows = plan.rings[0].rows
-        self._files = RecordFiles(files)
+        self._files = RecordFiles(files, growth)
         self._has_begun = has_begun
         self._written = 0
         self._told = 0
@@ -104,6 +107,11 @@ class Recorder:
     def files(self) -> tuple[tuple[str, int], ...]:
         """Each file and its number of rows written so far; after the `with` block, the number of rows in the file."""
         return self._files.counted
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What the rows warn of; complete after the `with` block."""
+        return self._files.warnings
 
     def __enter__(self) -> Self:
         self._thread.start()

@@ -14,7 +14,8 @@ from ..simtime import TimeGrid
 from ..system.recording import ResultFile
 from ..system.records import RecordPlan, union_of
 from ..variables.value_types import DTYPES, Value, VariableType
-from .record_files import ReadColumn, RecordFiles
+from .growth import GrowthWatch, ReadColumn
+from .record_files import RecordFiles
 
 __all__ = ["RowBuffer"]
 
@@ -29,6 +30,7 @@ class RowBuffer:
         grid: their times.
         records: what each file gets.
         types: of the values of a row, which are those of `union_of` the records.
+        growth: looks at all rows.
 
     Attributes:
         flushed_at: last time at which other processes could read all rows; monotonic, in s.
@@ -42,9 +44,10 @@ class RowBuffer:
         grid: TimeGrid,
         records: Sequence[RecordPlan],
         types: Sequence[VariableType],
+        growth: GrowthWatch | None = None,
     ) -> None:
         self.flushed_at = 0.0
-        self._files = RecordFiles(files)
+        self._files = RecordFiles(files, growth)
         self._types = types
         self._first = 0
         self._waiting: list[list[Value]] = []

@@ -70,6 +70,7 @@ class InProcessRun:
         if self._error is not None:
             if isinstance(self._error, FmuMeshError):
                 self.outcome = self._failed(self._error)
+                self._on_event(self.outcome)
             raise self._error
         assert self.outcome is not None
         self._on_event(self.outcome)
@@ -149,7 +150,9 @@ class InProcessRun:
         plan, mesh = self._run.plan, self._mesh
         point, files = (mesh.point, mesh.files) if mesh is not None else (0, ())
         file, rows = plan.system.result_file, files[0][1] if files else 0
-        return Outcome("failed", point, plan.grid.time(point), 0.0, rows, file, error.report(), files=files)
+        warnings = mesh.warnings if mesh is not None else ()
+        time_s, report = plan.grid.time(point), error.report()
+        return Outcome("failed", point, time_s, 0.0, rows, file, report, files=files, warnings=warnings)
 
     def _log(self, message: LogMessage) -> None:
         point = self._mesh.point if self._mesh is not None else 0

@@ -321,7 +321,8 @@ class Launcher:
             error.at(last, self._plan.grid.time(last))  # the last progress is older than the last row
         point, seconds = error.point or 0, outcome.seconds if outcome is not None else 0.0
         rows, time_s = files[0][1] if files else 0, self._plan.grid.time(point)
-        self.outcome = Outcome("failed", point, time_s, seconds, rows, file, error.report(), files=files)
+        warnings, report = outcome.warnings if outcome is not None else (), error.report()
+        self.outcome = Outcome("failed", point, time_s, seconds, rows, file, report, files=files, warnings=warnings)
         raise error.with_hint(what_is_kept(files))
 
     def _last_recorded(self, files: Sequence[tuple[str, int]]) -> int:

@@ -24,6 +24,7 @@ from ..instances.contract import Instance, LogMessage, Showing
 from ..instances.process_end import process_ends
 from ..instances.registry import open_instance
 from ..master.pacing import Pacer
+from ..recorder.growth import GrowthWatch
 from ..recorder.row_buffer import RowBuffer
 from ..system.layout import Layout
 from ..system.plan import Plan
@@ -83,6 +84,7 @@ class LocalMesh:
         self._buffer: RowBuffer | None = None
         self.files: tuple[tuple[str, int], ...] = ()
         self._plan = plan
+        self._growth = GrowthWatch(plan)
         self._system = LocalSystem(plan)
         self._log = log
         self._progress = progress
@@ -100,6 +102,11 @@ class LocalMesh:
     def point(self) -> int:
         """The last point reached."""
         return self._system.point
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What the rows so far warn of."""
+        return self._growth.warnings
 
     def interrupt(self, reason: str) -> None:
         """From any thread: end the run with `Interrupted` at the next point."""
@@ -142,6 +149,7 @@ class LocalMesh:
             file=self._plan.system.result_file,
             ended_by=ended_by,
             files=self.files,
+            warnings=self.warnings,
         )
 
     def close(self) -> None:
@@ -159,7 +167,7 @@ class LocalMesh:
         self._folder = Path(enter(tempfile.TemporaryDirectory(prefix="fmu_mesh-", dir=self._parent)))
         watch = enter(closing(CallWatch(self._take_hang, survives=process_ends())))
         files = open_results(self._loaded, plan.system, digest=plan.digest, contents=self._contents)
-        self._buffer = rows = RowBuffer(files, plan.grid, plan.system.records, types)
+        self._buffer = rows = RowBuffer(files, plan.grid, plan.system.records, types, self._growth)
         self._stack.callback(system.close)
         try:
             system.start(partial(self._guarded, folder=self._folder, watch=watch))

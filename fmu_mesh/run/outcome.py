@@ -27,7 +27,7 @@ class Outcome(msgspec.Struct, frozen=True, tag="end"):
         profile: where the time went, if that was asked for.
         signal: name of the signal by which the process of the master was asked to end, if it was.
         files: each result file, and the number of its rows.
-        warnings: what went wrong although the result is complete.
+        warnings: what is wrong although nothing failed: a value that grows without a limit, or how an FMU has ended.
     """
 
     state: Literal["done", "failed"]

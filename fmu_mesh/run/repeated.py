@@ -31,6 +31,7 @@ from ..node.engine import Engine, make_engine
 from ..node.initialization import Initialization
 from ..node.inputs import with_times
 from ..node.stepping import Position, Runner
+from ..recorder.growth import GrowthWatch
 from ..rings import native
 from ..rings.host_memory import HostMemory
 from ..system.plan import Plan, make_plan
@@ -112,7 +113,7 @@ class RepeatedRuns:
             FmuMeshError: a model failed, the run was interrupted, or this system cannot run in one process. The rows
                 that were recorded before are kept.
         """
-        writer = RowWriter(result)
+        writer = RowWriter(result, GrowthWatch(run.plan))
         try:
             if self._around.open_instance is None:
                 self._process.check(run.plan, run.contents)
@@ -144,6 +145,11 @@ class RepeatedRuns:
     def point(self) -> int:
         """The last point that all instances of the last run reached."""
         return self._run.point if self._run is not None else 0
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What the rows of the last run warn of."""
+        return self._run.writer.warnings if self._run is not None else ()
 
     @property
     def rows(self) -> int:
@@ -251,7 +257,17 @@ class _Run:
         time_s, writer = self._plan.grid.time(self.point), self.writer
         ended_by = self._first[1].report() if self._first is not None else None
         rows, file, files = writer.rows, writer.file, writer.counted
-        return Outcome("done", self.point, time_s, self._seconds, rows, file, ended_by=ended_by, files=files)
+        return Outcome(
+            "done",
+            self.point,
+            time_s,
+            self._seconds,
+            rows,
+            file,
+            ended_by=ended_by,
+            files=files,
+            warnings=writer.warnings,
+        )
 
     def _tell_end(self, _kind: type[BaseException] | None, error: BaseException | None, _trace: object) -> None:
         if self._around.before_close is not None:

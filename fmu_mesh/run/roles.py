@@ -19,6 +19,7 @@ from ..instances.contract import Instance, KeepsFiles, LogMessage, Opening
 from ..instances.registry import open_instance, prepare
 from ..master.master import Master, MasterSettings
 from ..node.node import Node
+from ..recorder.growth import GrowthWatch
 from ..recorder.recorder import Recorder
 from ..system.plan import MASTER, RECORDER
 from ..wire.runtime import MeshNote, fmu_folder, run_folder, write_note
@@ -186,6 +187,7 @@ def run_master(run: RunPlan, emit: Callable[[Event], None]) -> Outcome:
                     session,
                     results,
                     lambda: master.has_begun,
+                    growth=GrowthWatch(plan),
                     launch=process.launch,
                     memory=master.memory_for(RECORDER),
                 ) as recorder:
@@ -231,7 +233,7 @@ def _outcome_of(
         profile=master.profile(),
         signal=signal,
         files=files,
-        warnings=tuple(master.warnings),
+        warnings=(*(recorder.warnings if recorder is not None else ()), *master.warnings),
     )
 
 

@@ -10,6 +10,7 @@ import time
 from collections.abc import Mapping
 
 from ..node.stepping import Runner
+from ..recorder.growth import GrowthWatch
 from ..recorder.record_files import RecordFiles
 from ..recorder.recorder import RecordedSource
 from ..system.plan import RECORDER, Plan
@@ -28,14 +29,15 @@ class RowWriter:
 
     Args:
         file: the file; None: nothing is recorded.
+        growth: looks at all rows.
 
     Attributes:
         written: number of points whose rows are written.
     """
 
-    def __init__(self, file: ResultFile | None) -> None:
+    def __init__(self, file: ResultFile | None, growth: GrowthWatch | None = None) -> None:
         self.written = 0
-        self._files = RecordFiles([file] if file is not None else [])
+        self._files = RecordFiles([file] if file is not None else [], growth)
         self._sources: list[RecordedSource] = []
         self._rows = 1
         self._flushed = 0.0
@@ -72,6 +74,11 @@ class RowWriter:
     def counted(self) -> tuple[tuple[str, int], ...]:
         """The file and its number of rows, if there is one."""
         return self._files.counted
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What the rows so far warn of."""
+        return self._files.warnings
 
     @property
     def complete(self) -> int:

@@ -80,6 +80,7 @@ class Variable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     shape: tuple[int, ...] = ()
     negated: bool = False
     max_size: int | None = None
+    nominal: float | None = None
 
     @property
     def type_name(self) -> str:

@@ -15,7 +15,7 @@ from rich.markup import escape
 
 from ...api.plan_page import slower_than_it_could_be
 from ...api.result import summary_of
-from ...errors import ErrorReport, FmuMeshError, from_report
+from ...errors import FmuMeshError, from_report
 from ...run.events import Event, Log, OutputLine, Reachable, Restarted, Status
 from ...run.outcome import Outcome
 from ...run.wiring import is_socket, leaves_host
@@ -94,10 +94,8 @@ class Display:
             case Restarted(error, number, most):
                 again = f"The run starts again from its first point (restart {number} of {most})."
                 say(str(from_report(error).instead_of_hint(again)))
-            case Outcome(ended_by=ErrorReport() as report) if not self._quiet:
-                self.ended(from_report(report))
             case Outcome():
-                pass
+                self._end(event)
 
     def _show_address(self) -> None:
         """Show the endpoints that the user asked for, or else the socket."""
@@ -115,6 +113,13 @@ class Display:
         ):
             text = f"warning: whoever can reach this host at {wide} can read, set and end this mesh"
             self._console.print(f"[yellow]{escape(text)}[/]", soft_wrap=True)
+
+    def _end(self, outcome: Outcome) -> None:
+        """Show why a run ended early; and what its rows warn of, where there is no summary with that."""
+        if outcome.ended_by is not None and not self._quiet:
+            self.ended(from_report(outcome.ended_by))
+        for warning in outcome.warnings if outcome.state == "failed" else ():
+            say(f"warning: {warning}")
 
     def ended(self, early: FmuMeshError) -> None:
         """Show why a run ended before its last point without a failure."""
@@ -212,7 +217,7 @@ def stdout_as_stderr() -> Iterator[None]:
 
 def summary(plan: Plan, outcome: Outcome) -> list[str]:
     """The closing lines of a run; the last one is `20000 points in 1.234 s: 16207 points/s, real-time factor 32.4`."""
-    lines = [f"warning: {warning}" for warning in outcome.warnings]
-    lines += [f"result: {short_path(file)} ({rows} rows)" for file, rows in outcome.files]
+    lines = [f"result: {short_path(file)} ({rows} rows)" for file, rows in outcome.files]
+    lines += [f"warning: {warning}" for warning in outcome.warnings]
     lines.append(summary_of(outcome, plan.grid.step_size))
     return lines

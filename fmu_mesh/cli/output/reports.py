@@ -45,7 +45,7 @@ class RunReport(msgspec.Struct, frozen=True):
         error: why it failed.
         ended_by: what ended the simulation before its last point although nothing failed.
         files: all result files, each with its number of rows.
-        warnings: what went wrong although the result is complete.
+        warnings: what is wrong although nothing failed: a value that grows without a limit, or how an FMU has ended.
     """
 
     mesh: str | None

@@ -1,0 +1,126 @@
+"""Tells where recorded values grow without a limit, before they become infinite: one warning for a run.
+
+Looks at the blocks of rows that are written, so it costs a step nothing. Knows no file.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..simtime import ENDLESS
+from ..system.plan import Plan
+from ..variables.value_types import is_float
+
+__all__ = ["GrowthWatch", "ReadColumn"]
+
+ReadColumn = Callable[[int, int], NDArray[Any]]
+"""Returns the values of a variable at the points first to end - 1."""
+
+_STEPS: Final = (1.0, 1e3, 1e6)
+"""In scales: where a value begins to grow, from where on its rate is told, and where this is worth a warning."""
+
+_FIRST_PART: Final = 0.05
+_FIRST_POINTS: Final = 1000
+"""The points that show the scale of a value: a part of the run, or this many where it has no end."""
+
+
+class _Crossing(NamedTuple):
+    point: int
+    value: float
+
+
+class _Column:
+    """A recorded variable: its scale, and where it first was above each of the steps."""
+
+    def __init__(self, name: str, instance: str, read: ReadColumn, given: float) -> None:
+        self.name = name
+        self.instance = instance
+        self.scale = given
+        self._read = read
+        self._crossings: list[_Crossing] = []
+
+    def learn(self, first: int, end: int) -> None:
+        """Take the points first to end - 1 as a part of its normal size."""
+        values = self._read(first, end)
+        sizes = np.abs(values[np.isfinite(values)])
+        self.scale = max(self.scale, float(sizes.max(initial=0.0)))
+
+    def look(self, first: int, end: int) -> tuple[_Crossing, ...] | None:
+        """All crossings, once it has crossed all steps."""
+        values, crossings = self._read(first, end), self._crossings
+        most = max(float(values.max()), -float(values.min()))
+        while most > (limit := self.scale * _STEPS[len(crossings)]):
+            place = int((np.abs(values.astype(np.float64)) > limit).argmax())
+            crossings.append(_Crossing(first + place, abs(float(values[place]))))
+            if len(crossings) == len(_STEPS):
+                return tuple(crossings)
+        return None
+
+
+class GrowthWatch:
+    """Watches the recorded floats of a run.
+
+    Args:
+        plan: the plan of the run.
+
+    Attributes:
+        warnings: at most one.
+
+    Call sequence: `begin`, then `look` for consecutive points.
+    """
+
+    def __init__(self, plan: Plan) -> None:
+        self.warnings: tuple[str, ...] = ()
+        self._plan = plan
+        self._columns: list[_Column] = []
+        last = plan.grid.last_point
+        self._normal = _FIRST_POINTS if last >= ENDLESS else max(1, math.ceil(_FIRST_PART * (last + 1)))
+
+    def begin(self, columns: Mapping[tuple[str, str], ReadColumn]) -> None:
+        """Choose what is watched.
+
+        Args:
+            columns: how the values of each recorded variable are read.
+        """
+        for (instance, name), read in columns.items():
+            variable = self._plan.system.instances[instance].description.variable_of(name)
+            if variable is not None and is_float(variable.type):
+                bounds = (variable.nominal, variable.minimum, variable.maximum)
+                given = [abs(bound) for bound in bounds if bound is not None and math.isfinite(bound)]
+                least = 0.0 if variable.nominal else 1.0
+                self._columns.append(_Column(f"{instance}.{name}", instance, read, max([least, *given])))
+
+    def look(self, first: int, end: int) -> None:
+        """Look at the points first to end - 1."""
+        if self.warnings:
+            return
+        normal = min(max(self._normal, first), end)
+        if first < normal:
+            for column in self._columns:
+                column.learn(first, normal)
+        if normal < end:
+            found = [
+                (crossings[-1].point, column, crossings)
+                for column in self._columns
+                if (crossings := column.look(normal, end)) is not None
+            ]
+            if found:
+                _, column, crossings = min(found, key=lambda item: item[0])
+                self.warnings = (self._told(column, *crossings),)
+
+    def _told(self, column: _Column, begun: _Crossing, fast: _Crossing, far: _Crossing) -> str:
+        time, points, ratio = self._plan.grid.time, far.point - fast.point, far.value / fast.value
+        if points == 0:  # within one point
+            points, ratio = far.point - begun.point + 1, far.value / column.scale
+        cycle = next((own for own in self._plan.cycles if column.instance in own), ())
+        where = f" It belongs to the cycle {', '.join(cycle)}: a smaller step size may keep it stable." if cycle else ""
+        return (
+            f"{column.name} grows by a factor of {ratio ** (1 / points):.3g} per point: it left its scale of "
+            f"{column.scale:.3g} at point {begun.point} (t = {time(begun.point):.12g} s), and 1e6 times this scale "
+            f"at point {far.point} (t = {time(far.point):.12g} s).{where}"
+        )
