@@ -16,6 +16,7 @@ from ..run.events import Event
 from ..run.options import Options
 from ..run.run_plan import RunPlan
 from ..text import shown
+from ..variables.value_conversion import to_plain
 from ..wire.runtime import run_name, runtime_folder
 from ..wire.views import MeshStatus
 
@@ -146,7 +147,7 @@ def texts_of(values: Mapping[str, object] | Sequence[str], what: str) -> tuple[s
     texts = []
     for name, value in values.items():
         try:
-            texts.append(f"{name}={msgspec.json.encode(plain(value)).decode()}")
+            texts.append(f"{name}={msgspec.json.encode(to_plain(plain(value))).decode()}")
         except (TypeError, msgspec.MsgspecError) as error:
             raise CallRefused(f"the {what} of '{name}' is {shown(value)}: {error}", variable=name) from error
     return tuple(texts)

@@ -269,11 +269,13 @@ def _report(sweep: Sweep | None, error: FmuMeshError | None) -> SweepReport:
 def _show(sweep: Sweep) -> None:
     """Print the first failures, the table, and how fast it was."""
     failed, progress = sweep.result.failed, sweep.progress
-    for row in failed[:_SHOWN_FAILURES]:
-        values = ", ".join(f"{name}={shown(value)}" for name, value in row.parameters.items())
-        say(f"variant {row.variant} ({values}) failed: {row.message}")
-    if len(failed) > _SHOWN_FAILURES:
-        say(f"and {len(failed) - _SHOWN_FAILURES} more, which the table has")
+    warned = [row for row in sweep.result if row.message and not row.exit_code]
+    for rows, what in ((failed, "failed"), (warned, "warns")):
+        for row in rows[:_SHOWN_FAILURES]:
+            values = ", ".join(f"{name}={shown(value)}" for name, value in row.parameters.items())
+            say(f"variant {row.variant} ({values}) {what}: {row.message}")
+        if len(rows) > _SHOWN_FAILURES:
+            say(f"and {len(rows) - _SHOWN_FAILURES} more, which the table has")
     for warning in sweep.result.warnings:
         say(f"warning: {warning}")
     table = sweep.result.table

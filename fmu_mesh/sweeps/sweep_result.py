@@ -34,7 +34,7 @@ class SweepRow(msgspec.Struct, frozen=True):
         variant: its number, from 0 on.
         parameters: its parameters by name.
         exit_code: 0, or that of `fmu-mesh launch` for the same error.
-        message: why it failed; empty if it did not.
+        message: why it failed, or what its result warns of.
         values: what was calculated from its curves, by the name of the column; None where there was nothing.
         seconds: wall-clock time of the run in s.
         worker: host and process id of its worker.

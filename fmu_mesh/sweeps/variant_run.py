@@ -75,7 +75,7 @@ class Row(msgspec.Struct, frozen=True):
     Attributes:
         id: SHA-256 of the configuration, the parameters, and the files of all models.
         exit_code: 0, or that of `launch` for the same error.
-        message: why it failed, or how an FMU did while it was closed; empty if none did.
+        message: why it failed, or what its result warns of; empty if there is nothing to say.
         values: by the name of the column, what was calculated from its curves; None where there is nothing.
         seconds: wall-clock time of the run in s, with its planning.
         worker: host and process id of the worker.
@@ -131,8 +131,10 @@ def run_variant(task: bytes, functions: OwnReductions, identity: str, parameters
     started = time.perf_counter()
     values: dict[str, Cell] = {}
     error: ErrorReport | None = None
+    warnings: tuple[str, ...] = ()
     try:
-        values = own.run(functions, identity, parameters)
+        result = own.run(identity, parameters)
+        values, warnings = own.values(result, functions), result.warnings
     except FmuMeshError as failure:
         error = failure.report()
     except Exception as failure:  # noqa: BLE001  the other variants go on
@@ -140,7 +142,7 @@ def run_variant(task: bytes, functions: OwnReductions, identity: str, parameters
     return Row(
         id=identity,
         exit_code=error.exit_code if error is not None else 0,
-        message=_line(error) if error is not None else own.hung.warning,
+        message=_line(error) if error is not None else " ".join(filter(None, (*warnings, own.hung.warning))),
         values=values,
         seconds=time.perf_counter() - started,
         worker=f"{socket.gethostname()}:{os.getpid()}",
@@ -186,8 +188,8 @@ class _Loaded:
         """Whether its thread is inside an FMU that does not return."""
         return self.hung.stuck
 
-    def run(self, functions: OwnReductions, identity: str, parameters: Parameters) -> dict[str, Cell]:
-        """Run a variant; returns the values of its row.
+    def run(self, identity: str, parameters: Parameters) -> Result:
+        """Run a variant.
 
         Raises:
             FmuMeshError: it failed.
@@ -204,10 +206,15 @@ class _Loaded:
             ended: Future[Result] = Future()
             self._jobs.put(_Job(options, ended))
             with suppress(NotInOneProcess):  # a parameter may be the path of a model
-                return self._values(ended.result(), functions)
-        return self._values(self._mesh.run(**options), functions)
+                return ended.result()
+        return self._mesh.run(**options)
 
-    def _values(self, result: Result, functions: OwnReductions) -> dict[str, Cell]:
+    def values(self, result: Result, functions: OwnReductions) -> dict[str, Cell]:
+        """What the row of a variant has of its result.
+
+        Raises:
+            FmuMeshError: a reduction failed.
+        """
         values = {one.text: _cell(reduced_value(one, result)) for one in self._reductions}
         for name, function in functions.items():
             try:
