@@ -130,7 +130,7 @@ def test_the_input_that_was_not_finite_is_named_with_its_source(tmp_path: Path) 
     connections = [{"from": "ramp.y", "to": "gain.u", "factor": -1e306}]
     config = written(tmp_path, {"ramp": RAMP, "gain": GAIN | {"start_values": {"k": 1.0}}}, connections)
 
-    told = []
+    told: list[fmu_mesh.FmuMeshError] = []
     with fmu_mesh.load(config).open() as system, pytest.raises(fmu_mesh.NotFinite) as stepped:
         system.step(1000)
     told.append(stepped.value)
@@ -162,13 +162,16 @@ def test_the_first_point_must_be_finite(place: Place) -> None:
     assert failure_of(config).message == "output y is inf; its input u came as inf from ramp.y"
 
 
-def test_a_slow_instance_ends_the_run_at_its_own_point(tmp_path: Path) -> None:
-    slow = RAMP | {"step_size": 1.0}
-    config = written(tmp_path, {"ramp": slow, "gain": GAIN}, ["ramp.y -> gain.u"])
+def test_a_slow_instance_ends_the_run_at_its_own_point(place: Place) -> None:
+    config = written(place.folder, {"ramp": RAMP, "gain": GAIN | {"step_size": 0.7}}, ["ramp.y -> gain.u"])
 
-    error = failure_of(config)
+    done = place.run("launch", config, "--no-progress")
 
-    assert (error.instance, error.point) == ("gain", 1800)
+    assert done.wait() == 3
+    assert "instance gain, point 182, t = 18.2 s: output y is inf" in done.errors
+    rows = rows_of(place.folder / "m.csv")
+    assert (len(rows), rows[-1][-1]) == (182, 175e306)
+    assert failure_of(config).point == 182
 
 
 def test_nan_is_recorded_where_it_is_meant(tmp_path: Path) -> None:
@@ -274,7 +277,7 @@ def test_a_stiff_spring_explodes_and_is_told_twice(place: Place) -> None:
     mass = {"python": "parts.py:Mass"}
     ends = [("s1.x", "s2.other_x"), ("s1.v", "s2.other_v"), ("s2.x", "s1.other_x"), ("s2.v", "s1.other_v")]
     connections = [f"{source} -> {target}" for source, target in ends]
-    instances = {"s1": mass | {"start_values": {"first": 0.1}}, "s2": mass}
+    instances: dict[str, Any] = {"s1": mass | {"start_values": {"first": 0.1}}, "s2": mass}
     config = written(place.folder, instances, connections, step_size=0.005, stop_time=10.0)
 
     ended = [place.run("launch", config, "--no-progress", *options) for options in ((), ("--local",))]
@@ -290,3 +293,19 @@ def test_a_stiff_spring_explodes_and_is_told_twice(place: Place) -> None:
         "s1.v grows by a factor of 17.3 per point: it left its scale of 50 at point 2 (t = 0.01 s), and 1e6 times this "
         "scale at point 6 (t = 0.03 s). It belongs to the cycle s1, s2: a smaller step size may keep it stable."
     )
+
+
+EXAMPLES = [
+    path
+    for folder in ("configs", "examples/cart_pole", "examples/calibration", "examples/components")
+    for path in sorted((FMUS.parent / folder).glob("*.yaml"))
+    if "gazebo" not in path.name
+]
+
+
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
+def test_no_example_grows(path: Path) -> None:
+    with fmu_mesh.load(path).repeated() as runs:
+        result = runs.run(real_time_factor=0.0)
+
+    assert result.warnings == ()

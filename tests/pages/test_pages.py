@@ -126,6 +126,7 @@ class PageRun:
             command = f"{self._exports}fmu-mesh {words} {file}"
             done = self._place.start_command(["bash", "-euo", "pipefail", "-c", command])
             assert done.wait() == 0, f"{block.place}\n{done.story()}"
+            assert "grows by a factor" not in done.output, done.story()
 
     def _run_command(self, command: Command, *, in_background: bool) -> None:
         line = command.line.removesuffix("&").rstrip()
