@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any, Final, NoReturn
 
 import numpy as np
@@ -120,10 +121,10 @@ class CVodeSolver:
             self._is_new, self._states[:] = True, states
             flag = self._call(time, stop, reached)
         if flag < 0:
-            self._give_up(self._said or f"CVode returned {flag}")
+            self._give_up(time, self._said or f"CVode returned {flag}")
         self._stalled = 0 if resolvable(time, reached.value) else self._stalled + 1
         if self._stalled > _MOST_STALLED:
-            self._give_up(f"CVode makes no progress at t = {time:.12g} s")
+            self._give_up(time, f"CVode makes no progress at t = {time:.12g} s")
         self._equations.set_point(reached.value, self._x_data)
         return reached.value, flag == _CV_ROOT_RETURN
 
@@ -147,9 +148,16 @@ class CVodeSolver:
         self._check(self._api.CVodeSetStopTime(self._memory, stop))
         return int(self._api.CVode(self._memory, stop, self._x, ctypes.byref(reached), _CV_ONE_STEP))
 
-    def _give_up(self, why: str) -> NoReturn:
-        """End with what the model failed with during this step, or else with ``why``."""
-        raise self._failure or SolverFailed(why)
+    def _give_up(self, time: float, why: str) -> NoReturn:
+        """End with what the model failed with during this step, or else with ``why``, and a derivative that is NaN."""
+        if self._failure is not None:
+            raise self._failure
+        derivatives = np.zeros(self._n)
+        with suppress(FMICallException):
+            self._derivatives(time, self._x_data, derivatives.ctypes.data)
+        wrong = np.flatnonzero(~np.isfinite(derivatives))
+        told = f"; derivative {wrong[0] + 1} of {self._n} is {derivatives[wrong[0]]}" if len(wrong) else ""
+        raise SolverFailed(f"{why}{told}")
 
     def _on_rhs(self, time: float, x: int, dx: int, _data: int | None) -> int:
         get_pointer = self._api.N_VGetArrayPointer
