@@ -103,7 +103,8 @@ def looked_at(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str
         config = place.folder / "mesh.yaml"
         config.write_text(
             "mesh: types\nsimulation: {stop_time: 600, step_size: 0.01, real_time_factor: 1}\n"
-            f"instances: {{it: {{fmu: {fmu}, start_values: {{columns: 1}}, not_finite: record}}}}\nrecord: {{file: null}}\n"
+            f"instances: {{it: {{fmu: {fmu}, start_values: {{columns: 1}}, not_finite: record}}}}\n"
+            "record: {file: null}\n"
         )
         launched = place.start("launch", config, "--no-progress")
         place.note()
