@@ -15,7 +15,7 @@ import msgspec
 
 from ..config.instance_sections import InstanceSection
 from ..config.mesh import LimitsConfig
-from ..rings.native import NativeStep
+from ..rings.native import NativeStep, Span
 from ..rings.ring import Ring
 from ..simtime import TimeGrid
 from ..system.linear_inputs import LinearInput
@@ -292,6 +292,10 @@ class StepsNatively(Protocol):
     @property
     def stage(self) -> int:
         """What `do_step` is doing, a `fmu_mesh.rings.native.Stage`; from any thread. A node asks its own tables."""
+        ...
+
+    def check_rows(self, spans: Sequence[Span]) -> bool:
+        """From now on `do_step` raises `NotFinite` if one of these floats of its row is not finite; whether it does."""
         ...
 
     def finish(self, step: int, outcome: int) -> None:

@@ -11,7 +11,7 @@ from typing import Any, Generic, TypeVar, cast
 import msgspec
 
 from ..errors import FmuError, FmuMeshError
-from ..rings.native import NativeStep, Stage
+from ..rings.native import NativeStep, Span, Stage
 from ..rings.ring import Ring
 from ..simtime import TimeGrid
 from ..variables.model_description import ModelDescription, Value
@@ -131,6 +131,10 @@ class AroundNativeSteps(AroundInstance[Instance]):
     def stage(self) -> int:
         """See `StepsNatively`; `IN_PYTHON` if the inner instance has no such steps."""
         return self._instance.stage if isinstance(self._instance, StepsNatively) else Stage.IN_PYTHON
+
+    def check_rows(self, spans: Sequence[Span]) -> bool:
+        """See `StepsNatively`; False if the inner instance has no such steps."""
+        return self._instance.check_rows(spans) if isinstance(self._instance, StepsNatively) else False
 
     def finish(self, step: int, outcome: int) -> None:
         """See `StepsNatively`; only called if there is `native`."""

@@ -239,8 +239,6 @@ class BurstEngine(Engine):
             step_size=points * grid.step_size,
             points=points,
             every=points // self.tick_points(self.units[unit]),
-            finite=table(native.Span, runner.is_finite.spans),
-            n_finite=len(runner.is_finite.spans),
             last_step=runner.last_step,
             outputs=(native.OutputTable * 2)(*rings),
             counter=runner.counter.address,
@@ -249,6 +247,7 @@ class BurstEngine(Engine):
             stage=before.stage,
             outcome=before.outcome,
         )
+        made.check_rows(runner.is_finite.spans)
         self._kept[unit, index] = [made, bases, own]  # what the table points to
         self._members[unit][index] = made
         self._follow(unit, index)
@@ -429,7 +428,7 @@ class PlainEngine(Engine):
                 source.transfer.step(step)
             position.enter(Stage.IN_PYTHON)
             runner.instance.do_step(step)
-            if not runner.is_finite(step + 1):
+            if not runner.is_finite.check(step + 1):
                 raise runner.is_finite.error(step + 1, runner.grid)
         except FmuMeshError as error:
             self._stopped.add(number)

@@ -128,7 +128,7 @@ class Runner:
         Raises:
             NotFinite: one is not finite.
         """
-        if not self.is_finite(0):
+        if not self.is_finite.check(0):
             error = self.is_finite.error(0, self.grid)
             self.is_finite.explain(error, self.instance.get_values)
             raise error

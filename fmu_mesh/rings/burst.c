@@ -135,7 +135,7 @@ typedef struct { /* an input with a value for each own step that the burst takes
 enum { BY_PYTHON, FMI1, FMI2, FMI3 };                                    /* Member.kind */
 enum { WAITING, SETTING, STEPPING, GETTING, IN_PYTHON, STEPPED };        /* Member.stage */
 enum { FIXED, OUTPUT, WATCHED, FIRST_GATE, MAX_GATES = 4096 };           /* bases */
-enum { WARNING = 1, OUT_OF_RANGE = 100, STAGE_BITS = 24 };               /* statuses */
+enum { WARNING = 1, OUT_OF_RANGE = 100, WRONG_ROW = 101, STAGE_BITS = 24 }; /* statuses */
 enum { F64, F32, I8, U8, I16, U16, I32, U32, I64, U64, TRUTH };          /* types */
 enum { UNCHANGED, SCALED, LOOKED_UP };                                   /* Move.change */
 
@@ -557,10 +557,41 @@ static inline int64_t call_step(Member *member, int64_t step) {
   return 0;
 }
 
+/* Whether the floats of the row that a step has written are finite, whoever took the step. Integers are compared: a model
+ * may have changed the floating-point mode, and let operations with NaN trap. With all bits of the exponent set, one more
+ * is carried into the bit of the sign. */
+static inline int is_finite(const Member *member, int64_t step) {
+  const Output *own = &member->outputs[0];
+  const char *row = own->rows + ((step + 1) & own->mask) * own->stride;
+  for (int64_t i = 0; i < member->n_finite; i++) {
+    const Span *span = &member->finite[i];
+    const char *from = row + span->place;
+    if (span->type == F64) {
+      uint64_t bits, carried = 0;
+      for (int64_t j = 0; j < span->count; j++) {
+        memcpy(&bits, from + 8 * j, 8);
+        carried |= (bits & 0x7ff0000000000000) + 0x0010000000000000;
+      }
+      if (carried >> 63) return 0;
+    } else {
+      uint32_t bits, carried = 0;
+      for (int64_t j = 0; j < span->count; j++) {
+        memcpy(&bits, from + 4 * j, 4);
+        carried |= (bits & 0x7f800000) + 0x00800000;
+      }
+      if (carried >> 31) return 0;
+    }
+  }
+  return 1;
+}
+
+PUBLIC int64_t member_is_finite(const Member *member, int64_t step) { return is_finite(member, step); }
+
 /* One step for who counts rows and moves the inputs itself. */
 PUBLIC int64_t member_step(Member *member, int64_t step) {
   int64_t outcome = call_step(member, step);
   if (outcome == 0) member->stage = WAITING;
+  if (outcome == 0 && !is_finite(member, step)) return (int64_t)GETTING << STAGE_BITS | WRONG_ROW;
   return outcome;
 }
 
@@ -731,34 +762,6 @@ static inline int gates_held(const Member *member) {
   return 1;
 }
 
-/* Whether the floats of the row that a step has written are finite, whoever took the step. Integers are compared: a model
- * may have changed the floating-point mode, and let operations with NaN trap. With all bits of the exponent set, one more
- * is carried into the bit of the sign. */
-static inline int is_finite(const Member *member) {
-  const Output *own = &member->outputs[0];
-  const char *row = own->rows + ((member->step + 1) & own->mask) * own->stride;
-  for (int64_t i = 0; i < member->n_finite; i++) {
-    const Span *span = &member->finite[i];
-    const char *from = row + span->place;
-    if (span->type == F64) {
-      uint64_t bits, carried = 0;
-      for (int64_t j = 0; j < span->count; j++) {
-        memcpy(&bits, from + 8 * j, 8);
-        carried |= (bits & 0x7ff0000000000000) + 0x0010000000000000;
-      }
-      if (carried >> 63) return 0;
-    } else {
-      uint32_t bits, carried = 0;
-      for (int64_t j = 0; j < span->count; j++) {
-        memcpy(&bits, from + 4 * j, 4);
-        carried |= (bits & 0x7f800000) + 0x00800000;
-      }
-      if (carried >> 31) return 0;
-    }
-  }
-  return 1;
-}
-
 static inline void commit(Node *node, Member *member) {
   stamp(member, member->step + 1, member->step + 2);
   member->step++;
@@ -811,7 +814,7 @@ static int advance(Node *node, Unit *unit, int64_t *ticks) {
           goto out;
         }
       }
-      if (!is_finite(member)) {
+      if (!is_finite(member, member->step)) {
         result = NOT_FINITE;
         goto out;
       }

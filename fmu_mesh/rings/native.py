@@ -20,6 +20,7 @@ __all__ = [
     "NUMBER_TYPES",
     "OUT_OF_RANGE",
     "STAGE_BITS",
+    "WRONG_ROW",
     "BurstEnd",
     "Call",
     "Change",
@@ -50,6 +51,8 @@ STAGE_BITS: Final = 24
 _LARGEST: Final = 2**63 - 1
 OUT_OF_RANGE: Final = 100
 """The status of a call where a value does not fit into the type of the model."""
+WRONG_ROW: Final = 101
+"""The status of a step whose row is not finite."""
 
 
 class StepKind(IntEnum):
@@ -295,6 +298,10 @@ class MemberTable(Structure):
         ("outcome", c_int64),
     )
 
+    def check_rows(self, spans: Sequence[Span]) -> None:
+        """These floats of each row have to be finite."""
+        self.finite, self.n_finite = table(Span, spans), len(spans)
+
 
 class UnitTable(Structure):
     """Members that step together."""
@@ -419,6 +426,7 @@ class _Library:
         self.run = CFUNCTYPE(c_int64, address)(("node_run", slow))
         self.sleep_for = CFUNCTYPE(c_int64, address, c_uint32, address, c_int64, c_int64, address)(("sleep_for", slow))
         self.member_step = CFUNCTYPE(c_int64, address, c_int64)(("member_step", slow))
+        self.member_is_finite = PYFUNCTYPE(c_int64, address, c_int64)(("member_is_finite", quick))
         self.attend = PYFUNCTYPE(None, address)(("node_attend", quick))
         self.attended = PYFUNCTYPE(None, address)(("node_attended", quick))
         self.ring_bell = PYFUNCTYPE(None, address)(("ring_bell", quick))

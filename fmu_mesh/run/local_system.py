@@ -87,9 +87,13 @@ class LocalSystem:
             for self.stepping, step_from in steps:
                 step_from(point)
         except FmuError as error:
-            if not isinstance(error, NotFinite):
-                error.at(self.begun_at, self._grid.time(self.begun_at))
-            self._members[self.stepping].is_finite.explain(error)
+            member = self._members[self.stepping]
+            if isinstance(error, NotFinite):
+                found = member.is_finite.error(member.step + 1, self._grid)
+                member.is_finite.explain(found)
+                raise found from None
+            error.at(self.begun_at, self._grid.time(self.begun_at))
+            member.is_finite.explain(error)
             raise
         except TerminationRequested as asked:
             asked.at(point, self._grid.time(point))
@@ -246,6 +250,7 @@ class _Member:
         oldest = max(instance.step_points for instance in plan.system.instances.values())
         self._outputs = Ring(self.plan.outputs, 1 << (2 * oldest).bit_length())
         self.is_finite = FiniteRows(self.plan, self._outputs, self._inputs)
+        self._looks_at_rows = True
         self._points = self.plan.step_points
         self._feeds: list[_Feed] = []
         self._set_at = -1
@@ -297,11 +302,11 @@ class _Member:
         for name, value in zip(names, self.instance.get_values(names) if names else [], strict=True):
             self._inputs.put(0, name, value)  # elements that are not connected keep it
         self.instance.bind(self._inputs, (self._outputs,), grid, self.plan.step_points)
-        self._grid = grid
-        if not self.is_finite(0):
+        if not self.is_finite.check(0):
             error = self.is_finite.error(0, grid)
             self.is_finite.explain(error, self.instance.get_values)
             raise error
+        self._looks_at_rows = not self.instance.check_rows(self.is_finite.spans)
         for c in self.connections:
             if c.initial_only:
                 continue
@@ -335,8 +340,8 @@ class _Member:
         self._do_step(step)
         if floating_point_changed():
             restore_floating_point()
-        if not self.is_finite(step + 1):
-            raise self.is_finite.error(step + 1, self._grid)
+        if self._looks_at_rows and not self.is_finite.check(step + 1):
+            raise NotFinite("an output is not finite", instance=self.plan.name)
         self.step = step + 1
 
     def getter(self, name: str) -> Callable[[int], Value]:

@@ -11,8 +11,20 @@ from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from typing import Final
 
+from ....errors import NotFinite
 from ....rings import native
-from ....rings.native import OUT_OF_RANGE, STAGE_BITS, MemberTable, Move, NativeStep, OutputTable, Stage, StepKind
+from ....rings.native import (
+    OUT_OF_RANGE,
+    STAGE_BITS,
+    WRONG_ROW,
+    MemberTable,
+    Move,
+    NativeStep,
+    OutputTable,
+    Span,
+    Stage,
+    StepKind,
+)
 from ....rings.ring import Ring
 from ....simtime import TimeGrid
 from ..buffers import NumberBuffer
@@ -70,7 +82,18 @@ class NativeInstance(FmuInstance):
         """Set the inputs of row ``step``, advance to own step ``step + 1``, write the outputs to row ``step + 1``."""
         take, member = self._in_step
         if outcome := take(member, step):
-            self.finish(step, outcome)
+            if outcome & 0xFFFFFF != WRONG_ROW:
+                self.finish(step, outcome)
+            own, library = self._member, native.library
+            if own is not None and library is not None and not library.member_is_finite(ctypes.addressof(own), step):
+                raise NotFinite("an output is not finite", instance=self.name)
+
+    def check_rows(self, spans: Sequence[Span]) -> bool:
+        """Let `do_step` itself raise `NotFinite` for these floats of its row; whether it does."""
+        if self._member is None:
+            return False
+        self._member.check_rows(spans)
+        return True
 
     def finish(self, step: int, outcome: int) -> None:
         """See `StepsNatively`."""
