@@ -1,17 +1,14 @@
 """Protects a process from its FMUs: no call may run forever, and none may change the state of the process.
 
 Owns the deadline of every call outside the stepping loop, and the state of the process that a call could change:
-working directory, locale, floating-point environment, and the signal handlers that end a run. A `Guarded` instance does
-both for every call but `do_step`; the stepping loop itself checks the floating-point mode. The owner of the process
-decides what happens after a missed deadline.
+working directory, locale, floating-point environment, signals that end a run, umask and environment variables. A
+`Guarded` instance does both for every call but most steps: those are checked one by one only if the model may change
+the state, or has done so once. Whoever takes many steps of others checks the floating-point mode after each, and the
+rest after many. The owner of the process decides what happens after a missed deadline.
 """
 
 from __future__ import annotations
 
-import ctypes
-import locale
-import os
-import signal
 import sys
 import threading
 import time
@@ -23,43 +20,31 @@ import msgspec
 
 from ..config.mesh import TimeoutsConfig
 from ..errors import FmuError, InitializationFailed, LoadFailed, StepFailed
-from ..rings.native import Stage
+from ..rings.native import NativeStep, Stage
 from ..rings.ring import Ring
 from ..simtime import TimeGrid
 from ..text import short_path
 from ..variables.model_description import Value
-from .contract import Instance
+from .contract import ChangesProcess, Instance
 from .instance_wrapper import AroundNativeSteps
 from .process_end import surviving
+from .process_state import kept_mode, kept_state
 
 __all__ = [
-    "DEFAULT_MODE",
     "ENDED",
-    "FOLDER",
     "CallWatch",
     "Guarded",
     "Unwatched",
     "call_named",
     "current_function",
     "doing",
-    "floating_point_changed",
-    "kept_state",
     "lines_shown_of",
     "not_returned",
-    "restore_floating_point",
 ]
 
 Result = TypeVar("Result")
 
 _LOOK_S: Final = 0.25
-_SIGNALS: Final = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGPIPE") if hasattr(signal, name))
-
-# In the default mode, 1 + half an ulp is 1 (ties to even) and so is 1 - a quarter; each directed rounding mode changes
-# one of the two. The sum of two subnormal numbers is 0 if operands or results are flushed to zero. These are variables,
-# because Python evaluates expressions of literals when it compiles.
-DEFAULT_MODE: Final = (1.0, 2.0**-53, 2.0**-54, 5e-324)
-_ONE, _HALF_ULP, _QUARTER_ULP, _TINY = DEFAULT_MODE
-
 _DO_STEP: Final = "doStep"
 
 _functions: dict[int, str] = {}
@@ -68,69 +53,8 @@ _functions: dict[int, str] = {}
 _shown_files: set[str] = set()
 """Files of users: what does not return from a function of such a file is told with its line."""
 
-FOLDER: Final = threading.Lock()
-"""Held by who changes the working directory and goes back: all threads of the process have the same one."""
-
-_libm = ctypes.CDLL(None)
-_ENVIRONMENT_BYTES: Final = 512
-"""More than the size of `fenv_t` on any platform."""
-_ACTION_BYTES: Final = 512
-"""More than the size of `struct sigaction` on any platform."""
 ENDED: Final = "; its process is ended"
 """What an error about a call that does not return ends with, where that is so."""
-
-_DEFAULT_ENVIRONMENT: Final = ctypes.c_void_p(-1)
-"""`FE_DFL_ENV` of the C libraries on x86 and ARM."""
-
-
-def floating_point_changed() -> bool:
-    """Whether this thread does not round to nearest, or flushes subnormal numbers to zero; takes about 50 ns."""
-    return _ONE + _HALF_ULP - _QUARTER_ULP != _ONE or not _TINY + _TINY
-
-
-def restore_floating_point() -> None:
-    """Restore the default environment of C (C17, 7.6): round to nearest, subnormal numbers, no traps."""
-    _libm.fesetenv(_DEFAULT_ENVIRONMENT)
-
-
-@contextmanager
-def kept_state(*, keep_mode: bool = False) -> Iterator[None]:
-    """Restore the state of the process at the end of the block.
-
-    Args:
-        keep_mode: True restores the floating-point mode of before; False sets the default mode.
-    """
-    folder, language = _working_directory(), locale.setlocale(locale.LC_ALL)
-    actions = [(number, _action(number)) for number in _SIGNALS]
-    environment = ctypes.create_string_buffer(_ENVIRONMENT_BYTES)
-    if keep_mode:
-        _libm.fegetenv(environment)
-    try:
-        yield
-    finally:
-        _libm.fesetenv(environment if keep_mode else _DEFAULT_ENVIRONMENT)
-        if folder is not None and _working_directory() != folder:
-            with FOLDER:
-                os.chdir(folder)
-        if locale.setlocale(locale.LC_ALL) != language:
-            locale.setlocale(locale.LC_ALL, language)
-        for number, action in actions:
-            _libm.sigaction(number, action, None)
-
-
-def _action(number: int) -> ctypes.Array[ctypes.c_char]:
-    """The action of C at a signal: Python does not know of handlers that a library has installed."""
-    action = ctypes.create_string_buffer(_ACTION_BYTES)
-    _libm.sigaction(number, None, action)
-    return action
-
-
-def _working_directory() -> str | None:
-    try:
-        with FOLDER:
-            return os.getcwd()  # noqa: PTH109 `Path.cwd` is the same and slower
-    except FileNotFoundError:  # the folder was removed
-        return None
 
 
 class _Call(msgspec.Struct, frozen=True):
@@ -179,8 +103,7 @@ class CallWatch:
         self._call = _Call(instance, kind, setting, limit_s, time.monotonic())
         self._notify()
         try:
-            with kept_state():
-                yield
+            yield
         finally:
             self._call = None  # the watching thread reads this when it wakes up
 
@@ -260,23 +183,12 @@ class CallWatch:
 
 
 class Unwatched:
-    """Takes the place of a `CallWatch` in a program that is not ours to end: no call has a deadline.
-
-    Between two steps this restores only the floating-point mode: the rest takes longer than a step.
-    """
+    """Takes the place of a `CallWatch` in a program that is not ours to end: no call has a deadline."""
 
     @contextmanager
-    def calling(self, _instance: str, kind: type[FmuError], _setting: str, _limit_s: float) -> Iterator[None]:
+    def calling(self, _instance: str, _kind: type[FmuError], _setting: str, _limit_s: float) -> Iterator[None]:
         """Around one call of an FMU."""
-        if kind is not StepFailed:
-            with kept_state():
-                yield
-            return
-        try:
-            yield
-        finally:
-            if floating_point_changed():
-                restore_floating_point()
+        yield
 
     def surviving(self, _instance: str) -> AbstractContextManager[None]:
         """The process goes on after the last call, so a crash is one."""
@@ -336,16 +248,16 @@ def call_named(name: str, function: Callable[..., Result], *arguments: Any, **ke
 
 
 class Guarded(AroundNativeSteps):
-    """An instance whose calls have a deadline and leave the state of the process unchanged; steps are as they were.
+    """An instance whose calls have a deadline and leave the state of the process unchanged.
+
+    That a step leaves it is looked after only where a step may change it: it takes longer than many a step. Such an
+    instance has no `native` steps.
 
     Args:
         name: instance name.
         open_: makes the instance; a call with a deadline like the others.
         watch: watches the deadlines, or does not.
         timeouts: the deadlines.
-
-    Attributes:
-        do_step: that of the inner instance: `CallWatch.stepping` watches the steps.
     """
 
     def __init__(
@@ -355,9 +267,25 @@ class Guarded(AroundNativeSteps):
         self._watch = watch
         self._timeouts = timeouts
         self._running = False
-        with watch.calling(name, LoadFailed, "call", timeouts.call):
+        self._careful = False
+        with watch.calling(name, LoadFailed, "call", timeouts.call), self._kept():
             super().__init__(open_())
-        self.do_step: Callable[[int], None] = self._instance.do_step
+        if isinstance(self._instance, ChangesProcess) and self._instance.changes_process:
+            self._careful = True
+
+    @property
+    def native(self) -> NativeStep | None:
+        """See `StepsNatively`."""
+        return None if self._careful else super().native
+
+    @property
+    def do_step(self) -> Callable[[int], None]:
+        """That of the inner instance: `CallWatch.stepping` watches the steps."""
+        return self._step if self._careful else self._instance.do_step
+
+    def take_care(self) -> None:
+        """See `AroundInstance`."""
+        self._careful = True
 
     def bind(self, inputs: Ring, outputs: Sequence[Ring], grid: TimeGrid, points: int, step: int = 0) -> None:
         """Let `do_step` work on these rings."""
@@ -366,18 +294,36 @@ class Guarded(AroundNativeSteps):
 
     def set_in_step(self, values: Mapping[str, Value]) -> None:
         """As `set_values`, as a part of a step: whoever watches the steps watches this, too, and it takes less time."""
-        self._instance.set_values(values)
+        with self._kept():
+            self._instance.set_values(values)
 
     def close(self) -> None:
         """Terminate if allowed, free the instance and remove its files; one deadline for all of it."""
-        watch = self._watch
-        with watch.calling(self._name, FmuError, "terminate", self._timeouts.terminate), watch.surviving(self._name):
+        watch, name = self._watch, self._name
+        ending = watch.calling(name, FmuError, "terminate", self._timeouts.terminate)
+        with ending, watch.surviving(name), kept_state():
             self._instance.close()
+
+    def _step(self, step: int) -> None:
+        with self._kept():
+            self._instance.do_step(step)
 
     def _forward(self, call: Callable[..., Result], *arguments: Any) -> Result:  # noqa: ANN401 those of any method
         if self._running:
             watched = self._watch.calling(self._name, StepFailed, "step", self._timeouts.step)
         else:
             watched = self._watch.calling(self._name, InitializationFailed, "call", self._timeouts.call)
-        with watched:
+        with watched, self._kept():
             return call(*arguments)
+
+    @contextmanager
+    def _kept(self) -> Iterator[None]:
+        """Around one call: restore the state of the process, between steps only where they may change it."""
+        if self._running and not self._careful:
+            with kept_mode():
+                yield
+            return
+        with kept_state() as state:
+            yield
+        if state.changed:
+            self._careful = True

@@ -23,7 +23,17 @@ from ..system.process_sharing import Claims
 from ..variables.model_description import ModelDescription, Value
 from .kept_models import KeptModels
 
-__all__ = ["Instance", "KeepsFiles", "KeepsState", "Kind", "LogMessage", "Opening", "Showing", "StepsNatively"]
+__all__ = [
+    "ChangesProcess",
+    "Instance",
+    "KeepsFiles",
+    "KeepsState",
+    "Kind",
+    "LogMessage",
+    "Opening",
+    "Showing",
+    "StepsNatively",
+]
 
 Section = TypeVar("Section", bound=InstanceSection)
 
@@ -305,6 +315,16 @@ class StepsNatively(Protocol):
             FmuError: the step has failed.
             TerminationRequested: see `Instance.do_step`.
         """
+        ...
+
+
+@runtime_checkable
+class ChangesProcess(Protocol):
+    """An instance that knows whether its steps may change the state of their process (`ProcessState`)."""
+
+    @property
+    def changes_process(self) -> bool:
+        """Whether a step may change it."""
         ...
 
 

@@ -15,7 +15,7 @@ from ..rings.native import NativeStep, Span, Stage
 from ..rings.ring import Ring
 from ..simtime import TimeGrid
 from ..variables.model_description import ModelDescription, Value
-from .contract import Instance, KeepsState, StepsNatively
+from .contract import ChangesProcess, Instance, KeepsState, StepsNatively
 
 __all__ = ["AroundInstance", "AroundNativeSteps", "of_kind", "packed", "unpacked"]
 
@@ -86,6 +86,16 @@ class AroundInstance(Generic[Within]):
     def deserialize_state(self, data: bytes) -> object:
         """See `KeepsState`."""
         return self._forward(self._keeper().deserialize_state, data)
+
+    @property
+    def changes_process(self) -> bool:
+        """See `ChangesProcess`."""
+        return isinstance(self._instance, ChangesProcess) and self._instance.changes_process
+
+    def take_care(self) -> None:
+        """From the next step on, undo after each step what it does to the state of the process."""
+        if isinstance(self._instance, AroundInstance):
+            self._instance.take_care()
 
     def _forward(self, call: Callable[..., Result], *arguments: Any) -> Result:  # noqa: ANN401 those of any method
         """Call a method of the inner instance."""

@@ -11,7 +11,7 @@ import time
 from collections.abc import Mapping
 
 from ..errors import FmuMeshError, StepFailed
-from ..instances.call_guard import doing, not_returned
+from ..instances.call_guard import not_returned
 from ..system.plan import NodePlan
 from ..wire.refusals import Refusals
 from ..wire.views import InstanceStatus
@@ -102,7 +102,7 @@ class Activity:
         if under_way_s <= self._plan.timeouts.step:
             return None
         return StepFailed(
-            not_returned(threading.main_thread().ident or 0, under_way_s, doing(runner.stage)),
+            not_returned(threading.main_thread().ident or 0, under_way_s, runner.doing),
             instance=runner.name,
             point=runner.point,
             time=self._plan.grid.time(runner.point),

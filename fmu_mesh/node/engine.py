@@ -9,21 +9,21 @@ from __future__ import annotations
 
 import ctypes
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from threading import Lock
 from time import perf_counter
 from typing import Final, cast
 
 from ..errors import FmuMeshError, ProtocolBroken, TerminationRequested
-from ..instances.call_guard import floating_point_changed, restore_floating_point
 from ..instances.contract import StepsNatively
+from ..instances.process_state import ProcessState, floating_point_changed, restore_floating_point
 from ..rings import native
 from ..rings.host_memory import HostMemory
 from ..rings.native import NEVER, OUT_OF_RANGE, STAGE_BITS, BurstEnd, RowBase, Stage, StepKind, table
 from ..system.plan import NodePlan
 from .inputs import TimedInputs
-from .stepping import Position, Runner
+from .stepping import Position, PositionInTable, Runner
 
 __all__ = ["BurstEngine", "Engine", "PlainEngine", "make_engine"]
 
@@ -57,8 +57,8 @@ class Engine(ABC):
         self._progress = memory.progress[plan.node]
         self._windows = [(memory.progress[name], window) for name, window in plan.windows] if shared else []
         self._last_point = plan.grid.last_point
+        self._looked_after: ProcessState | None = None
 
-    @abstractmethod
     def run(self, wait_s: float, *, eager: bool) -> bool:
         """Step for about a millisecond, and wait for up to ``wait_s`` where nothing can step; whether there was a step.
 
@@ -72,6 +72,17 @@ class Engine(ABC):
 
         The unit of an instance that raised one of them is not stepped any more.
         """
+        self._looked_after = self._looked_after or ProcessState()
+        try:
+            return self._burst(wait_s, eager=eager)
+        finally:
+            if self._looked_after.restore():
+                for runner in self.runners:
+                    runner.take_care()
+
+    @abstractmethod
+    def _burst(self, wait_s: float, *, eager: bool) -> bool:
+        """As `run`, which then restores the state of the process."""
 
     @abstractmethod
     def ring_bell(self) -> None:
@@ -145,10 +156,10 @@ class BurstEngine(Engine):
         for number, unit in enumerate(units):
             for index, runner in enumerate(unit):
                 fill = partial(self._fill, number, index)
-                runner.follow(_InTable(self._members[number][index], fill))
+                runner.follow(PositionInTable(self._members[number][index], fill))
                 fill()
 
-    def run(self, wait_s: float, *, eager: bool) -> bool:
+    def _burst(self, wait_s: float, *, eager: bool) -> bool:
         """See `Engine`."""
         node, library = self._node, self._library
         node.wait_ns, node.eager = int(wait_s * 1e9), eager
@@ -313,28 +324,6 @@ class BurstEngine(Engine):
         )
 
 
-class _InTable(Position):
-    """How far a runner is, as its table has it."""
-
-    def __init__(self, member: native.MemberTable, fill: Callable[[], None]) -> None:
-        self._member = member
-        self._fill = fill
-
-    @property
-    def step(self) -> int:  # type: ignore[override]  # only the burst changes it
-        """See `Position`."""
-        return int(self._member.step)
-
-    @property
-    def stage(self) -> int:  # type: ignore[override]  # as above
-        """See `Position`."""
-        return int(self._member.stage)
-
-    def refit(self) -> None:
-        """See `Position`."""
-        self._fill()
-
-
 class PlainEngine(Engine):
     """Steps in plain Python.
 
@@ -362,7 +351,7 @@ class PlainEngine(Engine):
         for runner in self.runners:
             runner.follow(self._positions[runner.name])
 
-    def run(self, wait_s: float, *, eager: bool) -> bool:  # noqa: ARG002  it never waits after a step
+    def _burst(self, wait_s: float, *, eager: bool) -> bool:  # noqa: ARG002  it never waits after a step
         """See `Engine`."""
         started = perf_counter()
         seen = self._memory.seen()

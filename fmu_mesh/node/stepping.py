@@ -5,10 +5,13 @@ Owns what one step of one instance needs, and nothing about waiting. `fmu_mesh.n
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple, cast
 
-from ..instances.contract import Instance
+from ..instances.call_guard import doing
+from ..instances.contract import Instance, StepsNatively
+from ..instances.instance_wrapper import AroundInstance
+from ..rings import native
 from ..rings.array_elements import fill_unconnected
 from ..rings.finite import FiniteRows
 from ..rings.host_memory import Counter
@@ -20,7 +23,7 @@ from ..system.layout import Layout
 from ..system.plan import InstancePlan
 from .links import OutLink
 
-__all__ = ["Position", "Runner", "Source"]
+__all__ = ["Position", "PositionInTable", "Runner", "Source"]
 
 
 class Source(NamedTuple):
@@ -76,6 +79,28 @@ class Position:
 
     def refit(self) -> None:
         """The runner steps in another way from now on."""
+
+
+class PositionInTable(Position):
+    """How far a runner is, as its table has it."""
+
+    def __init__(self, member: native.MemberTable, fill: Callable[[], None]) -> None:
+        self._member = member
+        self._fill = fill
+
+    @property
+    def step(self) -> int:  # type: ignore[override]  # only the burst changes it
+        """See `Position`."""
+        return int(self._member.step)
+
+    @property
+    def stage(self) -> int:  # type: ignore[override]  # as above
+        """See `Position`."""
+        return int(self._member.stage)
+
+    def refit(self) -> None:
+        """See `Position`."""
+        self._fill()
 
 
 class Runner:
@@ -168,6 +193,12 @@ class Runner:
         self.instance = wrapped
         self._position.refit()
 
+    def take_care(self) -> None:
+        """A step has changed the state of its process: from the next step on, it is looked after."""
+        if isinstance(self.instance, AroundInstance):
+            self.instance.take_care()
+            self.refit()
+
     def refit(self) -> None:
         """The instance steps in another way from the next step on."""
         self._position.refit()
@@ -181,6 +212,12 @@ class Runner:
     def stage(self) -> int:
         """What it is doing, a `fmu_mesh.rings.native.Stage`."""
         return self._position.stage
+
+    @property
+    def doing(self) -> str:
+        """The same in words; of a step that Python takes, the instance knows more."""
+        is_known = self.stage == native.Stage.IN_PYTHON and isinstance(self.instance, StepsNatively)
+        return doing(cast("StepsNatively", self.instance).stage if is_known else self.stage)
 
     @property
     def point(self) -> int:

@@ -15,8 +15,9 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from ..errors import FmuError, InitializationFailed, NotFinite, TerminationRequested
-from ..instances.call_guard import Guarded, doing, floating_point_changed, restore_floating_point
+from ..instances.call_guard import Guarded, doing
 from ..instances.contract import LogMessage, Opening, Showing
+from ..instances.process_state import LOOK_STEPS, floating_point_changed, kept_state, restore_floating_point
 from ..rings.array_elements import element_of, scaled
 from ..rings.finite import FiniteRows
 from ..rings.ring import Ring, Rows
@@ -56,6 +57,8 @@ class LocalSystem:
         self._grid = plan.grid
         self._members: dict[str, _Member] = {}
         self._steps: tuple[tuple[str, Callable[[int], None]], ...] = ()
+        self._looked_after: tuple[tuple[str, Callable[[int], None]], ...] = ()
+        self._look_at = 0
         self._kept: dict[int, SavedSystem] = {}
         self._threads = ExitStack()
 
@@ -74,6 +77,7 @@ class LocalSystem:
         self._threads.enter_context(one_thread_meanwhile())  # with the libraries that a component has imported
         self._initialize()
         self._steps = tuple((name, member.step_from) for name, member in self._members.items())
+        self._looked_after = tuple((name, partial(self._look_after, step)) for name, step in self._steps)
 
     def step(self) -> None:
         """Take all steps that end at the next point, in the order of the plan.
@@ -83,6 +87,8 @@ class LocalSystem:
             TerminationRequested: an FMU asks to end the simulation. All outputs are still those of `point`.
         """
         point, steps = self.point, self._steps
+        if point >= self._look_at:
+            steps, self._look_at = self._looked_after, point + LOOK_STEPS
         try:
             for self.stepping, step_from in steps:
                 step_from(point)
@@ -100,6 +106,13 @@ class LocalSystem:
             raise
         self.point = point + 1
         self.stepping = ""
+
+    def _look_after(self, step_from: Callable[[int], None], point: int) -> None:
+        """Take a step; if it has changed the state of the process, all steps are looked after from now on."""
+        with kept_state() as state:
+            step_from(point)
+        if state.changed:
+            self._steps = self._looked_after
 
     @property
     def begun_at(self) -> int:
@@ -244,7 +257,6 @@ class _Member:
         self.plan = _instance_plan(plan, name)
         self.connections = [c for c in plan.connections if c.target_instance == name]
         self.instance = instance
-        self._do_step = instance.do_step
         self._inputs = Ring(self.plan.input_row, 1)
         # A slower instance reads values that are as old as its own step.
         oldest = max(instance.step_points for instance in plan.system.instances.values())
@@ -307,6 +319,7 @@ class _Member:
             self.is_finite.explain(error, self.instance.get_values)
             raise error
         self._looks_at_rows = not self.instance.check_rows(self.is_finite.spans)
+        self._do_step = self.instance.do_step
         for c in self.connections:
             if c.initial_only:
                 continue

@@ -21,9 +21,10 @@ from msgspec.structs import replace
 
 from ..config.mesh import TimeoutsConfig
 from ..errors import FmuError, FmuMeshError, Interrupted, NotFinite, ProtocolBroken, TerminationRequested
-from ..instances.call_guard import CallWatch, Guarded, doing
+from ..instances.call_guard import CallWatch, Guarded
 from ..instances.contract import Instance, LogMessage
 from ..instances.kept_models import KeptModels
+from ..instances.process_state import kept_state
 from ..instances.registry import open_instance
 from ..master.pacing import Pacer
 from ..node.connecting import connect
@@ -160,7 +161,8 @@ class RepeatedRuns:
         """Free all models, and remove their files; on the thread of the runs. May be called twice."""
         run = self._run
         if run is not None:
-            with self._watch_here().calling(run.names, FmuError, "terminate", run.timeouts.terminate):
+            watched = self._watch_here().calling(run.names, FmuError, "terminate", run.timeouts.terminate)
+            with watched, kept_state():
                 self._around.models.close()
         if self._watch is not None:
             self._watch.close()
@@ -360,7 +362,7 @@ class _Run:
     def _position(self) -> tuple[str, int, str]:
         """See `CallWatch.stepping`; between two steps, the answer changes all the time."""
         runner = self._engine.current if self._engine is not None else None
-        return (runner.name, runner.step, doing(runner.stage)) if runner else ("", time.monotonic_ns(), "")
+        return (runner.name, runner.step, runner.doing) if runner else ("", time.monotonic_ns(), "")
 
     def _write_rest(self, engine: Engine) -> None:
         """However the run ends: write the rows that are complete."""

@@ -30,7 +30,7 @@
 #define TARDY_SECONDS 1
 #define FAULT_TIME 0.0045 /* s; steps that end later have the fault */
 
-enum { U, THIRD, SUBNORMAL, PLAIN_LOCALE, FOLDER, COUNT };
+enum { U, THIRD, SUBNORMAL, PLAIN_LOCALE, FOLDER, UNDISTURBED, COUNT };
 
 typedef struct {
     char name[64];
@@ -94,6 +94,21 @@ static void leave_thread(void)
     if (pthread_create(&thread, NULL, compute, NULL) == 0) pthread_detach(thread);
 }
 
+static void block_signals(void)
+{
+    sigset_t set;
+
+    sigfillset(&set);
+    pthread_sigmask(SIG_BLOCK, &set, NULL);
+}
+
+static void change_environment(void)
+{
+    setenv("HOSTILE", "1", 1);
+    setenv("TZ", "Asia/Tokyo", 1);
+    unsetenv("PATH");
+}
+
 /* A process that outlives this one, and keeps its standard output open. */
 static void leave_orphan(int in_own_session)
 {
@@ -123,6 +138,10 @@ static void misbehave(const char *what)
     if (strcmp(what, "flushing") == 0) flush_to_zero();
     if (strcmp(what, "traps") == 0) feenableexcept(FE_DIVBYZERO | FE_INVALID);
     if (strcmp(what, "handlers") == 0) install_handlers();
+    if (strcmp(what, "blocking") == 0) block_signals();
+    if (strcmp(what, "umask") == 0) umask(0777);
+    if (strcmp(what, "environment") == 0) change_environment();
+    if (strcmp(what, "threadlocale") == 0) uselocale(newlocale(LC_ALL_MASK, "C.UTF-8", (locale_t)0));
     if (strcmp(what, "orphan") == 0) leave_orphan(0);
     if (strcmp(what, "daemon") == 0) leave_orphan(1);
 }
@@ -147,12 +166,21 @@ static void look_around(Hostile *hostile)
     const char *language = setlocale(LC_NUMERIC, NULL);
     volatile double u = hostile->values[U], three = 3.0, small = 1e-310, zero = 0.0, nothing;
     struct stat folder;
+    struct sigaction action;
+    sigset_t blocked;
+    mode_t mask = umask(022);
 
     nothing = zero / zero; /* ends the process where traps are enabled */
     (void)nothing;
     hostile->values[THIRD] = u / three;
     hostile->values[SUBNORMAL] = (u + 1.0) * small;
     hostile->values[PLAIN_LOCALE] = language != NULL && strcmp(language, "C") == 0;
+    umask(mask);
+    sigaction(SIGINT, NULL, &action);
+    pthread_sigmask(SIG_BLOCK, NULL, &blocked);
+    hostile->values[UNDISTURBED] = mask != 0777 && action.sa_handler != SIG_IGN && !sigismember(&blocked, SIGINT) &&
+                                   getenv("HOSTILE") == NULL && getenv("PATH") != NULL &&
+                                   uselocale((locale_t)0) == LC_GLOBAL_LOCALE;
     hostile->values[FOLDER] = stat(".", &folder) == 0 ? (double)folder.st_ino : -1.0;
 }
 
