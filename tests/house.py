@@ -259,6 +259,7 @@ ALLOWED: dict[str, dict[str, str]] = {
         "instances/fmi/callbacks.py: callbacks.freeMemory": _C_STRUCT,
         "instances/fmi/callbacks.py: callbacks.logger": _C_STRUCT,
         "instances/fmi/callbacks.py: callbacks.stepFinished": _C_STRUCT,
+        "instances/fmi/fmu_library.py: entry.name": _C_STRUCT,
         "node/engine.py: member.n_tracks": _C_STRUCT,
         "node/engine.py: member.python_at": _C_STRUCT,
         "node/engine.py: member.tracks": _C_STRUCT,

@@ -21,9 +21,10 @@ from types import TracebackType
 from typing import Any, Literal, Self
 
 from ..errors import FmuError
-from ..instances.call_guard import floating_point_changed, kept_state, restore_floating_point
 from ..instances.fmi import FmuInstance, LogMessage, open_instance, read_description
+from ..instances.fmi.step_options import StepOptions
 from ..instances.input_trajectory import Trajectory
+from ..instances.process_state import LOOK_STEPS, kept_mode, kept_state
 from ..system.start_values import forbidden
 from ..variables.model_description import ModelDescription, Value
 from ..variables.value_types import is_float
@@ -60,6 +61,7 @@ class FMIAdapter:
         fmu_path: the .fmu file.
         step_size: communication step size in s, or a `rclpy.duration.Duration`; None takes the default experiment's.
         interpolate_input: whether Real inputs are linear between their times.
+        deep_binding: whether the library of the FMU finds its own functions and variables before those of the program.
 
     Raises:
         CallRefused: ``step_size`` is not above 0, or missing here and in the FMU.
@@ -79,6 +81,8 @@ class FMIAdapter:
         fmu_path: str | os.PathLike[str],
         step_size: float | RosTime | None = None,
         interpolate_input: bool = True,  # noqa: FBT001, FBT002 as the constructor of fmi_adapter has it
+        *,
+        deep_binding: bool = True,
     ) -> None:
         path = Path(fmu_path)
         self._description = description = read_description(path)
@@ -99,7 +103,9 @@ class FMIAdapter:
         self._folder = folder = Path(tempfile.mkdtemp(prefix="fmu_mesh-"))
         try:
             with kept_state(keep_mode=True):
-                self._instance = open_instance(path, name, description, folder, _forward)
+                own = StepOptions(deep_binding=deep_binding)
+                self._instance = open_instance(path, name, description, folder, _forward, options=own)
+            self._careful = self._instance.changes_process
             self._release = weakref.finalize(self, _release, self._instance, folder)
         except BaseException:
             shutil.rmtree(folder, ignore_errors=True)
@@ -417,26 +423,18 @@ class FMIAdapter:
 
     @contextmanager
     def _fmu_called(self) -> Iterator[None]:
-        """Around every call of the FMU: restore the state of the process, and note a failure.
-
-        During steps this restores only the floating-point mode, as in a mesh: the rest takes longer than a step.
-        """
+        """Around every call of the FMU: restore the state of the process as a `Guarded` does, and note a failure."""
         stepping = self._mode == "stepping"
-        own_mode = stepping and floating_point_changed()  # the caller's mode, which must not change
+        looks = not stepping or self._careful or self._point % LOOK_STEPS == 0
         try:
-            if stepping:
+            with kept_state(keep_mode=True) if looks else kept_mode() as state:
                 yield
-            else:
-                with kept_state(keep_mode=True):
-                    yield
         except FmuError as error:
             if stepping:
                 error.at(self._point, self.simulation_time)
             self._mode = "failed"
             raise
-        finally:
-            if stepping and not own_mode and floating_point_changed():
-                restore_floating_point()
+        self._careful = self._careful or (state is not None and state.changed)
 
 
 def _forward(message: LogMessage) -> None:

@@ -42,6 +42,7 @@ ANNOTATION_ELEMENT: Final = "{https://fmu-mesh.github.io/ssp/1}Mesh"
 _VERSION: Final = 1
 _OF_SSP: Final = ("fmu", "kind", "start_values")
 _INSTANCE_KEYS: Final = (
+    "deep_binding",
     "group",
     "host",
     "interpolation",

@@ -14,6 +14,7 @@ from typing import Any, TypeAlias
 from cffi import FFI
 
 from ..call_guard import call_named
+from .fmu_library import FmuLibrary
 
 __all__ = [
     "FmpyCalls",
@@ -22,6 +23,7 @@ __all__ = [
     "RowPointers",
     "address_of",
     "cffi_function",
+    "declared",
     "memory",
     "pointer",
 ]
@@ -64,6 +66,11 @@ class FmpyCalls:
         function = name if name.startswith("fmi") else f"{self._prefix}{name[0].upper()}{name[1:]}"
         call = self.__dict__[name] = partial(call_named, self._names.get(name, function), found)
         return call
+
+
+def declared(library: FmuLibrary, name: str, prototype: Any) -> Any:  # noqa: ANN401 ctypes has no types
+    """The function ``name`` of a library with a prototype of ours."""
+    return ctypes.cast(getattr(library, name), prototype)
 
 
 def cffi_function(function: Function, declaration: str) -> Function:

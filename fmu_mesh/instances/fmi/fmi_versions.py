@@ -14,11 +14,11 @@ from ...variables.model_description import Variable
 from ...variables.value_types import DTYPES, Value, VariableType, is_text
 from .buffers import BinaryBuffer, Buffer, NumberBuffer, StringBuffer
 from .callbacks import FMI1_CALLBACKS, fmi2_callbacks, register, register_component, unregister
-from .calls import Function, Pointer
+from .calls import Function, Pointer, declared
 from .fmu_instance import FmuInstance
 from .fmu_values import Verb
 
-__all__ = ["FMI2_NAMES", "Fmi1Values", "Fmi2Values", "Fmi3Values"]
+__all__ = ["FMI2_NAMES", "FMI2_NEEDED", "FMI3_NEEDED", "Fmi1Values", "Fmi2Values", "Fmi3Values"]
 
 _GET_OR_SET = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_size_t, ctypes.c_void_p)
 _GET_OR_SET_3 = ctypes.CFUNCTYPE(
@@ -49,6 +49,14 @@ FMI2_NAMES: Final = {
     "deserializeFMUState": "fmi2DeSerializeFMUstate",
 }
 """FMI functions whose name does not follow from the name of FMPy's method, by that name."""
+FMI2_NEEDED: Final = (
+    "fmi2Instantiate",
+    "fmi2SetupExperiment",
+    "fmi2EnterInitializationMode",
+    "fmi2ExitInitializationMode",
+)
+FMI3_NEEDED: Final = ("fmi3EnterInitializationMode", "fmi3ExitInitializationMode")
+"""The functions that co-simulation and model exchange need, and so above for FMI 2.0."""
 _DIRECT: Final = ("Float64", "Int32")
 """The types that a ring stores as in C; an Enumeration is an `int` in FMI 1.0 and 2.0 (2.1.2)."""
 
@@ -73,7 +81,8 @@ class _Fmi1And2Values(FmuInstance):
         return f"{self._functions.prefix}{verb}{_SUFFIX[type_]}"
 
     def _function(self, verb: Verb, type_: VariableType) -> Callable[..., int]:
-        return _GET_OR_SET((self._symbol(f"{verb}{_SUFFIX[type_]}"), self._fmu.dll))
+        function: Callable[..., int] = declared(self._fmu.dll, self._symbol(f"{verb}{_SUFFIX[type_]}"), _GET_OR_SET)
+        return function
 
     def _symbol(self, function: str) -> str:
         """The name of a function in the library."""
@@ -207,7 +216,7 @@ class Fmi3Values(FmuInstance):
 
     def _function(self, verb: Verb, type_: VariableType) -> Callable[..., int]:
         prototype: Any = _GET_OR_SET_BINARY if type_ == "Binary" else _GET_OR_SET_3
-        function: Callable[..., int] = prototype((self._function_name(verb, type_), self._fmu.dll))
+        function: Callable[..., int] = declared(self._fmu.dll, self._function_name(verb, type_), prototype)
         return function
 
     def _buffer(self, type_: VariableType, variables: Sequence[Variable]) -> Buffer:

@@ -78,11 +78,12 @@ class FmuInstance(KeepsFmuState, FmuValues):
         self._keep = []
         self._describe(description)
         self._kept = kept
-        fmu = FmuToLoad(path, name, description, terms, self._functions)
+        fmu = FmuToLoad(path, name, description, terms, self._functions, options.deep_binding)
         self._model = LoadedFmu(fmu, folder) if kept is None else LoadedFmu.kept(fmu, kept)
         try:
             self._model.load()
             self._fmu = self._model.calls
+            self._check_functions()
             self._instantiate()
             self._component = self._fmu.component
             self._self = pointer(self._component)
@@ -100,6 +101,11 @@ class FmuInstance(KeepsFmuState, FmuValues):
     def description(self) -> ModelDescription:
         """The model description; arrays have the shapes that the structural parameters give them."""
         return self._description
+
+    @property
+    def changes_process(self) -> bool:
+        """See `ChangesProcess`."""
+        return self._model.changes_process
 
     def enter_initialization(
         self, start_time: float, stop_time: float | None, start_values: Mapping[str, Value]
@@ -238,6 +244,15 @@ class FmuInstance(KeepsFmuState, FmuValues):
     def _describe(self, description: ModelDescription) -> None:
         self._description = description
         self._variables = {variable.name: variable for variable in description.variables}
+
+    def _check_functions(self) -> None:
+        """Refuse a library without a function that every run needs; others may be missing until they are called."""
+        names = {*self._functions.needed}
+        names |= {self._function_name("Get", variable.type) for variable in self._description.with_causality("output")}
+        names |= {self._function_name("Set", variable.type) for variable in self._description.with_causality("input")}
+        missing = self._fmu.dll.missing  # in FMI 1.0 with the model identifier before the name
+        if lacking := sorted(name for name in names if any(one.endswith(name) for one in missing)):
+            raise RuntimeError(f"its library has no function {', '.join(lacking)}, which every run needs")
 
     def _check_live(self) -> None:
         if self._model.is_lost:

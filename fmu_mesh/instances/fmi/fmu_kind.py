@@ -108,6 +108,13 @@ class FmuConfig(Base, InstanceSection, frozen=True, kw_only=True, tag_field=KIND
         bool | None,
         Meta(description="Whether what FMI forbids is an error for this FMU (default: top level)."),
     ] = None
+    deep_binding: Annotated[
+        bool,
+        Meta(
+            description="Whether the library of the FMU finds its own functions and variables before those of the "
+            "process (RTLD_DEEPBIND). false: for an FMU that replaces malloc, or runs under a preloaded allocator."
+        ),
+    ] = True
 
     @property
     def retries_steps(self) -> bool:
@@ -213,6 +220,7 @@ class FmuKind(Kind[FmuConfig]):
             tolerance=section.tolerance,
             retry_discarded_steps=section.retry_discarded_steps,
             linear_inputs=opening.linear_inputs,
+            deep_binding=section.deep_binding,
         )
         path, folder, terms = opening.path, opening.folder, _terms(opening)
         instance = open_instance(path, opening.name, description, folder, opening.log, terms, options, opening.kept)

@@ -23,6 +23,7 @@ from ...variables.value_types import Value, VariableType, flattened, nested
 from ..call_guard import call_named, doing
 from .buffers import Buffer
 from .calls import Function, Pointer, RowPointers, address_of, cffi_function, memory
+from .fmu_library import MISSING
 
 __all__ = ["DISCARD", "FATAL", "OK", "WARNING", "FmuValues", "PartCall", "Verb", "status_name"]
 
@@ -277,6 +278,8 @@ class FmuValues(ABC):
 
 def status_name(status: int) -> str:
     """The name of a status in the words of FMI (FMI 2.0, 2.1.3); of a number that FMI does not know, the number."""
+    if status == MISSING:
+        return "nothing: its library does not have this function"
     return _STATUS_NAMES[status] if 0 <= status < len(_STATUS_NAMES) else str(status)
 
 

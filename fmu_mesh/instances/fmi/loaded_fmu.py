@@ -5,6 +5,7 @@ Owns the files, the library and the instance as FMPy has it; `FmuInstance` calls
 
 from __future__ import annotations
 
+import re
 import shutil
 from collections.abc import Callable, Hashable, Mapping
 from contextlib import chdir, suppress
@@ -14,15 +15,27 @@ from typing import Any, NamedTuple, Protocol, cast
 from fmpy.fmi1 import FMICallException
 
 from ...variables.model_description import ModelDescription
-from ..call_guard import FOLDER
 from ..kept_models import KeptModels
 from ..process_end import process_ends
+from ..process_state import FOLDER
 from .archive.archive import Terms
+from .archive.examining import library_name
 from .archive.sources import extract
 from .calls import FmpyCalls
+from .fmu_library import FmuLibrary, calling
 from .fmu_values import FATAL
 
 __all__ = ["FmuFunctions", "LoadedFmu"]
+
+_CHANGING = re.compile(
+    rb"(?:_*|g_|_gfortran_)"
+    rb"(?:f?chdir|setlocale|uselocale|umask|(?:un)?setenv|clearenv|putenv|(?:sysv_|bsd_|s)?signal|sigaction|sigset"
+    rb"|sigignore|sighold|sigblock|sigsetmask|sigprocmask|pthread_sigmask"
+    rb"|feenableexcept|feholdexcept|fesetenv|fesetmode|feupdateenv)(?:_i[48])?(?:_sub)?(?:_int)?"
+    rb"|_ZNSt6locale6globalE.*|_ZNSt10filesystem12current_pathERKN.*"
+)
+"""Functions of C, GLib, Fortran and C++ that change the state of their process. Not `fesetround`: the floating-point
+mode is checked after each step anyway, but for its traps."""
 
 
 class FmuFunctions(NamedTuple):
@@ -32,12 +45,14 @@ class FmuFunctions(NamedTuple):
         library: FMPy's class for them.
         prefix: the prefix of their names, such as `fmi2`.
         free: FMPy's method that frees an instance.
+        needed: the functions, without their prefix, that every run needs.
         names: FMI functions whose name does not follow from the name of FMPy's method, by that name.
     """
 
     library: type[Any]
     prefix: str
     free: str
+    needed: tuple[str, ...]
     names: Mapping[str, str] = {}
 
 
@@ -58,6 +73,7 @@ class FmuToLoad(NamedTuple):
         description: what `read_description` returned for it.
         terms: limits and checks for the archive.
         functions: of this version of FMI.
+        deep_binding: whether its library finds its own functions and variables before those of the process.
     """
 
     path: Path
@@ -65,12 +81,13 @@ class FmuToLoad(NamedTuple):
     description: ModelDescription
     terms: Terms
     functions: FmuFunctions
+    deep_binding: bool
 
     @property
     def key(self) -> Hashable:
         """Two FMUs with the same key are the same, for instances of one name."""
         own = self.description
-        return self.path, self.terms, own.guid, own.model_identifier, self.functions.library
+        return self.path, self.terms, own.guid, own.model_identifier, self.functions.library, self.deep_binding
 
 
 class LoadedFmu:
@@ -97,6 +114,7 @@ class LoadedFmu:
         self._fmu = fmu
         self._folder = extract(fmu.path, folder, fmu.terms, model=fmu.description)
         self._user: Logs | None = None
+        self._changes_process: bool | None = None
 
     @classmethod
     def kept(cls, fmu: FmuToLoad, kept: KeptModels) -> LoadedFmu:
@@ -108,14 +126,24 @@ class LoadedFmu:
         if self.calls is not None:
             return
         functions, description = self._fmu.functions, self._fmu.description
-        with FOLDER, chdir("."):  # FMPy loads a library from its own folder, and stays there if that fails
-            loaded = functions.library(
+        path = self._folder / library_name(description.model_identifier, description.fmi_version)
+        with FOLDER, chdir(path.parent):  # libraries may name others relative to it
+            library = FmuLibrary(path, deep_binding=self._fmu.deep_binding)
+            loaded = calling(functions.library)(
+                library=library,
                 guid=description.guid,
                 modelIdentifier=description.model_identifier,
                 unzipDirectory=str(self._folder),
                 instanceName=self._fmu.name,
             )
         self.calls = FmpyCalls(loaded, functions.prefix, functions.names)
+
+    @property
+    def changes_process(self) -> bool:
+        """See `ChangesProcess`; known once there is an instance, which may have loaded more libraries."""
+        if self._changes_process is None:
+            self._changes_process = any(_CHANGING.fullmatch(name) for name in self.calls.dll.imports)
+        return self._changes_process
 
     def instantiate(self, user: Logs, make: Callable[[], None]) -> None:
         """Give the FMU to its next user; ``make`` makes an instance, if none is there that was reset.

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any, NamedTuple, TypeVar
 
 import msgspec
@@ -15,6 +16,7 @@ from fmpy.fmi1 import FMICallException
 from ...errors import FmuError, StepFailed
 from ...variables.model_description import ModelDescription
 from ..instance_wrapper import of_kind, packed, unpacked
+from .fmu_values import status_name
 
 __all__ = ["Bookkeeping", "FmuState", "KeepsFmuState"]
 
@@ -73,7 +75,8 @@ class KeepsFmuState:
     def free_state(self, state: object) -> None:
         """See `KeepsState`."""
         own = of_kind(FmuState, state)
-        self._on_state(lambda: self._fmu.freeFMUState(own.handle))
+        with suppress(StepFailed):  # it takes memory, and nothing else
+            self._on_state(lambda: self._fmu.freeFMUState(own.handle))
 
     def serialize_state(self, state: object) -> bytes:
         """See `KeepsState`."""
@@ -117,4 +120,4 @@ class KeepsFmuState:
             return call()
         except FMICallException as error:
             self._note(error.status)
-            raise StepFailed(f"{error.function} failed with status {error.status}", instance=self.name) from error
+            raise StepFailed(f"{error.function} returned {status_name(error.status)}", instance=self.name) from error

@@ -1,4 +1,4 @@
-"""How the steps of an FMU are taken, as its section of the configuration and its model description say."""
+"""How an FMU is loaded and its steps are taken, as its section of the configuration and its model description say."""
 
 from __future__ import annotations
 
@@ -25,16 +25,18 @@ class SolverSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class StepOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How the steps of one instance are taken. The configuration has been checked against what its FMU can do.
+    """How one instance is loaded and stepped. The configuration has been checked against what its FMU can do.
 
     Attributes:
         solver: of a model-exchange FMU.
         tolerance: relative tolerance for a co-simulation FMU; None: that of its default experiment.
         retry_discarded_steps: whether a step that the FMU discards is repeated in smaller steps.
         linear_inputs: the inputs whose connections are extrapolated.
+        deep_binding: whether the library finds its own functions and variables before those of the process.
     """
 
     solver: SolverSettings = SolverSettings()
     tolerance: float | None = None
     retry_discarded_steps: bool = False
     linear_inputs: tuple[LinearInput, ...] = ()
+    deep_binding: bool = True

@@ -16,13 +16,13 @@ import numpy as np
 
 from .archive import OpenFmu
 
-__all__ = ["SharedLibrary", "libraries_beside", "read_shared_library"]
+__all__ = ["SYMBOL", "SharedLibrary", "libraries_beside", "read_shared_library"]
 
 _GNU_UNIQUE: Final = 10
 """The binding STB_GNU_UNIQUE."""
 _WRITABLE: Final = 2
 """The flag PF_W of a segment."""
-_SYMBOL: Final = np.dtype(
+SYMBOL: Final = np.dtype(
     [("name", "<u4"), ("info", "u1"), ("other", "u1"), ("section", "<u2"), ("value", "<u8"), ("size", "<u8")]
 )
 """`Elf64_Sym`."""
@@ -130,7 +130,7 @@ def _symbols(file: IO[bytes], dynamic: Any) -> list[_Symbol]:  # noqa: ANN401 it
     _, names_place = dynamic.get_table_offset("DT_STRTAB")
     count, names_size = dynamic.num_symbols(), next(dynamic.iter_tags("DT_STRSZ")).entry.d_val
     file.seek(place)
-    table = np.frombuffer(file.read(count * _SYMBOL.itemsize), _SYMBOL)
+    table = np.frombuffer(file.read(count * SYMBOL.itemsize), SYMBOL)
     file.seek(names_place)
     names = file.read(names_size)
     return [

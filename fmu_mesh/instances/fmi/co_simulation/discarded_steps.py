@@ -14,7 +14,7 @@ from typing import Any, Final
 from fmpy.fmi1 import FMICallException
 
 from ....simtime import step_within
-from ..calls import Function, Pointer
+from ..calls import Function, Pointer, declared
 from ..fmu_values import DISCARD, WARNING
 
 __all__ = [
@@ -53,8 +53,8 @@ class StepStatus:
 
     def __init__(self, dll: Any, component: int, prefix: str) -> None:  # noqa: ANN401 of ctypes
         self._component = component
-        self._get_status = _ASK((f"{prefix}GetStatus", dll))
-        self._get_real_status = _ASK((f"{prefix}GetRealStatus", dll))
+        self._get_status = declared(dll, f"{prefix}GetStatus", _ASK)
+        self._get_real_status = declared(dll, f"{prefix}GetRealStatus", _ASK)
 
     def wait(self) -> int | None:
         """Wait until a pending step is done, and return its status; None if the FMU does not tell.

@@ -12,7 +12,7 @@ from fmpy.fmi1 import FMICallException, FMU1Slave
 
 from ....rings.native import StepKind
 from ...call_guard import call_named
-from ..calls import cffi_function
+from ..calls import cffi_function, declared
 from ..fmi_versions import Fmi1Values
 from ..fmu_values import DISCARD, WARNING
 from ..loaded_fmu import FmuFunctions
@@ -32,6 +32,7 @@ _NAMES = {
     "fmi1FreeSlaveInstance": "fmiFreeSlaveInstance",
     "reset": "fmiResetSlave",
 }
+_NEEDED = "fmiInstantiateSlave", "fmiInitializeSlave", "fmiDoStep"
 _NEW, _REPEATED = b"\x01", b"\x00"
 """`newStep` of fmiDoStep."""
 
@@ -40,7 +41,7 @@ class Fmi1Instance(NativeInstance, Fmi1Values):
     """One instance of an FMI 1.0 co-simulation FMU."""
 
     _kind = StepKind.FMI1
-    _functions = FmuFunctions(FMU1Slave, "fmi", "fmi1FreeSlaveInstance", _NAMES)
+    _functions = FmuFunctions(FMU1Slave, "fmi", "fmi1FreeSlaveInstance", _NEEDED, _NAMES)
     _derivatives: Mapping[str, float] = {}
 
     def advance(self, time: float, step_size: float) -> None:
@@ -122,7 +123,7 @@ class Fmi1Instance(NativeInstance, Fmi1Values):
         references = (ctypes.c_uint * count)(*(variable.value_reference for variable in variables))
         orders = (ctypes.c_int * count)(*[1] * count)
         signed = [-d if v.negated else d for v, d in zip(variables, derivatives.values(), strict=True)]
-        function = _SET_DERIVATIVES((self._symbol("SetRealInputDerivatives"), self._fmu.dll))
+        function = declared(self._fmu.dll, self._symbol("SetRealInputDerivatives"), _SET_DERIVATIVES)
         status = function(self._component, references, count, orders, (ctypes.c_double * count)(*signed))
         if status > WARNING:
             raise self._failed("fmiSetRealInputDerivatives", status=status)
@@ -130,14 +131,14 @@ class Fmi1Instance(NativeInstance, Fmi1Values):
     def _initialize(self, start_time: float, stop_time: float | None) -> None:
         """FmiInitializeSlave (FMI 1.0 CS, 3.3)."""
         name = "fmiInitializeSlave"
-        function = _INITIALIZE((self._symbol("InitializeSlave"), self._fmu.dll))
+        function = declared(self._fmu.dll, self._symbol("InitializeSlave"), _INITIALIZE)
         stop_time_defined = b"\x00" if stop_time is None else b"\x01"
         status = call_named(name, function, self._component, start_time, stop_time_defined, stop_time or 0.0)
         if status > WARNING:
             raise self._failed(name, status=status)
 
     def _terminate_initialized(self) -> None:
-        function = _TERMINATE((self._symbol("TerminateSlave"), self._fmu.dll))
+        function = declared(self._fmu.dll, self._symbol("TerminateSlave"), _TERMINATE)
         status = call_named("fmiTerminateSlave", function, self._component)
         if status > WARNING:
             raise FMICallException(function="fmiTerminateSlave", status=status)

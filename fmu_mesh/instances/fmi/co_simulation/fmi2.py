@@ -13,7 +13,7 @@ from ....errors import TerminationRequested
 from ....rings.native import StepKind
 from ....variables.value_types import Value
 from ..calls import cffi_function
-from ..fmi_versions import FMI2_NAMES, Fmi2Values
+from ..fmi_versions import FMI2_NAMES, FMI2_NEEDED, Fmi2Values
 from ..fmu_values import DISCARD, WARNING
 from ..loaded_fmu import FmuFunctions
 from ..model_exchange.solver import resolvable
@@ -30,7 +30,7 @@ class Fmi2Instance(NativeInstance, Fmi2Values):
     """One instance of an FMI 2.0 co-simulation FMU."""
 
     _kind = StepKind.FMI2
-    _functions = FmuFunctions(FMU2Slave, "fmi2", "fmi2FreeInstance", FMI2_NAMES)
+    _functions = FmuFunctions(FMU2Slave, "fmi2", "fmi2FreeInstance", (*FMI2_NEEDED, "fmi2DoStep"), FMI2_NAMES)
     _retrying: RetriedSteps | None = None
     _derivatives: Mapping[str, float] = {}
     _terminated = False

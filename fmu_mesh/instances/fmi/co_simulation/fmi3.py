@@ -20,7 +20,7 @@ from ....rings.ring import Ring
 from ....simtime import TimeGrid
 from ....variables.value_types import Value
 from ..calls import Pointer, cffi_function
-from ..fmi_versions import Fmi3Values
+from ..fmi_versions import FMI3_NEEDED, Fmi3Values
 from ..fmu_values import PartCall, Verb
 from ..loaded_fmu import FmuFunctions
 from ..model_exchange.solver import SolverFailed, resolvable
@@ -32,6 +32,7 @@ __all__ = ["Fmi3Instance"]
 
 T = TypeVar("T")
 
+_NEEDED = "fmi3InstantiateCoSimulation", *FMI3_NEEDED, "fmi3DoStep"
 _DO_STEP = "int (*)(void *, double, double, _Bool, void *, void *, void *, void *)"
 
 
@@ -39,7 +40,7 @@ class Fmi3Instance(NativeInstance, Fmi3Values):
     """One instance of an FMI 3.0 co-simulation FMU."""
 
     _kind = StepKind.FMI3
-    _functions = FmuFunctions(FMU3Slave, "fmi3", "fmi3FreeInstance", {"instantiate": "fmi3InstantiateCoSimulation"})
+    _functions = FmuFunctions(FMU3Slave, "fmi3", "fmi3FreeInstance", _NEEDED, {"instantiate": _NEEDED[0]})
     _steps: Fmi3Steps
     _discrete_row: tuple[bytes | list[Any], ...] = ()
 

@@ -13,6 +13,8 @@ from typing import Any, NamedTuple
 from fmpy.fmi1 import FMICallException, fmi1EventInfo
 from fmpy.fmi2 import fmi2EventInfo
 
+from ..calls import declared
+from ..fmu_library import MISSING
 from ..fmu_values import WARNING
 
 __all__ = ["EventInfo", "Fmi1Calls", "Fmi3Calls", "ModelCalls"]
@@ -68,7 +70,7 @@ class ModelCalls:
         return self._declare("GetNominalsOfContinuousStates", _ARRAY), self._declare("GetDerivatives", _ARRAY)
 
     def _declare(self, name: str, prototype: Any) -> Any:  # noqa: ANN401 ctypes has no types
-        function = prototype((self._prefix + name, self._fmu.dll))
+        function = declared(self._fmu.dll, self._prefix + name, prototype)
         function.errcheck = self._checked(self._prefix.rpartition("_")[2] + name)
         return function
 
@@ -97,7 +99,12 @@ class ModelCalls:
 
     def get_nominals(self, nominals: int) -> None:
         """See `Equations.get_nominals`."""
-        self._get_nominals(self._component, nominals, self.n_states)
+        try:
+            self._get_nominals(self._component, nominals, self.n_states)
+        except FMICallException as error:
+            if error.status != MISSING:
+                raise
+            (ctypes.c_double * self.n_states).from_address(nominals)[:] = [1.0] * self.n_states
 
     def get_derivatives(self, derivatives: int) -> None:
         """See `Equations.get_derivatives`."""

@@ -8,7 +8,7 @@ from fmpy.fmi3 import FMU3Model
 
 from ....variables.value_types import Value
 from ..clocks import Clocks
-from ..fmi_versions import FMI2_NAMES, Fmi1Values, Fmi2Values, Fmi3Values
+from ..fmi_versions import FMI2_NAMES, FMI2_NEEDED, FMI3_NEEDED, Fmi1Values, Fmi2Values, Fmi3Values
 from ..loaded_fmu import FmuFunctions
 from .continuous import ContinuousInstance
 from .model_calls import Fmi1Calls, Fmi3Calls, ModelCalls
@@ -17,12 +17,21 @@ __all__ = ["Fmi1ModelInstance", "Fmi2ModelInstance", "Fmi3ModelInstance"]
 
 
 _NAMES = {"instantiate": "fmiInstantiateModel", "fmi1FreeModelInstance": "fmiFreeModelInstance"}
+_NEEDED_1 = "fmiInstantiateModel", "fmiSetTime", "fmiInitialize", "fmiEventUpdate"
+_NEEDED_2 = *FMI2_NEEDED, "fmi2SetTime", "fmi2NewDiscreteStates", "fmi2EnterContinuousTimeMode"
+_NEEDED_3 = (
+    "fmi3InstantiateModelExchange",
+    *FMI3_NEEDED,
+    "fmi3SetTime",
+    "fmi3UpdateDiscreteStates",
+    "fmi3EnterContinuousTimeMode",
+)
 
 
 class Fmi1ModelInstance(ContinuousInstance, Fmi1Values):
     """One instance of an FMI 1.0 FMU for model exchange (FMI 1.0, 2.8)."""
 
-    _functions = FmuFunctions(FMU1Model, "fmi", "fmi1FreeModelInstance", _NAMES)
+    _functions = FmuFunctions(FMU1Model, "fmi", "fmi1FreeModelInstance", _NEEDED_1, _NAMES)
 
     def _instantiated(self) -> None:
         self._calls = Fmi1Calls(self._fmu, self._description.continuous_states, self._description.event_indicators)
@@ -42,7 +51,7 @@ class Fmi1ModelInstance(ContinuousInstance, Fmi1Values):
 class Fmi2ModelInstance(ContinuousInstance, Fmi2Values):
     """One instance of an FMI 2.0 FMU for model exchange (FMI 2.0, 3.2)."""
 
-    _functions = FmuFunctions(FMU2Model, "fmi2", "fmi2FreeInstance", FMI2_NAMES)
+    _functions = FmuFunctions(FMU2Model, "fmi2", "fmi2FreeInstance", _NEEDED_2, FMI2_NAMES)
 
     def _model_calls(self) -> ModelCalls:
         return ModelCalls(self._fmu, self._description.continuous_states, self._description.event_indicators, "fmi2")
@@ -51,7 +60,7 @@ class Fmi2ModelInstance(ContinuousInstance, Fmi2Values):
 class Fmi3ModelInstance(ContinuousInstance, Fmi3Values):
     """One instance of an FMI 3.0 FMU for model exchange (FMI 3.0, 3.2)."""
 
-    _functions = FmuFunctions(FMU3Model, "fmi3", "fmi3FreeInstance", {"instantiate": "fmi3InstantiateModelExchange"})
+    _functions = FmuFunctions(FMU3Model, "fmi3", "fmi3FreeInstance", _NEEDED_3, {"instantiate": _NEEDED_3[0]})
 
     def _enter_initialization(self, start_time: float, stop_time: float | None, start_values: dict[str, Value]) -> None:
         super()._enter_initialization(start_time, stop_time, start_values)

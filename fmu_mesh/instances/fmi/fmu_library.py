@@ -1,0 +1,219 @@
+"""The shared library of an FMU, loaded so that the FMU uses its own functions first (ADR 65).
+
+Owns how the library and those beside it are loaded, and what the loaded ones say about themselves. A function that the
+library does not have is no error until it is called: then its status is `MISSING`.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import itertools
+import os
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from fmpy import freeLibrary
+
+from .archive.shared_library import SYMBOL, SharedLibrary, read_shared_library
+
+__all__ = ["MISSING", "FmuLibrary", "calling"]
+
+MISSING: Final = 999
+"""Our own status of a function that the library of an FMU does not have."""
+
+_ABSENT: Final = ctypes.CFUNCTYPE(ctypes.c_int)
+_DEEP_BINDING: Final = getattr(os, "RTLD_DEEPBIND", 0)
+_RTLD_DI_LINKMAP: Final = 2
+_DT_NEEDED: Final = 1
+_DT_STRTAB: Final = 5
+_DT_SYMTAB: Final = 6
+_DT_STRSZ: Final = 10
+
+
+class _LinkMap(ctypes.Structure):
+    """`struct link_map` of <link.h>: a library as the dynamic linker has it."""
+
+    _fields_ = [
+        ("address", ctypes.c_size_t),
+        ("name", ctypes.c_void_p),
+        ("dynamic", ctypes.c_size_t),
+        ("next", ctypes.c_void_p),
+        ("previous", ctypes.c_void_p),
+    ]
+
+    def needed(self) -> list[bytes]:
+        """The names of the libraries that it needs."""
+        names = self._table(_DT_STRTAB)
+        return [ctypes.string_at(names + value) for tag, value in self._tags() if tag == _DT_NEEDED]
+
+    def imports(self) -> set[bytes]:
+        """The symbols that others have to define."""
+        tags = dict(self._tags())
+        place, symbols_place = self._table(_DT_STRTAB), self._table(_DT_SYMTAB)
+        names = ctypes.string_at(place, tags[_DT_STRSZ])
+        # Their number stands nowhere; the table of names follows them, in the files of some linkers after others.
+        size = max(0, place - symbols_place) // SYMBOL.itemsize * SYMBOL.itemsize
+        symbols = np.frombuffer(ctypes.string_at(symbols_place, size), SYMBOL)
+        used = symbols["name"][(symbols["section"] == 0) & (symbols["name"] < len(names))]
+        return {names[start : names.index(b"\0", start)] for start in used.tolist()}
+
+    def _tags(self) -> Iterator[tuple[int, int]]:
+        """The entries of the dynamic section."""
+        for place in itertools.count(self.dynamic, 16):
+            tag, value = (ctypes.c_uint64 * 2).from_address(place)
+            if tag == 0:
+                return
+            yield tag, value
+
+    def _table(self, tag: int) -> int:
+        """The address of a table: in the libraries that glibc has loaded it stands there, elsewhere the offset."""
+        place = dict(self._tags())[tag]
+        return place if place > self.address else place + self.address
+
+
+class _Library(ctypes.CDLL):
+    """A library, or with the name None the process with all libraries that it started with."""
+
+    def close(self) -> None:
+        """Unload it, if it was loaded as often as closed."""
+        freeLibrary(self._handle)
+
+    @property
+    def entry(self) -> _LinkMap:
+        """It in the list of all libraries of the process."""
+        found = ctypes.c_void_p()
+        _PROCESS.dlinfo(ctypes.c_void_p(self._handle), _RTLD_DI_LINKMAP, ctypes.byref(found))
+        return _LinkMap.from_address(found.value or 0)
+
+
+_PROCESS: Final = _Library(None)
+
+
+class FmuLibrary(_Library):
+    """The library of one FMU.
+
+    Args:
+        path: its file, in an FMU that was extracted for it.
+        deep_binding: whether it finds its own functions and variables before those of the process.
+
+    Attributes:
+        missing: the functions that were asked for and that it does not have.
+
+    Raises:
+        OSError: it cannot be loaded.
+    """
+
+    def __init__(self, path: Path, *, deep_binding: bool) -> None:
+        self.missing: set[str] = set()
+        self._folder = f"{path.parents[2]}/".encode()
+        # A sanitizer ends a process that binds deeply.
+        mode = _DEEP_BINDING if deep_binding and not hasattr(_PROCESS, "__asan_init") else 0
+        with _loaded_before(path, mode):
+            super().__init__(str(path), mode)
+            if mode and any(name.startswith(b"libpython") for name in self.entry.needed()):
+                # Modules of a second Python would use functions of this one, so there may be no second one.
+                self.close()
+                super().__init__(str(path), 0)
+
+    def __getattr__(self, name: str) -> Any:  # noqa: ANN401 as in ctypes
+        try:
+            return super().__getattr__(name)
+        except AttributeError:
+            if "fmi" not in name:
+                raise
+        self.missing.add(name)
+        function = _ABSENT(lambda: MISSING)
+        setattr(self, name, function)  # whoever has its address needs it for as long as the library
+        return function
+
+    @property
+    def imports(self) -> set[bytes]:
+        """The functions and variables that the loaded libraries of the FMU use and do not define themselves."""
+        own = [one for one in _entries() if one.name and ctypes.string_at(one.name).startswith(self._folder)]
+        return set[bytes]().union(*(one.imports() for one in own))
+
+
+class _LoadedBefore:
+    """Goes before FMPy's class of an FMU, which loads the library again: that gives the same one."""
+
+    def __init__(self, library: FmuLibrary, **keywords: Any) -> None:  # noqa: ANN401 those of FMPy's class
+        self._library = library
+        super().__init__(**keywords)
+        library.close()
+
+    @property
+    def dll(self) -> FmuLibrary:
+        """The library."""
+        return self._library
+
+    @dll.setter
+    def dll(self, again: object) -> None:
+        """FMPy assigns what it has loaded."""
+
+
+def calling(fmpy_class: type[Any]) -> type[Any]:
+    """FMPy's class for the functions of an FMU, as one that also takes the ``library``."""
+    return type(fmpy_class.__name__, (_LoadedBefore, fmpy_class), {})
+
+
+@contextmanager
+def _loaded_before(path: Path, mode: int) -> Iterator[None]:
+    """Meanwhile, those libraries beside ``path`` are loaded that it needs and does not find by itself."""
+    beside = {one.name: one for one in path.parent.iterdir() if ".so" in one.name and not one.samefile(path)}
+    facts = {name: read_shared_library(one.read_bytes()) or SharedLibrary() for name, one in beside.items()}
+    own = read_shared_library(path.read_bytes()) if beside else None
+    with ExitStack() as stack:
+        for needed, name in _not_found(own, facts, path.parent).items() if own is not None else ():
+            with suppress(OSError):  # loading what needs it says why it cannot be loaded
+                library = _Library(str(beside[name]), mode)
+                stack.callback(library.close)
+                if not facts[name].soname:
+                    stack.enter_context(_named(library, needed))
+        yield
+
+
+def _not_found(library: SharedLibrary, beside: dict[str, SharedLibrary], folder: Path) -> dict[str, str]:
+    """What a library needs of those beside it, and finds by no run path; each after those that it needs itself.
+
+    Returns:
+        The names of the files, by the names that are needed.
+    """
+    found: dict[str, str] = {}
+    files = {facts.soname or name: name for name, facts in beside.items()}
+    seen = set[str]()
+
+    def visit(library: SharedLibrary) -> None:
+        runs = [Path(one.replace("${ORIGIN}", "$ORIGIN").replace("$ORIGIN", str(folder))) for one in library.run_paths]
+        for needed in library.needed:
+            plain = needed.rpartition("/")[2]
+            name = files.get(plain, plain)
+            if name in beside and name not in seen:
+                seen.add(name)
+                visit(beside[name])
+            if name in beside and not any((run / needed).exists() for run in runs):
+                found.setdefault(needed, name)
+
+    visit(library)
+    return found
+
+
+@contextmanager
+def _named(library: _Library, name: str) -> Iterator[None]:
+    """Meanwhile, the dynamic linker takes a library without a SONAME for the one that is needed as ``name``."""
+    entry, text = library.entry, ctypes.create_string_buffer(name.encode())
+    before, entry.name = entry.name, ctypes.addressof(text)
+    try:
+        yield
+    finally:
+        entry.name = before
+
+
+def _entries() -> Iterator[_LinkMap]:
+    """All libraries of the process."""
+    entry: _LinkMap | None = _PROCESS.entry
+    while entry is not None:
+        yield entry
+        entry = _LinkMap.from_address(entry.next) if entry.next else None
