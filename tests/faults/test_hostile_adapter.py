@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from fmu_mesh import FMIAdapter
-from fmu_mesh.instances.call_guard import floating_point_changed, restore_floating_point
+from fmu_mesh.instances.process_state import floating_point_changed, restore_floating_point
 from tests.fmus.helpers import NO_COMPILER, built_once
 from tests.fmus.packing import repacked
 
@@ -24,6 +24,8 @@ CALLS = (
     "fmi2SetupExperiment",
     "fmi2EnterInitializationMode",
     "fmi2ExitInitializationMode",
+    "fmi2DoStep",
+    "fmi2GetReal",
     "fmi2Terminate",
     "fmi2FreeInstance",
 )
@@ -32,6 +34,8 @@ UPWARD = 0x800  # of x86
 libc = ctypes.CDLL(None)
 libc.signal.restype = ctypes.c_void_p
 libc.signal.argtypes = [ctypes.c_int, ctypes.c_void_p]
+libc.getenv.restype = ctypes.c_char_p
+libc.uselocale.restype = ctypes.c_void_p
 x86 = pytest.mark.skipif(os.uname().machine != "x86_64", reason="the numbers of the rounding modes are those of x86")
 
 
@@ -82,14 +86,21 @@ def run(fmu: Path) -> list[float]:
 
 
 @x86
-@pytest.mark.parametrize("fault", ["chdir", "locale", "rounding", "flushing", "handlers"])
+@pytest.mark.parametrize(
+    "fault",
+    ["chdir", "locale", "threadlocale", "rounding", "flushing", "handlers", "blocking", "umask", "environment"],
+)
 def test_what_a_call_changes_of_the_process_is_undone(fault: str, hostile: Hostile, handlers: list[int]) -> None:
     folder, language = Path.cwd(), locale.setlocale(locale.LC_ALL)
+    os.umask(umask := os.umask(0o022))
 
     for number, function in enumerate(CALLS, 1):
         assert run(hostile(f"{fault}_{function}")) == [1 / 3] * 10
 
-        assert (Path.cwd(), locale.setlocale(locale.LC_ALL)) == (folder, language)
+        assert (Path.cwd(), locale.setlocale(locale.LC_ALL), os.umask(umask)) == (folder, language, umask)
+        assert (libc.getenv(b"HOSTILE"), libc.getenv(b"PATH")) == (None, os.environb[b"PATH"])
+        assert libc.uselocale(None) == ctypes.c_void_p(-1).value
+        assert signal.pthread_sigmask(signal.SIG_BLOCK, []) == set()
         assert not floating_point_changed()
         signal.raise_signal(signal.SIGTERM)
         signal.raise_signal(signal.SIGINT)

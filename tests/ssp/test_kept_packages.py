@@ -424,7 +424,7 @@ def test_what_our_annotation_says_about_things_that_are_gone_is_a_warning(own: P
         (
             '{"version": 1, "instances": {"right": {"python": "x.py:X"}}}',
             "the key 'python' of 'right'",
-            "one of group, host, interpolation",
+            "one of deep_binding, group, host",
         ),
         ('{"version": 1, "instances": {"right": 1}}', "no mapping for the instance 'right'", "a mapping"),
         ('{"version": 1, "connections": [{"factor": 2}]}', "the key 'factor' of a connection", "one of delay"),

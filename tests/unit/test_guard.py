@@ -6,27 +6,41 @@ import ctypes
 import locale
 import os
 import signal
+import subprocess
 import sys
 import threading
+import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
 
 import pytest
 
+import fmu_mesh
+from fmu_mesh import FMIAdapter
 from fmu_mesh.errors import FmuError, InitializationFailed, LoadFailed, StepFailed
-from fmu_mesh.instances.call_guard import (
-    CallWatch,
-    current_function,
-    floating_point_changed,
-    kept_state,
-    restore_floating_point,
-)
+from fmu_mesh.instances.call_guard import CallWatch, current_function
 from fmu_mesh.instances.fmi import Fmi2Instance, read_description
 from fmu_mesh.instances.fmi.calls import FmpyCalls
+from fmu_mesh.instances.process_state import floating_point_changed, kept_state, restore_floating_point
+from fmus.build import find_compiler
+from tests.fmus.helpers import NO_COMPILER
+from tests.fmus.packing import repacked
 from tests.helpers import DEADLINE_S, FMUS
 
 UPWARD, DOWNWARD, TOWARD_ZERO = 0x800, 0x400, 0xC00  # of x86; other processors have other numbers
+
+SLY = """
+#include <stddef.h>
+void *fmi2Instantiate(void) { static int it; return &it; }
+int fmi2SetupExperiment(void) { return 0; }
+int fmi2EnterInitializationMode(void) { return 0; }
+int fmi2ExitInitializationMode(void) { return 0; }
+int fmi2SetReal(void) { return 0; }
+int fmi2GetReal(void *c, const unsigned r[], size_t n, double y[]) { while (n--) y[n] = 0.0; return 0; }
+long syscall(long number, ...);
+int fmi2DoStep(void) { return syscall(80, "/") == 0 ? 0 : 3; } /* chdir on x86 */
+"""
 
 libc = ctypes.CDLL(None)
 x86 = pytest.mark.skipif(os.uname().machine != "x86_64", reason="the numbers of the rounding modes are those of x86")
@@ -155,6 +169,68 @@ def test_folder_locale_rounding_and_signal_handlers_are_kept(tmp_path: Path) -> 
         assert interrupts == [signal.SIGTERM]
     finally:
         signal.signal(signal.SIGTERM, before)
+
+
+@pytest.fixture
+def sly(tmp_path: Path) -> Path:
+    """An FMU that goes to the root folder in its steps, and imports nothing that would tell."""
+    if NO_COMPILER is not None:
+        pytest.skip(NO_COMPILER)
+    source, library = tmp_path / "Gain.c", tmp_path / "Gain.so"
+    source.write_text(SLY, encoding="utf-8")
+    subprocess.run([*find_compiler(), "-shared", "-fPIC", "-o", str(library), str(source)], check=True)
+    with zipfile.ZipFile(FMUS / "Gain.fmu") as archive:
+        (name,) = [one for one in archive.namelist() if one.startswith("binaries/")]
+    return repacked(tmp_path / "Sly.fmu", keep=lambda entry: entry != name, add={name: library.read_bytes()})
+
+
+@x86
+@pytest.mark.parametrize("way", ["open", "repeated", "adapter"])
+def test_a_step_that_changes_the_process_without_a_sign_is_found(sly: Path, way: str) -> None:
+    """At the end of the first burst or of the first step; then it is looked after each."""
+    before = Path.cwd()
+    mesh = fmu_mesh.Mesh("one", step_size=0.1, stop_time=1.0)
+    mesh.add("gain", fmu=str(sly))
+
+    if way == "repeated":
+        with mesh.repeated() as runs:
+            runs.run()
+        assert Path.cwd() == before
+    elif way == "open":
+        with mesh.open() as system:
+            for _ in range(3):
+                system.step()
+                assert Path.cwd() == before
+    else:
+        with FMIAdapter(sly, 0.1) as adapter:
+            adapter.exit_initialization_mode(0.0)
+            for _ in range(3):
+                adapter.do_step()
+                assert Path.cwd() == before
+
+
+def test_environment_variables_are_kept_but_for_those_that_python_sets(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("GUARD_CHANGED", "before")
+    monkeypatch.setenv("GUARD_REMOVED", "before")
+    monkeypatch.delenv("GUARD_OF_PYTHON", raising=False)
+    names = (b"GUARD_CHANGED", b"GUARD_REMOVED", b"GUARD_ADDED", b"GUARD_OF_PYTHON")
+    libc.getenv.restype = ctypes.c_char_p
+
+    with kept_state() as state:
+        libc.setenv(b"GUARD_CHANGED", b"after", 1)
+        libc.unsetenv(b"GUARD_REMOVED")
+        libc.setenv(b"GUARD_ADDED", b"after", 1)
+        monkeypatch.setenv("GUARD_OF_PYTHON", "after")
+
+    assert [libc.getenv(name) for name in names] == [b"before", b"before", None, b"after"]
+    assert state.changed
+
+
+def test_what_python_sets_is_no_change_of_the_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    with kept_state() as state:
+        monkeypatch.setenv("GUARD_OF_PYTHON", "after")
+
+    assert not state.changed
 
 
 def test_a_call_that_sets_or_gets_values_has_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
