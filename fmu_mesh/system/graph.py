@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Collection, Hashable, Iterable, Mapping, Sequence
-from itertools import accumulate
 from typing import Final, TypeVar
 
 __all__ = [
@@ -20,8 +19,6 @@ V = TypeVar("V", bound=Hashable)
 
 _EXACT: Final = 10
 """Up to so many vertices the best choice is searched: 2^10 sets of vertices take some 10 ms."""
-_PASSES: Final = 4
-"""In larger parts each vertex is moved so often; more passes save next to nothing."""
 
 
 def strongly_connected(vertices: Iterable[V], edges: Iterable[tuple[V, V]]) -> list[list[V]]:
@@ -114,9 +111,8 @@ def feedback_edges(vertices: Iterable[V], edges: Sequence[tuple[V, V, bool]]) ->
 def fewest_feedback_edges(vertices: Iterable[V], edges: Sequence[tuple[V, V, bool]]) -> list[int]:
     """As `feedback_edges`, but as few as possible, and of these choices the last ones.
 
-    Of two choices with as few edges, it is the one that keeps the first edge of those in which they differ. With more
-    than `_EXACT` vertices that reach one another, the choice is that of `feedback_edges`, improved by moving single
-    vertices.
+    Of two choices with as few edges, it is the one that keeps the first edge of those in which they differ. Where more
+    than `_EXACT` vertices reach one another, the choice is that of `feedback_edges`.
     """
     order = list(vertices)
     removed = feedback_edges(order, edges)
@@ -130,16 +126,14 @@ def fewest_feedback_edges(vertices: Iterable[V], edges: Sequence[tuple[V, V, boo
     for number, within in parts.items():
         place = {index: position for position, index in enumerate(within)}
         own = [place[index] for index in removed if index in place]
-        if len(own) <= 1:
-            continue
         members = [vertex for vertex in order if part_of[vertex] == number]
-        fewest = _fewest if len(members) <= _EXACT else _improved
-        fewer = fewest(members, [edges[index] for index in within], own)
-        removed = [index for index in removed if index not in place] + [within[position] for position in fewer]
+        if len(own) > 1 and len(members) <= _EXACT:
+            fewer = _fewest(members, [edges[index] for index in within])
+            removed = [index for index in removed if index not in place] + [within[position] for position in fewer]
     return sorted(removed)
 
 
-def _fewest(vertices: Sequence[V], edges: Sequence[tuple[V, V, bool]], _removed: Sequence[int]) -> list[int]:
+def _fewest(vertices: Sequence[V], edges: Sequence[tuple[V, V, bool]]) -> list[int]:
     """The best choice of all: by the best order of each set of vertices (Held and Karp).
 
     The cost of an order is a number whose digits say which edges go back in it, below the number of these edges.
@@ -154,36 +148,6 @@ def _fewest(vertices: Sequence[V], edges: Sequence[tuple[V, V, bool]], _removed:
         own = [vertex for vertex in range(len(place)) if members >> vertex & 1]
         best.append(min(best[members & ~(1 << last)] + sum(costs[last][vertex] for vertex in own) for last in own))
     return [index for index in range(len(edges)) if best[-1] & (one >> (index + 1))]
-
-
-def _improved(vertices: Sequence[V], edges: Sequence[tuple[V, V, bool]], removed: Sequence[int]) -> list[int]:
-    """Move each vertex to the best place in the order that ``removed`` leaves, where that saves edges."""
-    gone = set(removed)
-    left = [edge[:2] for index, edge in enumerate(edges) if index not in gone]
-    if any(len(part) > 1 for part in strongly_connected(vertices, left)):
-        return list(removed)  # a cycle of edges that have to stay
-    order = [vertex for part in strongly_connected(vertices, left) for vertex in part]
-    place = {vertex: number for number, vertex in enumerate(order)}
-    ends: dict[V, list[tuple[V, V, bool]]] = {vertex: [] for vertex in vertices}
-    for edge in edges:
-        ends[edge[0]].append(edge)
-        ends[edge[1]].append(edge)
-    for vertex in [*vertices] * _PASSES:
-        change = [0] * (len(order) + 1)  # of the cost, from one place to the next where the vertex could stand
-        for source, target, free in ends[vertex]:
-            cost = 1 if free else len(edges)
-            if source == vertex:
-                change[place[target] + 1] += cost
-            else:
-                change[0] += cost
-                change[place[source] + 1] -= cost
-        totals = list(accumulate(change))
-        least, here = totals.index(min(totals)), place[vertex]
-        if totals[least] < totals[here]:
-            order.remove(vertex)
-            order.insert(least - (least > here), vertex)
-            place = {other: number for number, other in enumerate(order)}
-    return [index for index, (source, target, _) in enumerate(edges) if place[source] > place[target]]
 
 
 def reaches(successors: Mapping[V, Iterable[V]], start: V, goal: V) -> bool:

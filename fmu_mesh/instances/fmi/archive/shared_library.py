@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import struct
 from io import BytesIO
-from typing import IO, Any, Final, NamedTuple
+from typing import Any, Final
 
 import msgspec
 import numpy as np
@@ -36,7 +36,6 @@ class SharedLibrary(msgspec.Struct, frozen=True):
         soname: the name that a process knows it by; empty if it has none: then that is the name of its file.
         needed: the names of the libraries that it needs.
         run_paths: the folders that it looks for them in, as written (`$ORIGIN` is its own folder).
-        imports: the functions and variables that others have to define.
         unique: the symbols that exist once in a process, whoever loads them and however (STB_GNU_UNIQUE): the bytes
             of a constant, None for a variable.
         machine: two bytes of its header that tell processors apart: the class and the machine.
@@ -48,7 +47,6 @@ class SharedLibrary(msgspec.Struct, frozen=True):
     soname: str = ""
     needed: tuple[str, ...] = ()
     run_paths: tuple[str, ...] = ()
-    imports: frozenset[str] = frozenset()
     unique: dict[str, bytes | None] = {}
     machine: bytes = b""
     versions: frozenset[str] = frozenset()
@@ -69,16 +67,14 @@ def read_shared_library(content: bytes) -> SharedLibrary | None:
     from elftools.common.exceptions import ELFError  # noqa: PLC0415 see above
     from elftools.elf.elffile import ELFFile  # noqa: PLC0415 see above
 
-    file = BytesIO(content)
     try:
-        elf = ELFFile(file)
+        elf = ELFFile(BytesIO(content))
         dynamic: Any = next(elf.iter_segments("PT_DYNAMIC"), None)
         if dynamic is None or elf.elfclass != 64 or not elf.little_endian:
             return None
         tags = list(dynamic.iter_tags())
-        symbols = _symbols(file, dynamic)
+        unique = _unique(content, elf, dynamic)
         versions, needed_versions = _versions(elf)
-        constants = [part.header for part in elf.iter_segments("PT_LOAD") if not part.header.p_flags & _WRITABLE]
     # Files of other people: pyelftools raises what the damage provokes.
     except (ELFError, ArithmeticError, AttributeError, LookupError, MemoryError, TypeError, ValueError, struct.error):
         return None
@@ -92,19 +88,14 @@ def read_shared_library(content: bytes) -> SharedLibrary | None:
             if tag.entry.d_tag in ("DT_RPATH", "DT_RUNPATH")
             for folder in (tag.rpath if tag.entry.d_tag == "DT_RPATH" else tag.runpath).split(":")
         ),
-        imports=frozenset(symbol.name for symbol in symbols if symbol.undefined and symbol.name),
-        unique={
-            symbol.name: _constant(symbol, constants, content)
-            for symbol in symbols
-            if symbol.binding == _GNU_UNIQUE and not symbol.undefined
-        },
+        unique=unique,
         machine=content[4:20:14],
         versions=versions,
         needed_versions=needed_versions,
     )
 
 
-def _versions(elf: Any) -> tuple[frozenset[str], dict[str, frozenset[str]]]:  # noqa: ANN401 as in `_symbols`
+def _versions(elf: Any) -> tuple[frozenset[str], dict[str, frozenset[str]]]:  # noqa: ANN401 as in `_unique`
     """The versions of symbols that a library has, and those that it cannot do without (VER_FLG_WEAK is 2)."""
     own, needed = elf.get_section_by_name(".gnu.version_d"), elf.get_section_by_name(".gnu.version_r")
     return (
@@ -116,33 +107,16 @@ def _versions(elf: Any) -> tuple[frozenset[str], dict[str, frozenset[str]]]:  # 
     )
 
 
-class _Symbol(NamedTuple):
-    name: str
-    binding: int
-    undefined: bool
-    value: int
-    size: int
-
-
-def _symbols(file: IO[bytes], dynamic: Any) -> list[_Symbol]:  # noqa: ANN401 its type has no tags
-    """The dynamic symbols; pyelftools takes 100 us for one of them."""
+def _unique(content: bytes, elf: Any, dynamic: Any) -> dict[str, bytes | None]:  # noqa: ANN401 its type has no tags
+    """The symbols that are unique in a process, with the bytes of constants; pyelftools takes 100 us for one symbol."""
     _, place = dynamic.get_table_offset("DT_SYMTAB")
-    _, names_place = dynamic.get_table_offset("DT_STRTAB")
-    count, names_size = dynamic.num_symbols(), next(dynamic.iter_tags("DT_STRSZ")).entry.d_val
-    file.seek(place)
-    table = np.frombuffer(file.read(count * SYMBOL.itemsize), SYMBOL)
-    file.seek(names_place)
-    names = file.read(names_size)
-    return [
-        _Symbol(names[start : names.index(b"\0", start)].decode(errors="replace"), info >> 4, section == 0, value, size)
-        for start, info, _, section, value, size in table.tolist()
-    ]
-
-
-def _constant(symbol: _Symbol, segments: list[Any], content: bytes) -> bytes | None:
-    """The bytes of a symbol, if it is in one of these segments."""
-    for segment in segments:
-        start = symbol.value - segment.p_vaddr
-        if 0 <= start < segment.p_filesz:
-            return content[segment.p_offset + start : segment.p_offset + start + symbol.size]
-    return None
+    _, names = dynamic.get_table_offset("DT_STRTAB")
+    table = np.frombuffer(content, SYMBOL, dynamic.num_symbols(), place)
+    constants = [part.header for part in elf.iter_segments("PT_LOAD") if not part.header.p_flags & _WRITABLE]
+    found: dict[str, bytes | None] = {}
+    for name, _, _, _, value, size in table[(table["info"] >> 4 == _GNU_UNIQUE) & (table["section"] != 0)].tolist():
+        text = content[names + name : content.index(b"\0", names + name)].decode(errors="replace")
+        within = (one for one in constants if one.p_vaddr <= value < one.p_vaddr + one.p_filesz)
+        start = next((one.p_offset + value - one.p_vaddr for one in within), None)
+        found[text] = content[start : start + size] if start is not None else None
+    return found
