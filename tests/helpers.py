@@ -351,7 +351,8 @@ class Launched:
     @property
     def message(self) -> str:
         """The error that it ended with: what it wrote in its own name, which must be one readable paragraph."""
-        message = "".join(line for line in self._errors if not line.startswith("mesh '")).strip()
+        told = ("mesh '", "fmu-mesh: warning: ")
+        message = "".join(line for line in self._errors if not line.startswith(told)).strip()
         assert "Traceback" not in message, message
         message = message[max(message.find("fmu-mesh: "), 0) :]
         assert_readable(message)

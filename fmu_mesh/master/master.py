@@ -163,9 +163,8 @@ class Master:
         try:
             self._wait_for_nodes()
             self._enter("initializing")
-            self._wait_for(
-                lambda: self._granting.slowest >= 0, self._timeouts.initialize, "Initialization Mode is not over in"
-            )
+            start_s = self._timeouts.initialize
+            self._wait_for(lambda: self._granting.slowest >= 0, start_s, "Initialization Mode is not over in")
             self._grant_to_the_end()
             if isinstance(self.ended_by, NotFinite):
                 raise self.ended_by
@@ -252,12 +251,9 @@ class Master:
                 self._clock.stop()
             silent_s = time.monotonic() - self._moved
             if silent_s > patience_s and self._granting.slowest < self._granting.grant and self._hold is None:
-                raise DeadlineExceeded(
-                    f"no progress for {silent_s:.1f} s",
-                    instance=spoken(self._granting.laggard),
-                    point=self._granting.slowest,
-                    time=self._plan.grid.time(self._granting.slowest),
-                )
+                slowest, who = self._granting.slowest, spoken(self._granting.laggard)
+                error = DeadlineExceeded(f"no progress for {silent_s:.1f} s", instance=who)
+                raise error.at(slowest, self._plan.grid.time(slowest))
         self._clock.stop()
 
     def _publish_grant(self) -> float:
@@ -369,9 +365,9 @@ class Master:
         """The process of a node is gone, which matters unless the node has reported its end."""
         if node in self._reports:
             return
-        loss, why = self._router.loss(), f"{spoken(node)} was lost: its process does not answer any more"
+        loss, point = self._router.loss(), max(self._granting.progress[node], 0)
+        why = f"{spoken(node)} was lost: its process does not answer any more"
         why = why if loss is None else f"{loss}, and {spoken(node)} with it"
-        point = max(self._granting.progress[node], 0)
         error = MeshLost(why, instance=self._granting.instances_of(node))
         self._end_of(node, error.at(point, self._plan.grid.time(point)))
 

@@ -184,9 +184,7 @@ class Node:
         self._activity.enter("loading")
         instances = {}
         for item in plan.instances:
-            instance = self._open_instance(item.name)
-            instance = with_times(instance, item, plan.grid)
-            instances[item.name] = instance
+            instances[item.name] = with_times(self._open_instance(item.name), item, plan.grid)
         self._activity.enter("waiting for the mesh")
         self._membership.keys(plan.timeouts.start)
         self._memory = self._membership.open_memory() or self._own_memory

@@ -23,8 +23,8 @@ CONFIGS = sorted((Path(__file__).parents[2] / "configs").glob("*.yaml"))
 
 
 def steered(folder: Path) -> fmu_mesh.Mesh:
-    """Free inputs and tunable parameters of instances with three step sizes, one of them with linear inputs."""
-    mesh = fmu_mesh.Mesh("steered", step_size=0.001, stop_time=1.0)
+    """Free inputs and tunable parameters of instances with three step sizes, one with linear inputs, and NaN."""
+    mesh = fmu_mesh.Mesh("steered", step_size=0.001, stop_time=1.0, not_finite="record")
     mesh.add("fast", fmu=FMUS / "Gain.fmu")
     mesh.add("slow", fmu=FMUS / "Gain.fmu", step_size=0.01)
     mesh.add("ramp", fmu=FMUS / "Gain.fmu", step_size=0.004, interpolation="linear")

@@ -723,6 +723,7 @@ SUPPORTED = (
             "sum.y -> one.u",
         ),
         {"one.k": Start(0.5, 'name="k"'), "two.k": Start(0.5, 'name="k"')},
+        warnings=(("a loop at every point", "sum.y -> one.u"),),
         algorithms=("jacobi", "gauss_seidel"),
     ),
     *(
@@ -734,6 +735,7 @@ SUPPORTED = (
                 *lines,
             ),
             {"one.k": Start(0.5, 'name="k"')},
+            warnings=(("a loop at every point", *lines),),
             algorithms=("jacobi", "gauss_seidel"),
         )
         for first, lines in (

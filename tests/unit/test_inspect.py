@@ -62,7 +62,7 @@ def test_the_page_says_all_kinds_what_they_can_and_how_many_states_there_are(
 
     assert "Kind FMI 3.0 co-simulation or model exchange " in page
     assert "Can variable step size, get and set its state, serialize its state, event mode " in page
-    assert "Variables 4 outputs, 2 parameters, 1 independent variable, 6 local variables " in page
+    assert "Variables 1 input, 4 outputs, 2 parameters, 1 independent variable, 6 local variables " in page
     assert "States 2 continuous, 1 event indicator " in page
 
 

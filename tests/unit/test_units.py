@@ -209,7 +209,7 @@ def test_units_of_fmi_1_are_names_and_its_display_units_convert_nothing(tmp_path
         "no base units of old.real_in: FMI 1.0 gives units a name only"
     )
     same = write_config(tmp_path, instances=instances, connections=["old.real_out -> old.real_in"])
-    assert "Warnings" not in plan_page(prepare(same))
+    assert not any("connects the unit" in line for line in plan_page(prepare(same)))
 
 
 def test_a_temperature_is_shifted_and_a_difference_is_not(tmp_path: Path) -> None:
