@@ -30,6 +30,10 @@ __all__ = ["BurstEngine", "Engine", "PlainEngine", "make_engine"]
 _SLICE_S: Final = 0.001
 """A burst of steps ends after about this time in s, so that its rows are sent and messages are handled."""
 
+_LOOK_S: Final = 0.05
+"""How often in s, at the end of a burst, a changed state of the process is looked for, which takes 10 us. Models that
+are known to change it are looked after in each step."""
+
 _BUSY: Final = (Stage.SETTING, Stage.STEPPING, Stage.GETTING, Stage.IN_PYTHON)
 
 
@@ -58,6 +62,7 @@ class Engine(ABC):
         self._windows = [(memory.progress[name], window) for name, window in plan.windows] if shared else []
         self._last_point = plan.grid.last_point
         self._looked_after: ProcessState | None = None
+        self._look_at = 0.0
 
     def run(self, wait_s: float, *, eager: bool) -> bool:
         """Step for about a millisecond, and wait for up to ``wait_s`` where nothing can step; whether there was a step.
@@ -73,12 +78,17 @@ class Engine(ABC):
         The unit of an instance that raised one of them is not stepped any more.
         """
         self._looked_after = self._looked_after or ProcessState()
+        looks = True
         try:
-            return self._burst(wait_s, eager=eager)
+            stepped = self._burst(wait_s, eager=eager)
+            looks = perf_counter() >= self._look_at
         finally:
-            if self._looked_after.restore():
-                for runner in self.runners:
-                    runner.take_care()
+            if looks:
+                self._look_at = perf_counter() + _LOOK_S
+                if self._looked_after.restore():
+                    for runner in self.runners:
+                        runner.take_care()
+        return stepped
 
     @abstractmethod
     def _burst(self, wait_s: float, *, eager: bool) -> bool:
