@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import threading
 from collections.abc import Iterator, Mapping, Sequence
@@ -140,7 +141,8 @@ def test_a_failed_run_is_a_row_with_its_exit_code_and_message(faulty: Path, tmp_
     assert failed == (
         "instance f, point 4, t = 0.004 s: fmi2DoStep returned error; the FMU says: the reactor is empty."
     )
-    assert hung.startswith("instance f, point 4, t = 0.004 s: the FMU has not returned for 1.0 s from doStep")
+    # On a busy machine, the watching thread looks a little after the deadline of 1 s.
+    assert re.match(r"instance f, point 4, t = 0\.004 s: the FMU has not returned for 1\.\d s from doStep", hung)
     assert crashed == "the worker process was ended by SIGABRT in each of 2 attempts"
     assert "'soon' for the Real 'crash_at'" in wrong
     assert fine == ""
