@@ -15,7 +15,6 @@ from ..rings import native
 from ..rings.array_elements import fill_unconnected
 from ..rings.finite import FiniteRows
 from ..rings.host_memory import Counter
-from ..rings.native import Gate
 from ..rings.ring import Ring
 from ..rings.transfer import Transfer
 from ..simtime import TimeGrid
@@ -44,10 +43,10 @@ class Source(NamedTuple):
         return self.counter.value > self.transfer.rule.row_for(step)
 
     @property
-    def gate(self) -> Gate:
+    def gate(self) -> native.Gate:
         """Its rows as the burst sees them."""
         ring, rule = self.transfer.source, self.transfer.rule
-        return Gate(
+        return native.Gate(
             counter=self.counter.address,
             rows=ring.address,
             stride=ring.stride,
@@ -153,10 +152,7 @@ class Runner:
         Raises:
             NotFinite: one is not finite.
         """
-        if not self.is_finite.check(0):
-            error = self.is_finite.error(0, self.grid)
-            self.is_finite.explain(error, self.instance.get_values)
-            raise error
+        self.is_finite.check_first(self.grid, self.instance.get_values)
         self.outputs.stamp(0)
         self.counter.raise_to(1)
 

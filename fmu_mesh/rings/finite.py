@@ -53,6 +53,17 @@ class FiniteRows:
         self.spans = [Span(start, count, NUMBER_TYPES[type_]) for type_, start, _, count in runs]
         self.check = _check(outputs, runs)
 
+    def check_first(self, grid: TimeGrid, get: Get) -> None:
+        """Check the row of the first point; ``get`` reads the inputs.
+
+        Raises:
+            NotFinite: it is not finite.
+        """
+        if not self.check(0):
+            error = self.error(0, grid)
+            self.explain(error, get)
+            raise error
+
     def error(self, row: int, grid: TimeGrid) -> NotFinite:
         """The error for a row that is not finite; `explain` adds the cause."""
         plan, outputs, point = self._plan, self._outputs, row * self._plan.step_points

@@ -314,10 +314,7 @@ class _Member:
         for name, value in zip(names, self.instance.get_values(names) if names else [], strict=True):
             self._inputs.put(0, name, value)  # elements that are not connected keep it
         self.instance.bind(self._inputs, (self._outputs,), grid, self.plan.step_points)
-        if not self.is_finite.check(0):
-            error = self.is_finite.error(0, grid)
-            self.is_finite.explain(error, self.instance.get_values)
-            raise error
+        self.is_finite.check_first(grid, self.instance.get_values)
         self._looks_at_rows = not self.instance.check_rows(self.is_finite.spans)
         self._do_step = self.instance.do_step
         for c in self.connections:

@@ -186,14 +186,14 @@ def _not_found(library: SharedLibrary, beside: dict[str, SharedLibrary], folder:
     seen = set[str]()
 
     def visit(library: SharedLibrary) -> None:
-        runs = [Path(one.replace("${ORIGIN}", "$ORIGIN").replace("$ORIGIN", str(folder))) for one in library.run_paths]
+        runs = library.folders(str(folder))
         for needed in library.needed:
             plain = needed.rpartition("/")[2]
             name = files.get(plain, plain)
             if name in beside and name not in seen:
                 seen.add(name)
                 visit(beside[name])
-            if name in beside and not any((run / needed).exists() for run in runs):
+            if name in beside and not any(Path(run, needed).exists() for run in runs):
                 found.setdefault(needed, name)
 
     visit(library)

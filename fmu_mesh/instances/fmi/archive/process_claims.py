@@ -72,9 +72,10 @@ class _Libraries:
         """The libraries that one needs or may open, by name: where in the FMU; None: on this host."""
         facts, content = self.read(path)
         folder = posixpath.dirname(path)
-        places = [posixpath.normpath(re.sub(r"\$\{?ORIGIN\}?", folder, place)) for place in facts.run_paths]
         found = {
-            name: next((file for place in [*places, folder] if (file := f"{place}/{name}") in self._names), None)
+            name: next(
+                (file for place in [*facts.folders(folder), folder] if (file := f"{place}/{name}") in self._names), None
+            )
             for name in facts.needed
             if "/" not in name  # otherwise it is a path
         }

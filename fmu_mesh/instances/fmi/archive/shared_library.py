@@ -7,6 +7,8 @@ process an FMU may call are questions for the callers.
 from __future__ import annotations
 
 import hashlib
+import posixpath
+import re
 import struct
 from io import BytesIO
 from typing import Any, Final
@@ -51,6 +53,10 @@ class SharedLibrary(msgspec.Struct, frozen=True):
     machine: bytes = b""
     versions: frozenset[str] = frozenset()
     needed_versions: dict[str, frozenset[str]] = {}
+
+    def folders(self, own: str) -> list[str]:
+        """The run paths of a library that lies in the folder ``own`` (ld.so(8), $ORIGIN)."""
+        return [posixpath.normpath(re.sub(r"\$(ORIGIN|\{ORIGIN\})", lambda _: own, path)) for path in self.run_paths]
 
 
 def libraries_beside(fmu: OpenFmu, library: str) -> dict[str, SharedLibrary]:

@@ -7,7 +7,6 @@ packages. It takes some 50 ms, so it is for those who ask before a run, and for 
 from __future__ import annotations
 
 import os
-import posixpath
 import re
 import sys
 from collections.abc import Iterator
@@ -55,11 +54,10 @@ def missing_libraries(path: Path, library: str, terms: Terms = Terms()) -> tuple
         if user is None or name in reached:
             continue
         reached.add(name)
-        inside = [posixpath.normpath(re.sub(r"\$(ORIGIN|\{ORIGIN\})", folder, one)) for one in user.run_paths]
         for needed in user.needed:
             if needed in beside:
                 waiting.append(needed)
-            elif not any(f"{one}/{needed}" in names for one in inside):
+            elif not any(f"{one}/{needed}" in names for one in user.folders(folder)):
                 found |= dict.fromkeys(_lacks(f"{folder}/{name}", user, needed))
     return tuple(found)
 
