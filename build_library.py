@@ -30,7 +30,7 @@ __all__ = ["SOURCES", "TARGETS", "BuildError", "WheelHook", "build", "library_pa
 ROOT: Final = Path(__file__).resolve().parent
 PACKAGE: Final = ROOT / "fmu_mesh"
 
-SOURCES: Final = ("rings/burst.c", "recorder/csv_rows.c")
+SOURCES: Final = ("rings/burst.c", "recorder/csv_rows.c", "instances/fmi/messages.c")
 """The files of the library, below the package. A header stands here, too, so that its SHA-256 counts."""
 
 TARGETS: Final = {"linux-x86_64": "x86_64-linux-gnu.2.17", "linux-aarch64": "aarch64-linux-gnu.2.17"}
@@ -101,7 +101,7 @@ def build(platform: str) -> bytes:
     with tempfile.TemporaryDirectory(prefix="fmu_mesh_library_") as name:
         folder = Path(name)
         for source in SOURCES:
-            (folder / source).parent.mkdir(exist_ok=True)
+            (folder / source).parent.mkdir(parents=True, exist_ok=True)
             (folder / source).write_bytes((PACKAGE / source).read_bytes())
         lines = "".join(f'  "{line}\\n"\n' for line in manifest().splitlines())
         visible = '__attribute__((visibility("default")))'

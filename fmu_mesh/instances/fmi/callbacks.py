@@ -1,16 +1,16 @@
-"""Callbacks for FMUs of FMI 1.0 and 2.0, and the assignment of log messages to instances.
+"""Callbacks for FMUs, and the assignment of log messages to instances.
 
-FMPy's proxy, which formats the variadic messages of an FMU, has one logger for the whole process. So a message goes to
-the instance whose address comes with it: the environment that the instance was made with (FMI 2.0, 2.1.5), or the
-component (FMI 1.0, 2.3). Some FMUs pass neither; then the instance name decides, which instances of several meshes in
-one process may share. If this name is unknown as well, every instance gets the message, because it may be the reason
-why a call fails.
+The loggers are those of `messages.c`, which format messages and pass on a limited number; without the library of C,
+FMPy's proxy formats them, and all are passed on. A message goes to the instance whose address comes with it: the
+environment that the instance was made with (FMI 2.0, 2.1.5; FMI 3.0, 2.3.1), or the component (FMI 1.0, 2.3). Some FMUs
+pass neither; then the instance name decides, which instances of several meshes in one process may share. If this name
+is unknown as well, every instance gets the message, because it may be the reason why a call fails.
 """
 
 from __future__ import annotations
 
 import ctypes
-from typing import Protocol
+from typing import Any, Final, Protocol
 
 import fmpy
 from fmpy.fmi1 import (
@@ -27,15 +27,44 @@ from fmpy.fmi2 import (
 )
 from fmpy.logging import addLoggerProxy
 
-__all__ = ["FMI1_CALLBACKS", "fmi2_callbacks", "register", "register_component", "unregister"]
+from ...rings.library import load_library
+
+__all__ = [
+    "FMI1_CALLBACKS",
+    "FMI3_LOGGER",
+    "fmi2_callbacks",
+    "recall",
+    "register",
+    "register_component",
+    "tell_counted",
+    "unregister",
+]
 
 
 class Logged(Protocol):
     """Receives log messages."""
 
-    def logged(self, status: int, category: bytes, message: bytes) -> None:
-        """Take a message."""
+    def logged(self, status: int, category: bytes, message: bytes, counted: int) -> None:
+        """Take a message, or the last one of ``counted`` messages of its kind that are not passed on."""
         ...
+
+    def recalled(self, message: bytes) -> None:
+        """Take a message that was only counted, because it may say why a call fails."""
+        ...
+
+
+class _Message(ctypes.Structure):
+    """As in `messages.c`."""
+
+    _fields_ = [
+        ("kind", ctypes.c_uint64),
+        ("address", ctypes.c_void_p),
+        ("counted", ctypes.c_int64),
+        ("status", ctypes.c_int32),
+        ("name", ctypes.c_char * 256),
+        ("category", ctypes.c_char * 256),
+        ("text", ctypes.c_char * 4096),
+    ]
 
 
 _by_address: dict[int, Logged] = {}
@@ -55,7 +84,8 @@ def register_component(component: int, instance: Logged) -> None:
 
 
 def unregister(instance: Logged) -> None:
-    """Discard messages of ``instance`` from now on."""
+    """Discard messages of ``instance`` from now on; tell how many were only counted."""
+    tell_counted(instance)
     _registered.pop(id(instance), None)
     for address in [address for address, one in tuple(_by_address.items()) if one is instance]:
         del _by_address[address]
@@ -68,19 +98,66 @@ def fmi2_callbacks(environment: int) -> fmi2CallbackFunctions:
     return callbacks
 
 
-def _log(address: int | None, name: bytes | None, status: int, category: bytes | None, message: bytes | None) -> None:
+def recall() -> None:
+    """Give the instances the last messages that were only counted."""
+    message = _Message()
+    while _library is not None and _library.recall_message(ctypes.byref(message)):
+        for instance in _receivers(message.address, message.name):
+            instance.recalled(message.text)
+
+
+def tell_counted(instance: Logged) -> None:
+    """Tell how many messages of ``instance`` were only counted, and not told yet."""
+    message, number = _Message(), 0
+    while _library is not None and _library.message_of_kind(number, ctypes.byref(message)):
+        receivers = _receivers(message.address, message.name)
+        if instance not in receivers:
+            number += 1
+        elif counted := _library.forget_kind(message.kind):
+            for receiver in receivers:
+                receiver.logged(message.status, message.category, message.text, counted)
+
+
+def _receivers(address: int | None, name: bytes | None) -> list[Logged]:
     addressed, everyone = _by_address.get(address or 0), tuple(_registered.values())
     named = [instance for own, instance in everyone if own == name]
-    for instance in [addressed] if addressed is not None else named or [one for _, one in everyone]:
-        instance.logged(status, category or b"", message or b"")
+    return [addressed] if addressed is not None else named or [one for _, one in everyone]
+
+
+def _pass_on(passed: Any) -> None:  # noqa: ANN401 ctypes has no type for a pointer
+    message = passed.contents
+    recall()
+    for instance in _receivers(message.address, message.name):
+        instance.logged(message.status, message.category, message.text, message.counted)
+
+
+def _log(address: int | None, name: bytes | None, status: int, category: bytes | None, text: bytes | None) -> None:
+    """The logger without the library."""
+    texts = (name or b"")[:255], (category or b"")[:255], (text or b"")[:4095]
+    _pass_on(ctypes.pointer(_Message(0, address, 0, status, *texts)))
+
+
+def _load() -> ctypes.PyDLL | None:
+    path = load_library()
+    if path is None:
+        return None
+    library = ctypes.PyDLL(path)
+    library.message_of_kind.argtypes = ctypes.c_int64, ctypes.c_void_p
+    library.forget_kind.argtypes = (ctypes.c_uint64,)
+    library.forget_kind.restype = ctypes.c_int64
+    library.pass_messages_to(_PASS_ON)
+    return library
 
 
 def _fmi2_callbacks() -> fmi2CallbackFunctions:
     callbacks = fmi2CallbackFunctions()
-    callbacks.logger = fmi2CallbackLoggerTYPE(_log)
     callbacks.allocateMemory = fmi2CallbackAllocateMemoryTYPE(fmpy.calloc)
     callbacks.freeMemory = fmi2CallbackFreeMemoryTYPE(fmpy.free)
-    addLoggerProxy(ctypes.byref(callbacks))
+    if _library is not None:
+        callbacks.logger = ctypes.cast(_library.log_fmi1_2, fmi2CallbackLoggerTYPE)
+    else:
+        callbacks.logger = fmi2CallbackLoggerTYPE(_log)
+        addLoggerProxy(ctypes.byref(callbacks))
     return callbacks
 
 
@@ -94,5 +171,14 @@ def _fmi1_callbacks() -> fmi1CallbackFunctions:
     return callbacks
 
 
+def _fmi3_logger() -> Any:  # noqa: ANN401 what FMPy makes a callback of
+    if _library is not None:
+        return ctypes.cast(_library.log_fmi3, ctypes.c_void_p).value
+    return lambda address, status, category, text: _log(address, None, status, category, text)
+
+
+_PASS_ON: Final = ctypes.CFUNCTYPE(None, ctypes.POINTER(_Message))(_pass_on)
+_library: Final = _load()
 _FMI2_CALLBACKS = _fmi2_callbacks()
 FMI1_CALLBACKS = _fmi1_callbacks()
+FMI3_LOGGER: Final = _fmi3_logger()

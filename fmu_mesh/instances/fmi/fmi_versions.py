@@ -13,7 +13,7 @@ from ...system.layout import Part
 from ...variables.model_description import Variable
 from ...variables.value_types import DTYPES, Value, VariableType, is_text
 from .buffers import BinaryBuffer, Buffer, NumberBuffer, StringBuffer
-from .callbacks import FMI1_CALLBACKS, fmi2_callbacks, register, register_component, unregister
+from .callbacks import FMI1_CALLBACKS, FMI3_LOGGER, fmi2_callbacks, register_component
 from .calls import Function, Pointer, declared
 from .fmu_instance import FmuInstance
 from .fmu_values import Verb
@@ -62,18 +62,12 @@ _DIRECT: Final = ("Float64", "Int32")
 
 
 class _Fmi1And2Values(FmuInstance):
-    """Values and messages in FMI 1.0 and 2.0."""
+    """Values in FMI 1.0 and 2.0."""
 
     _direct_declaration = "int (*)(void *, void *, size_t, void *)"
     _boolean: type[Any]
 
-    def close(self) -> None:
-        """Terminate if allowed, free the instance and remove its files. Never raises; may be called twice."""
-        super().close()
-        unregister(self)
-
     def _instantiate(self) -> None:
-        register(self.name, self, id(self._model))
         super()._instantiate()
         register_component(self._fmu.component, self)
 
@@ -187,7 +181,7 @@ class Fmi3Values(FmuInstance):
     _direct_declaration = "int (*)(void *, void *, size_t, void *, size_t)"
 
     def _make_instance(self) -> None:
-        self._fmu.instantiate(loggingOn=False, logMessage=self._model.message_came, **self._uses())
+        self._fmu.instantiate(loggingOn=False, logMessage=FMI3_LOGGER, **self._uses())
 
     def _uses(self) -> dict[str, bool]:
         """Arguments of the instantiation: the features of co-simulation that are used."""

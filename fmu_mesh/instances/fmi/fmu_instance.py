@@ -22,6 +22,7 @@ from ..contract import LogMessage
 from ..kept_models import KeptModels
 from .archive.archive import Terms
 from .archive.system_libraries import missing_libraries
+from .callbacks import recall, register, tell_counted, unregister
 from .calls import pointer
 from .fmu_values import FATAL, OK, FmuValues, status_name
 from .loaded_fmu import FmuFunctions, FmuToLoad, LoadedFmu
@@ -144,6 +145,7 @@ class FmuInstance(KeepsFmuState, FmuValues):
         elif self._live:
             self._quietly(self._release)
         self._leave_model(was_reset=was_reset)
+        unregister(self)
         self._live = False
         self._state = "closed"
         self._keep = []
@@ -152,13 +154,19 @@ class FmuInstance(KeepsFmuState, FmuValues):
         """From any thread, when the process is about to be ended: remove the extracted files."""
         self._model.remove_files()
 
-    def logged(self, status: int, category: bytes, message: bytes) -> None:
-        """Take a message from the FMU's logger; the last ones become part of an error that follows."""
-        text = message.decode(errors="replace").strip()
-        name = status_name(status)
+    def logged(self, status: int, category: bytes, message: bytes, counted: int) -> None:
+        """See `Logged`; the last messages become part of an error that follows."""
         if status > OK:
-            self._last_messages = [*self._last_messages[-2:], text]
-        self._log(LogMessage(self.name, name, category.decode(errors="replace"), text, self._said.step))
+            self.recalled(message)
+        text, kind = message.decode(errors="replace").strip(), category.decode(errors="replace")
+        if counted:
+            more = f"{counted:,} more messages" if counted > 1 else "1 more message"
+            text = f"{more} like '{text}' ({kind}) {'were' if counted > 1 else 'was'} not shown"
+        self._log(LogMessage(self.name, status_name(status), kind, text, self._said.step))
+
+    def recalled(self, message: bytes) -> None:
+        """See `Logged`."""
+        self._last_messages = [*self._last_messages[-2:], message.decode(errors="replace").strip()]
 
     # --- what a version of FMI adds
 
@@ -168,7 +176,8 @@ class FmuInstance(KeepsFmuState, FmuValues):
 
     def _instantiate(self) -> None:
         """Make the instance, unless there is one that was reset."""
-        self._model.instantiate(self, self._make_instance)
+        register(self.name, self, id(self._model))
+        self._model.instantiate(self._make_instance)
 
     def _instantiated(self) -> None:
         """Look up what the steps need, now that the instance exists."""
@@ -223,7 +232,6 @@ class FmuInstance(KeepsFmuState, FmuValues):
             return
         if not was_reset:
             model.free()
-        model.leave()
         self._kept.keep(self.name, model)
 
     @property
@@ -280,8 +288,11 @@ class FmuInstance(KeepsFmuState, FmuValues):
             self._note(status)
         kind = StepFailed if self._state == "stepping" else InitializationFailed
         self._state = "failed"
-        return kind(f"{what}{self._message()}", instance=self.name, variable=variable, hint=hint)
+        error = kind(f"{what}{self._message()}", instance=self.name, variable=variable, hint=hint)
+        tell_counted(self)  # a node closes its instances after it has told its failure
+        return error
 
     def _message(self) -> str:
+        recall()
         messages, self._last_messages = self._last_messages, []
         return f"; the FMU says: {' | '.join(messages)}." if messages else "; the FMU gave no message."

@@ -139,8 +139,9 @@ class FmuLibrary(_Library):
 class _LoadedBefore:
     """Goes before FMPy's class of an FMU, which loads the library again: that gives the same one."""
 
-    def __init__(self, library: FmuLibrary, **keywords: Any) -> None:  # noqa: ANN401 those of FMPy's class
+    def __init__(self, library: FmuLibrary, environment: int, **keywords: Any) -> None:  # noqa: ANN401 FMPy's own
         self._library = library
+        self._environment = environment
         super().__init__(**keywords)
         library.close()
 
@@ -152,6 +153,16 @@ class _LoadedBefore:
     @dll.setter
     def dll(self, again: object) -> None:
         """FMPy assigns what it has loaded."""
+
+    # FMPy gives no environment, and it takes these arguments by their places.
+
+    def fmi3InstantiateModelExchange(self, *given: Any) -> Any:  # noqa: ANN401, N802 as in FMPy
+        """Instantiate with the environment, which messages come with."""
+        return super().fmi3InstantiateModelExchange(*given[:5], self._environment, *given[6:])  # type: ignore[misc]
+
+    def fmi3InstantiateCoSimulation(self, *given: Any) -> Any:  # noqa: ANN401, N802 as in FMPy
+        """As above."""
+        return super().fmi3InstantiateCoSimulation(*given[:9], self._environment, *given[10:])  # type: ignore[misc]
 
 
 def calling(fmpy_class: type[Any]) -> type[Any]:

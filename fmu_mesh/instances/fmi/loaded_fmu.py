@@ -10,7 +10,7 @@ import shutil
 from collections.abc import Callable, Hashable, Mapping
 from contextlib import chdir, suppress
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol, cast
+from typing import Any, NamedTuple, cast
 
 from fmpy.fmi1 import FMICallException
 
@@ -54,14 +54,6 @@ class FmuFunctions(NamedTuple):
     free: str
     needed: tuple[str, ...]
     names: Mapping[str, str] = {}
-
-
-class Logs(Protocol):
-    """Receives log messages."""
-
-    def logged(self, status: int, category: bytes, message: bytes) -> None:
-        """Take a message."""
-        ...
 
 
 class FmuToLoad(NamedTuple):
@@ -113,7 +105,6 @@ class LoadedFmu:
         self.has_instance = self.is_lost = False
         self._fmu = fmu
         self._folder = extract(fmu.path, folder, fmu.terms, model=fmu.description)
-        self._user: Logs | None = None
         self._changes_process: bool | None = None
 
     @classmethod
@@ -131,6 +122,7 @@ class LoadedFmu:
             library = FmuLibrary(path, deep_binding=self._fmu.deep_binding)
             loaded = calling(functions.library)(
                 library=library,
+                environment=id(self),
                 guid=description.guid,
                 modelIdentifier=description.model_identifier,
                 unzipDirectory=str(self._folder),
@@ -145,23 +137,17 @@ class LoadedFmu:
             self._changes_process = any(_CHANGING.fullmatch(name) for name in self.calls.dll.imports)
         return self._changes_process
 
-    def instantiate(self, user: Logs, make: Callable[[], None]) -> None:
+    def instantiate(self, make: Callable[[], None]) -> None:
         """Give the FMU to its next user; ``make`` makes an instance, if none is there that was reset.
 
         Raises:
             RuntimeError: there is no instance.
         """
-        self._user = user
         if not self.has_instance:
             make()
             self.has_instance = bool(self.calls.component)
             if not self.has_instance:
                 raise RuntimeError(f"{self._fmu.functions.names['instantiate']} returned no instance")
-
-    def message_came(self, _environment: int | None, status: int, category: bytes, message: bytes) -> None:
-        """Pass a message of FMI 3.0 on to the instance that uses the FMU now."""
-        if self._user is not None:
-            self._user.logged(status, category or b"", message or b"")
 
     def reset(self) -> bool:
         """Reset the instance, so that it is as a new one; False if the FMU refuses, or this version of FMI cannot."""
@@ -179,10 +165,6 @@ class LoadedFmu:
         """The FMU has returned fatal: nothing of it is called any more, and its library stays as it is."""
         self.is_lost, self.has_instance = True, False
 
-    def leave(self) -> None:
-        """The user needs the FMU no more."""
-        self._user = None
-
     def free(self) -> None:
         """Free the instance; the library stays."""
         if self.has_instance:
@@ -196,7 +178,6 @@ class LoadedFmu:
         A process that ends anyway unloads nothing: the FMU may have left a thread or a timer, which needs the library.
         """
         self.free()
-        self.leave()
         if self.calls is not None and not self.is_lost and not process_ends():
             with suppress(FMICallException, OSError):
                 self.calls.freeLibrary()
