@@ -208,11 +208,16 @@ class NodeServer:
 
     # --- publishing
 
-    def say_everything(self) -> None:
-        """Wait until all log messages so far are published, before their consequences; at most for `_LAST_WORDS_S`."""
+    def say_everything(self, *, heard: bool = False) -> None:
+        """Wait until all log messages so far are published, before their consequences; at most for `_LAST_WORDS_S`.
+
+        With ``heard``, wait as long again for any answer of the master: then it has them.
+        """
         said = threading.Event()
         self._jobs.put(said.set)
         said.wait(_LAST_WORDS_S)
+        if heard:
+            next(iter(self._session.get(self._keys.mesh_key("status"), timeout=_LAST_WORDS_S)), None)
 
     def _streams_changed(self, streams: InstanceStreams) -> None:
         def update() -> None:

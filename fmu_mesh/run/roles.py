@@ -103,6 +103,8 @@ class _NodeProcess:
         if self._node is not None:
             line = LogLine(message.instance, message.status, message.category, message.message, point)
             self._node.server.log_message(line)
+            if message.status in ("error", "fatal"):  # the FMU may end the process next
+                self._node.server.say_everything(heard=True)
 
     def _close_instances(self) -> None:
         for instance in self._guarded:

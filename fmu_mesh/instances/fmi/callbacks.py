@@ -109,13 +109,14 @@ def recall() -> None:
 def tell_counted(instance: Logged) -> None:
     """Tell how many messages of ``instance`` were only counted, and not told yet."""
     message, number = _Message(), 0
-    while _library is not None and _library.message_of_kind(number, ctypes.byref(message)):
+    while _library is not None and _library.message_of_kind(ctypes.c_int64(number), ctypes.byref(message)):
         receivers = _receivers(message.address, message.name)
         if instance not in receivers:
             number += 1
-        elif counted := _library.forget_kind(message.kind):
-            for receiver in receivers:
-                receiver.logged(message.status, message.category, message.text, counted)
+            continue
+        _library.forget_kind(ctypes.byref(message))
+        for receiver in receivers if message.counted else ():
+            receiver.logged(message.status, message.category, message.text, message.counted)
 
 
 def _receivers(address: int | None, name: bytes | None) -> list[Logged]:
@@ -135,18 +136,6 @@ def _log(address: int | None, name: bytes | None, status: int, category: bytes |
     """The logger without the library."""
     texts = (name or b"")[:255], (category or b"")[:255], (text or b"")[:4095]
     _pass_on(ctypes.pointer(_Message(0, address, 0, status, *texts)))
-
-
-def _load() -> ctypes.PyDLL | None:
-    path = load_library()
-    if path is None:
-        return None
-    library = ctypes.PyDLL(path)
-    library.message_of_kind.argtypes = ctypes.c_int64, ctypes.c_void_p
-    library.forget_kind.argtypes = (ctypes.c_uint64,)
-    library.forget_kind.restype = ctypes.c_int64
-    library.pass_messages_to(_PASS_ON)
-    return library
 
 
 def _fmi2_callbacks() -> fmi2CallbackFunctions:
@@ -178,7 +167,9 @@ def _fmi3_logger() -> Any:  # noqa: ANN401 what FMPy makes a callback of
 
 
 _PASS_ON: Final = ctypes.CFUNCTYPE(None, ctypes.POINTER(_Message))(_pass_on)
-_library: Final = _load()
+_library: Final = ctypes.PyDLL(path) if (path := load_library()) is not None else None
+if _library is not None:
+    _library.pass_messages_to(_PASS_ON)
 _FMI2_CALLBACKS = _fmi2_callbacks()
 FMI1_CALLBACKS = _fmi1_callbacks()
 FMI3_LOGGER: Final = _fmi3_logger()

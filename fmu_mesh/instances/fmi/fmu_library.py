@@ -7,10 +7,12 @@ library does not have is no error until it is called: then its status is `MISSIN
 from __future__ import annotations
 
 import ctypes
+import inspect
 import itertools
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
+from functools import wraps
 from pathlib import Path
 from typing import Any, Final
 
@@ -141,7 +143,7 @@ class _LoadedBefore:
 
     def __init__(self, library: FmuLibrary, environment: int, **keywords: Any) -> None:  # noqa: ANN401 FMPy's own
         self._library = library
-        self._environment = environment
+        self.environment = environment
         super().__init__(**keywords)
         library.close()
 
@@ -154,20 +156,23 @@ class _LoadedBefore:
     def dll(self, again: object) -> None:
         """FMPy assigns what it has loaded."""
 
-    # FMPy gives no environment, and it takes these arguments by their places.
-
-    def fmi3InstantiateModelExchange(self, *given: Any) -> Any:  # noqa: ANN401, N802 as in FMPy
-        """Instantiate with the environment, which messages come with."""
-        return super().fmi3InstantiateModelExchange(*given[:5], self._environment, *given[6:])  # type: ignore[misc]
-
-    def fmi3InstantiateCoSimulation(self, *given: Any) -> Any:  # noqa: ANN401, N802 as in FMPy
-        """As above."""
-        return super().fmi3InstantiateCoSimulation(*given[:9], self._environment, *given[10:])  # type: ignore[misc]
-
 
 def calling(fmpy_class: type[Any]) -> type[Any]:
-    """FMPy's class for the functions of an FMU, as one that also takes the ``library``."""
-    return type(fmpy_class.__name__, (_LoadedBefore, fmpy_class), {})
+    """FMPy's class for the functions of an FMU, as one that takes ``library``, and ``environment`` for FMI 3.0."""
+    functions = inspect.getmembers(fmpy_class, inspect.isfunction)
+    ours = {name: _with_environment(one) for name, one in functions if name.startswith("fmi3Instantiate")}
+    return type(fmpy_class.__name__, (_LoadedBefore, fmpy_class), ours)
+
+
+def _with_environment(function: Callable[..., object]) -> Callable[..., object]:
+    """A function of FMPy, which gives no environment to an instance, as one that does."""
+    place = list(inspect.signature(function).parameters).index("instanceEnvironment")
+
+    @wraps(function)  # FMPy finds the types of C in the signature
+    def called(self: _LoadedBefore, *given: object) -> object:
+        return function(self, *given[: place - 1], self.environment, *given[place:])
+
+    return called
 
 
 @contextmanager

@@ -1,9 +1,9 @@
 /* The loggers that FMUs call: they format a message, and decide whether it is passed on or only counted.
  *
  * A kind of messages: whose they are (address and name, as the FMU gives them), status, category and format; where
- * there is no format (FMI 3.0, "%s"), the text without its numbers. The first SHOWN messages of a kind are passed on;
- * then one a second, with the number of those that were only counted before it. The last ones that were only counted
- * and have a status above ok are kept, because they may say why a call fails.
+ * there is no format (FMI 3.0, "%s"), the text without its numbers. The first messages of a kind are passed on; then one a
+ * second, with the number of those that were only counted before it. The last ones that were only counted and have a
+ * status above ok are kept, because they may say why a call fails.
  *
  * An FMU may log from any of its threads, so the tables have a lock. It is never held while Python is called: whoever
  * waits for it may hold the interpreter's lock.
@@ -20,7 +20,8 @@
 
 #define PUBLIC __attribute__((visibility("default")))
 
-enum { SHOWN = 10, KINDS = 256, MOST = 320, KEPT = 3, NAME = 256, TEXT = 4096, COMPARED = 200, SECOND = 1000000000 };
+enum { SHOWN = 100, IN_ALL = 1000, FEW = 5 };    /* of a kind, until all kinds have so many; from then on of a kind */
+enum { KINDS = 256, MOST = 320, KEPT = 3, NAME = 256, TEXT = 4096, COMPARED = 200, SECOND = 1000000000 };
 
 typedef struct { /* callbacks.py has the same structure */
   uint64_t kind;
@@ -35,7 +36,7 @@ static struct {
   int64_t shown, passed_at;
 } kinds[MOST]; /* apart from the messages, because every message searches it */
 static Message first[MOST], kept[KEPT];
-static int64_t n_kinds, n_kept, n_recalled;
+static int64_t n_kinds, n_kept, n_recalled, n_shown;
 static atomic_flag locked = ATOMIC_FLAG_INIT;
 static void (*pass_on)(const Message *);
 
@@ -79,10 +80,11 @@ static void take(Message *new, const char *format, va_list *values) {
     kinds[n].shown = new->counted = 0;
     copy(&first[n], new);
   }
-  int passes = kinds[n].shown < SHOWN || ns - kinds[n].passed_at >= SECOND;
+  int passes = kinds[n].shown < (n_shown < IN_ALL ? SHOWN : FEW) || ns - kinds[n].passed_at >= SECOND;
   new->counted = first[n].counted + (first[n].counted > 0 || !passes);
   first[n].counted = passes ? 0 : new->counted;
   if (passes) {
+    n_shown++;
     kinds[n].shown++;
     kinds[n].passed_at = ns;
   } else if (new->status > 0) copy(&kept[n_kept++ % KEPT], new);
@@ -125,17 +127,18 @@ PUBLIC int32_t message_of_kind(int64_t n, Message *to) {
   return found;
 }
 
-PUBLIC int64_t forget_kind(uint64_t kind) {
+/* Begin anew with the kind of a message; updates its number. */
+PUBLIC void forget_kind(Message *of) {
   lock();
-  int64_t n = place_of(kind), last = n_kinds - 1, counted = 0;
+  int64_t n = place_of(of->kind), last = n_kinds - 1;
+  of->counted = n <= last ? first[n].counted : 0;
   if (n <= last) {
-    counted = first[n].counted;
-    if (n < last) copy(&first[n], &first[last]);
+    n_shown -= kinds[n].shown;
     kinds[n] = kinds[last];
+    if (n < last) copy(&first[n], &first[last]);
     n_kinds--;
   }
   unlock();
-  return counted;
 }
 
 /* The oldest message that was kept and not recalled. */
