@@ -14,6 +14,7 @@ import pytest
 from fmu_mesh.instances.fmi.co_simulation.discarded_steps import RETRY
 from fmu_mesh.rings.library import LIBRARY_VARIABLE
 from tests.fmus import event_fmus
+from tests.fmus.chatty_fmus import chatty_fmu
 from tests.fmus.helpers import NO_COMPILER, find_fmu
 from tests.helpers import Place, row_count, rows_of, wait_until, write_config
 
@@ -349,3 +350,20 @@ def test_after_fatal_no_function_of_an_instance_is_called(
     assert launched.wait() == (0 if function == "fmi2Terminate" else 3)
     assert "ended its process" not in launched.errors
     assert (f"{function} returned fatal" in launched.errors) is (function != "fmi2Terminate")
+
+
+def test_an_error_message_right_before_a_crash_is_shown(place: Place) -> None:
+    logs = 'instance->logger(instance->environment, instance->name, fmi2Error, "a", "the pump is dry");'
+    once = f'if (strcmp(function, "fmi2DoStep") == 0 && instance->model.time > 0.5) {{ {logs} abort(); }}'
+    config = write_config(
+        place.folder,
+        instances={"pump": {"fmu": str(chatty_fmu(2, place.folder, "co_simulation", once))}},
+        connections=[],
+        stop_time=1.0,
+    )
+
+    launched = place.run("launch", config)
+
+    assert launched.wait() == 4
+    assert "pump at point 501: the pump is dry" in launched.errors
+    assert "its process was ended by SIGABRT" in launched.errors

@@ -10,6 +10,8 @@ from pathlib import Path
 import psutil
 import pytest
 
+from tests.fmus.chatty_fmus import chatty_fmu
+from tests.fmus.helpers import NO_COMPILER
 from tests.helpers import DEADLINE_S, Place, braked, on_a_busy_machine, row_count, rows_of, wait_until, write_config
 
 FAR_S = 1_000_000.0
@@ -69,6 +71,22 @@ def test_a_signal_ends_the_run_within_two_seconds_with_a_readable_partial_result
     rows = rows_of(result)
     assert f"({len(rows)} rows) is in '{result}'" in launched.message
     assert f"point {len(rows) - 1}, t = " in launched.message
+
+
+@pytest.mark.skipif(NO_COMPILER is not None, reason=str(NO_COMPILER))
+@pytest.mark.parametrize("options", [(), ("--local",)], ids=["distributed", "local"])
+def test_ctrl_c_ends_a_run_whose_fmu_logs_without_end(place: Place, options: tuple[str, ...]) -> None:
+    instances = {**braked(place.folder), "chatty": {"fmu": str(chatty_fmu(2, place.folder, "co_simulation"))}}
+    config = write_config(place.folder, instances=instances, stop_time=FAR_S)
+    launched = place.start("launch", config, *options)
+    wait_until(lambda: row_count(config.with_suffix(".csv")) > 10_000, "10,000 rows")
+
+    launched.signal(signal.SIGINT)
+
+    assert launched.wait() == 130
+    assert launched.ended_after_s < on_a_busy_machine(2.0)
+    assert "not shown" in launched.errors
+    assert len(launched.errors) < 100_000
 
 
 @pytest.mark.parametrize("options", [(), ("--local",)], ids=["distributed", "local"])

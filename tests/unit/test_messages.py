@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Literal
 
+import psutil
 import pytest
 import yaml
 
@@ -14,6 +16,7 @@ from fmu_mesh.cli.main import main
 from fmu_mesh.errors import StepFailed
 from fmu_mesh.instances.fmi import FmuInstance, LogMessage, open_instance, read_description
 from fmu_mesh.instances.fmi.archive.sources import extract
+from tests.fmus.chatty_fmus import chatty_fmu
 from tests.fmus.event_fmus import SOURCES, event_source_fmu
 from tests.fmus.helpers import NO_COMPILER, find_fmu
 from tests.fmus.packing import repacked, without_binaries
@@ -99,6 +102,17 @@ def test_a_message_is_told_of_the_instance_that_it_comes_from(
     assert pair.told["first"] == []
 
 
+def test_a_message_of_fmi_3_is_told_of_its_instance_only(tmp_path: Path, stack: ExitStack) -> None:
+    pair = Pair(chatty_fmu(3, tmp_path, "co_simulation"), tmp_path, stack)
+
+    pair.instances["second"].advance(0.0, 0.1)
+    for instance in pair.instances.values():
+        instance.close()
+
+    first, second = (sum(shown_and_counted(pair.told[name], "iteration")) for name in pair.told)
+    assert second == first + 20
+
+
 @pytest.mark.parametrize("version", [1, 2])
 @pytest.mark.parametrize("name", ['"20-sim"', "NULL"])
 def test_a_message_of_nobody_is_told_of_every_instance(
@@ -139,3 +153,115 @@ def test_a_run_says_what_an_fmu_says_under_another_name(tmp_path: Path, capsys: 
     said = capsys.readouterr().err
     assert f"the FMU says: {SAYS}" in said
     assert said.count(SAYS) == 1
+
+
+def opened(fmu: Path, folder: Path, told: list[LogMessage]) -> FmuInstance:
+    instance = open_instance(fmu, "it", read_description(fmu), folder, told.append)
+    instance.enter_initialization(0.0, 100.0, {"longest_step": 0.2})
+    instance.exit_initialization()
+    return instance
+
+
+def shown_and_counted(told: list[LogMessage], text: str) -> tuple[int, int]:
+    """How many messages with ``text`` were passed on, and how many were only counted."""
+    counts = [
+        re.fullmatch(r"([\d,]+) more messages? like '(.*)' \(a\) (was|were) not shown", one.message) for one in told
+    ]
+    counted = sum(int(one[1].replace(",", "")) for one in counts if one is not None and text in one[2])
+    return sum(one.message.startswith(text) for one in told), counted
+
+
+@pytest.mark.parametrize("version", [2, 3])
+@pytest.mark.parametrize("kind", ["co_simulation", "model_exchange"])
+def test_every_message_of_a_chatty_fmu_is_shown_or_counted(version: Literal[2, 3], kind: str, tmp_path: Path) -> None:
+    told: list[LogMessage] = []
+    instance = opened(chatty_fmu(version, tmp_path, kind), tmp_path, told)
+    for step in range(30):
+        instance.advance(step * 0.1, 0.1)
+
+    instance.close()
+
+    shown, counted = shown_and_counted(told, "iteration")
+    total = next(one.message for one in told if one.message.endswith("in all"))
+    assert f"{shown + counted} in all" == total
+    assert shown >= 100
+    assert counted > shown
+    assert {one.status for one in told} == {"warning"}
+
+
+def test_a_chatty_fmu_takes_no_more_memory_with_time(tmp_path: Path) -> None:
+    told: list[LogMessage] = []
+    instance = opened(chatty_fmu(2, tmp_path, "co_simulation"), tmp_path, told)
+    process = psutil.Process()
+    instance.advance(0.0, 0.001)
+    before = process.memory_info().rss
+
+    for step in range(1, 20_000):
+        instance.advance(step * 0.001, 0.001)
+
+    assert process.memory_info().rss - before < 20 << 20  # 400,000 messages would be 100 MB
+    assert len(told) < 500
+    instance.close()
+
+
+def test_what_was_only_counted_still_says_why_a_step_fails(tmp_path: Path) -> None:
+    told: list[LogMessage] = []
+    instance = opened(chatty_fmu(2, tmp_path, "co_simulation"), tmp_path, told)
+    for step in range(30):
+        instance.advance(step * 0.1, 0.1)
+
+    with pytest.raises(StepFailed, match=r"the FMU says: iteration \d+ \| iteration \d+ \| iteration \d+") as caught:
+        instance.advance(3.0, 0.25)
+
+    last = max(int(number) for number in re.findall(r"iteration (\d+)", str(caught.value)))
+    assert shown_and_counted(told, "iteration") == (100, last + 1 - 100)
+    instance.close()
+
+
+_THREAD = """
+        static long others;
+        pthread_t thread;
+        if (strcmp(function, "fmi2DoStep") == 0) {
+            void *run(void *c)
+            {
+                Instance *own = c;
+                for (int n = 0; n < 5000; n++)
+                    own->logger(own->environment, own->name, fmi2Warning, "a", "thread %ld", others++);
+                return NULL;
+            }
+            pthread_create(&thread, NULL, run, instance);
+            for (int n = 0; n < 5000; n++)
+                instance->logger(instance->environment, instance->name, fmi2Warning, "a", "main %d", n);
+            pthread_join(thread, NULL);
+        }
+"""
+
+
+def test_messages_of_two_threads_of_an_fmu_are_all_counted(tmp_path: Path) -> None:
+    told: list[LogMessage] = []
+    instance = opened(chatty_fmu(2, tmp_path, "co_simulation", _THREAD), tmp_path, told)
+
+    instance.advance(0.0, 0.1)
+    instance.close()
+
+    assert sum(shown_and_counted(told, "thread")) == 5000
+    assert sum(shown_and_counted(told, "main")) == 5000
+
+
+def test_an_fmu_with_a_new_kind_of_message_each_time_is_limited(tmp_path: Path) -> None:
+    once = """
+        static int number;
+        char letters[5] = "";
+        for (int n = 0; n < 1000; n++, number++) {
+            for (int digit = 0; digit < 4; digit++) letters[digit] = (char)('a' + (number >> 4 * digit) % 16);
+            instance->logger(instance->environment, instance->name, fmi2Warning, "b", letters);
+        }
+    """
+    told: list[LogMessage] = []
+    instance = opened(chatty_fmu(2, tmp_path, "co_simulation", once), tmp_path, told)
+    for step in range(10):
+        instance.advance(step * 0.1, 0.1)
+
+    instance.close()
+
+    assert len([one for one in told if one.category == "b"]) < 1000
