@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
+from benchmarks.chatty import CHATTY
 from benchmarks.first_step import FMU, POINTS
 from benchmarks.task import Algorithm, Member, System
 
@@ -132,6 +133,7 @@ _CYCLE2 = System(
         Member("velocity", "Integrator", "u", "y", {"k": -1.0, "y": 0.0}),
     ),
 )
+_CHATTY = System("chain", "gauss_seidel", 0.001, (Member("chatty", CHATTY, "u", "y", {"u": 1.0}),))
 _SIZES = (2, 16, 64)
 _US = "fmu_mesh"
 _NO_FILE = "fmu_mesh, nothing recorded"
@@ -306,6 +308,16 @@ JOBS = (
             _kind("FMI 3.0: Float64, Int32, Boolean", "fmi3", 40_000),
             _kind("FMI 2.0, model exchange", "model_exchange", 20_000),
             _kind("component in Python", "component", 100_000),
+        ),
+    ),
+    Job(
+        "chatty",
+        "an FMU that logs 20 messages at every step",
+        _CHATTY,
+        (
+            Entry(_US, OURS, 20_000),
+            Entry(_LOCAL, OURS, 20_000, options={"local": "yes"}),
+            Entry("FMPy loop whose logger appends to a list", "fmpy_loop", 20_000, beside=_US),
         ),
     ),
     Job(

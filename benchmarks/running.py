@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Self
 
+from benchmarks.chatty import CHATTY, build_chatty
 from benchmarks.commands import Command, Ended, RunFailed, run_command
 from benchmarks.comparing import Reference, compare
 from benchmarks.contestants.fmu_mesh_launch import configuration, launch_command
@@ -100,10 +101,13 @@ class Bench:
 
     def __enter__(self) -> Self:
         watched = [job for job in self._jobs if job.watched]
+        chatty = [job for job in self._jobs if any(member.fmu == CHATTY for member in job.system.members)]
         try:
             self._first_step = self._open.enter_context(FirstStep()) if watched else None
+            if chatty:
+                build_chatty()
         except RuntimeError as error:
-            for measured in (measured for job in watched for measured in self.results[job.name].values()):
+            for measured in (measured for job in (*watched, *chatty) for measured in self.results[job.name].values()):
                 measured.failure = str(error)
         return self
 

@@ -4,10 +4,19 @@ from __future__ import annotations
 
 import shutil
 from contextlib import contextmanager
+from ctypes import byref
 from typing import TYPE_CHECKING, Any
 
+import fmpy
 from fmpy import extract, read_model_description
-from fmpy.fmi2 import FMU2Slave
+from fmpy.fmi2 import (
+    FMU2Slave,
+    fmi2CallbackAllocateMemoryTYPE,
+    fmi2CallbackFreeMemoryTYPE,
+    fmi2CallbackFunctions,
+    fmi2CallbackLoggerTYPE,
+)
+from fmpy.logging import addLoggerProxy
 
 from benchmarks.contestants.entry import FMUS
 
@@ -26,6 +35,7 @@ class Fmu:
         fmu: FMPy's object.
         inputs: value references of the connected input, as FMPy's functions take them.
         outputs: likewise of the output.
+        messages: what it has logged.
     """
 
     def __init__(self, member: Member, stop_time: float) -> None:
@@ -34,6 +44,7 @@ class Fmu:
         references = {variable.name: variable.valueReference for variable in description.modelVariables}
         self.inputs = [references[member.input]]
         self.outputs = [references[member.output]]
+        self.messages: list[tuple[Any, ...]] = []
         self._folder = extract(path)
         self.fmu: Any = FMU2Slave(
             guid=description.guid,
@@ -41,7 +52,7 @@ class Fmu:
             unzipDirectory=self._folder,
             instanceName=member.name,
         )
-        self.fmu.instantiate(loggingOn=False)
+        self.fmu.instantiate(callbacks=_callbacks(self.messages), loggingOn=False)
         self.fmu.setupExperiment(startTime=0.0, stopTime=stop_time)
         names = list(member.start_values)
         self.fmu.setReal([references[name] for name in names], [member.start_values[name] for name in names])
@@ -61,6 +72,15 @@ class Fmu:
         self.fmu.terminate()
         self.fmu.freeInstance()
         shutil.rmtree(self._folder, ignore_errors=True)
+
+
+def _callbacks(messages: list[tuple[Any, ...]]) -> fmi2CallbackFunctions:
+    """Those of FMPy, but messages are not printed."""
+    logger = fmi2CallbackLoggerTYPE(lambda *message: messages.append(message))
+    allocate, free = fmi2CallbackAllocateMemoryTYPE(fmpy.calloc), fmi2CallbackFreeMemoryTYPE(fmpy.free)
+    callbacks = fmi2CallbackFunctions(logger=logger, allocateMemory=allocate, freeMemory=free)
+    addLoggerProxy(byref(callbacks))
+    return callbacks
 
 
 @contextmanager

@@ -1,9 +1,9 @@
 /* The loggers that FMUs call: they format a message, and decide whether it is passed on or only counted.
  *
  * A kind of messages: whose they are (address and name, as the FMU gives them), status, category and format; where
- * there is no format (FMI 3.0, "%s"), the text without its numbers. The first messages of a kind are passed on; then one a
- * second, with the number of those that were only counted before it. The last ones that were only counted and have a
- * status above ok are kept, because they may say why a call fails.
+ * that formats nothing (FMI 3.0, "%s", no %), the text without its numbers. The first messages of a kind are passed on;
+ * then one a second, in the end one a minute, with the number of those that were only counted before it. The last ones
+ * that were only counted and have a status above ok are kept, because they may say why a call fails.
  *
  * An FMU may log from any of its threads, so the tables have a lock. It is never held while Python is called: whoever
  * waits for it may hold the interpreter's lock.
@@ -20,7 +20,7 @@
 
 #define PUBLIC __attribute__((visibility("default")))
 
-enum { SHOWN = 100, IN_ALL = 1000, FEW = 5 };    /* of a kind, until all kinds have so many; from then on of a kind */
+enum { IN_ALL = 1000 }; /* once so many were passed on, less of each kind is */
 enum { KINDS = 256, MOST = 320, KEPT = 3, NAME = 256, TEXT = 4096, COMPARED = 200, SECOND = 1000000000 };
 
 typedef struct { /* callbacks.py has the same structure */
@@ -41,10 +41,10 @@ static atomic_flag locked = ATOMIC_FLAG_INIT;
 static void (*pass_on)(const Message *);
 
 static void lock(void) {
-  while (atomic_flag_test_and_set_explicit(&locked, memory_order_acquire)) sched_yield();
+  while (atomic_flag_test_and_set(&locked)) sched_yield();
 }
 
-static void unlock(void) { atomic_flag_clear_explicit(&locked, memory_order_release); }
+static void unlock(void) { atomic_flag_clear(&locked); }
 
 static void copy(Message *to, const Message *from) {
   memcpy(to, from, offsetof(Message, text) + strlen(from->text) + 1);
@@ -64,9 +64,9 @@ static int64_t place_of(uint64_t kind) {
 
 static void take(Message *new, const char *format, va_list *values) {
   uint64_t whose = mixed((uint64_t)(uintptr_t)new->address * 31 + (uint64_t)new->status, new->name, 1);
-  int formats = values && strcmp(format, "%s");
+  int formats = values && strchr(format, '%') && strcmp(format, "%s");
   if (formats) vsnprintf(new->text, TEXT, format, *values);
-  else snprintf(new->text, TEXT, "%s", values ? va_arg(*values, const char *) : format);
+  else snprintf(new->text, TEXT, "%s", values && *format == '%' ? va_arg(*values, const char *) : format);
   new->kind = mixed(mixed(whose, new->category, 1), formats ? format : new->text, formats);
   struct timespec now;
   clock_gettime(CLOCK_MONOTONIC, &now);
@@ -80,7 +80,8 @@ static void take(Message *new, const char *format, va_list *values) {
     kinds[n].shown = new->counted = 0;
     copy(&first[n], new);
   }
-  int passes = kinds[n].shown < (n_shown < IN_ALL ? SHOWN : FEW) || ns - kinds[n].passed_at >= SECOND;
+  int many = n_shown >= IN_ALL;
+  int passes = kinds[n].shown < (many ? 5 : 100) || ns - kinds[n].passed_at >= (many ? 60LL : 1LL) * SECOND;
   new->counted = first[n].counted + (first[n].counted > 0 || !passes);
   first[n].counted = passes ? 0 : new->counted;
   if (passes) {
