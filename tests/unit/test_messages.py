@@ -16,6 +16,7 @@ from fmu_mesh.cli.main import main
 from fmu_mesh.errors import StepFailed
 from fmu_mesh.instances.fmi import FmuInstance, LogMessage, open_instance, read_description
 from fmu_mesh.instances.fmi.archive.sources import extract
+from fmu_mesh.rings.library import load_library
 from tests.fmus.chatty_fmus import chatty_fmu
 from tests.fmus.event_fmus import SOURCES, event_source_fmu
 from tests.fmus.helpers import NO_COMPILER, find_fmu
@@ -23,6 +24,7 @@ from tests.fmus.packing import repacked, without_binaries
 
 pytestmark = pytest.mark.skipif(NO_COMPILER is not None, reason=str(NO_COMPILER))
 
+LIMITED = pytest.mark.skipif(load_library() is None, reason="without the library of C, all messages are passed on")
 SAYS = "the step is too long"
 OWN_2, OWN_1 = "instance->environment, instance->name,", "m->logger(NULL, m->name, Discard"
 
@@ -171,6 +173,7 @@ def shown_and_counted(told: list[LogMessage], text: str) -> tuple[int, int]:
     return sum(one.message.startswith(text) for one in told), counted
 
 
+@LIMITED
 @pytest.mark.parametrize("version", [2, 3])
 @pytest.mark.parametrize("kind", ["co_simulation", "model_exchange"])
 def test_every_message_of_a_chatty_fmu_is_shown_or_counted(version: Literal[2, 3], kind: str, tmp_path: Path) -> None:
@@ -189,6 +192,7 @@ def test_every_message_of_a_chatty_fmu_is_shown_or_counted(version: Literal[2, 3
     assert {one.status for one in told} == {"warning"}
 
 
+@LIMITED
 def test_a_chatty_fmu_takes_no_more_memory_with_time(tmp_path: Path) -> None:
     told: list[LogMessage] = []
     instance = opened(chatty_fmu(2, tmp_path, "co_simulation"), tmp_path, told)
@@ -204,6 +208,7 @@ def test_a_chatty_fmu_takes_no_more_memory_with_time(tmp_path: Path) -> None:
     instance.close()
 
 
+@LIMITED
 def test_what_was_only_counted_still_says_why_a_step_fails(tmp_path: Path) -> None:
     told: list[LogMessage] = []
     instance = opened(chatty_fmu(2, tmp_path, "co_simulation"), tmp_path, told)
@@ -237,6 +242,7 @@ _THREAD = """
 """
 
 
+@LIMITED
 def test_messages_of_two_threads_of_an_fmu_are_all_counted(tmp_path: Path) -> None:
     told: list[LogMessage] = []
     instance = opened(chatty_fmu(2, tmp_path, "co_simulation", _THREAD), tmp_path, told)
@@ -248,6 +254,7 @@ def test_messages_of_two_threads_of_an_fmu_are_all_counted(tmp_path: Path) -> No
     assert sum(shown_and_counted(told, "main")) == 5000
 
 
+@LIMITED
 def test_an_fmu_with_a_new_kind_of_message_each_time_is_limited(tmp_path: Path) -> None:
     once = """
         static int number;
