@@ -246,7 +246,7 @@ class ZenohConfig(Base, frozen=True, kw_only=True):
         Literal["peer", "client"],
         Meta(
             description="peer: nodes link directly to each other; client: everything goes through the router "
-            "in `connect`."
+            "in `connect`, which is always so for nodes and masters that are started manually and only connect."
         ),
     ] = "peer"
     listen: Annotated[

@@ -157,12 +157,13 @@ def run_master(run: RunPlan, emit: Callable[[Event], None]) -> Outcome:
         FmuMeshError: the run ended early; the outcome that was emitted before says the same.
     """
     plan, config = run.plan, run.loaded.config
+    zenoh = run.zenoh(config.zenoh.listen)
     with RunProcess(config.mesh, run.run) as process:
         process.take_place(MASTER, f"the master of mesh '{config.mesh}'")
         try:
-            session = open_session(wiring(config.zenoh, run.config_file, process.folder, MASTER, ()))
+            session = open_session(wiring(zenoh, run.config_file, process.folder, MASTER, ()))
             process.stack.callback(close_session, session)
-            settings = _settings(run, process, own_endpoints(session) if config.zenoh.mode == "peer" else ())
+            settings = _settings(run, process, own_endpoints(session) if zenoh.mode == "peer" else ())
             master = Master(plan, session, _Emitter(emit), settings, RouterLink(session, config.zenoh.connect))
             process.stack.callback(master.close)
             master.claim()

@@ -5,7 +5,7 @@ Owns the file through which they get it. Each process decodes only the parts of 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -81,7 +81,7 @@ class RunPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         options: what the command line changed.
         plan: the plan of the mesh.
         contents: the SHA-256 of the model of each instance, by instance name.
-        run: name of the run: the process id of the launcher, or `MANUAL`.
+        run: name of the run: that of the launcher (`run_name`), or `MANUAL`.
         restarts: how often the run was started before.
     """
 
@@ -102,6 +102,15 @@ class RunPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """Name of the mesh."""
         return self.loaded.config.mesh
 
+    def zenoh(self, listen: Sequence[str] = ()) -> ZenohConfig:
+        """The `zenoh` section for a process of this run that listens at ``listen``, besides its socket.
+
+        Processes that are started manually may be on several hosts. A router forwards nothing between peers: it tells
+        each where the others listen, and that is at sockets of their own host. So whoever only connects is a client.
+        """
+        own = self.loaded.config.zenoh
+        return replace(own, mode="client") if self.run == MANUAL and own.connect and not listen else own
+
     def node(self, name: str) -> NodeRun:
         """What the node ``name`` needs; a node with one instance and no group has the name of the instance.
 
@@ -114,7 +123,7 @@ class RunPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return NodeRun(
             config_file=self.config_file,
             run=self.run,
-            zenoh=self.loaded.config.zenoh,
+            zenoh=self.zenoh(),
             showing=self.options.showing,
             plan=replace(plan.nodes[name], restarts=self.restarts),
             models={item.name: self._model(item.name) for item in plan.nodes[name].instances},

@@ -41,7 +41,10 @@ class Registration(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A process that wants to be a node of the mesh.
 
     Attributes:
+        pid: its process id, for people: processes of two hosts may have the same one.
+        host: its host name, likewise.
         launch: the launcher that started it; None if it was started manually.
+        session: the random id of its Zenoh session, which no other process has.
     """
 
     node: str
@@ -49,6 +52,7 @@ class Registration(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     pid: int
     host: str
     launch: str | None = None
+    session: str = ""
 
 
 class Admission(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -260,7 +264,8 @@ class Membership:
     def _enter(self, on_master_gone: Callable[[], None]) -> Admission:
         """Register, then declare the token and `hello`: the master notices from now on if this process is lost."""
         plan, stack = self._plan, self._stack
-        registration = Registration(plan.node, plan.digest, os.getpid(), socket.gethostname(), self._launch)
+        host, own = socket.gethostname(), str(self._session.zid())
+        registration = Registration(plan.node, plan.digest, os.getpid(), host, self._launch, own)
         payload = msgspec.json.encode(registration)
         question = Question(self._public.register, "the master", plan.timeouts.start, payload)
         admission = _understood(ask(self._session, question, lambda: self.given_up), Admission)

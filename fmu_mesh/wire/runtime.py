@@ -1,7 +1,8 @@
 """The runtime folder: where the processes of a mesh on one host find each other, and where tools find meshes.
 
 Owns the folder of a run (sockets, plans, extracted FMUs) and the note about a running mesh. The process that creates
-the folder of a run also removes it, even if processes that used it were killed.
+the folder of a run also removes it, even if processes that used it were killed. Hosts and containers may share the
+folder; a process id means something only on the host of the process, so nothing of another host is judged by one.
 """
 
 from __future__ import annotations
@@ -12,11 +13,13 @@ import itertools
 import os
 import shutil
 import signal
+import socket
 import stat
 import tempfile
 from collections.abc import Iterator
 from contextlib import suppress
 from errno import ENOENT
+from functools import cache
 from pathlib import Path
 from typing import TextIO
 
@@ -38,6 +41,7 @@ __all__ = [
     "run_name",
     "runtime_folder",
     "socket_endpoint",
+    "this_host",
     "tidy_run_folder",
     "write_note",
 ]
@@ -63,6 +67,7 @@ class MeshNote(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     Attributes:
         endpoints: Zenoh endpoints where the master can be reached, the socket of this user first.
         pid: the process of the note: the launcher, or a master that was started manually.
+        host: where it runs, see `this_host`.
     """
 
     mesh: str
@@ -70,6 +75,7 @@ class MeshNote(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     endpoints: tuple[str, ...]
     pid: int
     config: str
+    host: str = ""
 
 
 def runtime_folder() -> Path:
@@ -101,15 +107,30 @@ def run_folder(mesh: str, run: str) -> Path:
 
 
 def run_name() -> str:
-    """A name for a run of this process: the process id, and from the second run on also the number of the run."""
+    """A name for a run of this process, such as `4711-3f9a1c`: the process id and the host.
+
+    From the second run on, it also has the number of the run.
+    """
     number = next(_runs)
-    return f"{os.getpid()}" if number == 1 else f"{os.getpid()}-{number}"
+    return "-".join((str(os.getpid()), *([str(number)] if number > 1 else []), this_host()))
+
+
+@cache
+def this_host() -> str:
+    """Six digits for all processes that see the same process ids: those of one boot of a host, or of one container."""
+    facts = [socket.gethostname()]
+    with suppress(OSError):  # the system has no /proc
+        facts = [
+            Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii"),
+            str(Path("/proc/self/ns/pid").readlink()),
+        ]
+    return hashlib.sha256(" ".join(facts).encode()).hexdigest()[:6]
 
 
 def _launcher_of(folder: Path) -> int | None:
-    """The process id of the launcher of the run that a folder belongs to; None without a launcher."""
-    pid = folder.suffix.removeprefix(".").partition("-")[0]
-    return int(pid) if pid.isdigit() else None
+    """The process id of the launcher of the run that a folder belongs to; None without a launcher on this host."""
+    pid, _, rest = folder.suffix.removeprefix(".").partition("-")
+    return int(pid) if pid.isdigit() and rest.endswith(this_host()) else None
 
 
 def _private(folder: Path) -> Path:
@@ -158,29 +179,30 @@ def remove_run_folder(folder: Path) -> None:
 
 def fmu_folder(folder: Path) -> Path:
     """Where this process extracts FMUs in the folder of a run."""
-    return folder / "fmus" / str(os.getpid())
+    return folder / "fmus" / _own_name(folder)
+
+
+def _own_name(folder: Path) -> str:
+    return Path(_held[folder].name).stem if folder in _held else str(os.getpid())
 
 
 def enter_run_folder(folder: Path, node: str) -> None:
     """Note that this process is the node ``node`` of a run, so that others can remove its files if it is killed."""
-    draft = folder / f"{os.getpid()}.new"
-    file = _first_file(draft)
-    _held[folder] = file
-    file.write(_socket_name(node))
-    file.flush()
-    fcntl.flock(file, fcntl.LOCK_EX)  # the lock ends with the process, however it ends
-    draft.rename(folder / f"{os.getpid()}.pid")
-
-
-def _first_file(path: Path) -> TextIO:
-    """Open a new file in the folder of a run, which nobody else removes from then on."""
+    pid = os.getpid()
     for _ in range(_ENTRIES):
-        _private(path.parent)
-        with suppress(FileNotFoundError):
-            return path.open("w", encoding="utf-8")
-    raise MeshLost(
-        f"the runtime folder '{path.parent}' is removed again and again", hint="Does something else do that?"
-    )
+        _private(folder)
+        # A process of another host, with which the folder is shared, may have the same id.
+        names = itertools.chain([f"{pid}"], (f"{pid}-{number}" for number in itertools.count(2)))
+        note = next(path for name in names if not (path := folder / f"{name}.pid").exists())
+        with suppress(FileExistsError, FileNotFoundError):
+            file = note.open("x", encoding="utf-8")
+            fcntl.flock(file, fcntl.LOCK_EX)  # the lock ends with the process, however it ends
+            if os.path.samestat(os.fstat(file.fileno()), note.stat()):  # nobody has removed it before it was locked
+                file.write(_socket_name(node))
+                file.flush()
+                _held[folder] = file
+                return
+    raise MeshLost(f"the runtime folder '{folder}' is removed again and again", hint="Does something else do that?")
 
 
 def tidy_run_folder(folder: Path) -> None:
@@ -193,35 +215,33 @@ def tidy_run_folder(folder: Path) -> None:
         try:
             with note.open(encoding="utf-8") as file:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                is_current = os.path.samestat(os.fstat(file.fileno()), note.stat())
+                if os.path.samestat(os.fstat(file.fileno()), note.stat()):  # its process has not left and come again
+                    _remove_traces(folder, note.stem)
         except OSError:  # its process still holds the lock, or another process was faster
             continue
-        if not is_current:  # its process has left the run, and has entered it again
-            continue
-        _remove_traces(folder, note.stem)
 
 
-def _remove_traces(folder: Path, pid: str) -> None:
+def _remove_traces(folder: Path, name: str) -> None:
     """Remove the socket and the extracted FMUs of a process."""
-    note = folder / f"{pid}.pid"
-    shutil.rmtree(folder / "fmus" / pid, ignore_errors=True)
+    note = folder / f"{name}.pid"
+    shutil.rmtree(folder / "fmus" / name, ignore_errors=True)
     try:
-        socket = note.read_text(encoding="utf-8")
+        used = note.read_text(encoding="utf-8")
     except FileNotFoundError:
         return
-    if socket.endswith(".sock") and "/" not in socket:
-        for name in (socket, f"{socket}.lock"):  # Zenoh uses a lock file beside its socket
-            (folder / name).unlink(missing_ok=True)
+    if used.endswith(".sock") and "/" not in used:
+        for file in (used, f"{used}.lock"):  # Zenoh uses a lock file beside its socket
+            (folder / file).unlink(missing_ok=True)
     note.unlink(missing_ok=True)
 
 
 def leave_run_folder(folder: Path) -> None:
     """Remove the folder of a run if no process uses it any more; every process calls this when it ends."""
-    _remove_traces(folder, str(os.getpid()))
+    _remove_traces(folder, _own_name(folder))
     if (held := _held.pop(folder, None)) is not None:
         held.close()
     tidy_run_folder(folder)
-    note = _read_note(folder / "mesh.json")
+    note = _own_note(folder / "mesh.json")
     if note is not None and note.pid == os.getpid():  # the master of processes that were started manually
         (folder / "mesh.json").unlink(missing_ok=True)
     elif (launcher := note.pid if note is not None else _launcher_of(folder)) is not None:
@@ -253,6 +273,7 @@ def _socket_name(node: str) -> str:
 def write_note(folder: Path, note: MeshNote) -> None:
     """Write the note of a running mesh atomically, so that no reader gets an incomplete one."""
     temporary = folder / "mesh.json.new"
+    note = msgspec.structs.replace(note, host=this_host())
     temporary.write_bytes(msgspec.json.format(msgspec.json.encode(note)))
     temporary.replace(folder / "mesh.json")
 
@@ -260,7 +281,7 @@ def write_note(folder: Path, note: MeshNote) -> None:
 def meshes() -> Iterator[MeshNote]:
     """The meshes of this user on this host; also removes folders whose process is gone."""
     for file in sorted(runtime_folder().glob("*/mesh.json")):
-        note = _read_note(file)
+        note = _own_note(file)
         if note is not None and is_alive(note.pid):
             yield note
         elif note is not None:
@@ -289,11 +310,13 @@ def _remove_if_empty(folder: Path) -> None:
         folder.rmdir()
 
 
-def _read_note(file: Path) -> MeshNote | None:
+def _own_note(file: Path) -> MeshNote | None:
+    """A note of this host; None if there is none, or one of a host with which the folder is shared."""
     try:
-        return msgspec.json.decode(file.read_bytes(), type=MeshNote)
+        note = msgspec.json.decode(file.read_bytes(), type=MeshNote)
     except (OSError, msgspec.DecodeError):
         return None
+    return note if note.host == this_host() else None
 
 
 def is_alive(pid: int) -> bool:

@@ -51,7 +51,7 @@ WHOLE: dict[str, dict[str, str]] = {
 """Instances, by their FMUs, of the file that the fragments of a page are part of."""
 
 UNTIL_CTRL_C = re.compile(r"fmu-mesh (foxglove|top|watch (?!.*--count))")
-SOCKET = re.compile(r"unixsock-stream//run/user/\d+/fmu_mesh/\w+\.\d+/\w+\.sock")
+SOCKET = re.compile(r"unixsock-stream//run/user/\d+/fmu_mesh/\w+\.[\w-]+/\w+\.sock")
 
 
 class PageRun:

@@ -1,0 +1,104 @@
+"""Two hosts on this machine: each has process ids, mounts, a host name, a network and a `/tmp` of its own.
+
+Without all of these, the processes of two hosts find the shared memory and the sockets of each other, and a test does
+not use the network.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Final
+
+import psutil
+import pytest
+
+from tests.helpers import DEADLINE_S, Launched, wait_until
+
+__all__ = ["NEEDS_HOSTS", "NetworkHost", "two_hosts"]
+
+_ROOT: Final = Path(__file__).resolve().parents[1]
+_TOOLS: Final = ("unshare", "nsenter", "ip")
+_SPACES: Final = ("--net", "--pid", "--mount", "--uts", "--ipc")
+
+NEEDS_HOSTS = pytest.mark.skipif(
+    os.geteuid() != 0 or any(shutil.which(tool) is None for tool in _TOOLS),
+    reason="needs root and the commands unshare, nsenter and ip",
+)
+
+
+class NetworkHost:
+    """One host: commands run in `/tmp/clone`, which has copies of the examples.
+
+    Args:
+        name: its host name.
+        folder: an empty folder of this machine; it is `/tmp` there.
+        shared: a folder of this machine that it has at `/shared`.
+
+    Attributes:
+        folder: as above.
+        pid: its first process.
+    """
+
+    def __init__(self, name: str, folder: Path, shared: Path) -> None:
+        self.folder = folder
+        for part in ("configs", "fmus"):
+            shutil.copytree(_ROOT / part, folder / "clone" / part)
+        (folder / "etc_hosts").write_text("127.0.0.1 localhost\n10.77.0.1 router\n", encoding="utf-8")
+        steps = (
+            f"hostname {name}",
+            "ip link set lo up",
+            f"mount --bind {shared} /mnt",
+            f"mount --bind {folder}/etc_hosts /etc/hosts",
+            f"mount --bind {folder} /tmp",
+            "exec sleep infinity",
+        )
+        command = ["unshare", *_SPACES, "--mount-proc", "--fork", "--kill-child", "sh", "-ec", "\n".join(steps)]
+        self._started: list[Launched] = []
+        self._outer = Launched(command, os.environ, folder)
+        self.pid = wait_until(self._first_process, f"the first process of a host; {self._outer.errors}")
+
+    def start(self, *command: str, **environment: str) -> Launched:
+        """Start a command there; its first word may be `fmu-mesh`."""
+        program = [sys.executable, "-m", "fmu_mesh"] if command[0] == "fmu-mesh" else [command[0]]
+        kept = {name: os.environ[name] for name in ("PATH", "COVERAGE_PROCESS_START") if name in os.environ}
+        entered = ["nsenter", f"--target={self.pid}", *_SPACES, "--wdns=/tmp/clone"]
+        launched = Launched(
+            [*entered, *program, *command[1:]], kept | {"COLUMNS": "1000", "HOME": "/"} | environment, self.folder
+        )
+        self._started.append(launched)
+        return launched
+
+    def close(self) -> None:
+        """End everything there."""
+        self._outer.close()
+        for launched in self._started:
+            launched.close()
+
+    def _first_process(self) -> int | None:
+        children = psutil.Process(self._outer.pid).children()
+        return next((child.pid for child in children if child.name() == "sleep"), None)
+
+
+@contextmanager
+def two_hosts(folder: Path, names: Sequence[str] = ("first", "second")) -> Iterator[list[NetworkHost]]:
+    """Two hosts with a network between them; the first one has the address of `router`."""
+    (shared := folder / "shared").mkdir()
+    with ExitStack() as stack:
+        hosts = []
+        for number, name in enumerate(names, 1):
+            (own := folder / f"host{number}").mkdir()
+            hosts.append(NetworkHost(name, own, shared))
+            stack.callback(hosts[-1].close)
+        first, second = (str(host.pid) for host in hosts)
+        link = ["ip", "link", "add", "wire", "netns", first, "type", "veth", "peer", "name", "wire", "netns", second]
+        subprocess.run(link, check=True, timeout=DEADLINE_S)
+        for number, host in enumerate(hosts, 1):
+            for words in (f"addr add 10.77.0.{number}/24 dev wire", "link set wire up"):
+                assert host.start("ip", *words.split()).wait() == 0
+        yield hosts
