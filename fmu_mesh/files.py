@@ -17,7 +17,9 @@ from __future__ import annotations
 import fcntl
 import hashlib
 import os
+import shutil
 import stat
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from io import BufferedReader, FileIO
@@ -34,12 +36,15 @@ __all__ = [
     "OwnFile",
     "archive_on_the_way",
     "beside",
+    "cloned",
     "exists",
     "is_file",
     "is_folder",
     "known_sha256",
+    "new_folder",
     "open_alone",
     "remember_sha256",
+    "remove_tree",
     "replaced",
     "sha256_of",
     "sha256_of_open",
@@ -52,6 +57,8 @@ FileVersion = tuple[int, int, int, int]
 """What changes if a file changes."""
 
 _DRAFT = ".starting"
+_ELSEWHERE = ".elsewhere"
+_FICLONE = 0x40049409
 _TRIES = 10
 """Attempts to open a file that other processes rename or remove at the same time."""
 
@@ -151,6 +158,38 @@ def replaced(path: Path) -> Iterator[Path]:
         draft.replace(target)
     finally:
         draft.unlink(missing_ok=True)
+
+
+def new_folder(parent: Path, prefix: str, place: Path) -> Path:
+    """A new private folder in ``place``: ``parent``, or else a link in ``parent`` leads to it, for `remove_tree`.
+
+    Raises:
+        OSError: it cannot be made.
+    """
+    parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+    folder = Path(tempfile.mkdtemp(prefix=prefix, dir=place))
+    if place != parent:
+        (parent / f"{folder.name}{_ELSEWHERE}").symlink_to(folder)
+    return folder
+
+
+def remove_tree(folder: Path) -> None:
+    """Remove a folder with all that is in it, and what `new_folder` has made for it elsewhere. Never raises."""
+    for link in folder.glob(f"**/*{_ELSEWHERE}"):
+        with suppress(OSError):
+            if link.name == f"{(target := link.readlink()).name}{_ELSEWHERE}":
+                shutil.rmtree(target, ignore_errors=True)
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+def cloned(source: str, target: str) -> None:
+    """Copy a file; where the file system can, both share their blocks until one of them is written to."""
+    with open(source, "rb") as of, open(target, "xb") as to:  # noqa: PTH123 as `shutil.copytree` calls it
+        try:
+            fcntl.ioctl(to, _FICLONE, of.fileno())
+        except OSError:
+            shutil.copyfileobj(of, to)
+    shutil.copymode(source, target)
 
 
 def archive_on_the_way(path: Path) -> Path | None:

@@ -19,13 +19,14 @@ import msgspec
 from msgspec.structs import replace
 
 from ..errors import DeadlineExceeded, FmuError, FmuMeshError, Interrupted, MeshLost, from_report
-from ..system.plan import RECORDER
+from ..system.plan import MASTER, RECORDER
 from ..wire.runtime import (
     MeshNote,
     remove_run_folder,
     remove_stale_folders,
     run_folder,
     run_name,
+    socket_endpoint,
     write_note,
 )
 from ..wire.session import LEASE_MS
@@ -103,6 +104,7 @@ class Launcher:
         remove_stale_folders()
         self._folder = run_folder(self._run.mesh, self._run.run)
         try:
+            socket_endpoint(self._folder, MASTER)  # a path that is too long is found here
             self._file = str(self._run.write(self._folder))
             self._spawn_all()
             while not self._over():

@@ -133,6 +133,9 @@ class RunPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """Write the plan into a private folder, for the other processes of the run; returns the file.
 
         The format is MessagePack: unlike JSON, it can hold any float and bytes.
+
+        Raises:
+            ConfigurationError: it cannot be written.
         """
         system = self.plan.system
         bare = {name: replace(own, description=_ELSEWHERE) for name, own in system.instances.items()}
@@ -148,7 +151,11 @@ class RunPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             rest=_encoded(rest),
         )
         file = folder / _FILE_NAME
-        file.write_bytes(_encoded(parts))
+        try:
+            file.write_bytes(_encoded(parts))
+        except OSError as error:
+            text = f"the runtime folder '{folder}' cannot be used: {error.strerror}"
+            raise ConfigurationError(text, hint="Set FMU_MESH_RUNTIME_DIR to another folder.") from error
         return file
 
     def _model(self, instance: str) -> PlannedModel:

@@ -312,7 +312,7 @@ class ExecutorSweep(Sweep):
                     continue
                 rows.add(row)
                 self._take(row)
-                if row.stuck and isinstance(executor, WorkerPool):
+                if row.spent and isinstance(executor, WorkerPool):
                     executor.replace(int(row.worker.rpartition(":")[2]))
         finally:
             for future in under_way:

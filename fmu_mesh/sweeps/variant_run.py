@@ -38,6 +38,8 @@ from .variants import Parameters
 
 __all__ = ["Row", "SweepTask", "curves_of", "encoded_task", "options_of_variant", "path_of", "run_variant"]
 
+_GROWTH_BYTES = 256 * 2**20
+
 Cell = float | int | bool | str | None
 """One value of the table."""
 
@@ -79,8 +81,8 @@ class Row(msgspec.Struct, frozen=True):
         values: by the name of the column, what was calculated from its curves; None where there is nothing.
         seconds: wall-clock time of the run in s, with its planning.
         worker: host and process id of the worker.
-        stuck: whether an FMU has not returned, or has crashed while it was closed, so that the worker has a thread
-            less.
+        spent: whether the worker is to be replaced: an FMU has not returned, or has crashed while it was closed, or
+            the process has grown, because an FMU does not free its memory.
         machine: what the last digits of results depend on, on the host of the worker.
     """
 
@@ -90,7 +92,7 @@ class Row(msgspec.Struct, frozen=True):
     values: dict[str, Cell]
     seconds: float
     worker: str
-    stuck: bool = False
+    spent: bool = False
     machine: str = ""
 
 
@@ -146,7 +148,7 @@ def run_variant(task: bytes, functions: OwnReductions, identity: str, parameters
         values=values,
         seconds=time.perf_counter() - started,
         worker=f"{socket.gethostname()}:{os.getpid()}",
-        stuck=own.stuck,
+        spent=own.stuck or own.has_grown(),
         machine=", ".join(machine().values()),
     )
 
@@ -177,6 +179,7 @@ class _Loaded:
         self._mesh = Mesh.from_configuration(PlainConfig(_with_one_record(self._task.data), self._task.file))
         self._jobs: SimpleQueue[_Job | None] = SimpleQueue()
         self.hung = _Hung()
+        self._bytes = 0
         arguments = self._mesh, self._jobs, self.hung
         threading.Thread(
             target=_work, args=arguments, kwargs={"reset": self._task.reset}, name="variants", daemon=True
@@ -187,6 +190,12 @@ class _Loaded:
     def stuck(self) -> bool:
         """Whether its thread is inside an FMU that does not return."""
         return self.hung.stuck
+
+    def has_grown(self) -> bool:
+        """Whether this process has more than twice the memory that it had after its first run."""
+        now = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1]) * os.sysconf("SC_PAGE_SIZE")
+        self._bytes = self._bytes or now
+        return now - self._bytes > max(self._bytes, _GROWTH_BYTES)
 
     def run(self, identity: str, parameters: Parameters) -> Result:
         """Run a variant.

@@ -11,7 +11,6 @@ import fcntl
 import hashlib
 import itertools
 import os
-import shutil
 import signal
 import socket
 import stat
@@ -26,6 +25,7 @@ from typing import TextIO
 import msgspec
 
 from ..errors import ConfigurationError, MeshLost
+from ..files import remove_tree
 
 __all__ = [
     "MeshNote",
@@ -46,7 +46,8 @@ __all__ = [
     "write_note",
 ]
 
-_SOCKET_PATH_LIMIT = 100
+_SOCKET_PATH_LIMIT = 107
+"""Of the system: 108 bytes with a zero at the end (unix(7))."""
 _PF_EXITING = 0x4
 _KILLED = 1 << (signal.SIGKILL - 1)
 """Bits of a process in /proc."""
@@ -174,7 +175,7 @@ def _made(folder: Path) -> os.stat_result:
 
 def remove_run_folder(folder: Path) -> None:
     """Remove the folder of a run with its content."""
-    shutil.rmtree(folder, ignore_errors=True)
+    remove_tree(folder)
 
 
 def fmu_folder(folder: Path) -> Path:
@@ -224,7 +225,7 @@ def tidy_run_folder(folder: Path) -> None:
 def _remove_traces(folder: Path, name: str) -> None:
     """Remove the socket and the extracted FMUs of a process."""
     note = folder / f"{name}.pid"
-    shutil.rmtree(folder / "fmus" / name, ignore_errors=True)
+    remove_tree(folder / "fmus" / name)
     try:
         used = note.read_text(encoding="utf-8")
     except FileNotFoundError:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shutil
 import signal
 import threading
 from collections.abc import Iterator, Mapping, Sequence
@@ -20,7 +21,9 @@ import pytest
 import fmu_mesh
 from fmu_mesh.sweeps.sweep_folder import SweepFolder
 from fmu_mesh.sweeps.worker_pool import WorkerLost, WorkerPool
-from tests.helpers import DEADLINE_S, PAIR, wait_until, write_config
+from fmus.build import build
+from tests.fmus.helpers import NO_COMPILER
+from tests.helpers import DEADLINE_S, FMUS, PAIR, wait_until, write_config
 
 VARY: Mapping[str, Any] = {
     "pendulum.d": [0.05, 0.3, 0.8],
@@ -203,6 +206,37 @@ def test_a_job_whose_worker_is_lost_says_so_and_those_that_waited_for_it_run() -
             assert pool.submit(abs, -5).result(DEADLINE_S) == 5
         except WorkerLost:  # nobody had noticed yet
             assert pool.submit(abs, -5).result(DEADLINE_S) == 5
+
+
+@pytest.mark.skipif(NO_COMPILER is not None, reason=str(NO_COMPILER))
+def test_a_worker_that_grows_is_replaced_and_the_rows_are_the_same(tmp_path: Path) -> None:
+    shutil.copytree(FMUS / "src" / "Gain", tmp_path / "leaking" / "Gain")
+    source = tmp_path / "leaking" / "Gain" / "Gain.c"
+    leak = "    if (time == 0.0) memset(lost = malloc(60 << 20), 1, 60 << 20);\n    calculate(s);\n    return fmi2OK;"
+    text = source.read_text(encoding="utf-8").replace("    (void)time;\n", "")
+    source.write_text(
+        "#include <stdlib.h>\n#include <string.h>\nstatic char *volatile lost;\n"
+        + text.replace("    calculate(s);\n    return fmi2OK;", leak),
+        encoding="utf-8",
+    )
+    values: dict[bool, list[Any]] = {}
+    workers: dict[bool, int] = {}
+    for leaks in (False, True):
+        fmu = build(source.parent, tmp_path / "leaking") if leaks else FMUS / "Gain.fmu"
+        instances = {"gain": {"fmu": str(fmu), "start_values": {"u": 2.0}}}
+        config = write_config(tmp_path, instances=instances, connections=[], stop_time=0.01)
+        wanted = {"gain.k": [float(number) for number in range(14)]}
+
+        with fmu_mesh.sweep(config, wanted, workers=1, folder=tmp_path / f"{leaks}") as running:
+            result = running.wait(DEADLINE_S)
+
+        assert [row.exit_code for row in result] == [0] * 14
+        values[leaks] = [row.values for row in result]
+        workers[leaks] = len({row.worker for row in result})
+
+    assert values[True] == values[False]
+    assert workers[False] == 1
+    assert workers[True] > 1
 
 
 def test_an_executor_that_is_broken_ends_the_sweep_and_keeps_the_rows(config: Path, tmp_path: Path) -> None:

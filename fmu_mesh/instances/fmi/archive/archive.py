@@ -1,9 +1,9 @@
 """The files of an FMU: a ZIP archive from any source, also inside another one, or a folder that somebody has unpacked.
 
 Owns the private folder that an instance uses. That folder has the layout of the FMU and can always be removed: if the
-FMU is a folder, it holds copies of the binaries and links to all other files. It lies below a folder that is passed in,
-so that it is removed even if the process that used it was killed. The protection against hostile archives is in
-`fmu_mesh.archives`; what the files mean, in `fmu_mesh.instances.fmi.archive.examining`.
+FMU is a folder, it holds copies of `binaries` and `resources` and links to all other files. It belongs to a folder that
+is passed in, so that it is removed even if the process that used it was killed. The protection against hostile archives
+is in `fmu_mesh.archives`; what the files mean, in `fmu_mesh.instances.fmi.archive.examining`.
 """
 
 from __future__ import annotations
@@ -12,10 +12,11 @@ import hashlib
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager
+from errno import EACCES, ENOSPC
 from pathlib import Path
-from typing import IO, Protocol
+from typing import IO, Final, Protocol
 from zipfile import ZipInfo
 
 import msgspec
@@ -26,8 +27,11 @@ from ....archives.inner_files import inner_file, inner_sha256, inner_size
 from ....config.mesh import LimitsConfig
 from ....errors import LoadFailed
 
-__all__ = ["Contents", "OpenFmu", "Terms", "content_of", "opened", "sha256_of", "size_of", "unpacked"]
+__all__ = ["Contents", "OpenFmu", "Terms", "content_of", "in_new_folder", "opened", "sha256_of", "size_of"]
 
+_MARGIN: Final = 2**20
+"""The bytes that the folder of a run keeps for everything else."""
+_PLACE_HINT: Final = "Set FMU_MESH_RUNTIME_DIR, or TMPDIR, to a folder with room from which code may run."
 _XML_FILES: tuple[str, ...] = ("modelDescription.xml", "sources/buildDescription.xml")
 
 
@@ -92,6 +96,10 @@ class OpenFmu(Protocol):
         """Calculate the SHA-256 of the archive, or of the names and contents of all files of a folder."""
         ...
 
+    def unpacked_size(self) -> int:
+        """How many bytes `unpack_into` writes."""
+        ...
+
     def unpack_into(self, folder: Path) -> None:
         """Unpack all files into an empty folder."""
         ...
@@ -144,30 +152,51 @@ def content_of(path: Path) -> str:
     return digest.hexdigest()
 
 
-@contextmanager
-def unpacked(fmu: OpenFmu, parent: Path) -> Iterator[Path]:
-    """Unpack an FMU into a new private folder below ``parent``.
+def in_new_folder(path: Path, parent: Path, size: int, fill: Callable[[Path], None]) -> Path:
+    """Fill a new private folder with the files of an FMU.
 
-    Inside the block the folder has the suffix `.part`. It gets its final name, without the suffix, when the block ends
-    without an exception; otherwise it is removed. So no reader sees an incomplete FMU.
+    It is below ``parent``, or in the folder for temporary files where that has no room or no code may run.
+
+    Args:
+        path: the FMU, for errors.
+        parent: what it is removed with.
+        size: the bytes that ``fill`` writes.
+        fill: gets the folder, and may raise `OSError`.
 
     Raises:
-        LoadFailed: the FMU is damaged, or the folder cannot be written; nothing is left behind.
+        LoadFailed: there is no place for it, or it is damaged; nothing is left behind.
     """
-    path = fmu.path
-    try:
-        parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        partial = Path(tempfile.mkdtemp(prefix=f"{path.stem[:40]}-", suffix=".part", dir=parent))
-    except OSError as error:
-        raise LoadFailed(f"'{path}' cannot be extracted into '{parent}': {error.strerror}") from error
-    try:
-        fmu.unpack_into(partial)
-        yield partial
-        partial.rename(partial.with_suffix(""))
-    except OSError as error:
-        raise LoadFailed(f"'{path}' cannot be extracted: {error}") from error
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
+    temporary = Path(tempfile.gettempdir())
+    reasons: list[str] = []
+    for place in (parent, temporary):
+        if reasons and parent.is_dir() and parent.stat().st_dev == temporary.stat().st_dev:
+            break
+        with ExitStack() as stack:
+            try:
+                folder = files.new_folder(parent, f"{path.stem[:40]}-", place)
+                stack.callback(shutil.rmtree, folder, ignore_errors=True)
+                _refuse_unfit(place, size)
+                fill(folder)
+            except (OSError, LoadFailed) as error:
+                cause = error.__cause__ if isinstance(error, LoadFailed) else error
+                if not isinstance(cause, OSError) or (cause is not error and cause.errno != ENOSPC):
+                    raise  # it is not this folder that is wrong
+                text = cause.args[0][0][2] if isinstance(cause, shutil.Error) else cause.strerror or cause
+                reasons.append(f"'{place}': {text}")
+            else:
+                stack.pop_all()
+                return folder
+    raise LoadFailed(f"'{path}' cannot be extracted into {' or into '.join(reasons)}.", hint=_PLACE_HINT)
+
+
+def _refuse_unfit(place: Path, size: int) -> None:
+    """Refuse a folder that has too little room, or that is on a file system from which no library can be loaded."""
+    found = os.statvfs(place)
+    free = found.f_bavail * found.f_frsize
+    if size + _MARGIN > free:
+        raise OSError(ENOSPC, f"too little room ({size / 1e6:.1f} MB needed, {free / 1e6:.1f} MB free)")
+    if found.f_flag & os.ST_NOEXEC:
+        raise OSError(EACCES, "no code may run from there (the file system is mounted noexec)")
 
 
 # --- an archive
@@ -215,6 +244,9 @@ class _Archive:
         with reading(self.path):
             return self._sha256()
 
+    def unpacked_size(self) -> int:
+        return sum(entry.file_size for entry in self._zip.infolist())
+
     def unpack_into(self, folder: Path) -> None:
         with reading(self.path):
             for entry in self._zip.infolist():
@@ -254,6 +286,8 @@ def _no_file(path: Path, name: str) -> LoadFailed:
 
 
 # --- a folder
+
+_COPIED: Final = ("binaries/", "resources/")
 
 
 class _Folder:
@@ -295,14 +329,18 @@ class _Folder:
         except OSError as error:
             raise LoadFailed(f"'{self.path}' cannot be read: {error.strerror}.") from error
 
+    def unpacked_size(self) -> int:
+        names = (name for name in _names_in(self.path) if name.startswith(_COPIED))
+        return sum((self.path / name).stat().st_size for name in names)
+
     def unpack_into(self, folder: Path) -> None:
-        """Give ``folder`` the layout of the FMU without writing to the FMU: binaries are copied, the rest is linked.
+        """Give ``folder`` the layout of the FMU without writing to the FMU: what it may change is copied.
 
         Each instance has a library file of its own, so that two instances in one process share no variables of it.
         """
         for entry in self.path.resolve().iterdir():
-            if entry.name == "binaries" and entry.is_dir():
-                shutil.copytree(entry, folder / entry.name, copy_function=shutil.copyfile)
+            if f"{entry.name}/" in _COPIED and entry.is_dir():
+                shutil.copytree(entry, folder / entry.name, copy_function=files.cloned)
             else:
                 (folder / entry.name).symlink_to(entry)
 

@@ -46,6 +46,7 @@ def rename_libraries(folder: Path) -> None:
             continue
         for old, own in new.items():
             content = content.replace(_whole(old), _whole(own))
+        file.unlink()  # other processes may use the same file
         file.write_bytes(content)
     for file in files:
         if file.name in new:

@@ -18,6 +18,8 @@ import subprocess
 import tempfile
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Sequence
+from contextlib import suppress
+from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Final, Literal
 
@@ -25,9 +27,11 @@ import fmpy
 import msgspec
 from fmpy.model_description import ModelDescription as FmpyDescription
 
+from .... import files
+from ....archives.archive_entries import reading
 from ....errors import LoadFailed
 from ....variables.model_description import Kind, ModelDescription
-from .archive import OpenFmu, Terms, opened, unpacked
+from .archive import OpenFmu, Terms, in_new_folder, opened
 from .examining import examine, library_name, source_names
 from .library_names import rename_libraries
 from .reading import description_of, parsed
@@ -64,6 +68,8 @@ _LINK_FLAGS: Final = ("-shared", "-Wl,--no-undefined", "-Wl,-Bsymbolic", "-lm", 
 
 _prepared: dict[tuple[Path, Terms, str, str], Path] = {}
 """The folders of FMUs that `prepare` has extracted."""
+_linked: set[Path] = set()
+"""Those whose files this process uses, as they are also those of other processes."""
 
 
 class _Build(msgspec.Struct, frozen=True):
@@ -99,7 +105,7 @@ def extract(
         folder = _copied(path, prepared, parent)
     else:
         with opened(path, terms) as fmu:
-            folder = _extract(fmu, parent, tell, model)
+            folder = in_new_folder(path, parent, fmu.unpacked_size(), partial(_fill, fmu, tell, model))
     rename_libraries(folder)
     return folder
 
@@ -118,14 +124,27 @@ def prepare(path: Path, parent: Path, terms: Terms, model: ModelDescription) -> 
 
 
 def _copied(path: Path, prepared: Path, parent: Path) -> Path:
-    """A new private folder below ``parent`` with copies of all files of an extracted FMU."""
-    try:
-        parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        folder = Path(tempfile.mkdtemp(prefix=f"{path.stem[:40]}-", dir=parent))
-        shutil.copytree(prepared, folder, symlinks=True, dirs_exist_ok=True)
-    except OSError as error:
-        raise LoadFailed(f"'{path}' cannot be extracted into '{parent}': {error.strerror or error}") from error
-    return folder
+    """A new private folder for the files of an FMU that was extracted before.
+
+    The first one of a process shares all files but the resources, which an FMU may write to. A process that loads the
+    same file twice has its variables once, so further ones are copies.
+    """
+    links = prepared not in _linked
+    _linked.add(prepared)
+    resources = prepared / "resources"
+
+    def copy(source: str, target: str) -> None:
+        if links and resources not in Path(source).parents:
+            with suppress(OSError):  # it is on another file system, or this one has no links
+                os.link(source, target)
+                return
+        files.cloned(source, target)
+
+    def fill(folder: Path) -> None:
+        shutil.copytree(prepared, folder, symlinks=True, dirs_exist_ok=True, copy_function=copy)
+
+    size = sum(one.lstat().st_size for one in (resources if links else prepared).rglob("*"))
+    return in_new_folder(path, parent, size, fill)
 
 
 def describe(path: Path, terms: Terms, kind: Literal["auto"] | Kind, tell: Callable[[str], None]) -> ModelDescription:
@@ -141,18 +160,18 @@ def describe(path: Path, terms: Terms, kind: Literal["auto"] | Kind, tell: Calla
         fmu.content_sha256()
         model = description_of(fmu, kind)
         if model.library is None:
-            with tempfile.TemporaryDirectory(prefix="fmu_mesh-") as folder:
-                _extract(fmu, Path(folder), tell, model)
+            with tempfile.TemporaryDirectory(prefix="fmu_mesh-") as folder, reading(path):
+                _fill(fmu, tell, model, Path(folder))
     return model
 
 
-def _extract(fmu: OpenFmu, parent: Path, tell: Callable[[str], None], model: ModelDescription | None) -> Path:
-    with unpacked(fmu, parent) as folder:
-        if model is not None and model.library is not None:
-            _name_library(folder, model, folder / model.library)
-        elif model is not None or not _has_binaries(folder):
-            _add_library(fmu, folder, model, tell)
-    return folder.with_suffix("")
+def _fill(fmu: OpenFmu, tell: Callable[[str], None], model: ModelDescription | None, folder: Path) -> None:
+    """Unpack an FMU into an empty folder, and give it the library that it lacks."""
+    fmu.unpack_into(folder)
+    if model is not None and model.library is not None:
+        _name_library(folder, model, folder / model.library)
+    elif model is not None or not _has_binaries(folder):
+        _add_library(fmu, folder, model, tell)
 
 
 def cache_folder() -> Path:
