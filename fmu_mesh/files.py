@@ -19,7 +19,6 @@ import hashlib
 import os
 import shutil
 import stat
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from io import BufferedReader, FileIO
@@ -32,6 +31,7 @@ if TYPE_CHECKING:
     from _typeshed import ReadableBuffer
 
 __all__ = [
+    "ELSEWHERE",
     "Kept",
     "OwnFile",
     "archive_on_the_way",
@@ -41,7 +41,6 @@ __all__ = [
     "is_file",
     "is_folder",
     "known_sha256",
-    "new_folder",
     "open_alone",
     "remember_sha256",
     "remove_tree",
@@ -56,8 +55,8 @@ __all__ = [
 FileVersion = tuple[int, int, int, int]
 """What changes if a file changes."""
 
+ELSEWHERE = ".elsewhere"
 _DRAFT = ".starting"
-_ELSEWHERE = ".elsewhere"
 _FICLONE = 0x40049409
 _TRIES = 10
 """Attempts to open a file that other processes rename or remove at the same time."""
@@ -160,24 +159,14 @@ def replaced(path: Path) -> Iterator[Path]:
         draft.unlink(missing_ok=True)
 
 
-def new_folder(parent: Path, prefix: str, place: Path) -> Path:
-    """A new private folder in ``place``: ``parent``, or else a link in ``parent`` leads to it, for `remove_tree`.
-
-    Raises:
-        OSError: it cannot be made.
-    """
-    parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-    folder = Path(tempfile.mkdtemp(prefix=prefix, dir=place))
-    if place != parent:
-        (parent / f"{folder.name}{_ELSEWHERE}").symlink_to(folder)
-    return folder
-
-
 def remove_tree(folder: Path) -> None:
-    """Remove a folder with all that is in it, and what `new_folder` has made for it elsewhere. Never raises."""
-    for link in folder.glob(f"**/*{_ELSEWHERE}"):
-        with suppress(OSError):
-            if link.name == f"{(target := link.readlink()).name}{_ELSEWHERE}":
+    """Remove a folder with all that is in it, and the folders elsewhere that links of their names lead to.
+
+    Never raises. A link of this kind is called as the folder, with `ELSEWHERE` behind; other links are not followed.
+    """
+    with suppress(OSError):
+        for link in folder.glob(f"**/*{ELSEWHERE}"):
+            if link.is_symlink() and link.name == f"{(target := link.readlink()).name}{ELSEWHERE}":
                 shutil.rmtree(target, ignore_errors=True)
     shutil.rmtree(folder, ignore_errors=True)
 

@@ -44,7 +44,7 @@ def wiring(config: ZenohConfig, config_file: Path, folder: Path, process: str, p
         mode="peer",
         listen=tuple(listen),
         connect=(*sockets, *config.connect),
-        # Peers on other hosts learn about each other by gossip.
+        # So peers of others on this host reach the nodes, too.
         gossip=bool(config.connect or config.listen),
         config=base,
         # Processes of one host start at the same time, so one of two that connect is not there yet. Each waits for the

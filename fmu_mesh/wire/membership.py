@@ -41,10 +41,8 @@ class Registration(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A process that wants to be a node of the mesh.
 
     Attributes:
-        pid: its process id, for people: processes of two hosts may have the same one.
-        host: its host name, likewise.
         launch: the launcher that started it; None if it was started manually.
-        session: the random id of its Zenoh session, which no other process has.
+        session: the random id of its Zenoh session. Processes of two hosts may have one process id and one host name.
     """
 
     node: str

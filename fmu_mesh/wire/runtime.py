@@ -189,13 +189,10 @@ def _own_name(folder: Path) -> str:
 
 def enter_run_folder(folder: Path, node: str) -> None:
     """Note that this process is the node ``node`` of a run, so that others can remove its files if it is killed."""
-    pid = os.getpid()
-    for _ in range(_ENTRIES):
-        _private(folder)
-        # A process of another host, with which the folder is shared, may have the same id.
-        names = itertools.chain([f"{pid}"], (f"{pid}-{number}" for number in itertools.count(2)))
-        note = next(path for name in names if not (path := folder / f"{name}.pid").exists())
-        with suppress(FileExistsError, FileNotFoundError):
+    name = str(os.getpid())
+    for number in range(2, _ENTRIES):
+        note = _private(folder) / f"{name}.pid"
+        try:
             file = note.open("x", encoding="utf-8")
             fcntl.flock(file, fcntl.LOCK_EX)  # the lock ends with the process, however it ends
             if os.path.samestat(os.fstat(file.fileno()), note.stat()):  # nobody has removed it before it was locked
@@ -203,6 +200,10 @@ def enter_run_folder(folder: Path, node: str) -> None:
                 file.flush()
                 _held[folder] = file
                 return
+        except FileExistsError:  # a process of another host, with which the folder is shared, has the same id
+            name = f"{os.getpid()}-{number}"
+        except FileNotFoundError:  # it is removed by somebody who leaves it, with the note or without
+            continue
     raise MeshLost(f"the runtime folder '{folder}' is removed again and again", hint="Does something else do that?")
 
 

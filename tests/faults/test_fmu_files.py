@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from fmu_mesh.files import new_folder, remove_tree
+from fmu_mesh.files import remove_tree
 from fmu_mesh.instances.fmi import read_description
 from fmu_mesh.instances.fmi.archive.archive import Terms
 from fmu_mesh.instances.fmi.archive.library_names import rename_libraries
@@ -141,13 +141,11 @@ def test_an_fmu_that_is_a_folder_keeps_its_resources(tmp_path: Path) -> None:
 
 
 def test_a_folder_elsewhere_is_removed_and_no_folder_of_the_user(tmp_path: Path) -> None:
-    (own := tmp_path / "own.elsewhere").mkdir()
     (parent := tmp_path / "run").mkdir()
-    (parent / "own.elsewhere").symlink_to(own)
+    for name, link in (("gain-1", "gain-1.elsewhere"), ("own.elsewhere", "own.elsewhere")):
+        (tmp_path / name).mkdir()
+        (parent / link).symlink_to(tmp_path / name)
 
-    elsewhere = new_folder(parent, "gain-", tmp_path)
     remove_tree(parent)
 
-    assert not elsewhere.exists()
-    assert not parent.exists()
-    assert own.is_dir()
+    assert [path.name for path in tmp_path.iterdir()] == ["own.elsewhere"]

@@ -153,15 +153,10 @@ def content_of(path: Path) -> str:
 
 
 def in_new_folder(path: Path, parent: Path, size: int, fill: Callable[[Path], None]) -> Path:
-    """Fill a new private folder with the files of an FMU.
+    """Make a private folder for an FMU, with ``size`` bytes that ``fill`` writes; returns the folder.
 
-    It is below ``parent``, or in the folder for temporary files where that has no room or no code may run.
-
-    Args:
-        path: the FMU, for errors.
-        parent: what it is removed with.
-        size: the bytes that ``fill`` writes.
-        fill: gets the folder, and may raise `OSError`.
+    It is below ``parent``. If that has no room, or no code may run from there, it is in the folder for temporary files,
+    and `files.remove_tree` finds it by a link below ``parent``.
 
     Raises:
         LoadFailed: there is no place for it, or it is damaged; nothing is left behind.
@@ -173,8 +168,11 @@ def in_new_folder(path: Path, parent: Path, size: int, fill: Callable[[Path], No
             break
         with ExitStack() as stack:
             try:
-                folder = files.new_folder(parent, f"{path.stem[:40]}-", place)
+                parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+                folder = Path(tempfile.mkdtemp(prefix=f"{path.stem[:40]}-", dir=place))
                 stack.callback(shutil.rmtree, folder, ignore_errors=True)
+                if place != parent:
+                    (parent / f"{folder.name}{files.ELSEWHERE}").symlink_to(folder)
                 _refuse_unfit(place, size)
                 fill(folder)
             except (OSError, LoadFailed) as error:
@@ -340,7 +338,7 @@ class _Folder:
         """
         for entry in self.path.resolve().iterdir():
             if f"{entry.name}/" in _COPIED and entry.is_dir():
-                shutil.copytree(entry, folder / entry.name, copy_function=files.cloned)
+                shutil.copytree(entry, folder / entry.name, copy_function=files.cloned, ignore_dangling_symlinks=True)
             else:
                 (folder / entry.name).symlink_to(entry)
 
