@@ -15,13 +15,13 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from ..errors import CallRefused, FmuError, FmuMeshError
-from ..files import Kept
+from ..files import Kept, remove_tree
 from ..run.outcome import Outcome
 from ..run.repeated import RepeatedRuns
 from ..run.results import open_result
 from ..run.run_plan import RunPlan
 from ..variables.value_types import DTYPES
-from ..wire.runtime import fmu_folder, remove_run_folder, remove_stale_folders, run_folder, run_name
+from ..wire.runtime import fmu_folder, remove_stale_folders, run_folder, run_name
 from .plan_options import PlanOptions, memory_of
 from .result import Result, types_of
 from .result_reading import Columns
@@ -193,5 +193,5 @@ def _release(loaded: list[tuple[RepeatedRuns, Path]], thread: int) -> None:
     for runs, folder in loaded:
         if threading.get_ident() == thread:
             runs.close()
-        remove_run_folder(folder)
+        remove_tree(folder)
     loaded.clear()

@@ -19,10 +19,11 @@ from contextlib import suppress
 from pathlib import Path
 
 from ..errors import FmuError, FmuMeshError, Interrupted
+from ..files import remove_tree
 from ..instances.call_guard import ENDED
 from ..instances.contract import LogMessage
 from ..instances.process_end import end_process, process_ends
-from ..wire.runtime import remove_run_folder, remove_stale_folders, run_folder, run_name
+from ..wire.runtime import remove_stale_folders, run_folder, run_name
 from ..wire.views import LogLine, MeshStatus
 from .events import Event, Log, Status
 from .local import LocalMesh
@@ -143,7 +144,7 @@ class InProcessRun:
 
     def _leave(self) -> None:
         if self._folder is not None:
-            remove_run_folder(self._folder)
+            remove_tree(self._folder)
         self._over.set()
 
     def _failed(self, error: FmuMeshError) -> Outcome:

@@ -19,10 +19,10 @@ import msgspec
 from msgspec.structs import replace
 
 from ..errors import DeadlineExceeded, FmuError, FmuMeshError, Interrupted, MeshLost, from_report
+from ..files import remove_tree
 from ..system.plan import MASTER, RECORDER
 from ..wire.runtime import (
     MeshNote,
-    remove_run_folder,
     remove_stale_folders,
     run_folder,
     run_name,
@@ -113,7 +113,7 @@ class Launcher:
             self._end_all()
             if self._files is None:  # the master could not say it any more
                 self._files = rows_left([record.file for record in self._plan.system.records], self._folder)
-            remove_run_folder(self._folder)
+            remove_tree(self._folder)
         return self._result()
 
     def interrupt(self) -> None:

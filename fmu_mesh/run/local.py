@@ -7,7 +7,6 @@ and the watch over FMUs that do not return.
 from __future__ import annotations
 
 import logging
-import shutil
 import tempfile
 import threading
 import time
@@ -19,6 +18,7 @@ from types import MappingProxyType
 
 from ..config.loading import LoadedConfig
 from ..errors import FmuError, FmuMeshError, Interrupted, TerminationRequested
+from ..files import remove_tree
 from ..instances.call_guard import CallWatch, Guarded
 from ..instances.contract import Instance, LogMessage, Showing
 from ..instances.process_end import process_ends
@@ -117,7 +117,7 @@ class LocalMesh:
         """From another thread, if the main thread does not return from an FMU: keep the rows, remove other files."""
         self._save_from_outside()
         if self._folder is not None:
-            shutil.rmtree(self._folder, ignore_errors=True)
+            remove_tree(self._folder)
 
     def run(self, *, closes: bool = True) -> Outcome:
         """Run from the first to the last point.

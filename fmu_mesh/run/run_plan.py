@@ -133,9 +133,6 @@ class RunPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """Write the plan into a private folder, for the other processes of the run; returns the file.
 
         The format is MessagePack: unlike JSON, it can hold any float and bytes.
-
-        Raises:
-            ConfigurationError: it cannot be written.
         """
         system = self.plan.system
         bare = {name: replace(own, description=_ELSEWHERE) for name, own in system.instances.items()}

@@ -35,13 +35,11 @@ __all__ = [
     "leave_run_folder",
     "meshes",
     "process_state",
-    "remove_run_folder",
     "remove_stale_folders",
     "run_folder",
     "run_name",
     "runtime_folder",
     "socket_endpoint",
-    "this_host",
     "tidy_run_folder",
     "write_note",
 ]
@@ -68,7 +66,7 @@ class MeshNote(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     Attributes:
         endpoints: Zenoh endpoints where the master can be reached, the socket of this user first.
         pid: the process of the note: the launcher, or a master that was started manually.
-        host: where it runs, see `this_host`.
+        host: where it runs; other hosts may share the folder.
     """
 
     mesh: str
@@ -108,30 +106,25 @@ def run_folder(mesh: str, run: str) -> Path:
 
 
 def run_name() -> str:
-    """A name for a run of this process, such as `4711-3f9a1c`: the process id and the host.
-
-    From the second run on, it also has the number of the run.
-    """
+    """A name for a run of this process: the process id, the host, and from the second run on the number of the run."""
     number = next(_runs)
-    return "-".join((str(os.getpid()), *([str(number)] if number > 1 else []), this_host()))
+    return f"{os.getpid()}-{_this_host()}" + (f"-{number}" if number > 1 else "")
 
 
 @cache
-def this_host() -> str:
+def _this_host() -> str:
     """Six digits for all processes that see the same process ids: those of one boot of a host, or of one container."""
-    facts = [socket.gethostname()]
+    facts = socket.gethostname()
     with suppress(OSError):  # the system has no /proc
-        facts = [
-            Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii"),
-            str(Path("/proc/self/ns/pid").readlink()),
-        ]
-    return hashlib.sha256(" ".join(facts).encode()).hexdigest()[:6]
+        boot = Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii")
+        facts = f"{boot} {Path('/proc/self/ns/pid').readlink()}"
+    return hashlib.sha256(facts.encode()).hexdigest()[:6]
 
 
 def _launcher_of(folder: Path) -> int | None:
     """The process id of the launcher of the run that a folder belongs to; None without a launcher on this host."""
     pid, _, rest = folder.suffix.removeprefix(".").partition("-")
-    return int(pid) if pid.isdigit() and rest.endswith(this_host()) else None
+    return int(pid) if pid.isdigit() and rest.startswith(_this_host()) else None
 
 
 def _private(folder: Path) -> Path:
@@ -171,11 +164,6 @@ def _made(folder: Path) -> os.stat_result:
         with suppress(FileNotFoundError):
             return folder.lstat()
     raise FileNotFoundError(ENOENT, "it is removed again and again")
-
-
-def remove_run_folder(folder: Path) -> None:
-    """Remove the folder of a run with its content."""
-    remove_tree(folder)
 
 
 def fmu_folder(folder: Path) -> Path:
@@ -248,7 +236,7 @@ def leave_run_folder(folder: Path) -> None:
         (folder / "mesh.json").unlink(missing_ok=True)
     elif (launcher := note.pid if note is not None else _launcher_of(folder)) is not None:
         if not is_alive(launcher):  # it was killed, and so may be a process that has begun to remove the folder
-            remove_run_folder(folder)
+            remove_tree(folder)
         return
     _remove_if_empty(folder)
 
@@ -275,7 +263,7 @@ def _socket_name(node: str) -> str:
 def write_note(folder: Path, note: MeshNote) -> None:
     """Write the note of a running mesh atomically, so that no reader gets an incomplete one."""
     temporary = folder / "mesh.json.new"
-    note = msgspec.structs.replace(note, host=this_host())
+    note = msgspec.structs.replace(note, host=_this_host())
     temporary.write_bytes(msgspec.json.format(msgspec.json.encode(note)))
     temporary.replace(folder / "mesh.json")
 
@@ -287,7 +275,7 @@ def meshes() -> Iterator[MeshNote]:
         if note is not None and is_alive(note.pid):
             yield note
         elif note is not None:
-            remove_run_folder(file.parent)
+            remove_tree(file.parent)
 
 
 def remove_stale_folders() -> None:
@@ -299,7 +287,7 @@ def remove_stale_folders() -> None:
             tidy_run_folder(folder)
             _remove_if_empty(folder)
         elif (pid := _launcher_of(folder)) is not None and not (folder / "mesh.json").exists() and not is_alive(pid):
-            remove_run_folder(folder)  # it was killed before it wrote a note, or runs without one
+            remove_tree(folder)  # it was killed before it wrote a note, or runs without one
 
 
 def _remove_if_empty(folder: Path) -> None:
@@ -318,7 +306,7 @@ def _own_note(file: Path) -> MeshNote | None:
         note = msgspec.json.decode(file.read_bytes(), type=MeshNote)
     except (OSError, msgspec.DecodeError):
         return None
-    return note if note.host == this_host() else None
+    return note if note.host == _this_host() else None
 
 
 def is_alive(pid: int) -> bool:

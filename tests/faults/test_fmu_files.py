@@ -24,30 +24,33 @@ MOUNT += '&& ls -A "$FMU_MESH_RUNTIME_DIR" "$TMPDIR"'
 ROOMY = "size=100m"
 
 
-def launched(place: Place, name: str, runtime: str, temporary: str) -> Launched:
+def launched(place: Place, name: str, runtime: str, temporary: str, *options: str) -> Launched:
     """Launch four instances of an FMU with the large file ``name``, with these options for the two file systems."""
     fmu = repacked(place.folder / "large.fmu", add={name: LARGE})
     instances = {f"gain{number}": {"fmu": str(fmu)} for number in range(4)}
     config = write_config(place.folder, instances=instances, connections=[], stop_time=0.01)
     prefix = ("unshare", "--mount", "sh", "-c", MOUNT, "sh", runtime, temporary)
-    run = place.start("launch", config, "--no-progress", prefix=prefix)
+    run = place.start("launch", config, "--no-progress", *options, prefix=prefix)
     run.wait()
     return run
 
 
 @NEEDS_MOUNTS
 @pytest.mark.parametrize(
-    ("name", "runtime", "temporary"),
+    ("name", "runtime", "temporary", "options"),
     [
-        ("binaries/any/large.bin", "size=16m", "size=1m"),
-        ("resources/large.bin", "size=16m", ROOMY),
-        ("binaries/any/large.bin", "size=4m", ROOMY),
-        ("binaries/any/large.bin", "size=100m,noexec", ROOMY),
+        ("binaries/any/large.bin", "size=16m", "size=1m", ()),
+        ("resources/large.bin", "size=16m", ROOMY, ()),
+        ("binaries/any/large.bin", "size=4m", ROOMY, ()),
+        ("binaries/any/large.bin", "size=100m,noexec", ROOMY, ()),
+        ("binaries/any/large.bin", "size=16m", ROOMY, ("--local",)),
     ],
-    ids=["shared", "full", "small", "noexec"],
+    ids=["shared", "full", "small", "noexec", "local"],
 )
-def test_four_instances_of_a_large_fmu_find_room(place: Place, name: str, runtime: str, temporary: str) -> None:
-    run = launched(place, name, runtime, temporary)
+def test_four_instances_of_a_large_fmu_find_room(
+    place: Place, name: str, runtime: str, temporary: str, options: tuple[str, ...]
+) -> None:
+    run = launched(place, name, runtime, temporary, *options)
 
     assert run.wait() == 0, run.story()
     left = run.output.partition("points/s")[2].splitlines()[1:]
