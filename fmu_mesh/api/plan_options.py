@@ -55,7 +55,7 @@ class PlanOptions(TypedDict, total=False):
         listen: Zenoh endpoints where others can connect.
         connect: Zenoh endpoints to connect to.
         paused: stay paused at the first point until `Run.resume` or `Run.step`.
-        allow_code: run the Python code that a configuration names although another user owns the file.
+        allow_code: run Python code that a package or a file of another user names, or that other users can write.
         view: show the world of a physics engine in a window.
         video: film that world into this file.
         profile: measure where the time goes; `Result.outcome` has it.

@@ -8,7 +8,6 @@ every float is the same as before, however long each process takes.
 from __future__ import annotations
 
 import logging
-import os
 from collections.abc import Callable, Mapping, Sequence
 from itertools import groupby
 from pathlib import Path
@@ -19,6 +18,7 @@ import msgspec
 from .. import __version__
 from ..config.loading import PlainConfig
 from ..errors import CallRefused, ConfigurationError, Finding, FmuMeshError, MeshLost
+from ..run.allowed_code import check_owner
 from ..run.run_plan import RunPlan
 from ..system.run_metadata import RunMetadata, machine, machine_difference, scenario_files
 from ..text import listed
@@ -111,7 +111,7 @@ def rerun(
     Args:
         result: the result file; a CSV needs the `.json` file beside it.
         output: the new result file; by default `NAME.rerun` with the same ending, beside the first one.
-        allow_code: run the Python code that the file names although another user owns the file.
+        allow_code: run the Python code that the file names; also, run it although another user owns the file.
         on_notice: called with a sentence about what may make a difference, such as another version of fmu_mesh.
         how: see `StartOptions`.
 
@@ -137,7 +137,7 @@ def planned_rerun(
     first = Result.read(path)
     metadata, values = _metadata_of(path, first)
     if not allow_code:
-        _check_owner(path)
+        check_owner(path, f"'{path}'")
     output = Path(output) if output is not None else path.with_name(f"{path.stem}.rerun{path.suffix}")
     if output.absolute() == path.absolute():
         raise ConfigurationError(f"'{output}' is the result itself", hint="Give another file with --output.")
@@ -148,7 +148,7 @@ def planned_rerun(
     last_point = _last_point(metadata, first)
     if last_point is not None:  # an instance may have been ahead of the rows that were left
         values = [value for value in values if value.point < last_point]
-    mesh = Mesh.from_configuration(PlainConfig(data, Path(metadata.file)))
+    mesh = Mesh.from_configuration(PlainConfig(data, Path(metadata.file), foreign=f"the result '{path}'"))
     plan = mesh.plan(
         real_time_factor=0.0,
         paused=bool(values) or last_point is not None,
@@ -216,14 +216,6 @@ def _last_point(metadata: RunMetadata, result: Result) -> int | None:
     if metadata.stop_time is not None and metadata.stop_time - result.times[-1] < metadata.step_size / 2:
         return None
     return round((float(result.times[-1]) - metadata.start_time) / metadata.step_size)
-
-
-def _check_owner(path: Path) -> None:
-    """Check that this user, or root, has made the file: it may name Python code."""
-    if path.stat().st_uid not in {os.getuid(), 0}:
-        raise ConfigurationError(
-            f"'{path}' belongs to another user", hint="`--allow-code` runs it, with the Python code that it may name."
-        )
 
 
 def _check_models(path: Path, metadata: RunMetadata, plan: RunPlan) -> None:

@@ -178,7 +178,8 @@ def _planned(arguments: argparse.Namespace) -> PlannedSweep:
         if given or options != Options(allow_code=options.allow_code):
             text = f"'{arguments.config}' is the folder of a sweep, which says what varies"
             raise ConfigurationError(text, hint="Continue it with its folder alone, or give the configuration file.")
-        return continued_sweep(arguments.config, allow_code=options.allow_code)
+        tell = teller(quiet=arguments.quiet)
+        return continued_sweep(arguments.config, allow_code=options.allow_code, on_notice=tell)
     if arguments.part is not None:
         raise ConfigurationError("--part needs the folder of a sweep in place of the configuration file.")
     vary: dict[str, Values] = {}
@@ -226,10 +227,10 @@ def _started(planned: PlannedSweep, arguments: argparse.Namespace) -> Iterator[S
 def _follow(sweep: Sweep, arguments: argparse.Namespace) -> None:
     """Wait for the end, and show the progress meanwhile; with `--no-wait`, only say what was submitted."""
     if isinstance(sweep, SlurmSweep) and sweep.job is not None:
-        job, folder = sweep.job, short_path(sweep.folder)
+        job = sweep.job
         say(f"job {job.id} of Slurm has {job.tasks} tasks")
         if arguments.no_wait:
-            say(f"`fmu-mesh sweep {folder} --slurm` follows it, and `scancel {job.id}` ends it")
+            say(f"`{sweep.again}` follows it, and `scancel {job.id}` ends it")
             return
     line = SweepProgressLine(sweep.mesh, error_console(), show=not (arguments.no_progress or arguments.quiet))
     line.start()

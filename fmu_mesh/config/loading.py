@@ -62,6 +62,7 @@ class PlainConfig(NamedTuple):
         warnings: findings that do not prevent a run.
         needed: what an option has to give because the file cannot say it: the option, by path in the file.
         explained: paths about which the findings say already, in the words of the file, what is wrong.
+        foreign: what it comes from, in words, if that must not name code, such as `a package of SSP`.
     """
 
     data: Plain
@@ -73,6 +74,7 @@ class PlainConfig(NamedTuple):
     warnings: tuple[Finding, ...] = ()
     needed: dict[str, str] = {}
     explained: tuple[str, ...] = ()
+    foreign: str = ""
 
 
 class LoadedConfig(msgspec.Struct, frozen=True):
@@ -85,6 +87,7 @@ class LoadedConfig(msgspec.Struct, frozen=True):
         overrides: the option (`--set pendulum.l=2`) that replaced a value, by path in the file.
         origins: where a value was written, by path in the file, if that is another file.
         warnings: findings of the file that do not prevent a run.
+        foreign: as in `PlainConfig`.
     """
 
     config: Config
@@ -93,6 +96,7 @@ class LoadedConfig(msgspec.Struct, frozen=True):
     overrides: dict[str, str] = {}
     origins: dict[str, ValueOrigin] = {}
     warnings: tuple[Finding, ...] = ()
+    foreign: str = ""
 
     def findings(self) -> Findings:
         """An empty collection of findings about this file."""
@@ -236,8 +240,8 @@ def examine_data(plain: PlainConfig, overrides: Sequence[str], kinds: Kinds) -> 
         findings.raise_any()
     assert config is not None  # without a finding there is a configuration
     # The kinds have done their part: from here on, a configuration is a plain `Config`, in every process.
-    loaded = LoadedConfig(Config(**structs.asdict(config)), path, lines, replaced, plain.origins, plain.warnings)
-    return loaded, findings
+    own, origins, warnings = Config(**structs.asdict(config)), plain.origins, plain.warnings
+    return LoadedConfig(own, path, lines, replaced, origins, warnings, plain.foreign), findings
 
 
 @lru_cache(maxsize=8)

@@ -86,7 +86,7 @@ class Options(msgspec.Struct, frozen=True):
         bool, Flag("--paused", text="stay paused at the first point until `resume`, `step` or `play`")
     ] = False
     allow_code: Annotated[
-        bool, Flag("--allow-code", text="run the Python code that CONFIG names although another user owns CONFIG")
+        bool, Flag("--allow-code", text="run Python code that a file of others names, or that others can write")
     ] = False
     view: Annotated[bool, Flag("--view", text="show the world of the physics engine in a window")] = False
     video: Annotated[

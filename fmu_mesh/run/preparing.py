@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import pwd
 from collections.abc import Callable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from contextlib import suppress
@@ -32,6 +31,7 @@ from ..system.scenario import Scenario
 from ..system.system import build
 from ..text import nearest_file
 from ..variables.model_description import ModelDescription
+from .allowed_code import check_code
 from .options import Options, with_config_values, with_needed, with_options
 from .results import check_results
 from .run_plan import RunPlan
@@ -40,8 +40,6 @@ __all__ = ["KnownModels", "plan_run", "planned", "prepare"]
 
 _MOST_KNOWN = 256
 T = TypeVar("T")
-_PACKAGE = ".ssd"
-"""The suffix of the file of a configuration that comes from a package."""
 
 
 class KnownModels:
@@ -155,8 +153,7 @@ def planned(
         ConfigurationError: the configuration or an FMU is wrong; carries all findings.
     """
     loaded = _located(with_options(loaded, options, findings))
-    if not options.allow_code:
-        _check_owner(loaded, findings)
+    check_code(loaded, findings, tell, allow_code=options.allow_code)
     if not len(findings):  # otherwise the world may be what is wrong
         check_showing(loaded.config.instances, options.showing)
     known = known or KnownModels()
@@ -245,33 +242,6 @@ def _located(loaded: LoadedConfig) -> LoadedConfig:
     folder = loaded.file.absolute().parent
     sections = {name: section.located(folder) for name, section in loaded.config.instances.items()}
     return replace(loaded, config=replace(loaded.config, instances=sections))
-
-
-def _check_owner(loaded: LoadedConfig, findings: Findings) -> None:
-    """Check that the code in a configuration is named by this user, or by root: everybody else could run code as us.
-
-    A package of SSP is made to be given to others, so whose file it is says nothing about who has written it.
-    """
-    if loaded.file.suffix.lower() == _PACKAGE:
-        found = "Python code, in a package of SSP"
-    else:
-        try:
-            owner = loaded.file.stat().st_uid
-        except OSError:
-            return  # there is no file: a program of this user has made the configuration
-        if owner in {os.getuid(), 0}:
-            return
-        found = f"Python code, in a file of the user {_user(owner)}"
-    for name, section in loaded.config.instances.items():
-        if section.names_code:
-            findings.add(f"instances.{name}.{key_of(section)}", found, "a file of your own, or `--allow-code`")
-
-
-def _user(uid: int) -> str:
-    try:
-        return f"'{pwd.getpwuid(uid).pw_name}'"
-    except KeyError:
-        return str(uid)
 
 
 def _expected(section: InstanceSection, path: Path) -> str:

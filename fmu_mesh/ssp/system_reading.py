@@ -163,6 +163,7 @@ class _Configuration:
             warnings=tuple(self._problems.warnings),
             needed={key: option for key, option in NEEDED.items() if key.partition(".")[2] not in times},
             explained=self._explained,
+            foreign="a package of SSP",
         )
 
     def _chosen_names(self) -> dict[str, str]:

@@ -6,7 +6,6 @@ All that is wrong with the mesh, the parameters, or the columns is told here, be
 from __future__ import annotations
 
 import logging
-import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypedDict, Unpack, cast
@@ -21,6 +20,7 @@ from ..api.result import Result, types_of
 from ..config.loading import PlainConfig
 from ..config.mesh import Config
 from ..errors import ConfigurationError, Finding, FmuError
+from ..run.allowed_code import check_owner
 from ..run.one_process import apart
 from ..run.options import Options
 from ..run.run_plan import RunPlan
@@ -63,7 +63,7 @@ class SweepOptions(TypedDict, total=False):
         step_size: base communication step size in s.
         stop_time: time of the last communication point in s.
         window: how many points a node may run ahead of the slowest one, or "auto".
-        allow_code: run the Python code that a configuration names although another user owns the file.
+        allow_code: run Python code that a package or a file of another user names, or that other users can write.
         on_notice: called with a sentence before something that takes long, such as compiling an FMU.
     """
 
@@ -108,6 +108,11 @@ class PlannedSweep(NamedTuple):
     task: bytes
     at_once: int | None
     found: dict[str, Row]
+
+    @property
+    def may_run_code(self) -> bool:
+        """Whether its parts may run code that the folder names: it was checked here, or the user allows it."""
+        return self.wanted.options.allow_code or not self.plan.loaded.foreign
 
 
 def planned_sweep(
@@ -161,23 +166,27 @@ def planned_sweep(
     return _planned(own, plan, wanted, folder, functions)
 
 
-def continued_sweep(folder: Path, *, allow_code: bool = False) -> PlannedSweep:
+def continued_sweep(
+    folder: Path, *, allow_code: bool = False, on_notice: Callable[[str], None] = log.info
+) -> PlannedSweep:
     """Plan what is missing of the sweep in a folder.
 
     Args:
         folder: the folder.
-        allow_code: run the Python code that it names although another user owns it.
+        allow_code: run the Python code that it names; also, run it although another user owns it.
+        on_notice: as in `SweepOptions`.
 
     Raises:
         ConfigurationError: there is no sweep in the folder, another user has made it, or its mesh cannot run any more.
     """
     own = SweepFolder(folder.absolute())
     wanted = own.wanted()
-    if own.owner() not in {os.getuid(), 0} and not allow_code:
-        hint = "`--allow-code` continues it, with the Python code that it may name."
-        raise ConfigurationError(f"the sweep in '{own.path}' belongs to another user", hint=hint)
-    mesh = Mesh.from_configuration(PlainConfig(wanted.data, Path(wanted.file)))
-    return _planned(mesh, _any_plan(mesh, wanted.options, wanted), wanted, own, {})
+    source = f"the sweep in '{own.path}'"
+    if not allow_code:
+        check_owner(own.wanted_file, source)
+    wanted = replace(wanted, options=replace(wanted.options, allow_code=allow_code))  # a file cannot allow its own code
+    mesh = Mesh.from_configuration(PlainConfig(wanted.data, Path(wanted.file), foreign=source))
+    return _planned(mesh, _any_plan(mesh, wanted.options, wanted, on_notice), wanted, own, {})
 
 
 def _planned(mesh: Mesh, plan: RunPlan, wanted: Wanted, folder: SweepFolder, functions: OwnReductions) -> PlannedSweep:
@@ -187,6 +196,7 @@ def _planned(mesh: Mesh, plan: RunPlan, wanted: Wanted, folder: SweepFolder, fun
         version=wanted.version,
         data=wanted.data,
         file=Path(wanted.file),
+        foreign=mesh.configuration.foreign,
         options=wanted.options,
         reductions=wanted.reductions,
         curves=folder.curves if wanted.curves else None,

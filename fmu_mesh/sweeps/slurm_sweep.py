@@ -14,6 +14,8 @@ from typing import Final
 import msgspec
 
 from ..errors import ConfigurationError, MeshLost
+from ..run.allowed_code import names_code
+from ..text import short_path
 from .planned_sweep import PlannedSweep
 from .slurm import PART, SlurmJob, ended_tasks, submit, unfinished
 from .sweeping import Sweep
@@ -87,6 +89,7 @@ class SlurmSweep(Sweep):
                 raise ConfigurationError(text, hint="Give each task fewer workers.")
         command = [sys.executable, "-Pm", "fmu_mesh", "sweep", str(planned.folder.path), "--part", PART]
         command += ["--workers", str(options.workers), "--no-progress"]
+        command += ["--allow-code"] if planned.may_run_code else []
         job = submit(
             planned.folder.path,
             command,
@@ -139,11 +142,13 @@ class SlurmSweep(Sweep):
             else:
                 self._waiting.append(number)
 
+    @property
+    def again(self) -> str:
+        """The command that follows it, or runs what is missing."""
+        allowed = " --allow-code" if names_code(self._planned.plan.loaded) else ""
+        return f"fmu-mesh sweep {short_path(self.folder)} --slurm{allowed}"
+
     def _way_on(self) -> str:
-        folder = self.folder
         if self.job is not None and self._cancelled.is_set():
-            return (
-                f"Job {self.job.id} goes on: `fmu-mesh sweep {folder} --slurm` follows it, and "
-                f"`scancel {self.job.id}` ends it."
-            )
-        return f"`fmu-mesh sweep {folder} --slurm` runs them."
+            return f"Job {self.job.id} goes on: `{self.again}` follows it, and `scancel {self.job.id}` ends it."
+        return f"`{self.again}` runs them."

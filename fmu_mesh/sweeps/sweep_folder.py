@@ -106,9 +106,10 @@ class SweepFolder:
         """The file with the curves of a run."""
         return curves_of(self.curves, identity)
 
-    def owner(self) -> int:
-        """The user who has made the sweep."""
-        return (self.path / _WANTED).stat().st_uid
+    @property
+    def wanted_file(self) -> Path:
+        """The file that says what was asked."""
+        return self.path / _WANTED
 
     def begin(self, wanted: Wanted) -> None:
         """Make the folder, and write down what is asked.

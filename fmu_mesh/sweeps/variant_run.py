@@ -54,6 +54,7 @@ class SweepTask(msgspec.Struct, frozen=True):
         version: that of fmu_mesh, which all workers must have.
         data: the values of the configuration.
         file: the file of the configuration.
+        foreign: as in `PlainConfig`.
         options: the options of each run.
         reductions: what is calculated from the curves of each run.
         curves: the folder for the curves of each run; None: they are not kept.
@@ -69,6 +70,7 @@ class SweepTask(msgspec.Struct, frozen=True):
     curves: Path | None = None
     processes: bool = False
     reset: bool = False
+    foreign: str = ""
 
 
 class Row(msgspec.Struct, frozen=True):
@@ -176,7 +178,8 @@ class _Loaded:
         self.task = task
         self._task = msgspec.msgpack.decode(task, type=SweepTask, dec_hook=path_of)
         self._reductions = [read_reduction(text) for text in self._task.reductions]
-        self._mesh = Mesh.from_configuration(PlainConfig(_with_one_record(self._task.data), self._task.file))
+        data, file, foreign = _with_one_record(self._task.data), self._task.file, self._task.foreign
+        self._mesh = Mesh.from_configuration(PlainConfig(data, file, foreign=foreign))
         self._jobs: SimpleQueue[_Job | None] = SimpleQueue()
         self.hung = _Hung()
         self._bytes = 0

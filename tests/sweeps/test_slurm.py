@@ -18,9 +18,12 @@ import psutil
 import pytest
 import yaml
 
+import fmu_mesh
 from fmu_mesh.errors import ConfigurationError, DeadlineExceeded
 from fmu_mesh.sweeps import slurm
+from fmu_mesh.sweeps.planned_sweep import planned_sweep
 from fmu_mesh.sweeps.slurm import PART, SlurmJob, cancel, ended_tasks, submit, unfinished
+from fmu_mesh.sweeps.slurm_sweep import SlurmOptions, SlurmSweep
 from fmu_mesh.sweeps.sweep_folder import SweepFolder
 from fmu_mesh.sweeps.variant_run import Row
 from tests.helpers import Launched, Place, wait_until
@@ -568,6 +571,21 @@ class Gate(fmu_mesh.Component):
 """The variant 9 does not end before there is a file `open`."""
 
 
+def test_the_tasks_of_a_sweep_may_run_its_code(fake: Fake, tmp_path: Path) -> None:
+    fake("sbatch", "echo 17")
+    fake("squeue", "echo '1|RUNNING'")
+    (tmp_path / "gate.py").write_text(GATE, encoding="utf-8")
+    mesh = fmu_mesh.Mesh("gates", step_size=0.01, stop_time=0.02)
+    mesh.add("gate", python=tmp_path / "gate.py:Gate")
+    planned = planned_sweep(mesh, {"gate.number": [1.0, 2.0]}, folder=tmp_path / "held")
+
+    with SlurmSweep(planned, SlurmOptions(tasks=1)) as sweep:
+        assert sweep.again.endswith("held --slurm --allow-code")
+
+    script = (tmp_path / "held" / "sweep.sbatch").read_text(encoding="utf-8")
+    assert "--no-progress --allow-code\n" in script
+
+
 @pytest.fixture
 def shared(cluster: SlurmCluster) -> Iterator[Place]:
     """A place that all hosts of the cluster share."""
@@ -637,7 +655,7 @@ def test_the_variants_of_a_killed_task_run_again_by_resume(shared: Place) -> Non
     task.kill()
     code = following.wait()
     (shared.folder / "open").touch()
-    resumed = shared.run("sweep", "held", "--resume")
+    resumed = shared.run("sweep", "held", "--resume", "--allow-code")
 
     assert code == 4, shared.story()
     assert "4 variants have no row: task 2: FAILED" in following.errors
@@ -654,7 +672,7 @@ def test_ctrl_c_leaves_the_tasks_and_the_same_job_is_followed_again(cluster: Slu
     following.signal(signal.SIGINT)
     code = following.wait()
     [job] = cluster.jobs()
-    again = shared.start("sweep", "held", "--slurm")
+    again = shared.start("sweep", "held", "--slurm", "--allow-code")
     wait_until(lambda: f"job {job} of Slurm" in again.errors, "the second command, which follows")
     (shared.folder / "open").touch()
 
@@ -673,12 +691,12 @@ def test_a_command_that_does_not_wait_ends_without_an_error(cluster: SlurmCluste
 
     (shared.folder / "open").touch()
     wait_until(lambda: not cluster.jobs(), "the end of the job")
-    resumed = shared.run("sweep", "held", "--resume")
+    resumed = shared.run("sweep", "held", "--resume", "--allow-code")
 
     assert code == 0, shared.story()
     assert submitting.errors.splitlines() == [
         f"fmu-mesh: job {job} of Slurm has 2 tasks",
-        f"fmu-mesh: `fmu-mesh sweep held --slurm` follows it, and `scancel {job}` ends it",
+        f"fmu-mesh: `fmu-mesh sweep held --slurm --allow-code` follows it, and `scancel {job}` ends it",
     ]
     assert "16 of 16 runs, 16 of them before" in resumed.output
 
@@ -694,7 +712,7 @@ def test_a_sweep_is_not_submitted_again_while_nobody_knows_whether_its_tasks_run
     (broken / "squeue").chmod(0o755)
 
     shared.environment["PATH"] = f"{broken}:{cluster.environment['PATH']}"
-    again = shared.start("sweep", "held", "--slurm")
+    again = shared.start("sweep", "held", "--slurm", "--allow-code")
     wait_until(lambda: again.errors or not again.running, "the second command")
 
     assert len(cluster.jobs()) == 1

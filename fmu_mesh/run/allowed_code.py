@@ -1,0 +1,115 @@
+"""Whether code that a configuration names may run: one rule, asked wherever a file names code.
+
+A configuration of the user's own may name code. A result, the folder of a sweep, a package, and a configuration of
+another user may not, and code that other users can write does not run. `--allow-code` lifts both, and the user is told
+what runs. Models are no code in this sense: an FMU runs wherever it is named.
+"""
+
+from __future__ import annotations
+
+import grp
+import os
+import pwd
+import stat
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+
+from ..config.findings import Findings
+from ..config.instance_sections import InstanceSection, key_of
+from ..config.loading import LoadedConfig
+from ..errors import ConfigurationError
+
+__all__ = ["check_code", "check_owner", "names_code"]
+
+
+def check_code(loaded: LoadedConfig, findings: Findings, tell: Callable[[str], None], *, allow_code: bool) -> None:
+    """Check that all code of a configuration may run: add a finding for each instance whose code may not.
+
+    Args:
+        loaded: the configuration, with absolute paths of interpreters.
+        findings: those of the configuration.
+        tell: called with what runs only because it is allowed.
+        allow_code: whether the user allows it.
+    """
+    source = loaded.foreign or _other_owner(loaded.file)
+    for name, section in loaded.config.instances.items():
+        if not _names_code(section):
+            continue
+        key = key_of(section)
+        path = loaded.resolve(section.path) if section.path else None
+        found, expected = f"Python code, in {source}", "a file of your own, or `--allow-code`"
+        if not source:
+            if path is None or (open_path := _writable_by_others(path)) is None:
+                continue
+            mode = stat.S_IMODE(open_path.stat().st_mode)
+            found = f"other users can write '{open_path}', which has mode {mode:04o}"
+            expected = f"one that only you can write (`chmod go-w {open_path}`), or `--allow-code`"
+        if not allow_code:
+            findings.add(f"instances.{name}.{key}", found, expected)
+            continue
+        code = getattr(section, key).replace(section.path, str(path), 1) if path is not None else getattr(section, key)
+        by = f" with {section.interpreter}" if section.interpreter is not None else ""
+        tell(f"instance '{name}' runs {code}{by}, because of `--allow-code` ({found})")
+
+
+def names_code(loaded: LoadedConfig) -> bool:
+    """Whether a configuration names code."""
+    return any(map(_names_code, loaded.config.instances.values()))
+
+
+def check_owner(path: Path, what: str) -> None:
+    """Check that this user, or root, owns a file that says what to run.
+
+    Raises:
+        ConfigurationError: another user owns it.
+    """
+    if _other_owner(path):
+        raise ConfigurationError(
+            f"{what} belongs to another user", hint="`--allow-code` runs it, with the Python code that it may name."
+        )
+
+
+def _names_code(section: InstanceSection) -> bool:
+    return section.names_code or section.interpreter is not None
+
+
+def _other_owner(file: Path) -> str:
+    """A configuration file of another user in words; empty if this user, or root, owns it."""
+    try:
+        owner = file.stat().st_uid
+    except OSError:
+        return ""  # there is no file: a program of this user has made the configuration
+    return f"a file of the user {_user(owner)}" if owner not in {os.getuid(), 0} else ""
+
+
+def _user(uid: int) -> str:
+    try:
+        return f"'{pwd.getpwuid(uid).pw_name}'"
+    except KeyError:
+        return str(uid)
+
+
+def _writable_by_others(path: Path) -> Path | None:
+    """The file, or the folder on the way to it, by which other users could replace its content; None: they cannot."""
+    for place in dict.fromkeys([path, *path.parents, *(real := path.resolve()).parents, real]):
+        with suppress(OSError):  # whoever reads it says why
+            found = place.stat()
+            is_shared = found.st_mode & stat.S_IWGRP and not _is_private(found.st_gid, found.st_uid)
+            is_sticky = place.is_dir() and found.st_mode & stat.S_ISVTX  # only owners replace entries
+            if (is_shared or found.st_mode & stat.S_IWOTH) and not is_sticky:
+                return place
+    return None
+
+
+def _is_private(group: int, user: int) -> bool:
+    """Whether a group is the one of a user alone, as distributions make one for each, or that of root."""
+    try:
+        name = pwd.getpwuid(user).pw_name
+    except KeyError:
+        name = ""
+    try:
+        own = grp.getgrgid(group)
+    except KeyError:
+        return group in {user, 0}
+    return group == 0 or (not {*own.gr_mem} - {name} and (group == user or own.gr_name == name))
