@@ -1,12 +1,14 @@
 """The command `fmu-mesh`, and `python -m fmu_mesh`. Ctrl-C gives its exit code even during the imports."""
 
+import os
 import sys
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, nullcontext, redirect_stderr, redirect_stdout
 
 
 def main() -> int:
     """Import the command and run it; returns the exit code."""
     try:
+        _open_standard_streams()
         from .run.threads import one_thread_from_now_on  # noqa: PLC0415 before numpy is imported
 
         one_thread_from_now_on()
@@ -30,6 +32,16 @@ def main() -> int:
 
         print("fmu-mesh: interrupted", file=sys.stderr)
         return Interrupted.exit_code
+
+
+def _open_standard_streams() -> None:
+    """Let what a shell has closed (`>&-`) lead nowhere: a file that is opened next would get its number."""
+    while (opened := os.open(os.devnull, os.O_RDWR)) <= 2:
+        pass
+    os.close(opened)
+    for number, stream, redirect in ((1, sys.stdout, redirect_stdout), (2, sys.stderr, redirect_stderr)):
+        if stream is None:
+            redirect(os.fdopen(number, "w", encoding="utf-8")).__enter__()
 
 
 def _prepared(arguments: list[str]) -> AbstractContextManager[None]:

@@ -32,6 +32,8 @@ from typing import Any, ClassVar, Self
 
 import msgspec
 
+from .printing import paragraph, printable
+
 __all__ = [
     "CallRefused",
     "ConfigurationError",
@@ -136,7 +138,7 @@ class FmuMeshError(Exception):
         if self.time is not None:
             where.append(f"t = {self.time:.12g} s")
         text = f"{', '.join(where)}: {self.message}" if where else self.message
-        return f"{text.rstrip('.')}. {self.hint}" if self.hint else text
+        return paragraph(f"{text.rstrip('.')}. {self.hint}" if self.hint else text)
 
     def at(self, point: int, time: float) -> Self:
         """Set the communication point and its time in s; returns this error."""
@@ -209,7 +211,7 @@ class Finding(msgspec.Struct, frozen=True):
         place = f"{self.file}:{self.line}" if self.line is not None else self.file
         text = f"{place}: {self.path}: " if self.path else f"{place}: "
         text += f"{self.found}; expected {self.expected}" if self.expected else self.found
-        return f"{text}. Did you mean '{self.suggestion}'?" if self.suggestion else text
+        return printable(f"{text}. Did you mean '{self.suggestion}'?" if self.suggestion else text)
 
 
 class ConfigurationError(FmuMeshError):

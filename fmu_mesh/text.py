@@ -8,6 +8,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from .errors import ConfigurationError
+from .printing import printable
 
 __all__ = [
     "EXPRESSION",
@@ -81,16 +82,6 @@ def shown(value: object) -> str:
         case _:
             text = str(value)
     return text if len(text) <= _SHOWN_CHARACTERS else f"{text[: _SHOWN_CHARACTERS - 3]}..."
-
-
-def printable(text: str) -> str:
-    r"""A text of a file in one line: line breaks and other characters that a terminal acts on are escaped.
-
-    Example:
-        >>> printable("pump\n2")
-        'pump\\n2'
-    """
-    return text if text.isprintable() else "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
 
 
 def short_number(value: float) -> str:

@@ -25,6 +25,7 @@ from ..instances.fmi import FmuInstance, LogMessage, open_instance, read_descrip
 from ..instances.fmi.step_options import StepOptions
 from ..instances.input_trajectory import Trajectory
 from ..instances.process_state import LOOK_STEPS, kept_mode, kept_state
+from ..printing import paragraph
 from ..system.start_values import forbidden
 from ..variables.model_description import ModelDescription, Value
 from ..variables.value_types import is_float
@@ -439,7 +440,8 @@ class FMIAdapter:
 
 def _forward(message: LogMessage) -> None:
     level = {"ok": logging.DEBUG, "warning": logging.WARNING}.get(message.status, logging.ERROR)
-    log.log(level, "fmu_message instance=%s category=%s: %s", message.instance, message.category, message.message)
+    said = map(paragraph, (message.category, message.message))
+    log.log(level, "fmu_message instance=%s category=%s: %s", message.instance, *said)
 
 
 def _release(instance: FmuInstance, folder: Path) -> None:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import msgspec
 
+from ..printing import page
 from ..text import listed, short_number
 from .tables import shortened, table
 
@@ -142,7 +143,7 @@ class Comparison(msgspec.Struct, frozen=True):
             lines += [f"and {len(order) - _SHOWN} more"] if len(order) > _SHOWN else []
         for names, where in ((self.only_here, self.here), (self.only_there, self.there)):
             lines += [f"only in {where}: {listed(names)}"] if names else []
-        return "\n".join(lines)
+        return page(lines)
 
     def plot(self, *names: str) -> Figure:
         """Draw both results and their difference; without names, the variables that differ most.

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from ..errors import ConfigurationError
 from ..files import replaced
+from ..printing import printable
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -164,7 +165,7 @@ def add_legend(axes: Axes, lines: Sequence[Line2D], labels: Sequence[str], title
 
 def short(text: str) -> str:
     """A name as a picture shows it: a long one without its middle: both ends of a structured name matter."""
-    half = _CHARACTERS // 2
+    text, half = printable(text), _CHARACTERS // 2
     return text if len(text) <= _CHARACTERS else f"{text[: half - 1]}…{text[-half:]}"
 
 

@@ -15,6 +15,7 @@ from ..config.instance_sections import KIND
 from ..errors import CallRefused, LoadFailed, UnknownName
 from ..instances.fmi import missing_libraries, read_description, sha256_of, size_of
 from ..instances.registry import KINDS, describe
+from ..printing import page, printable
 from ..ssp.configuration_files import names_package
 from ..text import listed, matching, nearest, nearest_file, short_number, shown
 from ..variables.model_description import Causality, Kind, ModelDescription, Variable
@@ -94,7 +95,7 @@ class Inspection(msgspec.Struct, frozen=True, omit_defaults=False):
                 near = nearest(pattern, names)
                 hint = f"Did you mean '{near}'?" if near else None
                 raise UnknownName(f"'{self.file}' has no variable '{pattern}'", hint=hint)
-        return "\n".join(_page(self, width, variables, everything=everything))
+        return page(_page(self, width, variables, everything=everything))
 
     def __str__(self) -> str:
         return self.page()
@@ -261,7 +262,10 @@ def _wrapped(line: str, width: int, indent: str) -> list[str]:
 
 def _variables(variables: Sequence[Variable], width: int) -> list[str]:
     """One line each: name, type, variability, start value with unit, and as much of the description as fits."""
-    rows = [[v.name, v.type_name, v.variability, _start(v), " ".join((v.description or "").split())] for v in variables]
+    found = (
+        (v.name, v.type_name, v.variability, _start(v), " ".join((v.description or "").split())) for v in variables
+    )
+    rows = [[*map(printable, row)] for row in found]
     widest = [max(len(row[column]) for row in rows) for column in range(4)]
     # A very long name must not move the other columns off the page.
     widest[0] = min(widest[0], width // 2)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import msgspec
 
 from ..errors import ConfigurationError, Finding
+from ..printing import page
 from ..run.run_plan import RunPlan
 from .plan_page import plan_page
 from .plan_view import PlanView, plan_view
@@ -58,7 +59,7 @@ class Check(msgspec.Struct, frozen=True):
     @property
     def page(self) -> str:
         """What would run, as text; empty if the configuration is wrong."""
-        return "\n".join(plan_page(self.run.plan, self.run.loaded)) if self.run is not None else ""
+        return page(plan_page(self.run.plan, self.run.loaded)) if self.run is not None else ""
 
     def require(self) -> RunPlan:
         """The plan of the run.

@@ -26,6 +26,7 @@ from ..errors import CallRefused, ErrorReport, FmuError, TerminationRequested, U
 from ..instances.call_guard import Guarded, Unwatched
 from ..instances.contract import LogMessage
 from ..instances.registry import open_instance
+from ..printing import paragraph
 from ..run.local_system import LocalSystem, SavedSystem, opening_of
 from ..run.one_process import OneProcess
 from ..run.run_plan import RunPlan
@@ -418,7 +419,8 @@ def _as_array(read: Callable[[int], Value], dtype: DTypeLike, point: int) -> NDA
 
 def _forward(message: LogMessage) -> None:
     level = {"ok": logging.DEBUG, "warning": logging.WARNING}.get(message.status.lower(), logging.ERROR)
-    log.log(level, "fmu_message instance=%s category=%s: %s", message.instance, message.category, message.message)
+    said = map(paragraph, (message.category, message.message))
+    log.log(level, "fmu_message instance=%s category=%s: %s", message.instance, *said)
 
 
 def _release(local: LocalSystem, folder: Path, thread: int) -> None:

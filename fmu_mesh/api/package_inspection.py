@@ -12,6 +12,7 @@ import msgspec
 from .. import files
 from ..config.loading import PlainConfig
 from ..errors import ConfigurationError
+from ..printing import page
 from ..ssp.configuration_files import named_package
 from ..ssp.package import Package
 from ..ssp.problems import Problems
@@ -145,7 +146,7 @@ class PackageInspection(msgspec.Struct, frozen=True, omit_defaults=False):
     @property
     def page(self) -> str:
         """The page in lines."""
-        return "\n".join(_page(self))
+        return page(_page(self))
 
     def __str__(self) -> str:
         return self.page

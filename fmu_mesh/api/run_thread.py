@@ -18,6 +18,7 @@ import msgspec
 from msgspec.structs import replace
 
 from ..errors import CallRefused, ConfigurationError, FmuMeshError, Interrupted, MeshLost
+from ..printing import paragraph
 from ..recorder.arrays_file import bytes_of_a_row, read_arrays
 from ..run.events import Event, Log, OutputLine, Reachable, Restarted, Status
 from ..run.in_process import InProcessRun
@@ -278,10 +279,10 @@ def _log(event: Event) -> None:
     match event:
         case Log(line):
             level = _LEVELS.get(line.status, logging.ERROR)
-            log.log(level, "%s at point %d: %s", line.instance, line.point, line.message)
+            log.log(level, "%s at point %d: %s", line.instance, line.point, paragraph(line.message))
         case OutputLine(process, text):
-            log.info("%s: %s", process, text)
+            log.info("%s: %s", process, paragraph(text))
         case Restarted(error, number, _):
-            log.warning("restart %d: %s", number, error.message)
+            log.warning("restart %d: %s", number, paragraph(error.message))
         case _:
             pass

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import msgspec
 from msgspec.structs import replace
 
+from ..printing import page
 from ..system.graph import strongly_connected, topological_order
 from ..system.value_map import map_text
 from .graph_drawing import GraphEdge, GraphNode, GraphVariable, drawing_of
@@ -134,7 +135,7 @@ class SystemGraph(msgspec.Struct, frozen=True):
                 lines += self._lines_of(node, indent)
         if self.cycles:
             lines += ["", *_wrapped([("cycle", cycle) for cycle in self.cycles])]
-        return "\n".join(line.rstrip() for line in lines)
+        return page(line.rstrip() for line in lines)
 
     @property
     def _first_of_group(self) -> dict[str, int]:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
+from ..text import printable
+
 __all__ = ["pairs", "shortened", "table", "width_of"]
 
 _GAP = "  "
@@ -12,7 +14,7 @@ _ELLIPSIS = "\N{HORIZONTAL ELLIPSIS}"
 
 def table(rows: Iterable[Sequence[str]], *, heading: Sequence[str] | None = None, indent: int = 0) -> list[str]:
     """The lines of a table; every column is as wide as its widest cell, and empty columns are left out."""
-    cells = [list(row) for row in rows]
+    cells = [list(map(printable, row)) for row in rows]
     shown = [column for column in range(len(cells[0]) if cells else 0) if any(row[column] for row in cells)]
     if heading is not None and cells:
         cells.insert(0, list(heading))
@@ -27,6 +29,7 @@ def width_of(rows: Iterable[Sequence[str]], heading: Sequence[str]) -> int:
 
 def shortened(name: str, width: int) -> str:
     """A name in at most ``width`` columns, without its middle: names differ mostly at their ends."""
+    name = printable(name)
     if len(name) <= width:
         return name
     kept = max(width - len(_ELLIPSIS), 0)

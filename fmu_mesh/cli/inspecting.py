@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import shutil
-import sys
 from pathlib import Path
 from typing import Final
 
@@ -12,6 +11,7 @@ import msgspec
 
 from ..api.inspection import SHOWN_VARIABLES, inspect
 from ..errors import ConfigurationError, LoadFailed
+from ..printing import write_data
 from ..ssp.configuration_files import named_package
 from .arguments import CommandParser, Parsers, add_json, add_ssd
 from .output.json_output import print_failure
@@ -60,7 +60,7 @@ def _inspected(arguments: argparse.Namespace) -> int:
     except LoadFailed as error:  # a wrong argument: nothing was going to run
         raise ConfigurationError(error.message, hint=error.hint) from error
     if arguments.json:
-        sys.stdout.buffer.write(msgspec.json.format(msgspec.json.encode(inspection)) + b"\n")
+        write_data(msgspec.json.format(msgspec.json.encode(inspection)) + b"\n")
         return 0
     width = max(_NARROWEST, shutil.get_terminal_size((_WIDE, 0)).columns)
     print(inspection.page(width, arguments.variables, everything=arguments.all))
@@ -76,7 +76,7 @@ def _inspect_package(arguments: argparse.Namespace) -> int:
 
     found = inspect_package(arguments.fmu, ssd=arguments.ssd)
     if arguments.json:
-        sys.stdout.buffer.write(msgspec.json.format(msgspec.json.encode(found)) + b"\n")
+        write_data(msgspec.json.format(msgspec.json.encode(found)) + b"\n")
     else:
         print(found)
     return 0

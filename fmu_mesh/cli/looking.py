@@ -17,6 +17,7 @@ import msgspec
 
 from ..api.tables import table
 from ..errors import ConfigurationError, FmuMeshError, Interrupted
+from ..printing import page, printable
 from ..wire.client.mesh_client import MeshClient
 from ..wire.client.reaching import Meshes
 from ..wire.client.readings import Target
@@ -204,13 +205,14 @@ def _set(arguments: argparse.Namespace, meshes: Meshes) -> int:
     client = meshes.one(arguments.key)
     target = client.target(arguments.key)
     answer = client.set(target, _value(target, arguments.value), arguments.at)
+    key = printable(answer.key)
     if arguments.json:
         print_json(answer)
     elif answer.late:
         past = f"t = {seconds(arguments.at)} was past"
-        print(f"{answer.key}: {past}; it holds from t = {seconds(answer.time)} (point {answer.point}) instead")
+        print(f"{key}: {past}; it holds from t = {seconds(answer.time)} (point {answer.point}) instead")
     else:
-        print(f"{answer.key} holds from point {answer.point} on (t = {seconds(answer.time)})")
+        print(f"{key} holds from point {answer.point} on (t = {seconds(answer.time)})")
     return 0
 
 
@@ -240,7 +242,7 @@ def _watch(arguments: argparse.Namespace, meshes: Meshes) -> int:
                 if arguments.json:
                     print_json(reading)
                 else:
-                    print("  ".join(cell for cell in cells(reading) if cell), flush=True)
+                    print(printable("  ".join(cell for cell in cells(reading) if cell)), flush=True)
         except KeyboardInterrupt:
             # At once: closing a session in order can take long, and the others notice that this process is gone.
             sys.stdout.flush()
@@ -262,7 +264,7 @@ def _selected(references: list[str], meshes: Meshes) -> list[tuple[MeshClient, l
 
 
 def _print(lines: list[str]) -> None:
-    print("\n".join(lines))
+    print(page(lines))
 
 
 PARSERS: Parsers = {

@@ -18,6 +18,7 @@ from typing import Final
 
 from .. import __version__
 from ..errors import ConfigurationError
+from ..printing import guard_streams
 from ..run.limits import needed_mib
 from ..text import nearest
 from .arguments import CommandParser
@@ -70,6 +71,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         from .completion import complete  # noqa: PLC0415 only then
 
         return complete(command_parser)
+    guard_streams()
     given = [*(sys.argv[1:] if arguments is None else arguments)]
     try:
         options = _parsed(given)

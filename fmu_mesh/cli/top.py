@@ -14,15 +14,16 @@ from collections.abc import Sequence
 from types import TracebackType
 from typing import Any, Final, Self
 
-import msgspec
 import numpy as np
 
+from .. import printing
 from ..api.attaching import attach
 from ..api.run_handle import Run
 from ..api.tables import shortened, table, width_of
 from ..errors import DeadlineExceeded, FmuMeshError, Interrupted
 from ..wire.views import InstanceStatus, MeshStatus
 from .arguments import CommandParser, Parsers, add_json, add_reaching, positive_seconds
+from .output.json_output import print_json
 from .output.pages import progress, seconds
 from .output.screen import Screen
 from .output.sparklines import Histories, sparkline_signs
@@ -145,10 +146,10 @@ class _Courses:
 def _show_once(look: Look, courses: _Courses, *, as_json: bool) -> None:
     if as_json:
         content = {"mesh": look[0], "instances": list(look[1].values()), **courses.values()}
-        print(msgspec.json.encode(content).decode(), flush=True)
+        print_json(content)
     else:
         width = shutil.get_terminal_size().columns if sys.stdout.isatty() else None
-        print("\n".join([*page(look, width=width), *courses.lines(width)]), flush=True)
+        print(printing.page([*page(look, width=width), *courses.lines(width)]), flush=True)
 
 
 def _follow(run: Run, courses: _Courses, *, as_json: bool) -> int:

@@ -14,6 +14,7 @@ from nicegui import run, ui
 
 from ..api.run_handle import Run
 from ..errors import FmuMeshError
+from ..printing import paragraph
 from .instance_table import InstanceTable
 from .mesh_follower import MeshFollower, MeshView
 from .plot_card import PlotCard, first_plots
@@ -206,7 +207,8 @@ class MeshPage:
         for line in self._follower.log:
             if line.number > self._last_line:
                 self._last_line = line.number
-                self._log.push(f"{line.instance} at point {line.point}: {line.status.lower()}: {line.message}")
+                message = paragraph(line.message)
+                self._log.push(f"{line.instance} at point {line.point}: {line.status.lower()}: {message}")
 
     def _enlarge(self, event: Any) -> None:  # noqa: ANN401  an event of NiceGUI
         self._picture.classes(add="fm-full") if event.value else self._picture.classes(remove="fm-full")

@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable
 
 from ..errors import ConfigurationError, FmuMeshError, Interrupted
+from ..printing import OutputFailed, guard_streams, paragraph
 from .limits import address_space_problem, out_of_memory
 
 __all__ = ["exit_code_of"]
@@ -21,6 +22,21 @@ def exit_code_of(command: Callable[[], int], needed_mib: int, *, debug: bool = F
         needed_mib: the address space that the command needs, in MiB.
         debug: raise an error instead of writing it.
     """
+    guard_streams()
+    code = 0
+    try:
+        code = _code_of(command, needed_mib, debug=debug)
+        sys.stdout.flush()
+    except BrokenPipeError:
+        # The reader of our output is gone, as in `fmu-mesh watch … | head`.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except OutputFailed as error:
+        sys.stderr.write(f"fmu-mesh: {error}\n")
+        return code or FmuMeshError.exit_code
+    return code
+
+
+def _code_of(command: Callable[[], int], needed_mib: int, *, debug: bool) -> int:
     try:
         return _run(command, needed_mib)
     except FmuMeshError as error:
@@ -32,10 +48,6 @@ def exit_code_of(command: Callable[[], int], needed_mib: int, *, debug: bool = F
     except KeyboardInterrupt:
         sys.stderr.write("fmu-mesh: interrupted\n")
         return Interrupted.exit_code
-    except BrokenPipeError:
-        # The reader of our output is gone, as in `fmu-mesh watch … | head`.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
 
 
 def _run(command: Callable[[], int], needed_mib: int) -> int:
@@ -59,6 +71,15 @@ def _start_logging(level: str) -> None:
         raise ConfigurationError(
             f"FMU_MESH_LOG is '{level}', which is no level.", hint="There are DEBUG, INFO, WARNING, ERROR and CRITICAL."
         )
-    logging.basicConfig(level=names[level.upper()], format="%(name)s: %(levelname)s: %(message)s")
+    logging.basicConfig(level=names[level.upper()])
+    for handler in logging.root.handlers:
+        handler.setFormatter(_Formatter("%(name)s: %(levelname)s: %(message)s"))
     # The warning of matplotlib about a missing folder of its own does not concern the user.
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
+
+
+class _Formatter(logging.Formatter):
+    """Shows messages, which may quote what others have written, as printable text."""
+
+    def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802  the name of the base class
+        return paragraph(super().formatMessage(record))

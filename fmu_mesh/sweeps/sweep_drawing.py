@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from ..api.drawing import COLOURS, DASHES, MAX_POINTS, add_legend, empty_figure, reduced, short
 from ..errors import CallRefused
+from ..printing import printable
 from ..text import shown
 from ..variables.value_types import PlainValue
 
@@ -347,7 +348,7 @@ def _finite(value: object, label: str) -> float:
 
 
 def _text(value: PlainValue) -> str:
-    return ("false", "true")[value] if isinstance(value, bool) else str(value)
+    return ("false", "true")[value] if isinstance(value, bool) else printable(str(value))
 
 
 def _is_logarithmic(numbers: NDArray[np.float64], ratio: float) -> bool:

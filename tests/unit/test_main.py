@@ -70,6 +70,7 @@ def test_the_version_imports_this_much_of_the_package_and_little_else() -> None:
         "config",
         "config.base",
         "errors",
+        "printing",
         "run",
         "run.limits",
         "run.threads",

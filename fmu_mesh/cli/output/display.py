@@ -7,7 +7,7 @@ import os
 import sys
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from types import TracebackType
 from typing import Final, Self
 
@@ -16,6 +16,7 @@ from rich.markup import escape
 from ...api.plan_page import slower_than_it_could_be
 from ...api.result import summary_of
 from ...errors import FmuMeshError, from_report
+from ...printing import paragraph, printable
 from ...run.events import Event, Log, OutputLine, Reachable, Restarted, Status
 from ...run.outcome import Outcome
 from ...run.wiring import is_socket, leaves_host
@@ -73,7 +74,7 @@ class Display:
         for (instance, message), times in self._times.items():
             if times > _SHOWN_TIMES:
                 more = f"{times - _SHOWN_TIMES} more {'times' if times > _SHOWN_TIMES + 1 else 'time'}"
-                self._console.print(f"[dim]{escape(instance)}: {escape(message)} ({more})[/]")
+                self._print(f"[dim]{escape(instance)}: {escape(paragraph(message))} ({more})[/]")
 
     def event(self, event: Event) -> None:
         """Show one event of the master."""
@@ -100,7 +101,7 @@ class Display:
     def _show_address(self) -> None:
         """Show the endpoints that the user asked for, or else the socket."""
         if shown := ", ".join([one for one in self._endpoints if not is_socket(one)] or self._endpoints):
-            self._console.print(escape(f"mesh '{self._plan.system.config.mesh}' at {shown}"), soft_wrap=True)
+            self._print(escape(f"mesh '{self._plan.system.config.mesh}' at {shown}"))
         self._endpoints = ()
 
     def _warn(self) -> None:
@@ -112,7 +113,7 @@ class Display:
             and (wide := ", ".join(filter(leaves_host, config.zenoh.listen)))
         ):
             text = f"warning: whoever can reach this host at {wide} can read, set and end this mesh"
-            self._console.print(f"[yellow]{escape(text)}[/]", soft_wrap=True)
+            self._print(f"[yellow]{escape(text)}[/]")
 
     def _end(self, outcome: Outcome) -> None:
         """Show why a run ended early; and what its rows warn of, where there is no summary with that."""
@@ -123,7 +124,7 @@ class Display:
 
     def ended(self, early: FmuMeshError) -> None:
         """Show why a run ended before its last point without a failure."""
-        self._console.print(escape(str(early)))
+        self._print(escape(str(early)))
 
     def log(self, line: LogLine) -> None:
         """Show one log message of an FMU. After five times, the same text is only counted.
@@ -162,13 +163,17 @@ class Display:
                 return
         style = _STYLES.get(line.status, "dim")
         where = f"{line.instance} at point {line.point}"
-        self._console.print(f"[{style}]{escape(where)}: {escape(line.message)}[/]")
+        self._print(f"[{style}]{escape(where)}: {escape(paragraph(line.message))}[/]")
 
     def _output(self, name: str, text: str) -> None:
         """Show a line of the output of a process."""
         if text:
-            shown = "".join(c if c.isprintable() or c == "\t" else "\N{REPLACEMENT CHARACTER}" for c in text)
-            self._console.print(f"[dim]{escape(name)} |[/] {escape(shown)}")
+            self._print(f"[dim]{escape(name)} |[/] {escape(printable(text.expandtabs()))}")
+
+    def _print(self, text: str) -> None:
+        """Print marked-up, printable text; nobody needs it so much that a full disk ends the run."""
+        with suppress(OSError):
+            self._console.print(text, soft_wrap=True)  # a wrapped line could begin with words of a model
 
     def _status(self, status: MeshStatus) -> None:
         self._progress.status(status)
@@ -182,7 +187,7 @@ class Display:
 
 def say(text: str) -> None:
     """Print one line on standard error before a run."""
-    print(f"fmu-mesh: {text}", file=sys.stderr, flush=True)
+    print(f"fmu-mesh: {paragraph(text)}", file=sys.stderr, flush=True)
 
 
 def teller(*, quiet: bool) -> Callable[[str], None]:

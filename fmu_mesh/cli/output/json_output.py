@@ -5,6 +5,7 @@ from __future__ import annotations
 import msgspec
 
 from ...errors import ConfigurationError, ErrorReport, Finding, FmuMeshError, Interrupted
+from ...printing import write_data
 
 __all__ = ["Failure", "failure_of", "print_failure", "print_json"]
 
@@ -32,4 +33,4 @@ def print_failure(error: FmuMeshError) -> None:
 
 def print_json(view: object) -> None:
     """Print a value as one line of JSON."""
-    print(msgspec.json.encode(view).decode(), flush=True)
+    write_data(msgspec.json.encode(view) + b"\n")

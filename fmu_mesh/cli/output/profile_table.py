@@ -15,6 +15,7 @@ import msgspec
 from ...api.tables import table
 from ...errors import ConfigurationError
 from ...files import replaced
+from ...printing import page
 from ...system.plan import RECORDER, Plan
 from ...wire.time_profile import GRANT, MeshProfile, NodeProfile
 
@@ -31,7 +32,7 @@ def show_profile(plan: Plan, profile: MeshProfile, seconds: float, file: Path) -
     Raises:
         ConfigurationError: the file cannot be written.
     """
-    print("\n".join(profile_page(plan, profile)))
+    print(page(profile_page(plan, profile)))
     if file == Path():
         return
     try:

@@ -19,6 +19,8 @@ from contextlib import ExitStack, suppress
 from types import FrameType, TracebackType
 from typing import Final, Self
 
+from ...printing import printable, unguarded
+
 __all__ = ["Screen"]
 
 _OTHER_SCREEN: Final = "\x1b[?1049h\x1b[?25l"
@@ -70,7 +72,7 @@ class Screen:
         if len(lines) > height:
             lines = [*lines[: height - 1], f"({len(lines) - height + 1} more lines)"]
         # Each line is erased before it is drawn: after a full line the cursor is still on its last character.
-        text = "\r\n".join(_END_OF_LINE + "".join(map(_printable, line)) for line in lines)
+        text = "\r\n".join(_END_OF_LINE + printable(line) for line in lines)
         self._write(_HOME + text + ("\r\n" + _REST if len(lines) < height else ""))
 
     def quits_within(self, seconds: float) -> bool:
@@ -95,12 +97,9 @@ class Screen:
             os.write(self._waker, b".")
 
     def _write(self, text: str) -> None:
-        sys.stdout.write(text)
-        sys.stdout.flush()
-
-
-def _printable(sign: str) -> str:
-    return sign if sign.isprintable() else "\N{REPLACEMENT CHARACTER}"
+        stream = unguarded(sys.stdout)
+        stream.write(text)
+        stream.flush()
 
 
 def _end(_number: int, _frame: FrameType | None) -> None:

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import os
+import sys
 from typing import IO
 
 from rich.console import Console
+
+from ...printing import unguarded
 
 __all__ = ["error_console", "may_draw"]
 
 
 def error_console() -> Console:
     """Standard error: plain text if it is no terminal or `NO_COLOR` is set; with colours if `FORCE_COLOR` is set."""
-    return Console(stderr=True, highlight=False, force_terminal=False if _plain() else None)
+    stream = unguarded(sys.stderr)  # Rich moves the cursor; whoever prints text on this makes it printable before
+    return Console(file=stream, stderr=True, highlight=False, force_terminal=False if _plain() else None)
 
 
 def may_draw(stream: IO[str]) -> bool:

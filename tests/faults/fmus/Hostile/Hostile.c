@@ -28,6 +28,7 @@
 #define PAGE_BYTES 4096
 #define SLOW_SECONDS 5
 #define TARDY_SECONDS 1
+#define FORGED "bad\nfmu-mesh: all is well\033]52;c;Zm9v\a\xc2\x9b\xe2\x80\xae" /* clears, copies, reverses */
 #define FAULT_TIME 0.0045 /* s; steps that end later have the fault */
 
 enum { U, THIRD, SUBNORMAL, PLAIN_LOCALE, FOLDER, UNDISTURBED, COUNT };
@@ -277,6 +278,9 @@ fmi2Status fmi2DoStep(fmi2Component c, fmi2Real currentCommunicationPoint, fmi2R
     look_around(c);
     ((Hostile *)c)->late = currentCommunicationPoint + communicationStepSize > FAULT_TIME;
     if (((Hostile *)c)->late) CALLED(c);
+    if (strcmp(((Hostile *)c)->name, "forger") == 0 || strncmp(((Hostile *)c)->name, "Hostile@", 8) == 0)
+        ((Hostile *)c)->callbacks->logger(((Hostile *)c)->callbacks->componentEnvironment, "forger", fmi2Warning,
+                                          "\033[2J", "%s", FORGED);
     return fmi2OK;
 }
 
