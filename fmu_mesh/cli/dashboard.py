@@ -4,8 +4,14 @@ from __future__ import annotations
 
 import argparse
 import os
+import signal
 import sys
 import webbrowser
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from html import escape
+from pathlib import Path
+from tempfile import NamedTemporaryFile
 
 from ..dashboard.access import is_loopback
 from ..dashboard.dashboard_server import DashboardOptions, serve
@@ -47,13 +53,27 @@ def _dashboard(arguments: argparse.Namespace) -> int:
             )
         print(f"dashboard: {url}", flush=True)
         if not arguments.no_browser and _has_screen():
-            webbrowser.open(url)
+            webbrowser.open(until_end.enter_context(_redirecting(url)))
 
-    try:
-        serve(options, ready)
-    except KeyboardInterrupt:
-        return Interrupted.exit_code
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))  # so that the file below is removed
+    with ExitStack() as until_end:
+        try:
+            serve(options, ready)
+        except KeyboardInterrupt:
+            return Interrupted.exit_code
     return 0
+
+
+@contextmanager
+def _redirecting(url: str) -> Iterator[str]:
+    """The address of a page that only this user can read and that leads to the URL.
+
+    All users of the host see the arguments of a browser that is started, and the URL has the token.
+    """
+    with NamedTemporaryFile("w", prefix="fmu_mesh-", suffix=".html", encoding="utf-8") as file:  # its mode is 0600
+        file.write(f'<meta http-equiv="refresh" content="0; url={escape(url)}">\n')
+        file.flush()
+        yield Path(file.name).as_uri()
 
 
 def _has_screen() -> bool:

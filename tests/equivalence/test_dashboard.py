@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import socket
 from pathlib import Path
@@ -48,6 +49,30 @@ def test_only_requests_with_the_token_and_a_name_of_this_host_get_the_page(place
     assert headers["x-frame-options"] == "DENY"
     assert [answer[0] for answer in (stranger, script, rebound, other_page)] == [403, 403, 403, 403]
     assert b"token" in stranger[2]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_the_arguments_of_a_browser_do_not_have_the_token(place: Place, number: signal.Signals) -> None:
+    opened, browser = place.folder / "opened", place.folder / "browser"
+    copied = (
+        f'path="${{1#file://}}"; stat -c %a "$path" > {opened}.mode; cp "$path" {opened}.html; echo "$*" > {opened}'
+    )
+    browser.write_text(f"#!/bin/sh\n{copied}\n", encoding="utf-8")
+    browser.chmod(0o755)
+    place.environment |= {"BROWSER": f"{browser} %s"}
+
+    process = place.start("dashboard")
+    url = wait_until(lambda: re.search(r"dashboard: (http://\S+)\n", process.output), "the address")[1]
+    wait_until(lambda: opened.is_file() and opened.read_text(encoding="utf-8").strip(), "the browser")
+    arguments = opened.read_text(encoding="utf-8").split()
+    process.signal(number)
+    process.wait()
+
+    [page] = [Path(argument.removeprefix("file://")) for argument in arguments]
+    assert url.partition("token=")[2] not in str(arguments)
+    assert opened.with_suffix(".mode").read_text(encoding="utf-8").strip() == "600"
+    assert f"url={url}" in opened.with_suffix(".html").read_text(encoding="utf-8")
+    assert not page.exists()
 
 
 def test_ctrl_c_ends_it_and_leaves_nothing(place: Place) -> None:
