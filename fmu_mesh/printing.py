@@ -6,6 +6,7 @@ the order of what is shown, and a line break begins a line that looks like one o
 
 from __future__ import annotations
 
+import io
 import os
 import re
 import sys
@@ -53,6 +54,8 @@ def page(lines: Iterable[str]) -> str:
 def guard_streams() -> None:
     """From now on, what this process prints cannot control the terminal; a full disk raises `OutputFailed`."""
     for stream, redirect in ((sys.stdout, redirect_stdout), (sys.stderr, redirect_stderr)):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # what its encoding does not have
         if not isinstance(stream, _GuardedStream):
             redirect(_GuardedStream(stream, needed=stream is sys.stdout)).__enter__()  # until the process has ended
 
@@ -70,7 +73,7 @@ def unguarded(stream: TextIO) -> TextIO:
 
 
 class _GuardedStream:
-    """A text stream that escapes all but text, line breaks and tabs, and what the encoding does not have.
+    """A text stream that escapes all but text, line breaks and tabs.
 
     Args:
         stream: the stream.
@@ -86,10 +89,7 @@ class _GuardedStream:
 
     def write(self, text: str) -> int:
         """Write a text."""
-        shown = _NO_LINES.sub(_escaped, text)
-        encoding = self.stream.encoding or "utf-8"
-        shown = shown.encode(encoding, "backslashreplace").decode(encoding)
-        _written(self.stream.write, shown, needed=self._needed)
+        _written(self.stream.write, _NO_LINES.sub(_escaped, text), needed=self._needed)
         return len(text)
 
     def flush(self) -> None:

@@ -36,8 +36,7 @@ def check_code(loaded: LoadedConfig, findings: Findings, tell: Callable[[str], N
     for name, section in loaded.config.instances.items():
         if not _names_code(section):
             continue
-        key = key_of(section)
-        path = loaded.resolve(section.path) if section.path else None
+        key, path = key_of(section), loaded.resolve(section.path) if section.path else None
         found, expected = f"Python code, in {source}", "a file of your own, or `--allow-code`"
         if not source:
             if path is None or (open_path := _writable_by_others(path)) is None:
@@ -48,7 +47,7 @@ def check_code(loaded: LoadedConfig, findings: Findings, tell: Callable[[str], N
         if not allow_code:
             findings.add(f"instances.{name}.{key}", found, expected)
             continue
-        code = getattr(section, key).replace(section.path, str(path), 1) if path is not None else getattr(section, key)
+        code = getattr(section, key).replace(section.path, str(path or ""), 1)
         by = f" with {section.interpreter}" if section.interpreter is not None else ""
         tell(f"instance '{name}' runs {code}{by}, because of `--allow-code` ({found})")
 
@@ -80,14 +79,15 @@ def _other_owner(file: Path) -> str:
         owner = file.stat().st_uid
     except OSError:
         return ""  # there is no file: a program of this user has made the configuration
-    return f"a file of the user {_user(owner)}" if owner not in {os.getuid(), 0} else ""
+    name = repr(_name_of(owner)) if _name_of(owner) else owner
+    return f"a file of the user {name}" if owner not in {os.getuid(), 0} else ""
 
 
-def _user(uid: int) -> str:
+def _name_of(user: int) -> str:
     try:
-        return f"'{pwd.getpwuid(uid).pw_name}'"
-    except KeyError:
-        return str(uid)
+        return pwd.getpwuid(user).pw_name
+    except KeyError:  # as in a container
+        return ""
 
 
 def _writable_by_others(path: Path) -> Path | None:
@@ -104,12 +104,8 @@ def _writable_by_others(path: Path) -> Path | None:
 
 def _is_private(group: int, user: int) -> bool:
     """Whether a group is the one of a user alone, as distributions make one for each, or that of root."""
-    try:
-        name = pwd.getpwuid(user).pw_name
-    except KeyError:
-        name = ""
-    try:
+    own, name = None, _name_of(user)
+    with suppress(KeyError):
         own = grp.getgrgid(group)
-    except KeyError:
-        return group in {user, 0}
-    return group == 0 or (not {*own.gr_mem} - {name} and (group == user or own.gr_name == name))
+    has_others = own is not None and {*own.gr_mem} - {name}
+    return group == 0 or (not has_others and (group == user or (own is not None and own.gr_name == name)))

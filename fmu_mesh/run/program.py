@@ -32,7 +32,7 @@ def exit_code_of(command: Callable[[], int], needed_mib: int, *, debug: bool = F
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except OutputFailed as error:
         sys.stderr.write(f"fmu-mesh: {error}\n")
-        return code or FmuMeshError.exit_code
+        return code or ConfigurationError.exit_code  # as for a result file that cannot be written
     return code
 
 

@@ -109,11 +109,6 @@ class PlannedSweep(NamedTuple):
     at_once: int | None
     found: dict[str, Row]
 
-    @property
-    def may_run_code(self) -> bool:
-        """Whether its parts may run code that the folder names: it was checked here, or the user allows it."""
-        return self.wanted.options.allow_code or not self.plan.loaded.foreign
-
 
 def planned_sweep(
     mesh: Mesh | str | Path,

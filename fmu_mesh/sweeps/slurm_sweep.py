@@ -89,7 +89,8 @@ class SlurmSweep(Sweep):
                 raise ConfigurationError(text, hint="Give each task fewer workers.")
         command = [sys.executable, "-Pm", "fmu_mesh", "sweep", str(planned.folder.path), "--part", PART]
         command += ["--workers", str(options.workers), "--no-progress"]
-        command += ["--allow-code"] if planned.may_run_code else []
+        if planned.wanted.options.allow_code or not planned.plan.loaded.foreign:  # the tasks see only the folder
+            command.append("--allow-code")
         job = submit(
             planned.folder.path,
             command,
