@@ -14,8 +14,9 @@ from typing import Any, BinaryIO, Final, Self, TypeVar
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet
 from numpy.typing import NDArray
+
+from ..system.arrow import open_parquet
 
 __all__ = ["ParquetTail"]
 
@@ -171,7 +172,7 @@ class _Groups(_File):
 
     def __init__(self, path: Path, file: BinaryIO) -> None:
         super().__init__(path, file)
-        self._content = pyarrow.parquet.ParquetFile(self._file)
+        self._content = open_parquet(self._file)
         self._group = 0
         self.schema = self._content.schema_arrow
 
@@ -186,7 +187,7 @@ class _Groups(_File):
         if self._group == self._content.num_row_groups:
             return None
         self._group += 1
-        return self._content.read_row_group(self._group - 1, columns=list(columns))
+        return self._content.read_row_group(self._group - 1, columns=list(columns), use_threads=False)
 
 
 _Batches = TypeVar("_Batches", _Stream, _Groups)

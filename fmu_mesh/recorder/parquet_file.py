@@ -26,10 +26,11 @@ from numpy.typing import NDArray
 from ..config.findings import Findings
 from ..errors import ConfigurationError
 from ..files import Kept, exists, is_file, open_alone
+from ..system.arrow import open_parquet, parquet_batches, parquet_module, pyarrow_module
 from ..system.recording import Columns, Recording, with_notes
 from ..variables.model_description import Variable
 from ..variables.value_types import DTYPES, VariableType, is_text
-from .parquet_groups import KEY, GroupWriter, decoded, parquet_module, pyarrow_module
+from .parquet_groups import KEY, GroupWriter, decoded
 
 __all__ = ["ParquetFile"]
 
@@ -144,10 +145,9 @@ class ParquetFile:
                     metadata = with_notes(decoded(schema), batches.notes)
             else:
                 with path.open("rb") as file:
-                    content = parquet_module().ParquetFile(file)
+                    content = open_parquet(file)
                     schema = content.schema_arrow
-                    groups = map(content.read_row_group, range(content.num_row_groups))
-                    columns = _columns_of(path, schema, content.metadata.num_rows, groups)
+                    columns = _columns_of(path, schema, content.metadata.num_rows, parquet_batches(content))
                     metadata = decoded(content.metadata)
         except (pa.ArrowException, msgspec.DecodeError) as error:
             raise _no_result(path, str(error)) from error
@@ -317,7 +317,7 @@ def _rows_of(path: Path) -> int:
     """
     try:
         with path.open("rb") as file:
-            rows: int = parquet_module().ParquetFile(file).metadata.num_rows
+            rows: int = open_parquet(file).metadata.num_rows
     except pyarrow_module().ArrowException as error:
         raise _no_result(path, str(error)) from error
     return rows

@@ -1,4 +1,4 @@
-"""The row groups of a Parquet file, written into a draft; and pyarrow, which is optional."""
+"""The row groups of a Parquet file, written into a draft."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from typing import Any, Final, Self
 
 import msgspec
 
-from ..errors import ConfigurationError
 from ..files import replaced
+from ..system.arrow import parquet_module, pyarrow_module
 from ..system.recording import with_notes
 
-__all__ = ["KEY", "GroupWriter", "decoded", "parquet_module", "pyarrow_module"]
+__all__ = ["KEY", "GroupWriter", "decoded"]
 
 KEY: Final = b"fmu_mesh"
 """Of the metadata."""
@@ -145,27 +145,3 @@ class _Abandoned(Exception):
 def decoded(container: Any) -> dict[str, Any]:  # noqa: ANN401  a schema of pyarrow, or the end of a file
     """The metadata of a run in it; empty if there are none."""
     return msgspec.json.decode((container.metadata or {}).get(KEY, b"{}"), type=dict[str, Any])
-
-
-def pyarrow_module() -> Any:  # noqa: ANN401  an optional dependency
-    """The module pyarrow.
-
-    Raises:
-        ConfigurationError: it is not installed.
-    """
-    try:
-        import pyarrow as pa  # noqa: PLC0415  an optional dependency
-        from pyarrow import ipc  # noqa: F401, PLC0415  an optional dependency; `pa.ipc`
-    except ImportError as error:
-        raise ConfigurationError(
-            "results in .parquet need the package pyarrow", hint="Install it: pip install 'fmu-mesh[parquet]'."
-        ) from error
-    return pa
-
-
-def parquet_module() -> Any:  # noqa: ANN401  an optional dependency
-    """The module pyarrow.parquet; see `pyarrow_module`."""
-    pyarrow_module()
-    from pyarrow import parquet  # noqa: PLC0415  slow to import, and writing rows does without
-
-    return parquet

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import csv
 import hashlib
-import importlib
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
@@ -24,6 +23,7 @@ from ..text import listed, nearest
 from ..variables.model_description import ModelDescription, Value, Variable
 from ..variables.value_conversion import ValueRefused, to_value
 from ..variables.value_types import INTEGERS, is_float
+from .arrow import open_parquet, parquet_batches
 from .schedule import Course, Schedule, SeriesFile
 
 __all__ = ["SeriesRefused", "columns_of", "content_of", "course_of", "courses_of", "read_series"]
@@ -247,7 +247,7 @@ def _parquet_pairs(path: Path, time: str, column: str) -> Iterator[tuple[str, An
     names = table.schema_arrow.names
     _place(names, time, "time", path), _place(names, column, "column", path)
     row = 0
-    for batch in table.iter_batches(columns=list(dict.fromkeys([time, column]))):
+    for batch in parquet_batches(table, list(dict.fromkeys([time, column]))):
         for when, cell in zip(batch.column(time).to_pylist(), batch.column(column).to_pylist(), strict=True):
             row += 1
             yield f"row {row}", when, cell
@@ -255,11 +255,9 @@ def _parquet_pairs(path: Path, time: str, column: str) -> Iterator[tuple[str, An
 
 def _parquet(path: Path) -> Any:  # noqa: ANN401  pyarrow has no types
     try:
-        parquet = importlib.import_module("pyarrow.parquet")
-    except ImportError as error:
+        return open_parquet(path)
+    except ConfigurationError as error:
         raise SeriesRefused(f"'{path}', which needs the package pyarrow", "`pip install pyarrow`") from error
-    try:
-        return parquet.ParquetFile(path)
     except (OSError, ValueError) as error:
         raise SeriesRefused(f"'{path}', which cannot be read ({error})", "a Parquet file") from error
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -346,6 +347,41 @@ def test_a_file_of_another_program_may_have_nulls_and_a_name_twice(tmp_path: Pat
     assert np.array_equal(result["whole"], [1, 2, np.nan, 4], equal_nan=True)
     assert result["flag"].tolist() == [True, None, False, True]
     assert result["x"].tolist() == [5.0, 6.0, 7.0, 8.0]
+
+
+THREADS = """
+import os, sys
+from pathlib import Path
+import pyarrow.parquet
+from fmu_mesh import Result
+from fmu_mesh.dashboard.parquet_tail import ParquetTail
+from fmu_mesh.recorder.parquet_file import ParquetFile
+from fmu_mesh.system.series_files import SeriesFile, content_of, read_series
+from fmu_mesh.variables.model_description import Variable
+
+def threads():
+    return len(os.listdir("/proc/self/task"))
+
+path, before = Path(sys.argv[1]), threads()
+assert Result.read(path).compare(Result.read(path))
+assert ParquetFile.keep_whole_rows(path, (0, 0)) == 200_000
+tail = ParquetTail.open(path, path.with_suffix(".none"))
+assert tail.read(["it.Float64"]) is not None
+file = SeriesFile(str(path), content_of(path), "time", "it.Float64")
+assert len(read_series(file, Variable("u", 0, "Float64", "input", "continuous"))[0]) == 200_000
+assert threads() == before, os.listdir("/proc/self/task")
+"""
+
+
+def test_reading_parquet_starts_no_thread(tmp_path: Path) -> None:
+    path = tmp_path / "a.parquet"
+    types: list[VariableType] = ["Float64", "Int32"]
+    file = ParquetFile.open(path, recording(types))
+    file.write(np.arange(200_000) * 0.1, [np.full(200_000, 0.5), np.arange(200_000, dtype=np.int32)])
+    file.close()
+
+    # A thread of pyarrow that waits for the lock of Python at the end of the interpreter ends the process with 134.
+    subprocess.run([sys.executable, "-c", THREADS, path], check=True, timeout=120)
 
 
 def test_row_groups_are_bounded_and_small_batches_become_large_ones(
