@@ -59,6 +59,9 @@ __all__ = [
 ]
 
 
+_SHOWN_FINDINGS = 20
+
+
 class ErrorReport(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """An error as one process sends it to another: the fields of `FmuMeshError`, its class and its exit code."""
 
@@ -217,7 +220,7 @@ class Finding(msgspec.Struct, frozen=True):
 class ConfigurationError(FmuMeshError):
     """A file, an option or a command is wrong. Carries all findings, not only the first.
 
-    If there is one finding, it may be the message itself. Other findings are listed below the message.
+    If there is one finding, it may be the message itself. Other findings are listed below the message, the first 20.
     """
 
     exit_code = 2
@@ -227,8 +230,9 @@ class ConfigurationError(FmuMeshError):
         self.findings = findings
 
     def __str__(self) -> str:
-        listed = [str(finding) for finding in self.findings if str(finding) != self.message]
-        return "\n".join([super().__str__(), *(f"  - {finding}" for finding in listed)])
+        listed = [f"  - {text}" for finding in self.findings if (text := str(finding)) != self.message]
+        listed[_SHOWN_FINDINGS:] = [f"  and {len(listed) - _SHOWN_FINDINGS:,} more"] * (len(listed) > _SHOWN_FINDINGS)
+        return "\n".join([super().__str__(), *listed])
 
 
 class NotInOneProcess(ConfigurationError):

@@ -14,16 +14,19 @@ second run are refused before the first point. It writes from the first point on
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import hashlib
 import os
 import shutil
 import stat
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from io import BufferedReader, FileIO
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, NamedTuple, cast
+from typing import IO, TYPE_CHECKING, Any, NamedTuple, TypeVar, cast
+
+import msgspec
 
 from .errors import ConfigurationError
 
@@ -37,11 +40,13 @@ __all__ = [
     "archive_on_the_way",
     "beside",
     "cloned",
+    "decoded_json",
     "exists",
     "is_file",
     "is_folder",
     "known_sha256",
     "open_alone",
+    "opened",
     "remember_sha256",
     "remove_tree",
     "replaced",
@@ -51,6 +56,8 @@ __all__ = [
     "version_at",
     "version_of",
 ]
+
+T = TypeVar("T")
 
 FileVersion = tuple[int, int, int, int]
 """What changes if a file changes."""
@@ -101,6 +108,33 @@ def beside(file: Path, relative: str) -> Path:
     if archive_on_the_way(file) is not None:
         path = Path(os.path.normpath(path))
     return path.parent.resolve() / path.name
+
+
+def opened(path: Path) -> BufferedReader[FileIO]:
+    """A file that somebody has named, open for reading.
+
+    Raises:
+        OSError: it cannot be opened; or it is a pipe or a device, which may have no end.
+    """
+    # A pipe would wait for a writer.
+    file = BufferedReader(FileIO(path, opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK)))
+    if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+        file.close()
+        raise OSError(errno.EINVAL, "it is a pipe or a device, and no file", str(path))
+    return file
+
+
+def decoded_json(data: bytes | str, type_: type[T], dec_hook: Callable[[type, Any], Any] | None = None) -> T:
+    """JSON that somebody else has written; ``dec_hook`` as for `msgspec.json.decode`.
+
+    Raises:
+        ValueError: it is not JSON of that type.
+    """
+    try:
+        return msgspec.json.decode(data, type=type_, dec_hook=dec_hook)
+    # msgspec does not catch exceptions of Python itself, such as UnicodeDecodeError.
+    except (msgspec.MsgspecError, ValueError, OverflowError, RecursionError) as error:
+        raise ValueError(str(error)) from error
 
 
 def open_alone(path: Path, result: Path | None = None) -> OwnFile:

@@ -5,12 +5,13 @@ Knows results only by their arrays and units.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..system.recording import Columns
 from ..variables.units import BaseUnit, Linear, conversion
 from .comparison import Comparison, FirstDifference, Rows, VariableDifference
 
@@ -25,49 +26,41 @@ class Side(NamedTuple):
 
     Attributes:
         title: what messages call it.
-        times: the times in s, not decreasing.
         columns: the names of its variables.
-        values: the array of a variable by its name.
+        pieces: its rows, piece by piece; times do not decrease.
+        all: all of its rows.
         unit: the unit of a variable by its name; None if it is not known.
         base_unit: the same in SI base units; None if it is not known.
-        point: the number of the communication point of a row.
+        point: the number of the communication point of a row, by its number and time.
     """
 
     title: str
-    times: NDArray[np.float64]
     columns: Sequence[str]
-    values: Callable[[str], NDArray[Any]]
+    pieces: Callable[[], Iterator[Columns]]
+    all: Callable[[], Columns]
     unit: Callable[[str], str | None]
     base_unit: Callable[[str], BaseUnit | None]
-    point: Callable[[int], int]
+    point: Callable[[int, float], int]
 
 
 class _Matching(NamedTuple):
-    """Which rows belong together: numbers of rows here and there; those there are None for interpolation.
+    """Which rows belong together: how many, and their numbers here and there.
 
-    ``near`` is how far times may be apart that are the same.
+    Those here are None for all rows in their order, those there for interpolation. ``near`` is how far times may be
+    apart that are the same.
     """
 
     how: Rows
-    here: NDArray[np.intp]
-    there: NDArray[np.intp] | None
-    only_here: int
-    only_there: int
+    rows: int
+    here: NDArray[np.intp] | None = None
+    there: NDArray[np.intp] | None = None
+    only_here: int = 0
+    only_there: int = 0
     near: float = 0.0
 
 
-class _Pair(NamedTuple):
-    """Both results, their rows that belong together, and the tolerances."""
-
-    here: Side
-    there: Side
-    matching: _Matching
-    rtol: float
-    atol: float
-
-
 def compared(here: Side, there: Side, names: Sequence[str], *, rtol: float = 0.0, atol: float = 0.0) -> Comparison:
-    """Compare two results.
+    """Compare two results; rows that belong together in their order are read piece by piece.
 
     Args:
         here: the one result, whose times and units hold.
@@ -77,25 +70,25 @@ def compared(here: Side, there: Side, names: Sequence[str], *, rtol: float = 0.0
         atol: absolute tolerance.
     """
     both = [name for name in names if name in here.columns and name in there.columns]
-    pair = _Pair(here, there, _matched(here.times, there.times), rtol, atol)
-    matching = pair.matching
-    differences: dict[str, VariableDifference] = {}
-    first: tuple[int, str] | None = None
-    for name in both:
-        found, row = _difference(pair, name)
-        if found is not None:
-            differences[name] = found
-        if row is not None and (first is None or row < first[0]):
-            first = row, name
+    tallies = {name: _Tally(here, there, name, (rtol, atol)) for name in both}
+    matching = _in_step(here, there, tallies)
+    if matching is None:
+        tallies = {name: _Tally(here, there, name, (rtol, atol)) for name in both}
+        matching, own, other = _matched(here, there)
+        for name, tally in tallies.items():
+            values = _values_there(matching, own.times, other, tally.converted(other.values[name]))
+            tally.add(own.times[matching.here], own.values[name][matching.here], values)
+    found = {name: tally.difference for name, tally in tallies.items()}
+    first = min(((tally.first, name) for name, tally in tallies.items() if tally.first), default=None, key=_row_of)
     return Comparison(
         here.title,
         there.title,
         rtol,
         atol,
-        len(matching.here),
+        matching.rows,
         matching.how,
-        _first(pair, *first) if first is not None else None,
-        differences,
+        _first(here, there, matching, *first) if first is not None else None,
+        {name: difference for name, difference in found.items() if difference is not None},
         tuple(both),
         tuple(name for name in names if name in here.columns and name not in there.columns),
         tuple(name for name in names if name not in here.columns and name in there.columns),
@@ -108,54 +101,131 @@ def differences_of(
     here: Side, there: Side, names: Sequence[str]
 ) -> dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]:
     """By variable that both have, the compared times in s, and the values here minus those there."""
-    pair = _Pair(here, there, _matched(here.times, there.times), 0.0, 0.0)
-    rows = pair.matching.here
+    matching, one, other = _matched(here, there)
+    times = one.times[matching.here]
     found = {}
     for name in names:
-        if name in here.columns and name in there.columns and _conversion(pair.here, pair.there, name)[1] is not None:
-            own, other = here.values(name)[rows], _values_there(pair, name)
-            if object not in (own.dtype, other.dtype):
-                found[name] = here.times[rows], own.astype(np.float64) - other.astype(np.float64)
+        if name in here.columns and name in there.columns and _conversion(here, there, name)[1] is not None:
+            own = one.values[name][matching.here]
+            values = _values_there(matching, one.times, other, values_in_unit_of(here, there, name, other.values[name]))
+            if object not in (own.dtype, values.dtype):
+                found[name] = times, own.astype(np.float64) - values.astype(np.float64)
     return found
 
 
 # --- rows
 
 
-def _matched(here: NDArray[np.float64], there: NDArray[np.float64]) -> _Matching:
-    """The rows that belong together."""
-    if not len(here) or not len(there):
+class _Span:
+    """The times of a result, from its first piece on: their number, the first, the last and the least distance in s."""
+
+    def __init__(self) -> None:
+        self.rows = 0
+        self.first = self.last = 0.0
+        self.step = np.inf
+        self.rises = True
+
+    def add(self, times: NDArray[np.float64]) -> None:
+        """Add the times of the next rows."""
+        self.first = self.first if self.rows else float(times[0])
+        distances = np.diff(times, prepend=self.last if self.rows else times[0])
+        self.step = min(self.step, float(distances.min(initial=np.inf, where=distances > 0.0)))
+        self.rises = self.rises and bool((distances >= 0.0).all())
+        self.rows, self.last = self.rows + len(times), float(times[-1])
+
+
+def _in_step(here: Side, there: Side, tallies: Mapping[str, _Tally]) -> _Matching | None:
+    """Compare the rows of both in their order; None if they do not belong together, and then tallies are useless."""
+    one, two = _Span(), _Span()
+    rows, apart, next_time = 0, 0.0, np.inf
+    for own, other in _aligned(here.pieces(), there.pieces()):
+        if own is not None:
+            one.add(own.times)
+        if other is not None:
+            two.add(other.times)
+        if own is None or other is None:
+            rest = own or other
+            assert rest is not None  # one of them has rows
+            next_time = min(next_time, float(rest.times[0]))
+            continue
+        apart = max(apart, float(np.nan_to_num(np.abs(own.times - other.times), nan=np.inf).max()))
+        if apart > _near(one, two):
+            return None
+        for name, tally in tallies.items():
+            tally.add(own.times, own.values[name], tally.converted(other.values[name]))
+        rows += len(own.times)
+    if one.rows and two.rows:
+        near, shorter = _near(one, two), min(one, two, key=lambda span: span.rows)
+        if not (one.rises and two.rises and apart <= near and next_time > shorter.last + _margin(shorter.step, near)):
+            return None
+    return _Matching("same", rows, only_here=one.rows - rows, only_there=two.rows - rows)
+
+
+def _aligned(here: Iterator[Columns], there: Iterator[Columns]) -> Iterator[tuple[Columns | None, Columns | None]]:
+    """Pieces with the same numbers of rows; where one result has ended, the rest of the other one with None."""
+    pieces = [here, there]
+    waiting: list[Columns | None] = [Columns(np.zeros(0), {})] * 2
+    while True:
+        for place, piece in enumerate(waiting):
+            while piece is not None and not len(piece.times):
+                piece = next(pieces[place], None)  # noqa: PLW2901  the next one that has rows
+            waiting[place] = piece
+        left = [len(piece.times) for piece in waiting if piece is not None]
+        if not left:
+            return
+        own, other = (None if piece is None else _part(piece, slice(min(left))) for piece in waiting)
+        yield own, other
+        waiting = [None if piece is None else _part(piece, slice(min(left), None)) for piece in waiting]
+
+
+def _part(columns: Columns, rows: slice) -> Columns:
+    return Columns(columns.times[rows], {name: values[rows] for name, values in columns.values.items()})
+
+
+def _near(here: _Span, there: _Span) -> float:
+    """How far times may be apart that are the same."""
+    largest = max(abs(time) for span in (here, there) for time in (span.first, span.last))
+    step = min(here.step, there.step)
+    return max(_ROUNDING * step if np.isfinite(step) else 0.0, 4.0 * float(np.spacing(largest)))
+
+
+def _margin(step: float, near: float) -> float:
+    """A time that is farther outside is outside: that of less than one step of the others is not."""
+    return max(step - near, near) if np.isfinite(step) else near
+
+
+def _matched(here: Side, there: Side) -> tuple[_Matching, Columns, Columns]:
+    """The rows that belong together, and all rows of both."""
+    one, two = here.all(), there.all()
+    times, others = one.times, two.times
+    if not len(times) or not len(others):
         nothing = np.zeros(0, np.intp)
-        return _Matching("same", nothing, nothing, len(here), len(there))
-    step_here, step_there = _step(here), _step(there)
-    largest = max(abs(here[0]), abs(here[-1]), abs(there[0]), abs(there[-1]))
-    near = max(_ROUNDING * min(step_here or step_there, step_there or step_here), 4.0 * float(np.spacing(largest)))
-    only_here = _outside(here, there, step_there, near)
-    only_there = _outside(there, here, step_here, near)
-    count = min(len(here), len(there))
-    if abs(len(here) - len(there)) == only_here + only_there and np.allclose(here[:count], there[:count], 0.0, near):
+        return _Matching("same", 0, nothing, nothing, len(times), len(others)), one, two
+    spans = _Span(), _Span()
+    spans[0].add(times)
+    spans[1].add(others)
+    near = _near(*spans)
+    only_here, only_there = _outside(times, others, spans[1].step, near), _outside(others, times, spans[0].step, near)
+    count = min(len(times), len(others))
+    is_same = abs(len(times) - len(others)) == only_here + only_there
+    if is_same and np.allclose(times[:count], others[:count], 0.0, near):
         rows = np.arange(count)
-        return _Matching("same", rows, rows, only_here, only_there)
-    nearest = _nearest(here, there)
-    is_common = np.abs(there[nearest] - here) <= near
-    within_here = (here >= there[0] - near) & (here <= there[-1] + near)
-    within_there = (there >= here[0] - near) & (there <= here[-1] + near)
+        return _Matching("same", count, rows, rows, only_here, only_there), one, two
+    nearest = _nearest(times, others)
+    is_common = np.abs(others[nearest] - times) <= near
+    within_here = (times >= others[0] - near) & (times <= others[-1] + near)
+    within_there = (others >= times[0] - near) & (others <= times[-1] + near)
     common = int(is_common.sum())
     if common and common in (int(within_here.sum()), int(within_there.sum())):
-        return _Matching("common", np.flatnonzero(is_common), nearest[is_common], only_here, only_there)
-    return _Matching("interpolated", np.flatnonzero(within_here), None, only_here, only_there, near)
-
-
-def _step(times: NDArray[np.float64]) -> float:
-    """The smallest distance of two times; 0 for a single one."""
-    distances = np.diff(times)
-    distances = distances[distances > 0.0]
-    return float(distances.min()) if len(distances) else 0.0
+        rows = np.flatnonzero(is_common)
+        return _Matching("common", common, rows, nearest[is_common], only_here, only_there), one, two
+    rows = np.flatnonzero(within_here)
+    return _Matching("interpolated", len(rows), rows, None, only_here, only_there, near), one, two
 
 
 def _outside(times: NDArray[np.float64], others: NDArray[np.float64], step: float, near: float) -> int:
     """How many times are at least one step of the others before or after all of these."""
-    margin = max(step - near, near)
+    margin = _margin(step, near)
     return int(((times < others[0] - margin) | (times > others[-1] + margin)).sum())
 
 
@@ -169,58 +239,106 @@ def _nearest(times: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray
 # --- values
 
 
-def _difference(pair: _Pair, name: str) -> tuple[VariableDifference | None, int | None]:
-    """How a variable differs, None if not at all; and the first of the compared rows beyond the tolerance."""
-    here, matching = pair.here, pair.matching
-    unit, (note, change) = here.unit(name), _conversion(pair.here, pair.there, name)
-    times = here.times[matching.here]
-    own, other = here.values(name)[matching.here], _values_there(pair, name)
-    if change is None or (own.dtype == object) != (other.dtype == object):
-        note = note or f"{_kind(own)} in {here.title}, {_kind(other)} in {pair.there.title}"
-        return VariableDifference(len(times), unit=unit, note=note), 0 if len(times) else None
-    if own.dtype == object:
-        wrong = own != other
-        return (VariableDifference(int(wrong.sum()), unit=unit), _first_of(wrong)) if wrong.any() else (None, None)
-    are_floats = own.dtype.kind == "f" or other.dtype.kind == "f"
-    unequal = ~((own == other) | (np.isnan(own) & np.isnan(other))) if are_floats else own != other
-    if not unequal.any():
-        return None, None
-    with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
-        left, right = own.astype(np.float64), other.astype(np.float64)
-        distance = np.where(unequal, np.abs(left - right), 0.0)
-        larger = np.maximum(np.abs(left), np.abs(right))
-        relative = np.where(unequal, distance / larger, 0.0)
-        is_within = np.isfinite(distance) & (distance <= pair.atol + pair.rtol * larger)
-    # Whole numbers beyond 2**53 may differ although their floats do not.
-    has_tolerance = (pair.rtol > 0.0 or pair.atol > 0.0) and np.bool_ not in (own.dtype, other.dtype)
-    wrong = unequal & ~is_within if has_tolerance else unequal
-    finite = np.isfinite(distance) & unequal
-    if not finite.any():
-        return VariableDifference(int(wrong.sum()), unit=unit, note="infinite or NaN in one"), _first_of(wrong)
-    largest = int(np.argmax(np.where(finite, distance, -1.0)))
-    steepest = int(np.argmax(np.where(finite, relative, -1.0)))
-    numbers = float(distance[largest]), float(times[largest]), float(relative[steepest]), float(times[steepest])
-    return VariableDifference(int(wrong.sum()), *numbers, unit, note), _first_of(wrong)
+class _Tally:
+    """What differs in one variable, of the rows so far.
+
+    Attributes:
+        first: (row, time, value here, value there) of the first row beyond the tolerance, by the number of the compared
+            row.
+    """
+
+    def __init__(self, here: Side, there: Side, name: str, tolerances: tuple[float, float]) -> None:
+        self._name, self._here, self._there, (self._rtol, self._atol) = name, here, there, tolerances
+        self._unit, (self._note, self._change) = here.unit(name), _conversion(here, there, name)
+        self.first: tuple[int, float, Any, Any] | None = None
+        self._rows = self._wrong = 0
+        self._mismatch, self._is_unequal, self._are_texts = self._change is None, False, False
+        self._largest = self._steepest = (-1.0, 0.0)
+
+    def converted(self, values: NDArray[Any]) -> NDArray[Any]:
+        """The values of the other result, in the unit of this one."""
+        return values_in_unit_of(self._here, self._there, self._name, values)
+
+    def add(self, times: NDArray[np.float64], own: NDArray[Any], other: NDArray[Any]) -> None:
+        """Add rows: their times in s, and both values."""
+        if (own.dtype == object) != (other.dtype == object):
+            self._note = self._note or f"{_kind(own)} in {self._here.title}, {_kind(other)} in {self._there.title}"
+            self._mismatch = True
+        wrong = np.ones(len(times), bool) if self._mismatch else self._beyond(times, own, other)
+        self._wrong += int(wrong.sum())
+        if self.first is None and wrong.any():
+            row = int(np.argmax(wrong))
+            self.first = self._rows + row, float(times[row]), _plain(own[row]), _plain(other[row])
+        self._rows += len(times)
+
+    def _beyond(self, times: NDArray[np.float64], own: NDArray[Any], other: NDArray[Any]) -> NDArray[np.bool_]:
+        """Which values differ beyond the tolerance."""
+        are_floats = own.dtype.kind == "f" or other.dtype.kind == "f"
+        unequal: NDArray[np.bool_] = own != other
+        if are_floats:
+            unequal &= ~(np.isnan(own) & np.isnan(other))
+        if not unequal.any():
+            return unequal
+        self._is_unequal, self._are_texts = True, own.dtype == object
+        if own.dtype == object:
+            return unequal
+        with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
+            left, right = own.astype(np.float64), other.astype(np.float64)
+            distance = np.where(unequal, np.abs(left - right), 0.0)
+            larger = np.maximum(np.abs(left), np.abs(right))
+            relative = np.where(unequal, distance / larger, 0.0)
+            is_within = np.isfinite(distance) & (distance <= self._atol + self._rtol * larger)
+        finite = np.isfinite(distance) & unequal
+        if finite.any():
+            largest = int(np.argmax(np.where(finite, distance, -1.0)))
+            steepest = int(np.argmax(np.where(finite, relative, -1.0)))
+            self._largest = max(self._largest, (float(distance[largest]), float(times[largest])), key=_size)
+            self._steepest = max(self._steepest, (float(relative[steepest]), float(times[steepest])), key=_size)
+        # Whole numbers beyond 2**53 may differ although their floats do not.
+        has_tolerance = (self._rtol > 0.0 or self._atol > 0.0) and np.bool_ not in (own.dtype, other.dtype)
+        return np.logical_and(unequal, ~is_within) if has_tolerance else unequal
+
+    @property
+    def difference(self) -> VariableDifference | None:
+        """How the variable differs; None if not at all."""
+        if self._mismatch:
+            return VariableDifference(self._rows, unit=self._unit, note=self._note)
+        if not self._is_unequal:
+            return None
+        if self._are_texts:
+            return VariableDifference(self._wrong, unit=self._unit)
+        if self._largest[0] < 0.0:
+            return VariableDifference(self._wrong, unit=self._unit, note="infinite or NaN in one")
+        return VariableDifference(self._wrong, *self._largest, *self._steepest, self._unit, self._note)
 
 
-def _values_there(pair: _Pair, name: str) -> NDArray[Any]:
-    """The values of the other result at the compared times, in the unit of this one."""
-    there, matching = pair.there, pair.matching
-    values = values_in_unit_of(pair.here, there, name)
+def _size(found: tuple[float, float]) -> float:
+    """Of a difference and its time; the first of equal ones is kept."""
+    return found[0]
+
+
+def _row_of(first: tuple[Any, str]) -> int:
+    row: int = first[0][0]
+    return row
+
+
+def _values_there(
+    matching: _Matching, times: NDArray[np.float64], other: Columns, values: NDArray[Any]
+) -> NDArray[Any]:
+    """The values of the other result at the compared times."""
     if matching.there is not None:
         return values[matching.there]
-    times = pair.here.times[matching.here]
-    before = np.clip(np.searchsorted(there.times, times + matching.near, "right") - 1, 0, None)
+    times = times[matching.here]
+    before = np.clip(np.searchsorted(other.times, times + matching.near, "right") - 1, 0, None)
     held: NDArray[Any] = values[before]
     if values.dtype.kind != "f":
         return held
-    is_same = np.abs(there.times[before] - times) <= matching.near
-    return np.where(is_same, held, np.interp(times, there.times, values))
+    is_same = np.abs(other.times[before] - times) <= matching.near
+    return np.where(is_same, held, np.interp(times, other.times, values))
 
 
-def values_in_unit_of(here: Side, there: Side, name: str) -> NDArray[Any]:
-    """The values of a variable there, in the unit that it has here; as they are if that is not known."""
-    values = there.values(name)
+def values_in_unit_of(here: Side, there: Side, name: str, values: NDArray[Any]) -> NDArray[Any]:
+    """Values of a variable there, in the unit that it has here; as they are if that is not known."""
     change = _conversion(here, there, name)[1] if name in here.columns else None
     if change is None or change.identity or values.dtype == object:
         return values
@@ -242,26 +360,14 @@ def _conversion(here: Side, there: Side, name: str) -> tuple[str, Linear | None]
     return f"converted from {other}", change
 
 
-def _first(pair: _Pair, row: int, name: str) -> FirstDifference:
-    here, matching = pair.here, pair.matching
-    place = int(matching.here[row])
-    other_place = matching.there[row : row + 1] if matching.there is not None else None
-    one = pair._replace(matching=matching._replace(here=matching.here[row : row + 1], there=other_place))
-    own, other = here.values(name)[place], _values_there(one, name)[0]
+def _first(
+    here: Side, there: Side, matching: _Matching, first: tuple[int, float, Any, Any], name: str
+) -> FirstDifference:
+    row, time, own, other = first
+    place = row if matching.here is None else int(matching.here[row])
     is_number = not any(isinstance(value, str | bytes) for value in (own, other))
-    has_difference = is_number and _conversion(pair.here, pair.there, name)[1] is not None
-    return FirstDifference(
-        float(here.times[place]),
-        here.point(place),
-        name,
-        _plain(own),
-        _plain(other),
-        float(own) - float(other) if has_difference else None,
-    )
-
-
-def _first_of(wrong: NDArray[np.bool_]) -> int | None:
-    return int(np.argmax(wrong)) if wrong.any() else None
+    difference = float(own) - float(other) if is_number and _conversion(here, there, name)[1] is not None else None
+    return FirstDifference(time, here.point(place, time), name, own, other, difference)
 
 
 def _plain(value: Any) -> Any:  # noqa: ANN401  an element of any array

@@ -8,7 +8,7 @@ from __future__ import annotations
 import importlib.util
 import math
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from ..errors import ConfigurationError
 from ..files import replaced
 from ..printing import printable
+from ..system.recording import Columns, joined
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -39,6 +40,7 @@ __all__ = [
     "reduced",
     "require_matplotlib",
     "short",
+    "thinned",
 ]
 
 MAX_POINTS = 4000
@@ -70,6 +72,8 @@ DASHES: tuple[Any, ...] = (
 """With ten colours each: 80 distinguishable lines."""
 _GREATEST = 1e300
 """Largest value that is drawn: matplotlib adds and subtracts the limits of its axes."""
+_KEPT = 1 << 20
+"""Numbers of a long result that are kept for its picture: many more than are visible."""
 _ROWS = 40
 """Lines of one column of a legend."""
 _NAMES = 100
@@ -178,12 +182,53 @@ def reduced(
         return times, values
     size = -(-len(times) // (most // 2))
     sections = np.pad(values, (0, -len(values) % size), constant_values=np.nan).reshape(-1, size)
-    first = np.arange(len(sections)) * size
-    # Of a section without any value the first row is taken, which keeps the gap visible.
-    lowest = first + np.where(np.isnan(sections), np.inf, sections).argmin(axis=1)
-    highest = first + np.where(np.isnan(sections), -np.inf, sections).argmax(axis=1)
-    picked = np.unique(np.concatenate(([0, len(times) - 1], lowest, highest)))
+    extremes = _extremes(sections) + (np.arange(len(sections)) * size)[:, None]
+    picked = np.unique(np.concatenate(([0, len(times) - 1], extremes.ravel())))
     return times[picked], values[picked]
+
+
+def thinned(pieces: Iterable[Columns], names: Sequence[str], *, in_order: bool = False) -> Columns:
+    """These variables of a result; of a long one, about as many rows as memory is there for.
+
+    Of a section of rows two remain, with the minimum and the maximum of each variable in their order; or two rows as
+    they are, if the values of a row belong together (``in_order``).
+    """
+    most = max(_KEPT // (1 + len(names)), 2 * MAX_POINTS)
+    kept, waiting, size = [Columns(np.zeros(0), {name: np.zeros(0, bool) for name in names})], [], 1
+    for piece in pieces:
+        waiting.append(Columns(piece.times, {name: piece.values[name] for name in names}))
+        if sum(len(own.times) for own in waiting) < min(64 * size, most):
+            continue
+        kept += waiting if size == 1 else [_halved(joined(waiting), 2 * size, in_order=in_order)]
+        waiting = []
+        if sum(len(own.times) for own in kept) > most:
+            kept, size = [_halved(joined(kept), 4, in_order=in_order)], 2 * size
+    return joined([*kept, *waiting])
+
+
+def _halved(columns: Columns, rows: int, *, in_order: bool) -> Columns:
+    """Two rows of each section with this number of rows; what is left at the end stays."""
+    end = len(columns.times) // rows * rows
+
+    def picked(values: NDArray[Any], *, is_plain: bool) -> NDArray[Any]:
+        sections = values[:end].reshape(-1, rows)
+        places = np.broadcast_to([0, rows // 2], (len(sections), 2))
+        if not is_plain and values.dtype != object:
+            places = np.sort(_extremes(limited(sections.astype(np.float64))), axis=1)
+        return np.concatenate([np.take_along_axis(sections, places, axis=1).ravel(), values[end:]])
+
+    times = picked(columns.times, is_plain=True)
+    return Columns(times, {name: picked(values, is_plain=in_order) for name, values in columns.values.items()})
+
+
+def _extremes(sections: NDArray[np.float64]) -> NDArray[np.intp]:
+    """Where each section has its minimum and maximum, shape `(sections, 2)`.
+
+    Of a section without any value it is the first row, which keeps the gap visible.
+    """
+    lowest = np.where(np.isnan(sections), np.inf, sections).argmin(axis=1)
+    highest = np.where(np.isnan(sections), -np.inf, sections).argmax(axis=1)
+    return np.stack([lowest, highest], axis=1)
 
 
 def limited(values: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from ..errors import ConfigurationError
 from ..files import Kept, is_file, open_alone
-from ..system.recording import result_format
+from ..system.recording import reading, result_format
 from ..text import nearest_file
 
 __all__ = ["recover"]
@@ -39,15 +39,17 @@ def recover(path: str | Path) -> int:
     if format_ is None:
         raise ConfigurationError(f"no installed package writes the format of '{path}'.")
     growing = format_.growing_file(path)
-    try:
-        if not is_file(growing):
-            if not is_file(path):
-                raise _missing(path)
-            return format_.keep_whole_rows(path, Kept())
-        with open_alone(growing, path):
-            return format_.keep_whole_rows(path, Kept())
-    except OSError as error:
-        raise ConfigurationError(f"the result file '{path}' cannot be recovered: {error.strerror or error}.") from error
+    with reading(path):
+        try:
+            if not is_file(growing):
+                if not is_file(path):
+                    raise _missing(path)
+                return format_.keep_whole_rows(path, Kept())
+            with open_alone(growing, path):
+                return format_.keep_whole_rows(path, Kept())
+        except OSError as error:
+            text = f"the result file '{path}' cannot be recovered: {error.strerror or error}."
+            raise ConfigurationError(text) from error
 
 
 def _missing(path: Path) -> ConfigurationError:

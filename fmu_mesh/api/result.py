@@ -16,6 +16,7 @@ from ..errors import CallRefused, ConfigurationError, UnknownName
 from ..instances.python.unit_names import base_unit_of
 from ..run.outcome import Outcome
 from ..run.run_plan import RunPlan
+from ..system.recording import joined
 from ..system.run_metadata import machine_difference
 from ..system.system import ResolvedSystem
 from ..text import listed, short_path
@@ -24,8 +25,9 @@ from ..variables.units import BaseUnit
 from ..variables.value_types import VariableType, is_float
 from .compared_rows import Side, compared, differences_of, values_in_unit_of
 from .comparison import Comparison
+from .drawing import thinned
 from .result_drawing import FLAGS, NUMBERS, Curve, Curves, PictureOptions, figure_of
-from .result_reading import Columns, chosen_names, read_result
+from .result_reading import Columns, chosen_names, read_result, result_pieces
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -124,7 +126,7 @@ class Result(Mapping[str, NDArray[Any]]):
             >>> mesh.run(stop_time=0.1, record="memory").metadata
             {}
         """
-        return dict(self._columns.metadata)
+        return dict((self._columns if "_columns" in self.__dict__ else self._head).metadata)
 
     @property
     def all(self) -> tuple[Result, ...]:
@@ -278,22 +280,38 @@ class Result(Mapping[str, NDArray[Any]]):
                 raise UnknownName(error.message, hint=error.hint) from None
         return columns[name]
 
+    def __contains__(self, name: object) -> bool:
+        return name in (self._variables or self._head.values)
+
     def __iter__(self) -> Iterator[str]:
-        return iter(self._variables or self._columns.values)
+        return iter(self._variables or self._head.values)
 
     def __len__(self) -> int:
-        return len(self._variables or self._columns.values)
+        return len(self._variables or self._head.values)
 
     def __repr__(self) -> str:
         return f"<Result of '{self.title}': {self.summary}>"
 
     @cached_property
     def _columns(self) -> Columns:
-        if self._given is not None:
-            return self._given
+        return joined(self._pieces()) if self._given is None else self._given
+
+    @cached_property
+    def _head(self) -> Columns:
+        """The beginning of the result, with its names, units and metadata; if it is all of it, it is kept."""
+        pieces = self._pieces()
+        first = next(pieces)
+        if next(pieces, None) is None:
+            self._columns = first
+        return first
+
+    def _pieces(self) -> Iterator[Columns]:
+        """The rows, piece by piece; those of a file that was not read yet are not kept."""
+        if self._given is not None or "_columns" in self.__dict__:
+            return iter([self._columns])
         if self.file is None or (self.outcome is not None and not self.outcome.rows):
-            return Columns(np.zeros(0), {name: np.zeros(0) for name in self._variables})
-        return read_result(self.file, types_of(self._system, self._record))
+            return iter([Columns(np.zeros(0), {name: np.zeros(0) for name in self._variables})])
+        return result_pieces(self.file, types_of(self._system, self._record))
 
     def _of_file(self, number: int) -> Result:
         assert self.outcome is not None  # it has files
@@ -304,13 +322,11 @@ class Result(Mapping[str, NDArray[Any]]):
     def _drawn(self, other: Result, label: str, names: Sequence[str], x: str | None, *, difference: bool) -> Curves:
         """What is drawn of a result, in the units of this one."""
         here, there = self._side, other._side
-        values = {
-            name: values_in_unit_of(here, there, name)
-            for name in dict.fromkeys([*names, *([x] if x is not None else [])])
-            if name in other
-        }
+        wanted = [name for name in dict.fromkeys([*names, *([x] if x is not None else [])]) if name in other]
+        rows = thinned(other._pieces(), wanted, in_order=x is not None)
+        values = {name: values_in_unit_of(here, there, name, rows.values[name]) for name in wanted}
         has_difference = difference and other is not self
-        return Curves(label, other.times, values, differences_of(here, there, names) if has_difference else {})
+        return Curves(label, rows.times, values, differences_of(here, there, names) if has_difference else {})
 
     def _curves_of(self, other: Result, names: Iterable[str]) -> dict[str, Curve]:
         return {name: other._curve(name) for name in names}
@@ -320,9 +336,9 @@ class Result(Mapping[str, NDArray[Any]]):
         """This result, as it is compared with another one."""
         return Side(
             str(short_path(self.file)) if self.file is not None else self.title,
-            self.times,
             [*self],
-            self._columns.values.__getitem__,
+            self._pieces,
+            lambda: self._columns,
             self._unit,
             self._base_unit,
             self._point,
@@ -335,21 +351,21 @@ class Result(Mapping[str, NDArray[Any]]):
         unit = self._unit(name)
         return base_unit_of(unit) if unit is not None else None
 
-    def _point(self, row: int) -> int:
+    def _point(self, row: int, time: float) -> int:
         """The communication point of a row; its number, counted from 0, where a file does not say more."""
         if self._system is None:
-            said = self._columns.metadata
+            said = self._head.metadata
             return int(said.get("first", 0)) + row * int(said.get("every", 1))
         grid = self._system.grid
-        return round((float(self.times[row]) - grid.start_time) / grid.step_size)
+        return round((time - grid.start_time) / grid.step_size)
 
     def _unit(self, name: str) -> str | None:
-        return self._variables[name][1].unit if name in self._variables else self._columns.units.get(name)
+        return self._variables[name][1].unit if name in self._variables else self._head.units.get(name)
 
     def _curve(self, name: str) -> Curve:
         """How a variable is drawn: one axes for each unit, and steps for what holds between two points."""
         if name not in self._variables:
-            values, said = self[name], self._columns.metadata.get("variables", {}).get(name, {})
+            values, said = self._head.values[name], self._head.metadata.get("variables", {}).get(name, {})
             held = values.dtype.kind != "f" or said.get("variability") in _HELD
             axis = FLAGS if values.dtype == bool else NUMBERS if said and values.dtype.kind in "iu" else ""
             return Curve(self._unit(name) or "", axis=axis, held=held)

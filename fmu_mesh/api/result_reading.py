@@ -1,11 +1,12 @@
-"""Reads the columns of a result file, whose last row may be cut off where a run was killed."""
+"""Reads a result file, all of it or in pieces; its last row may be cut off where a run was killed."""
 
 from __future__ import annotations
 
 import base64
 import csv
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from codecs import BOM_UTF8
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from io import BytesIO
 from pathlib import Path
 from typing import Any, Final, cast
@@ -14,17 +15,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import ConfigurationError
+from ..files import opened
 from ..recorder.csv_file import CsvFile
 from ..recorder.notes_file import read_notes
-from ..system.recording import Columns, ReadableFormat, result_format
-from ..text import listed, matching, nearest, nearest_file
+from ..system.recording import Columns, PiecewiseFormat, ReadableFormat, joined, reading, result_format
+from ..text import listed, matching, nearest
 from ..variables.value_types import DTYPES, VariableType, is_float
 
-__all__ = ["Columns", "chosen_names", "read_csv", "read_result", "require_readable"]
+__all__ = ["Columns", "chosen_names", "read_result", "require_readable", "result_pieces"]
 
 _TIME = "time"
 _FLAGS: Final = {"true": True, "false": False}
-_FIELD = re.compile(rb'"((?:[^"]|"")*)"|([^,]*)')
+_FIELD = re.compile(rb'(?:(?<=,)|(?<!.))("[^"]*(?:""[^"]*)*"|[^,"]*)(?=,|\Z)', re.DOTALL)
+_BEGUN = re.compile(rb'(?:(?:"[^"]*(?:""[^"]*)*"|[^,"]*),)*(?:"[^"]*(?:""[^"]*)*"?|[^,"]*)')
+_PIECE_BYTES: Final = 1 << 22
 
 
 def require_readable(path: Path) -> None:
@@ -40,113 +44,147 @@ def require_readable(path: Path) -> None:
 
 
 def read_result(path: Path, types: Mapping[str, VariableType] | None = None) -> Columns:
-    """Read a result file of any format.
+    """Read a result file of any format; the arguments and errors are those of `result_pieces`."""
+    return joined(result_pieces(path, types))
+
+
+def result_pieces(path: Path, types: Mapping[str, VariableType] | None = None) -> Iterator[Columns]:
+    """The rows of a result file of any format, piece by piece; there is at least one piece.
 
     Args:
         path: the file.
-        types: the types of the columns, by name, if they are known.
+        types: the types of the columns of a CSV, by name. Without them, the first row tells truth values, whole
+            numbers, floats and texts apart; a column with a number that is not whole is one of floats from there on.
 
     Raises:
-        ConfigurationError: there is no such file, or it is no result file.
+        ConfigurationError: there is no such file, or it is no result file; of a CSV it says in which line.
     """
     require_readable(path)
     format_ = result_format(path)
-    if format_ in (CsvFile, None):
-        return read_csv(path, types)
-    try:
-        return cast("ReadableFormat", format_).read(path)
-    except OSError as error:
-        raise _unreadable(path, error) from error
+    with reading(path):
+        if format_ in (CsvFile, None):
+            yield from _csv_pieces(path, types or {})
+        elif isinstance(format_, PiecewiseFormat):
+            yield from format_.pieces(path)
+        else:
+            yield cast("ReadableFormat", format_).read(path)
 
 
-def read_csv(path: Path, types: Mapping[str, VariableType] | None = None) -> Columns:
-    """Read a CSV of results.
+def _csv_pieces(path: Path, types: Mapping[str, VariableType]) -> Iterator[Columns]:
+    with opened(path) as file:
+        heading = file.readline().removeprefix(BOM_UTF8)  # Excel writes one
+        names = next(csv.reader([heading.decode()], strict=True), [])
+        if not names or names[0] != _TIME:
+            found = f"its first column is '{names[0][:40]}'" if names else "it is empty"
+            raise ConfigurationError(f"'{path}' is no result file: {found}, not '{_TIME}'.")
+        metadata = read_notes(path)
+        about = {name: known for name, known in metadata.get("variables", {}).items() if name in names}
+        units = {name: of["unit"] for name, of in about.items() if of.get("unit") is not None}
+        table = _CsvTable(path, names, {name: of["type"] for name, of in about.items()} | dict(types))
+        data, body = file.read(_PIECE_BYTES), b""
+        while True:
+            body += data
+            end = _end_of_rows(body)
+            if end or not data:
+                yield table.columns(body[:end])._replace(units=units, metadata=metadata)
+                body = body[end:]
+            if not data:
+                table.check_end(body)
+                return
+            data = file.read(_PIECE_BYTES)
+
+
+def _end_of_rows(body: bytes) -> int:
+    """The end of the last whole row; a text may contain line ends."""
+    end = body.rfind(b"\n") + 1
+    quotes = body.count(b'"', 0, end)
+    while quotes % 2:
+        start = body.rfind(b"\n", 0, end - 1) + 1
+        quotes -= body.count(b'"', start, end)
+        end = start
+    return end
+
+
+class _CsvTable:
+    """Turns the rows of a CSV into columns, piece by piece.
 
     Args:
-        path: the file.
-        types: the types of the columns, by name. Without them, the first row tells truth values, whole numbers, floats
-            and texts apart.
-
-    Raises:
-        ConfigurationError: there is no such file, or it is no result file; says in which line.
+        path: the file, for errors.
+        names: its columns.
+        types: their types by name, as far as they are known.
     """
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise _unreadable(path, error) from error
-    heading, _, body = data.partition(b"\n")
-    try:
-        body.decode()
-        names = next(csv.reader([heading.decode()]), [])
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise ConfigurationError(f"'{path}' is no result file: {error}.") from error
-    if not names or names[0] != _TIME:
-        found = f"its first column is '{names[0][:40]}'" if names else "it is empty"
-        raise ConfigurationError(f"'{path}' is no result file: {found}, not '{_TIME}'.")
-    metadata = read_notes(path)
-    about = {name: known for name, known in metadata.get("variables", {}).items() if name in names}
-    known = {name: of["type"] for name, of in about.items()} | dict(types or {})
-    units = {name: of["unit"] for name, of in about.items() if of.get("unit") is not None}
-    return _columns(path, names, body, known)._replace(units=units, metadata=metadata)
 
+    def __init__(self, path: Path, names: Sequence[str], types: Mapping[str, VariableType]) -> None:
+        self._path, self._names, self._known = path, names, types
+        self._types: list[VariableType] = []
+        self._line = 2
 
-def _unreadable(path: Path, error: OSError) -> ConfigurationError:
-    near = nearest_file(path) if isinstance(error, FileNotFoundError) else None
-    hint = f"Did you mean '{near}'?" if near is not None else None
-    return ConfigurationError(f"the result file '{path}' cannot be read: {error.strerror}.", hint=hint)
+    def columns(self, body: bytes) -> Columns:
+        """The columns of whole rows, which follow those of the last call."""
+        body.decode()  # not every number would tell a byte that is no text
+        if not self._types:
+            first = next(self._rows(body), [b"0.0"] * len(self._names))
+            of_columns = zip(self._names[1:], first[1:], strict=True)
+            self._types = [self._known.get(name, _type_of(text)) for name, text in of_columns]
+        if all(map(is_float, self._types)) and (table := self._floats(body)) is not None:
+            arrays: list[NDArray[Any]] = [*table.T]
+        else:
+            rows = list(self._rows(body))
+            arrays = [self._array(*column) for column in enumerate(zip(*rows, strict=True))]
+            arrays = arrays or [np.zeros(0, DTYPES[type_]) for type_ in ("Float64", *self._types)]
+        self._line += body.count(b"\n")
+        return Columns(arrays[0], dict(zip(self._names[1:], arrays[1:], strict=True)))
 
+    def check_end(self, rest: bytes) -> None:
+        """Check that what follows the last whole row is the beginning of a row; its writer was killed there."""
+        if not _BEGUN.fullmatch(rest):
+            raise self._refused(self._line, "a quotation mark in the wrong place")
 
-def _columns(path: Path, names: Sequence[str], body: bytes, types: Mapping[str, VariableType]) -> Columns:
-    first = _fields(body.partition(b"\n")[0])
-    of_columns = [types.get(name, _type_of(text)) for name, text in zip(names[1:], first[1:], strict=False)]
-    if all(map(is_float, of_columns)) and (table := _table_of_floats(names, body)) is not None:
-        return Columns(table[:, 0], dict(zip(names[1:], table.T[1:], strict=True)))
-    rows = list(_rows(path, names, body))
-    texts = list(zip(*rows, strict=True)) if rows else [()] * len(names)
-    columns = {}
-    for name, type_, values in zip(names[1:], of_columns or ["Float64"] * (len(names) - 1), texts[1:], strict=True):
-        # Another program may write 0 for 0.0.
-        guessed_wrong = name not in types and type_ == "Int64" and not all(map(_is_whole, values))
-        columns[name] = _array(path, "Float64" if guessed_wrong else type_, values)
-    return Columns(_array(path, "Float64", texts[0]), columns)
+    def _floats(self, body: bytes) -> NDArray[np.float64] | None:
+        """All rows of a table with nothing but floats, fast; None where it has something else, or no rows."""
+        if not body.strip():
+            return None
+        try:
+            table: NDArray[np.float64] = np.loadtxt(BytesIO(body), delimiter=",", comments=None, ndmin=2)
+        except ValueError:
+            return None
+        # `loadtxt` passes over empty lines.
+        return table if table.shape == (body.count(b"\n"), len(self._names)) else None
 
+    def _rows(self, body: bytes) -> Iterator[list[bytes]]:
+        """The fields of every row; a text keeps its quotation marks."""
+        waiting, first = b"", self._line
+        for number, line in enumerate(body.split(b"\n")[:-1], self._line):
+            waiting = waiting + b"\n" + line if waiting else line
+            if waiting.count(b'"') % 2:  # a text with line ends in it
+                continue
+            row = waiting.removesuffix(b"\r")
+            fields = row.split(b",") if b'"' not in row else _FIELD.findall(row)
+            if b",".join(fields) != row:
+                raise self._refused(first, "a quotation mark in the wrong place")
+            if len(fields) != len(self._names):
+                raise self._refused(first, f"{len(fields)} values where the heading has {len(self._names)}")
+            yield fields
+            waiting, first = b"", number + 1
 
-def _table_of_floats(names: Sequence[str], body: bytes) -> NDArray[np.float64] | None:
-    """All rows of a file with nothing but floats, fast; None where the file has something else, or no rows."""
-    whole = body[: body.rfind(b"\n") + 1]
-    if not whole.strip():
-        return None
-    try:
-        table: NDArray[np.float64] = np.loadtxt(BytesIO(whole), delimiter=",", comments=None, ndmin=2)
-    except ValueError:
-        return None
-    # `loadtxt` passes over empty lines.
-    return table if table.shape == (whole.count(b"\n"), len(names)) else None
+    def _array(self, place: int, texts: Sequence[bytes]) -> NDArray[Any]:
+        """The values of a column."""
+        type_ = self._types[place - 1] if place else "Float64"
+        if type_ == "Int64" and self._names[place] not in self._known and not all(map(_is_whole, texts)):
+            type_ = self._types[place - 1] = "Float64"  # another program may write 0 for 0.0
+        read = _READERS.get(type_, float if is_float(type_) else int)
+        values: list[Any] = []
+        text = b""
+        try:
+            for text in texts:
+                values.append(read(text))
+            return np.array(values, dtype=DTYPES[type_])
+        except (ValueError, KeyError, OverflowError) as error:
+            what = f"{text.decode(errors='replace')!r} is no value of type {type_}"
+            raise self._refused(self._line + len(values), what) from error
 
-
-def _rows(path: Path, names: Sequence[str], body: bytes) -> Iterable[list[bytes]]:
-    """The fields of every whole row; a text keeps its quotation marks."""
-    waiting, first = b"", 2
-    for number, line in enumerate(body.split(b"\n")[:-1], 2):
-        waiting = waiting + b"\n" + line if waiting else line
-        if waiting.count(b'"') % 2:  # a text with line ends in it
-            continue
-        fields = waiting.split(b",") if b'"' not in waiting else _fields(waiting)
-        if len(fields) != len(names):
-            found = f"{len(fields)} values where the heading has {len(names)}"
-            raise ConfigurationError(f"'{path}' is no result file: line {first}: {found}.")
-        yield fields
-        waiting, first = b"", number + 1
-
-
-def _fields(line: bytes) -> list[bytes]:
-    fields, at = [], 0
-    while at <= len(line):
-        match = _FIELD.match(line, at)
-        assert match is not None  # the second alternative matches anything
-        fields.append(match.group())
-        at = match.end() + 1
-    return fields
+    def _refused(self, line: int, what: str) -> ConfigurationError:
+        return ConfigurationError(f"'{self._path}' is no result file: line {line}: {what}.")
 
 
 def _type_of(text: bytes) -> VariableType:
@@ -159,20 +197,8 @@ def _type_of(text: bytes) -> VariableType:
 
 
 def _is_whole(text: bytes) -> bool:
-    return text.removeprefix(b"-").isdigit()
-
-
-def _array(path: Path, type_: VariableType, texts: Sequence[bytes]) -> NDArray[Any]:
-    read = _READERS.get(type_, float if is_float(type_) else int)
-    values: list[Any] = []
-    text = b""
-    try:
-        for text in texts:
-            values.append(read(text))
-        return np.array(values, dtype=DTYPES[type_])
-    except (ValueError, KeyError, OverflowError) as error:
-        what = f"{text.decode(errors='replace')!r} is no value of type {type_}"
-        raise ConfigurationError(f"'{path}' is no result file: line {len(values) + 2}: {what}.") from error
+    """Whether a text is a whole number; with a sign, 0 is a float."""
+    return text.removeprefix(b"-").isdigit() and text != b"-0" and -(1 << 63) <= int(text) < 1 << 63
 
 
 def _text(field: bytes) -> str:

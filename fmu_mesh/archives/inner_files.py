@@ -49,7 +49,7 @@ def inner_file(path: Path, outer: Path, limits: LimitsConfig) -> InnerFile:
         LoadFailed: there is no such file, or an archive on the way is damaged or exceeds ``limits``; names the archive.
     """
     with ExitStack() as stack, reading(outer):
-        file = stack.enter_context(outer.open("rb"))
+        file = stack.enter_context(files.opened(outer))
         version = files.version_of(file)
         copy = _followed(path, outer, file, limits, stack)
     files.remember_sha256(version, _inside(path, outer), copy.sha256)

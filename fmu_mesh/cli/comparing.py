@@ -45,7 +45,7 @@ def _add_compare(parser: CommandParser) -> None:
 def _compare(arguments: argparse.Namespace) -> int:
     if arguments.plot is not None:
         require_matplotlib()
-    first, second = Result.read(arguments.first), Result.read(arguments.second)
+    first, second = (Result(path.stem, file=path) for path in (arguments.first, arguments.second))
     comparison = first.compare(second, rtol=arguments.rtol, atol=arguments.atol, variables=tuple(arguments.variables))
     if arguments.json:
         print_json(_plain(comparison))

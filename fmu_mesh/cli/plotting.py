@@ -85,7 +85,7 @@ def _of_files(arguments: argparse.Namespace) -> Figure:
     Raises:
         ConfigurationError: a file cannot be read or has no such variable, or options cannot be combined.
     """
-    result, *others = map(Result.read, arguments.results)
+    result, *others = (Result(path.stem, file=path) for path in arguments.results)
     if arguments.difference and (not others or arguments.x is not None):
         hint = "Name two result files." if not others else "Leave --x out."
         raise ConfigurationError("--difference draws the difference of two result files over time.", hint=hint)

@@ -24,7 +24,7 @@ from fmu_mesh.config.scenario_section import ScenarioConfig, ScenarioSource, con
 from fmu_mesh.config.structure import check
 from fmu_mesh.config.yaml_text import Plain, read
 from fmu_mesh.errors import Finding
-from fmu_mesh.files import archive_on_the_way, beside
+from fmu_mesh.files import archive_on_the_way, beside, opened
 from fmu_mesh.text import listed, nearest, nearest_file, shown
 
 __all__ = [
@@ -258,7 +258,7 @@ def _right(loaded: LoadedConfig, findings: Findings) -> LoadedConfig:
 def _text(path: Path, findings: Findings) -> str:
     """The text of the file; empty if there is a finding."""
     try:
-        with path.open("rb") as file:
+        with opened(path) as file:
             data = file.read(MAXIMUM_BYTES + 1)
     except FileNotFoundError:
         findings.add("", "no such file", "", nearest_file(path))

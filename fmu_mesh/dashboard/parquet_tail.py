@@ -71,7 +71,10 @@ class ParquetTail:
             The times in s, shape `(rows,)`, and the values, shape `(columns, rows)`.
         """
         is_over = self._batches.is_over  # asked before the last batch is
-        batch = self._batches.next([_TIME, *columns])
+        try:
+            batch = self._batches.next([_TIME, *columns])
+        except (pa.ArrowException, OSError, ValueError):  # it is damaged
+            batch = None
         if batch is None:
             if is_over and (file := _opened(_Groups, self.path)) is not None:
                 file.skip()  # all of it was in the stream
@@ -142,7 +145,11 @@ class _Stream(_File):
 
     def next(self, columns: Sequence[str]) -> Any:  # noqa: ANN401, ARG002  pyarrow has no types; all columns are there
         message = self._message()
-        return None if message is None else pa.ipc.read_record_batch(message, self.schema)
+        if message is None:
+            return None
+        batch = pa.ipc.read_record_batch(message, self.schema)
+        batch.validate()  # to read beyond its memory would crash
+        return batch
 
     def _message(self) -> Any:  # noqa: ANN401  pyarrow has no types
         """The next message in the memory of the file; None if it is not complete."""
@@ -198,7 +205,9 @@ def _opened(kind: type[_Batches], path: Path) -> _Batches | None:
     with ExitStack() as stack:
         try:
             opened = kind(path, stack.enter_context(path.open("rb")))
-        except (OSError, pa.ArrowException):
+            if not opened.schema.names:  # or they are no text
+                return None
+        except (OSError, ValueError, pa.ArrowException):
             return None
         stack.pop_all()
     return opened

@@ -12,7 +12,8 @@ from typing import Any
 
 import msgspec
 
-from ..files import replaced
+from ..files import opened, replaced
+from ..system.recording import metadata_in
 
 __all__ = ["NotesFile", "read_notes"]
 
@@ -86,8 +87,9 @@ class NotesFile:
 def read_notes(path: Path) -> dict[str, Any]:
     """The metadata beside a result file; empty if there are none."""
     try:
-        found = msgspec.json.decode(_beside(path).read_bytes(), type=dict[str, Any])
-    except (OSError, msgspec.DecodeError):
+        with opened(_beside(path)) as file:
+            found = metadata_in(file.read())
+    except (OSError, ValueError):
         return {}
     if not found.get("set", True):
         del found["set"]

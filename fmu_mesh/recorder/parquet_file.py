@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import io
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final, Self
@@ -25,9 +25,9 @@ from numpy.typing import NDArray
 
 from ..config.findings import Findings
 from ..errors import ConfigurationError
-from ..files import Kept, exists, is_file, open_alone
+from ..files import Kept, decoded_json, exists, is_file, open_alone, opened
 from ..system.arrow import open_parquet, parquet_batches, parquet_module, pyarrow_module
-from ..system.recording import Columns, Recording, with_notes
+from ..system.recording import Columns, Recording, joined, with_notes
 from ..variables.model_description import Variable
 from ..variables.value_types import DTYPES, VariableType, is_text
 from .parquet_groups import KEY, GroupWriter, decoded
@@ -120,7 +120,10 @@ class ParquetFile:
         """Make the Parquet file of the stream that a killed process has left; return the number of its rows."""
         stream = ParquetFile.growing_file(path)
         if not stream.exists():
-            return _rows_of(path) if is_file(path) else 0
+            if not is_file(path):
+                return 0
+            with opened(path) as file:
+                return int(open_parquet(file).metadata.num_rows)
         rows = 0
         if stream.stat().st_size:
             with _Stream(stream) as batches, GroupWriter(path, batches.schema) as groups:
@@ -133,26 +136,27 @@ class ParquetFile:
     @staticmethod
     def read(path: Path) -> Columns:
         """Read a result file; while its run goes on, or after it was killed, the complete batches of its stream."""
-        pa = pyarrow_module()
+        return joined(ParquetFile.pieces(path))
+
+    @staticmethod
+    def pieces(path: Path) -> Iterator[Columns]:
+        """The same, piece by piece."""
+        pyarrow_module()
         stream = ParquetFile.growing_file(path)
-        try:
-            if stream.is_file() and not path.exists():
-                with _Stream(stream) as batches:
-                    rows = sum(batch.num_rows for batch in batches)
-                with _Stream(stream) as batches:
-                    schema = batches.schema
-                    columns = _columns_of(path, schema, rows, batches)
-                    metadata = with_notes(decoded(schema), batches.notes)
-            else:
-                with path.open("rb") as file:
-                    content = open_parquet(file)
-                    schema = content.schema_arrow
-                    columns = _columns_of(path, schema, content.metadata.num_rows, parquet_batches(content))
-                    metadata = decoded(content.metadata)
-        except (pa.ArrowException, msgspec.DecodeError) as error:
-            raise _no_result(path, str(error)) from error
-        units = {f.name: f.metadata[_UNIT].decode() for f in schema if f.metadata and _UNIT in f.metadata}
-        return Columns(columns.pop(_TIME), columns, units, metadata)
+        if stream.is_file() and not path.exists():
+            with _Stream(stream) as batches:
+                none = _columns_of(path, batches.schema)
+                for batch in batches:
+                    yield none._replace(**_arrays_of(batch))
+                yield none._replace(metadata=with_notes(none.metadata, batches.notes))
+            return
+        with opened(path) as file:
+            content = open_parquet(file)
+            none = _columns_of(path, content.schema_arrow)._replace(metadata=decoded(content.metadata))
+            if not content.metadata.num_rows:
+                yield none
+            for batch in parquet_batches(content):
+                yield none._replace(**_arrays_of(batch))
 
     def write(self, times: NDArray[np.float64], columns: Sequence[NDArray[Any]]) -> None:
         """Append one row per time; ``columns`` are arrays of the same length, of their types' dtypes."""
@@ -281,9 +285,11 @@ class _Stream:
         while True:
             try:
                 batch, own = self._reader.read_next_batch_with_custom_metadata()
+                batch.validate(full=True)  # wrong offsets of texts would crash
                 if own is not None:
-                    self.notes += msgspec.json.decode(own[KEY], type=list[dict[str, Any]])
-            except (StopIteration, self._pa.ArrowException, OSError):  # the end, or a batch that is cut off
+                    self.notes += decoded_json(own[KEY], list[dict[str, Any]])
+            except (StopIteration, self._pa.ArrowException, OSError, KeyError, ValueError):
+                # The end, or a batch that is cut off.
                 return
             yield batch
 
@@ -307,20 +313,6 @@ class _Sink(io.RawIOBase):
         taken = b"".join(self._parts)
         self._parts.clear()
         return taken
-
-
-def _rows_of(path: Path) -> int:
-    """The number of rows of a complete Parquet file.
-
-    Raises:
-        ConfigurationError: it is none.
-    """
-    try:
-        with path.open("rb") as file:
-            rows: int = open_parquet(file).metadata.num_rows
-    except pyarrow_module().ArrowException as error:
-        raise _no_result(path, str(error)) from error
-    return rows
 
 
 def _schema_of(recording: Recording) -> Any:  # noqa: ANN401  pyarrow has no types
@@ -361,22 +353,19 @@ def _arrow_array(values: NDArray[Any], type_: Any) -> Any:  # noqa: ANN401  pyar
     return pa.Array.from_buffers(type_, len(values), [None, *map(pa.py_buffer, buffers)], null_count=0)
 
 
-def _columns_of(path: Path, schema: Any, rows: int, tables: Iterable[Any]) -> dict[str, NDArray[Any]]:  # noqa: ANN401  pyarrow has no types
-    """The columns as numpy has them; besides these, only one table is in memory at a time."""
+def _columns_of(path: Path, schema: Any) -> Columns:  # noqa: ANN401  pyarrow has no types
+    """The columns without rows."""
     pa = pyarrow_module()
     if not schema.names or schema.names[0] != _TIME or not pa.types.is_float64(schema[0].type):
         raise _no_result(path, f"its first column is not '{_TIME}' in float64")
-    columns = {field.name: np.empty(rows, _array(pa.array([], field.type)).dtype) for field in schema}
-    done = 0
-    for table in tables:
-        block = slice(done, min(done + table.num_rows, rows))  # a stream may have grown meanwhile
-        done = block.stop
-        for name, column in zip(schema.names, table.columns, strict=True):
-            part = _array(column)[: block.stop - block.start]
-            if part.dtype != columns[name].dtype:  # it has nulls, as the files of other programs may
-                columns[name] = columns[name].astype(np.result_type(columns[name], part))
-            columns[name][block] = part
-    return columns
+    units = {f.name: f.metadata[_UNIT].decode() for f in schema if f.metadata and _UNIT in f.metadata}
+    return Columns(**_arrays_of(schema.empty_table()), units=units, metadata=decoded(schema))
+
+
+def _arrays_of(batch: Any) -> dict[str, Any]:  # noqa: ANN401  pyarrow has no types
+    """The times and values of a batch, as numpy has them."""
+    arrays = dict(zip(batch.schema.names, map(_array, batch.columns), strict=True))
+    return {"times": arrays.pop(_TIME), "values": arrays}
 
 
 def _array(column: Any) -> NDArray[Any]:  # noqa: ANN401  pyarrow has no types

@@ -13,7 +13,7 @@ import msgspec
 
 from ..files import replaced
 from ..system.arrow import parquet_module, pyarrow_module
-from ..system.recording import with_notes
+from ..system.recording import metadata_in, with_notes
 
 __all__ = ["KEY", "GroupWriter", "decoded"]
 
@@ -144,4 +144,4 @@ class _Abandoned(Exception):
 
 def decoded(container: Any) -> dict[str, Any]:  # noqa: ANN401  a schema of pyarrow, or the end of a file
     """The metadata of a run in it; empty if there are none."""
-    return msgspec.json.decode((container.metadata or {}).get(KEY, b"{}"), type=dict[str, Any])
+    return metadata_in((container.metadata or {}).get(KEY, b"{}"))

@@ -24,7 +24,7 @@ from ..config.loading import LoadedConfig
 from ..errors import ConfigurationError
 from ..files import Kept, open_alone
 from ..recorder.arrays_file import ENDING
-from ..system.recording import Recording, ResultFile, ResultFormat, result_format
+from ..system.recording import Recording, ResultFile, ResultFormat, reading, result_format
 from ..system.records import record_paths
 from ..system.run_metadata import metadata_of
 from ..system.system import ResolvedSystem
@@ -144,7 +144,7 @@ def _rows_left(path: Path, note: Path) -> int:
         kept = None
     growing = _format(path).growing_file(path)
     # Opening the file makes sure that no other run is writing it, and removes a draft that the process has left.
-    with suppress(ConfigurationError, OSError), open_alone(growing):
+    with suppress(ConfigurationError), reading(path), open_alone(growing):
         if kept is not None and growing.is_file() and growing.stat().st_size >= kept.size:  # or it is another file
             return _format(path).keep_whole_rows(path, kept)
     return 0

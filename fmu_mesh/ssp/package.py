@@ -232,7 +232,7 @@ def _way_out(path: Path, error: LoadFailed) -> str | None:
 def beginning(path: Path) -> bytes:
     """The first bytes of a file; empty if it cannot be read."""
     try:
-        with path.open("rb") as file:
+        with files.opened(path) as file:
             return file.read(len(ARCHIVE))
     except OSError:
         return b""

@@ -156,6 +156,8 @@ def submit(  # noqa: PLR0913  each is a line of the script
     limit = f"%{at_once}" if at_once is not None else ""
     script = folder.absolute() / _SCRIPT
     log = str(script.parent).replace("%", "%%") + "/" + _LOG.format(task="%a")  # Slurm replaces %a, in folders, too
+    if not log.isprintable():  # a line break would end the comment; tasks run in this folder anyway
+        log = _LOG.format(task="%a")
     settings = [
         f"--job-name={shlex.quote(name)}",
         f"--array=1-{tasks}{limit}",

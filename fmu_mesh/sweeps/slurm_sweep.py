@@ -14,6 +14,7 @@ from typing import Final
 import msgspec
 
 from ..errors import ConfigurationError, MeshLost
+from ..files import decoded_json
 from ..run.allowed_code import names_code
 from ..text import short_path
 from .planned_sweep import PlannedSweep
@@ -74,8 +75,8 @@ class SlurmSweep(Sweep):
     def _submitted_before(self) -> SlurmJob | None:
         """The job of an earlier call, unless Slurm says that all its tasks have ended."""
         try:
-            job = msgspec.json.decode(self._note.read_bytes(), type=SlurmJob, dec_hook=path_of)
-        except (OSError, msgspec.MsgspecError):
+            job = decoded_json(self._note.read_bytes(), SlurmJob, path_of)
+        except (OSError, ValueError):
             return None
         return None if unfinished(job) == 0 else job
 

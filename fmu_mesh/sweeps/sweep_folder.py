@@ -27,7 +27,7 @@ import msgspec
 from msgspec.structs import replace
 
 from ..errors import ConfigurationError
-from ..files import is_file, replaced
+from ..files import decoded_json, is_file, replaced
 from ..run.options import Options
 from .variant_run import Cell, Row, curves_of, path_of
 from .variants import Parameters
@@ -132,11 +132,11 @@ class SweepFolder:
         """
         file = self.path / _WANTED
         try:
-            return msgspec.json.decode(file.read_bytes(), type=Wanted, dec_hook=path_of)
+            return decoded_json(file.read_bytes(), Wanted, path_of)
         except OSError as error:
             text = f"there is no sweep in '{self.path}': '{file}' cannot be read ({error.strerror})"
             raise ConfigurationError(text) from error
-        except msgspec.MsgspecError as error:
+        except ValueError as error:
             raise ConfigurationError(f"'{file}' is not what this version of fmu_mesh writes: {error}") from error
 
     def rows(self) -> dict[str, Row]:
@@ -278,7 +278,7 @@ def _lines(file: Path) -> Iterator[Row]:
     for line in file.read_bytes().splitlines():
         try:
             yield msgspec.convert(json.loads(line), Row)
-        except ValueError:
+        except (ValueError, msgspec.MsgspecError, RecursionError):
             continue
 
 

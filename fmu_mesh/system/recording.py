@@ -6,9 +6,10 @@ the dot. CSV, Parquet and MCAP are found in the same way. `docs/extending.md` sh
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol, cast
+from typing import Any, NamedTuple, Protocol, cast, runtime_checkable
 
 import msgspec
 import numpy as np
@@ -16,19 +17,25 @@ from numpy.typing import NDArray
 
 from fmu_mesh.config.findings import Findings
 from fmu_mesh.config.loading import LoadedConfig
-from fmu_mesh.files import Kept
+from fmu_mesh.errors import ConfigurationError, FmuMeshError
+from fmu_mesh.files import Kept, decoded_json
 from fmu_mesh.plugins import plugin, plugin_names
+from fmu_mesh.text import nearest_file, printable
 from fmu_mesh.variables.model_description import ModelDescription
 from fmu_mesh.variables.value_types import VariableType
 
 __all__ = [
     "Columns",
+    "PiecewiseFormat",
     "ReadableFormat",
     "Recording",
     "ResultFile",
     "ResultFormat",
     "has_unknown_ending",
     "is_in_memory",
+    "joined",
+    "metadata_in",
+    "reading",
     "result_endings",
     "result_format",
     "with_notes",
@@ -96,6 +103,23 @@ class Columns(NamedTuple):
     values: dict[str, NDArray[Any]]
     units: Mapping[str, str] = {}
     metadata: Mapping[str, Any] = {}
+
+
+class _Metadata(msgspec.Struct):
+    """The metadata that are used when a file is read, with their types."""
+
+    mesh: str = ""
+    first: int = 0
+    every: int = 1
+    versions: dict[str, str] = {}
+    variables: dict[str, _Described] = {}
+    set: list[dict[str, Any]] = []
+
+
+class _Described(msgspec.Struct):
+    type: VariableType
+    unit: str | None = None
+    variability: str = ""
 
 
 class ResultFormat(Protocol):
@@ -173,6 +197,15 @@ class ReadableFormat(Protocol):
             ConfigurationError: it is not a result file of this format.
             OSError: it cannot be read.
         """
+        ...
+
+
+@runtime_checkable
+class PiecewiseFormat(Protocol):
+    """What a `ReadableFormat` also has whose files may be larger than the memory."""
+
+    def pieces(self, path: Path) -> Iterator[Columns]:
+        """The rows of a result file, piece by piece; there is at least one piece. The errors are those of `read`."""
         ...
 
 
@@ -275,6 +308,56 @@ def with_notes(metadata: Mapping[str, Any], entries: Iterable[Mapping[str, Any]]
         else:
             noted |= entry
     return {**noted, "set": values} if values else noted
+
+
+def joined(pieces: Iterable[Columns]) -> Columns:
+    """All rows of a result. Besides its columns, only one piece is in memory at a time."""
+    columns: dict[str, NDArray[Any]] = {}
+    rows = 0
+    for piece in pieces:
+        end = rows + len(piece.times)
+        for name, part in (("", piece.times), *piece.values.items()):
+            own = columns.setdefault(name, np.empty(0, part.dtype))
+            if own.dtype != part.dtype:  # it has nulls, as the files of other programs may, or is no whole number
+                own = columns[name] = own.astype(np.result_type(own, part))
+            if len(own) < end:
+                own.resize(max(end, rows + rows // 4), refcheck=False)  # large memory grows where it is
+            own[rows:end] = part
+        rows = end
+    for own in columns.values():
+        own.resize(rows, refcheck=False)
+    return piece._replace(times=columns.pop(""), values=columns)
+
+
+def metadata_in(data: bytes | str) -> dict[str, Any]:
+    """The metadata of a run, from the JSON in a result file.
+
+    Raises:
+        ValueError: they are none.
+    """
+    decoded_json(data, _Metadata)
+    return decoded_json(data, dict[str, Any])
+
+
+@contextmanager
+def reading(path: Path, what: str = "result file") -> Iterator[None]:
+    """In the block a result file, or another kind of file, is read. Whatever is wrong with it is one error.
+
+    Raises:
+        ConfigurationError: it cannot be read, or it is none.
+    """
+    try:
+        yield
+    except FmuMeshError:
+        raise
+    except OSError as error:
+        near = nearest_file(path) if isinstance(error, FileNotFoundError) else None
+        hint = f"Did you mean '{near}'?" if near is not None else None
+        text = f"the {what} '{path}' cannot be read: {error.strerror or error}.".replace("..", ".")
+        raise ConfigurationError(text, hint=hint) from error
+    except Exception as error:  # each library of a format has errors of its own for damaged bytes
+        text = f"'{path}' is no {what}: {printable(str(error)) or type(error).__name__}."
+        raise ConfigurationError(text.replace("..", ".")) from error
 
 
 def _ending(path: str | Path) -> str:

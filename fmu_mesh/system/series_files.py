@@ -10,14 +10,16 @@ import csv
 import hashlib
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from functools import lru_cache
+from io import TextIOWrapper
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
 from ..errors import ConfigurationError
+from ..files import opened
 from ..simtime import TimeGrid
 from ..text import listed, nearest
 from ..variables.model_description import ModelDescription, Value, Variable
@@ -28,7 +30,6 @@ from .schedule import Course, Schedule, SeriesFile
 
 __all__ = ["SeriesRefused", "columns_of", "content_of", "course_of", "courses_of", "read_series"]
 
-_CHUNK = 1 << 20
 _PARQUET = ".parquet"
 _DELIMITERS = ",;\t"
 _TRUTH = {"true": True, "1": True, "1.0": True, "false": False, "0": False, "0.0": False}
@@ -64,14 +65,8 @@ def content_of(path: Path) -> str:
     Raises:
         SeriesRefused: it cannot be read.
     """
-    digest = hashlib.sha256()
-    try:
-        with path.open("rb") as file:
-            while chunk := file.read(_CHUNK):
-                digest.update(chunk)
-    except OSError as error:
-        raise SeriesRefused(f"'{path}', which cannot be read ({error.strerror})", "a readable file") from error
-    return digest.hexdigest()
+    with _reading(path), opened(path) as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def columns_of(path: Path) -> list[str]:
@@ -80,14 +75,11 @@ def columns_of(path: Path) -> list[str]:
     Raises:
         SeriesRefused: it is no table.
     """
-    if path.suffix.lower() == _PARQUET:
-        names: list[str] = _parquet(path).schema_arrow.names
-        return names
-    try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            return _header(file.readline(), path)[0]
-    except (OSError, UnicodeDecodeError) as error:
-        raise SeriesRefused(f"'{path}', which cannot be read ({error})", "a table in UTF-8") from error
+    with _reading(path), opened(path) as file:
+        if path.suffix.lower() == _PARQUET:
+            names: list[str] = open_parquet(file).schema_arrow.names
+            return names
+        return _header(file.readline().decode("utf-8-sig"), path)[0]
 
 
 def course_of(schedule: Schedule, variable: Variable, grid: TimeGrid, points: int) -> Course:
@@ -215,18 +207,15 @@ def _read(path: str, sha256: str, time: str, column: str) -> Series:
 
 def _csv_pairs(path: Path, time: str, column: str) -> Iterator[tuple[str, str, str]]:
     """(where, time, cell) of each row of a CSV."""
-    try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            names, delimiter = _header(file.readline(), path)
-            first, second = _place(names, time, "time", path), _place(names, column, "column", path)
-            for number, row in enumerate(csv.reader(file, delimiter=delimiter), start=2):
-                if not row:
-                    continue
-                if len(row) <= max(first, second):
-                    raise SeriesRefused(f"{len(row)} cells in line {number} of '{path}'", f"{len(names)} cells")
-                yield f"line {number}", row[first], row[second]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise SeriesRefused(f"'{path}', which cannot be read ({error})", "a table in UTF-8") from error
+    with _reading(path), TextIOWrapper(opened(path), "utf-8-sig", newline="") as file:
+        names, delimiter = _header(file.readline(), path)
+        first, second = _place(names, time, "time", path), _place(names, column, "column", path)
+        for number, row in enumerate(csv.reader(file, delimiter=delimiter), start=2):
+            if not row:
+                continue
+            if len(row) <= max(first, second):
+                raise SeriesRefused(f"{len(row)} cells in line {number} of '{path}'", f"{len(names)} cells")
+            yield f"line {number}", row[first], row[second]
 
 
 def _header(line: str, path: Path) -> tuple[list[str], str]:
@@ -243,23 +232,27 @@ def _header(line: str, path: Path) -> tuple[list[str], str]:
 
 def _parquet_pairs(path: Path, time: str, column: str) -> Iterator[tuple[str, Any, Any]]:
     """(where, time, cell) of each row of a Parquet file."""
-    table = _parquet(path)
-    names = table.schema_arrow.names
-    _place(names, time, "time", path), _place(names, column, "column", path)
-    row = 0
-    for batch in parquet_batches(table, list(dict.fromkeys([time, column]))):
-        for when, cell in zip(batch.column(time).to_pylist(), batch.column(column).to_pylist(), strict=True):
-            row += 1
-            yield f"row {row}", when, cell
+    with _reading(path), opened(path) as file:
+        table = open_parquet(file)
+        names = table.schema_arrow.names
+        _place(names, time, "time", path), _place(names, column, "column", path)
+        row = 0
+        for batch in parquet_batches(table, list(dict.fromkeys([time, column]))):
+            for when, cell in zip(batch.column(time).to_pylist(), batch.column(column).to_pylist(), strict=True):
+                row += 1
+                yield f"row {row}", when, cell
 
 
-def _parquet(path: Path) -> Any:  # noqa: ANN401  pyarrow has no types
+@contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    """In the block a table is read; whatever is wrong with it is refused."""
     try:
-        return open_parquet(path)
-    except ConfigurationError as error:
-        raise SeriesRefused(f"'{path}', which needs the package pyarrow", "`pip install pyarrow`") from error
-    except (OSError, ValueError) as error:
-        raise SeriesRefused(f"'{path}', which cannot be read ({error})", "a Parquet file") from error
+        yield
+    except SeriesRefused:
+        raise
+    except Exception as error:  # each format has errors of its own for damaged bytes
+        reason = (error.strerror if isinstance(error, OSError) else None) or error
+        raise SeriesRefused(f"'{path}', which cannot be read ({reason})", "a table in UTF-8") from error
 
 
 def _place(names: Sequence[str], name: str, key: str, path: Path) -> int:

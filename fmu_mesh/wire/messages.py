@@ -14,6 +14,7 @@ from typing import Final, TypeVar
 import msgspec
 
 from ..errors import ErrorReport, MessageRefused
+from ..files import decoded_json
 from ..variables.value_types import PlainValue
 from .time_profile import NodeProfile
 
@@ -110,7 +111,6 @@ def decode_json(data: bytes, type_: type[T], most: int = MAX_MESSAGE_SIZE) -> T:
     if len(data) > most:
         raise MessageRefused(f"it has {len(data)} bytes; the limit is {most}")
     try:
-        return msgspec.json.decode(data, type=type_)
-    # msgspec does not catch exceptions of Python itself, such as UnicodeDecodeError.
-    except (msgspec.MsgspecError, ValueError, OverflowError, RecursionError) as error:
+        return decoded_json(data, type_)
+    except ValueError as error:
         raise MessageRefused(str(error)) from error

@@ -142,6 +142,18 @@ def test_a_host_without_slurm_is_told_what_to_install(fake: Fake, folder: Path) 
         cancel(job_in(folder))
 
 
+def test_a_line_break_in_the_name_of_the_folder_is_not_executed(fake: Fake, folder: Path) -> None:
+    fake("sbatch", 'sh "$2"; echo 17')
+    hostile = folder / "a\ntouch executed\n"
+    hostile.mkdir()
+
+    submitted(hostile)
+
+    assert [path.name for path in hostile.iterdir()] == ["sweep.sbatch"]
+    settings = [line for line in (hostile / "sweep.sbatch").read_text().splitlines() if not line.startswith("exec ")]
+    assert all(line.startswith("#") for line in settings)
+
+
 def test_the_words_of_sbatch_are_shown_if_it_refuses_a_job(fake: Fake, folder: Path) -> None:
     fake("sbatch", "echo 'sbatch: error: invalid partition specified: x' >&2; echo 'sbatch: error: Failed' >&2; exit 1")
 

@@ -39,14 +39,15 @@ def result(columns: Values, *, step: float = 0.5, start: float = 0.0) -> Result:
 
 def side(values: Sequence[float], unit: str | None, title: str) -> Side:
     """A result with one variable `a.u`."""
+    columns = Columns(np.arange(len(values), dtype=np.float64), {"a.u": np.array(values)})
     return Side(
         title,
-        np.arange(len(values), dtype=np.float64),
         ["a.u"],
-        lambda _: np.array(values),
+        lambda: iter([columns]),
+        lambda: columns,
         lambda _: unit,
         lambda _: base_unit_of(unit) if unit else None,
-        lambda row: row,
+        lambda row, _: row,
     )
 
 

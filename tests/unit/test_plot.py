@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from fmu_mesh.api.drawing import reduced
 from fmu_mesh.api.result import Result
 from fmu_mesh.api.result_drawing import Curves, PictureOptions, figure_of
-from fmu_mesh.api.result_reading import Columns, read_csv
+from fmu_mesh.api.result_reading import Columns, read_result
 from fmu_mesh.cli.main import main
 from fmu_mesh.cli.plotting import plot_results, plotted_where_it_ends
 from fmu_mesh.errors import ConfigurationError, StepFailed
@@ -76,7 +76,7 @@ def test_a_plot_for_which_the_disk_has_no_room_leaves_the_last_one(results: Path
 
 
 def test_a_result_file_is_read_as_it_was_written(results: Path) -> None:
-    read = read_csv(results)
+    read = read_result(results)
 
     assert read.times.tolist() == [0.0, 0.5, 1.0]
     assert list(read.values) == ["a.y", "a.der(x,2)", "b.on", "b.count"]
@@ -90,14 +90,14 @@ def test_a_result_file_is_read_as_it_was_written(results: Path) -> None:
 @pytest.mark.parametrize("rest", ["1.5", "1.5,0.1", "1.5,0.1,0.2,true,1", ""])
 def test_a_last_row_that_is_cut_off_is_left_out(results: Path, rest: str) -> None:
     results.write_text(RESULTS + rest, encoding="utf-8")
-    assert read_csv(results).times.tolist() == [0.0, 0.5, 1.0]
+    assert read_result(results).times.tolist() == [0.0, 0.5, 1.0]
 
 
 def test_columns_of_text_are_read_and_not_drawn(tmp_path: Path) -> None:
     path = tmp_path / "a.csv"
     path.write_text('time,a,"s,t",b\n0.0,1.5,"x, ""y""\nz",2\n0.5,2.5,"",3\n1.0,3.5,"cut')
 
-    values = read_csv(path).values
+    values = read_result(path).values
 
     assert {name: column.tolist() for name, column in values.items()} == {
         "a": [1.5, 2.5],
@@ -127,7 +127,7 @@ def test_what_is_no_result_file_is_refused_with_the_place(results: Path, text: s
         results.write_bytes(b"time,a\n\xff\xfe\n")
         message = "codec can't decode"
     with pytest.raises(ConfigurationError, match=r"'.*run\.csv' is no result file: ") as caught:
-        read_csv(results)
+        read_result(results)
     assert message in str(caught.value)
 
 

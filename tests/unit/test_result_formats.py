@@ -377,11 +377,11 @@ def test_reading_parquet_starts_no_thread(tmp_path: Path) -> None:
     path = tmp_path / "a.parquet"
     types: list[VariableType] = ["Float64", "Int32"]
     file = ParquetFile.open(path, recording(types))
-    file.write(np.arange(200_000) * 0.1, [np.full(200_000, 0.5), np.arange(200_000, dtype=np.int32)])
+    file.write(times_of(200_000), [np.full(200_000, 0.5), np.arange(200_000, dtype=np.int32)])
     file.close()
 
     # A thread of pyarrow that waits for the lock of Python at the end of the interpreter ends the process with 134.
-    subprocess.run([sys.executable, "-c", THREADS, path], check=True, timeout=120)
+    subprocess.run([sys.executable, "-c", THREADS, path], check=True, timeout=300)
 
 
 def test_row_groups_are_bounded_and_small_batches_become_large_ones(

@@ -16,6 +16,7 @@ from urllib.parse import unquote
 import msgspec
 
 from ...errors import LoadFailed
+from ...files import opened
 
 __all__ = ["GazeboModel", "SdfWorld", "read_world"]
 
@@ -77,7 +78,8 @@ def read_world(path: Path) -> SdfWorld:
         LoadFailed: it is no world that Gazebo could simulate without looking elsewhere.
     """
     try:
-        source = path.read_bytes()
+        with opened(path) as file:
+            source = file.read()
         root = ET.fromstring(source)  # noqa: S314  a file of the user's own; it is run as a simulation anyway
     except (OSError, ET.ParseError) as error:
         reason = error.strerror if isinstance(error, OSError) else str(error)

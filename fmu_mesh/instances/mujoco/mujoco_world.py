@@ -34,6 +34,7 @@ from typing import Any, Literal
 import msgspec
 
 from ...errors import LoadFailed
+from ...files import opened
 from ...text import listed, nearest
 from ...variables.model_description import Causality, DefaultExperiment, ModelDescription, Variable
 from .mujoco_section import MujocoConfig
@@ -116,7 +117,8 @@ def load_world(path: Path, config: MujocoConfig) -> World:
     """
     mujoco = engine()
     try:
-        data = path.read_bytes()
+        with opened(path) as file:
+            data = file.read()
         warnings.clear()
         model = mujoco.MjModel.from_xml_path(str(path))
     except (OSError, ValueError) as error:

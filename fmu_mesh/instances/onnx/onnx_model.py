@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from ...config.mesh import LimitsConfig
 from ...errors import LoadFailed
+from ...files import opened
 from ...text import listed
 from ...variables.model_description import ModelDescription, Variable
 from ...variables.value_types import MAX_ELEMENTS, VariableType, is_float, nested, zero
@@ -168,7 +169,8 @@ def _read(path: Path, limits: LimitsConfig) -> bytes:
         if size > limits.unpacked_bytes:
             text = f"'{path}' has {size} bytes; the limit is {limits.unpacked_bytes}"
             raise LoadFailed(text, hint="Raise `limits.unpacked_bytes` if that is right.")
-        return path.read_bytes()
+        with opened(path) as file:
+            return file.read()
     except OSError as error:
         raise LoadFailed(f"'{path}' cannot be read: {error.strerror or error}") from error
 

@@ -18,6 +18,7 @@ from ... import files
 from ...config.loading import LoadedConfig
 from ...config.mesh import RosConfig, RosTopicConfig
 from ...errors import ConfigurationError
+from ...system.recording import reading
 from ...text import listed, nearest, nearest_file
 from ...variables.model_description import ModelDescription, Value
 from ...variables.value_types import nested
@@ -66,7 +67,7 @@ class Bag:
 
     def __init__(self, path: Path) -> None:
         try:
-            from rosbags.highlevel import AnyReader, AnyReaderError  # noqa: PLC0415 an optional dependency
+            from rosbags.highlevel import AnyReader  # noqa: PLC0415 an optional dependency
         except ImportError as error:
             raise ConfigurationError(
                 "reading a bag needs the package rosbags", hint="Install it: pip install 'fmu-mesh[ros]'."
@@ -82,11 +83,11 @@ class Bag:
                 f"the folder '{path}' is no bag: it has no metadata.yaml.",
                 hint="Name the folder that `ros2 bag record` made, or an .mcap file.",
             )
-        try:
+        with reading(path, "bag"):
+            if not files.is_folder(path):
+                files.opened(path).close()  # no pipe
             self._reader: AnyReader = AnyReader([path])
             self._reader.open()
-        except (AnyReaderError, OSError, ValueError) as error:
-            raise ConfigurationError(f"'{path}' cannot be read as a bag: {str(error).rstrip('.')}.") from error
 
     def __enter__(self) -> Self:
         return self
@@ -116,12 +117,13 @@ class Bag:
         """
         wanted = {topic.name: [(path_parts(port.path), port) for port in topic.ports] for topic in topics}
         connections = [connection for connection in self._reader.connections if connection.topic in wanted]
-        for connection, logged, data in self._reader.messages(connections) if connections else ():
-            message: Any = self._reader.deserialize(data, connection.msgtype)
-            stamp = _header_stamp(message) if stamps == "header" else None
-            for parts, port in wanted[connection.topic]:
-                value = _value_at(message, parts, port, connection.topic)
-                yield BagSample(logged if stamp is None else stamp, port.instance, port.variable.name, value)
+        with reading(self.path, "bag"):
+            for connection, logged, data in self._reader.messages(connections) if connections else ():
+                message: Any = self._reader.deserialize(data, connection.msgtype)
+                stamp = _header_stamp(message) if stamps == "header" else None
+                for parts, port in wanted[connection.topic]:
+                    value = _value_at(message, parts, port, connection.topic)
+                    yield BagSample(logged if stamp is None else stamp, port.instance, port.variable.name, value)
 
 
 def chosen_topics(

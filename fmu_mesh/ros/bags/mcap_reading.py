@@ -10,11 +10,11 @@ import numpy as np
 from mcap.records import Channel, McapRecord, Message, Schema
 from numpy.typing import NDArray
 
-from ...errors import ConfigurationError
+from ...files import opened
 from ...simtime import ENDLESS, TimeGrid
 from ...system.recording import Columns
 from ...variables.value_types import DTYPES, VariableType, is_text
-from ..messages.cdr import CdrError, Codec
+from ..messages.cdr import Codec
 from ..messages.definitions import Basic, MessageTypes, path_parts
 from .mcap_layout import RecordedMcap, TopicColumns
 from .mcap_records import McapContent
@@ -37,18 +37,15 @@ def read_mcap(path: Path) -> Columns:
         ConfigurationError: it is not the MCAP of a run.
         OSError: it cannot be read.
     """
-    with path.open("rb") as file:
+    with opened(path) as file:
         content = McapContent(file, path)
         recording = content.recording
         rows = content.rows if content.rows is not None else content.whole_rows()[0]
         reader = _ColumnReader(recording)
-        try:
-            for chunk in content.chunks:
-                for record in content.records_of(chunk):
-                    reader.take(record)
-            return reader.columns(rows)._replace(metadata=content.metadata)
-        except (CdrError, KeyError, ValueError, TypeError, IndexError) as error:
-            raise ConfigurationError(f"'{path}' is no result file: {error}.") from error
+        for chunk in content.chunks:
+            for record in content.records_of(chunk):
+                reader.take(record)
+        return reader.columns(rows)._replace(metadata=content.metadata)
 
 
 class _ColumnReader:

@@ -16,11 +16,9 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import BinaryIO, Final
+from typing import Any, BinaryIO, Final
 
-import msgspec
 from mcap.data_stream import ReadDataStream, RecordBuilder
-from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import (
     Channel,
@@ -40,8 +38,8 @@ from mcap.records import (
 from mcap.stream_reader import breakup_chunk
 
 from ...errors import ConfigurationError
-from ...files import Kept
-from ...system.recording import with_notes
+from ...files import Kept, decoded_json
+from ...system.recording import metadata_in, with_notes
 from .mcap_layout import NOTE, RECORDING, ROWS, RecordedMcap
 
 __all__ = ["McapContent", "finish_mcap"]
@@ -133,22 +131,19 @@ class McapContent:
         file.seek(0)
         if file.read(len(_MAGIC)) != _MAGIC:
             raise ConfigurationError(f"'{path}' is no result file: it does not begin as an MCAP does.")
-        try:
-            for offset, opcode, length in self._heads():
-                self._look(offset, opcode, length)
-            records = [(note.name, note.metadata) for _, _, note in self.notes]
-            about = next((record for name, record in records if name == RECORDING), None)
-            if about is None:
-                hint = "Was it recorded by this version? `fmu-mesh play` reads all bags."
-                text = f"'{path}' is no result file: it does not say which variables are in its topics."
-                raise ConfigurationError(text, hint=hint)
-            self.recording = msgspec.json.decode(about["recording"], type=RecordedMcap)
-            entries = [msgspec.json.decode(record["entry"]) for name, record in records if name == NOTE]
-            self.metadata = with_notes(msgspec.json.decode(about["metadata"]), entries)
-            rows = [int(record["rows"]) for name, record in records if name == ROWS]
-            self.rows = rows[-1] if rows and self._is_finished else None
-        except (McapError, struct.error, KeyError, ValueError) as error:
-            raise ConfigurationError(f"'{path}' is no result file: {error}.") from error
+        for offset, opcode, length in self._heads():
+            self._look(offset, opcode, length)
+        records = [(note.name, note.metadata) for _, _, note in self.notes]
+        about = next((record for name, record in records if name == RECORDING), None)
+        if about is None:
+            hint = "Was it recorded by this version? `fmu-mesh play` reads all bags."
+            text = f"'{path}' is no result file: it does not say which variables are in its topics."
+            raise ConfigurationError(text, hint=hint)
+        self.recording = decoded_json(about["recording"], RecordedMcap)
+        entries = [decoded_json(record["entry"], dict[str, Any]) for name, record in records if name == NOTE]
+        self.metadata = with_notes(metadata_in(about["metadata"]), entries)
+        rows = [int(record["rows"]) for name, record in records if name == ROWS]
+        self.rows = rows[-1] if rows and self._is_finished else None
 
     def records_of(self, placed: _PlacedChunk) -> list[McapRecord]:
         """The schemas, channels and messages of a chunk."""

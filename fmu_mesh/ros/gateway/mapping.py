@@ -11,6 +11,7 @@ from ...config.findings import Findings
 from ...config.loading import LoadedConfig
 from ...config.mesh import Config, RosConfig
 from ...errors import ConfigurationError
+from ...files import opened
 from ...system.start_values import sized
 from ...text import nearest_file
 from ...variables.model_description import Causality, ModelDescription, Variability, Variable
@@ -36,7 +37,8 @@ def message_types(loaded: LoadedConfig, findings: Findings) -> MessageTypes | No
             continue
         place = loaded.resolve(file)
         try:
-            custom[name] = place.read_text(encoding="utf-8")
+            with opened(place) as source:
+                custom[name] = source.read().decode()
         except (OSError, UnicodeDecodeError) as error:
             reason = error.strerror if isinstance(error, OSError) else str(error)
             findings.add(path, f"'{file}', which cannot be read ({reason})", "a .msg file", nearest_file(place))

@@ -209,7 +209,7 @@ class _Archive:
         self._digest: str | None = None
         with ExitStack() as stack, reading(path):
             if (outer := files.archive_on_the_way(path)) is None:
-                self._file: IO[bytes] = stack.enter_context(path.open("rb"))
+                self._file: IO[bytes] = stack.enter_context(files.opened(path))
             else:
                 copy = inner_file(path, outer, terms.limits)
                 self._file, self._digest = stack.enter_context(copy.file), copy.sha256
