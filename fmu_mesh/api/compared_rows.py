@@ -6,6 +6,7 @@ Knows results only by their arrays and units.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from operator import itemgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -79,7 +80,8 @@ def compared(here: Side, there: Side, names: Sequence[str], *, rtol: float = 0.0
             values = _values_there(matching, own.times, other, tally.converted(other.values[name]))
             tally.add(own.times[matching.here], own.values[name][matching.here], values)
     found = {name: tally.difference for name, tally in tallies.items()}
-    first = min(((tally.first, name) for name, tally in tallies.items() if tally.first), default=None, key=_row_of)
+    firsts = [(tally.first, name) for name, tally in tallies.items() if tally.first is not None]
+    first = min(firsts, default=None, key=lambda own: own[0][0])  # of equal rows the first variable
     return Comparison(
         here.title,
         there.title,
@@ -292,8 +294,8 @@ class _Tally:
         if finite.any():
             largest = int(np.argmax(np.where(finite, distance, -1.0)))
             steepest = int(np.argmax(np.where(finite, relative, -1.0)))
-            self._largest = max(self._largest, (float(distance[largest]), float(times[largest])), key=_size)
-            self._steepest = max(self._steepest, (float(relative[steepest]), float(times[steepest])), key=_size)
+            self._largest = max(self._largest, (float(distance[largest]), float(times[largest])), key=itemgetter(0))
+            self._steepest = max(self._steepest, (float(relative[steepest]), float(times[steepest])), key=itemgetter(0))
         # Whole numbers beyond 2**53 may differ although their floats do not.
         has_tolerance = (self._rtol > 0.0 or self._atol > 0.0) and np.bool_ not in (own.dtype, other.dtype)
         return np.logical_and(unequal, ~is_within) if has_tolerance else unequal
@@ -310,16 +312,6 @@ class _Tally:
         if self._largest[0] < 0.0:
             return VariableDifference(self._wrong, unit=self._unit, note="infinite or NaN in one")
         return VariableDifference(self._wrong, *self._largest, *self._steepest, self._unit, self._note)
-
-
-def _size(found: tuple[float, float]) -> float:
-    """Of a difference and its time; the first of equal ones is kept."""
-    return found[0]
-
-
-def _row_of(first: tuple[Any, str]) -> int:
-    row: int = first[0][0]
-    return row
 
 
 def _values_there(

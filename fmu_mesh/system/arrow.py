@@ -16,7 +16,8 @@ from ..errors import ConfigurationError
 
 __all__ = ["open_parquet", "parquet_batches", "parquet_module", "pyarrow_module"]
 
-_BATCH_ROWS: Final = 65536
+_BATCH_VALUES: Final = 1 << 20
+"""A batch has about so many values."""
 
 
 def pyarrow_module() -> Any:  # noqa: ANN401  an optional dependency
@@ -48,11 +49,8 @@ def open_parquet(source: Path | IO[bytes]) -> Any:  # noqa: ANN401  pyarrow has 
     return parquet_module().ParquetFile(source, pre_buffer=False)
 
 
-def parquet_batches(
-    content: Any,  # noqa: ANN401  pyarrow has no types
-    columns: Sequence[str] | None = None,
-    groups: Sequence[int] | None = None,
-) -> Iterator[Any]:
-    """The rows of a file from `open_parquet`: of these columns, and of these row groups; default: all."""
-    rows: Iterator[Any] = content.iter_batches(_BATCH_ROWS, row_groups=groups, columns=columns, use_threads=False)
+def parquet_batches(content: Any, columns: Sequence[str] | None = None) -> Iterator[Any]:  # noqa: ANN401  pyarrow has no types
+    """The rows of a file from `open_parquet`; of these columns, if some are named."""
+    size = max(1, _BATCH_VALUES // len(columns or content.schema_arrow.names))
+    rows: Iterator[Any] = content.iter_batches(size, columns=columns, use_threads=False)
     return rows
