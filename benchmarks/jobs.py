@@ -298,6 +298,15 @@ JOBS = (
         ),
     ),
     Job(
+        "frames",
+        "pendulum -> delay without shared memory, as between two hosts, own process per FMU",
+        _PENDULUM,
+        (
+            Entry("fmu_mesh, shared memory", OURS, 400_000),
+            Entry("fmu_mesh, no shared memory", OURS, 400_000, options={"shared_memory": "no"}),
+        ),
+    ),
+    Job(
         "kinds",
         "two instances of one kind in a chain, launch --local, nothing recorded",
         _NOTHING,

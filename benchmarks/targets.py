@@ -54,6 +54,7 @@ _COMMAND, _LOCAL = "fmu-mesh launch", "fmu-mesh launch --local"
 _NO_FILE = "fmu_mesh, nothing recorded"
 _EIGHT, _TWO = "fmu_mesh, chain of 8", "fmu_mesh, chain of 2"
 _ROUND_TRIP = "shared memory, C: one round trip"
+_FRAMES, _MEMORY = "fmu_mesh, no shared memory", "fmu_mesh, shared memory"
 _WINDOW1 = "fmu_mesh, gauss_seidel"
 
 TARGETS = (
@@ -63,6 +64,7 @@ TARGETS = (
     Target("cycle in one group, against the FMPy loop", "group", "fmu_mesh", "times as fast", 40, 80, _FMPY),
     Target("window 1: a point, against a round trip", "window1", _WINDOW1, "times as long", 25, 8, _ROUND_TRIP),
     Target("chain of 8 against chain of 2", "chain8", _EIGHT, "times as long, each", 1.0, 0.7, _TWO),
+    Target("main job without shared memory, against with it", "frames", _FRAMES, "times as fast", 0.33, 0.5, _MEMORY),
     Target("FMI 1.0, against the other checkout", "kinds", _FMI1, "times as fast", 2, 4, _FMI1 + OTHER),
     Target("Boolean, Enumeration, against the other checkout", "kinds", _FMI2, "times as fast", 2, 4, _FMI2 + OTHER),
     Target("main job, launch --local", "pendulum", "fmu_mesh, launch --local", "points/s", 437_000, 800_000),

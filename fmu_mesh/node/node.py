@@ -76,7 +76,7 @@ _NO_MASTER_S = 1.0
 """How long in s the report of a failure waits for a master that was never seen."""
 
 _LAZY_S = 0.05
-"""How long in s rows that no step needs may wait for more rows: each frame wakes a process, which needs a core."""
+"""How long in s rows that no step needs may wait for more rows while this node steps: each frame wakes a process."""
 
 
 class Node:
@@ -254,16 +254,17 @@ class Node:
         eager = any(link.has_frames for runner in self._runners.values() for link in runner.out_links)
         if self._profiler is not None:
             self._profiler.start(engine)
+        all_sent = True
         while not self.finished:
-            try:
-                stepped = engine.run(_LOOK_S, eager=eager)
+            try:  # it waits only when everything is sent: the grant may depend on it
+                stepped = engine.run(_LOOK_S if all_sent or not eager else 0.0, eager=eager)
             except (TerminationRequested, NotFinite) as asked:
                 stepped = True
                 self._end_early(asked)
             if self._profiler is not None:
                 self._profiler.look(engine)
             with engine.sending:
-                self._send_rows(stepped=stepped)
+                all_sent = self._send_rows(stepped=stepped)
             if stepped:
                 self.server.stepped()
             while (message := self._inbox.poll()) is not None:
@@ -287,14 +288,15 @@ class Node:
             member.flush()
         self._memory.progress[self._plan.node].raise_to(self._engine.covered + 1)
 
-    def _send_rows(self, *, stepped: bool) -> None:
-        """Send rows that a consumer may wait for; those for the recorder every 50 ms, and where nothing happens."""
+    def _send_rows(self, *, stepped: bool) -> bool:
+        """Send rows that a step may wait for; those for the recorder every 50 ms, and before a wait. Are all sent?"""
         now = time.monotonic()
         lazy = not stepped or now - self._lazy_sent > _LAZY_S
         if lazy:
             self._lazy_sent = now
         for runner in self._runners.values():
             runner.flush(lazy=lazy)
+        return lazy
 
     def _sort_in(self, message: Message) -> None:
         """Put a frame into its mirror, or store a new grant; any other message is refused."""

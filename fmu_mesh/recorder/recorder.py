@@ -90,6 +90,9 @@ class Recorder:
         self._memory = memory if memory is not None else self._own_memory
         self._sources: dict[int, RecordedSource] = {}
         self._rows = plan.rings[0].rows
+        self._wake_rows = min(
+            _WAKE_ROWS, max(1, plan.window // 2)
+        )  # at the window, the nodes would wait for this thread
         self._files = RecordFiles(files, growth)
         self._has_begun = has_begun
         self._written = 0
@@ -201,7 +204,7 @@ class Recorder:
         last_point, complete = self._plan.grid.last_point, self._complete()
         if self._written > last_point:
             return []
-        due = min(self._written + _WAKE_ROWS if complete >= 0 else 0, last_point)
+        due = min(self._written + self._wake_rows if complete >= 0 else 0, last_point)
         if self._written <= complete and complete >= due and (self._written or self._has_begun()):
             return None
         slowest = min(self._sources.values(), key=lambda source: source.covered)

@@ -55,11 +55,13 @@ class SimulatedMesh:
     Attributes:
         recorded: the rows (Real part) that reached the recorder, by instance.
         messages: how many frames were sent.
+        waits_before_sending: how often a node waited while it had rows that were not sent.
     """
 
     def __init__(self, plan: Plan, open_instance: Callable[[str], Instance], seed: int = 0) -> None:
         self.recorded: dict[str, list[NDArray[np.float64]]] = {}
         self.messages = 0
+        self.waits_before_sending = 0
         self._plan = plan
         self._random = random.Random(seed)  # noqa: S311 no secret
         self._nodes = list(plan.nodes)
@@ -340,7 +342,10 @@ class _SimulatedEngine(PlainEngine):
 
     def run(self, wait_s: float, *, eager: bool) -> bool:
         self._process.give_up()
+        links = [(runner, link) for runner in self.runners for link in runner.out_links if link.has_frames]
+        is_unsent = any(link.sent <= runner.step for runner, link in links)
         stepped = super().run(wait_s, eager=eager)
+        self._process.mesh.waits_before_sending += is_unsent and wait_s > 0 and not stepped
         for _ in range(1, self._process.mesh.burst() if stepped else 1):
             if not super().run(0.0, eager=eager):
                 break

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from tests.scenarios.scenario import Scenario
+from tests.scenarios.scenario import Counter, Scenario
+from tests.scenarios.simulated import SimulatedMesh
 
 CHAIN = ("a -> b", "b -> c")
 
@@ -101,3 +102,15 @@ def test_initial_values_run_down_the_chain_from_node_to_node(seed: int) -> None:
 
     assert calls["b"] == ["enter", "set a", "get point", "set a", "exit"]
     assert calls["c"] == ["enter", "set b", "exit"]
+
+
+@pytest.mark.parametrize("window", [1, 16, 300])
+def test_a_node_that_waits_has_sent_all_of_its_rows(window: int) -> None:
+    """The grant may depend on them: a recorder that lacks rows holds it."""
+    plan = Scenario(("a -> b",), points=300).plan(window=window, record=True)
+    mesh = SimulatedMesh(plan, lambda name: Counter(plan, name), seed=window)
+
+    mesh.run()
+
+    assert mesh.waits_before_sending == 0
+    assert [row[0] for row in mesh.recorded["b"]] == list(range(301))
