@@ -293,6 +293,13 @@ class TimeoutsConfig(Base, frozen=True, kw_only=True):
             "in s. Keep it below start and initialize: then the error names the FMU."
         ),
     ] = 45.0
+    link: Annotated[
+        DeadlineSeconds,
+        Meta(
+            description="Between hosts, without any sign of life of the other end of a link, in s. On one host, a "
+            "process counts as lost only when it has ended."
+        ),
+    ] = 30.0
     stop: Annotated[
         DeadlineSeconds,
         Meta(

@@ -14,10 +14,11 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from typing import Any, Final, TypeVar
+from typing import Any, Final, TypeVar, cast
 
 import msgspec
 
+from ..awake import AwakeClock
 from ..config.mesh import TimeoutsConfig
 from ..errors import FmuError, InitializationFailed, LoadFailed, StepFailed
 from ..rings.native import NativeStep, Stage
@@ -143,40 +144,35 @@ class CallWatch:
             self._changed.notify_all()
 
     def _run(self) -> None:
-        seen: tuple[tuple[str, int], float] = (("", -1), 0.0)
+        clock, since, watched = AwakeClock(), 0.0, cast("object", None)
         while True:
             with self._changed:
                 if self._closed:
                     return
                 call, position = self._call, self._position
-                self._changed.wait(self._patience(call, position))
-                if call is not self._call:
+                if call is None:
+                    self._changed.wait(_LOOK_S if position is not None else None)
+                elif call == watched:
+                    self._changed.wait(min(_LOOK_S, max(0.0, since + call.limit_s - clock())))
+                if call is not self._call or position is not self._position:
                     continue
-            now = time.monotonic()
-            if call is not None:
-                if now - call.started >= call.limit_s:
-                    self._on_overrun(self._overrun(call, now, "a call"))
-                    return
-            elif position is not None and position is self._position:
-                instance, point, call_of_step = position()
-                place = instance, point
-                if place != seen[0]:
-                    seen = (place, now)
-                elif now - seen[1] >= self._step_limit_s:
-                    step = _Call(instance, StepFailed, "step", self._step_limit_s, seen[1])
-                    self._on_overrun(self._overrun(step, now, call_of_step))
-                    return
+            place: object = call
+            otherwise = "a call"
+            if call is None:
+                if position is None:
+                    continue
+                instance, point, otherwise = position()
+                place, call = (instance, point), _Call(instance, StepFailed, "step", self._step_limit_s, 0.0)
+            now = clock()
+            if place != watched:
+                watched, since = place, now
+            if now - since >= call.limit_s:
+                self._on_overrun(self._overrun(call, now - since, otherwise))
+                return
 
-    @staticmethod
-    def _patience(call: _Call | None, position: object) -> float | None:
-        """Time in s until the next deadline can be missed; None: no call is watched."""
-        if call is not None:
-            return max(0.0, call.started + call.limit_s - time.monotonic())
-        return _LOOK_S if position is not None else None
-
-    def _overrun(self, call: _Call, now: float, otherwise: str) -> FmuError:
+    def _overrun(self, call: _Call, seconds: float, otherwise: str) -> FmuError:
         return self._crash or call.kind(
-            not_returned(self._caller, now - call.started, otherwise),
+            not_returned(self._caller, seconds, otherwise),
             instance=call.instance,
             hint=f"If it needs that long, raise `timeouts.{call.setting}` in the configuration.",
         )

@@ -11,10 +11,11 @@ import operator
 import time
 from collections.abc import Collection
 
-from ..errors import ProtocolBroken
+from ..errors import DeadlineExceeded, ProtocolBroken
 from ..rings.host_memory import HostMemory, Wish
 from ..system.plan import RECORDER, Plan
-from .members import spoken
+from ..wire.runtime import STOPPED
+from .members import Members, spoken
 from .pacing import CLOCK, PAUSE, Reach
 
 __all__ = ["Granting"]
@@ -75,6 +76,23 @@ class Granting:
     def instances_of(self, node: str) -> str | None:
         """The names of the instances of a node, for an error."""
         return ", ".join(item.name for item in self._plan.nodes[node].instances) or None
+
+    def check_progress(self, silent_s: float, members: Members) -> None:
+        """There was no progress for ``silent_s`` seconds.
+
+        Raises:
+            DeadlineExceeded: there should have been some. The instances of a node step one after the other, each with a
+                deadline of its own; a node that is stopped has only one.
+        """
+        step_s = self._plan.system.config.timeouts.step
+        if silent_s <= step_s or self.slowest >= self.grant:
+            return
+        most_instances = max(len(node.instances) for node in self._plan.nodes.values())
+        if (stopped := members.stopped) or silent_s > 3 * step_s * most_instances:
+            state = f": its process {STOPPED}" if stopped else ""
+            who = spoken(*(stopped or [self.laggard]))
+            error = DeadlineExceeded(f"no progress for {silent_s:.1f} s{state}", instance=who)
+            raise error.at(self.slowest, self._plan.grid.time(self.slowest))
 
     def take(self, node: str, point: int, *, ended: bool) -> bool:
         """Store the progress that a message tells; return whether it has increased.

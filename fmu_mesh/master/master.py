@@ -21,6 +21,7 @@ from collections.abc import Callable
 import msgspec
 import zenoh
 
+from ..awake import AwakeClock
 from ..errors import (
     ConfigurationError,
     DeadlineExceeded,
@@ -119,7 +120,8 @@ class Master:
         self._pacer = Pacer(plan, config.simulation.real_time_factor)
         self._clock = RunClock()
         self._published = 0.0
-        self._moved = time.monotonic()
+        self._awake = AwakeClock()
+        self._moved = 0.0
         self._shares = config.zenoh.shared_memory and can_share()
         memory_of = HostMemory.create if self._shares else HostMemory.private
         self._memory = memory_of(next(iter(plan.nodes.values())).memory, MASTER)
@@ -228,9 +230,9 @@ class Master:
         self._publish_status(at_once=True)
 
     def _wait_for_nodes(self) -> None:
-        deadline = time.monotonic() + self._timeouts.start
+        deadline = self._awake() + self._timeouts.start
         while not self._members.complete:
-            if time.monotonic() > deadline:
+            if self._awake() > deadline:
                 raise self._members.absence()
             self._turn(0.25)
         self._members.welcome(TIME_LINE_ENTRIES // len(self._nodes) if self._watch is not None else 0)
@@ -242,18 +244,13 @@ class Master:
         if self._hold is None:
             self._clock.start()
         self._pacer.start(0)
-        self._moved = time.monotonic()
-        # Each instance has its own deadline for a step; the instances of a group step one after the other.
-        patience_s = 3 * self._timeouts.step * self._most_instances
+        self._moved = self._awake()
         while self._granting.slowest < self._last_point:
             self._turn(self._publish_grant())
             if self._hold is not None and self._granting.slowest >= self._hold:
                 self._clock.stop()
-            silent_s = time.monotonic() - self._moved
-            if silent_s > patience_s and self._granting.slowest < self._granting.grant and self._hold is None:
-                slowest, who = self._granting.slowest, spoken(self._granting.laggard)
-                error = DeadlineExceeded(f"no progress for {silent_s:.1f} s", instance=who)
-                raise error.at(slowest, self._plan.grid.time(slowest))
+            if self._hold is None:
+                self._granting.check_progress(self._awake() - self._moved, self._members)
         self._clock.stop()
 
     def _publish_grant(self) -> float:
@@ -264,7 +261,7 @@ class Master:
         grant = max(granting.grant, min(grant, paced))
         if grant > granting.grant:
             if granting.slowest >= granting.grant:  # they had nothing to do until now, because of the wall clock
-                self._moved = time.monotonic()
+                self._moved = self._awake()
             granting.raise_to(grant)
         self._tell_grant()
         if self._watch is not None:
@@ -287,9 +284,9 @@ class Master:
         return self._plan.grid.last_point if ended is None else ended
 
     def _wait_for(self, reached: Callable[[], bool], timeout_s: float, what: str) -> None:
-        deadline = time.monotonic() + timeout_s
+        deadline = self._awake() + timeout_s
         while not reached():
-            if time.monotonic() > deadline:
+            if self._awake() > deadline:
                 initializing = self._state == "initializing"
                 progress = self._granting.progress
                 missing = [n for n in self._nodes if (progress[n] < 0 if initializing else n not in self._reports)]
@@ -315,8 +312,9 @@ class Master:
                 self._inbox.refusals.add(spoken(node), f"a message of kind {kind} is not one that the master accepts")
             message = self._inbox.poll()
         if granting.look(ended=self.ended_by is not None) or moved:  # the slowest node may wait for another slow one
-            self._moved = time.monotonic()
+            self._moved = self._awake()
         self._publish_status()
+        self._members.look_at_doubted()
         if self._failure is not None:
             raise self._failure
 
@@ -408,7 +406,7 @@ class Master:
                 self._pacer.start(self._granting.slowest)
             case "stop":
                 self._stop()
-        self._moved = time.monotonic()
+        self._moved = self._awake()
         answer = CommandAnswer(command.command, self._state, self._granting.slowest, self._hold)
         query.reply(self._keys.mesh_key("command"), msgspec.json.encode(answer), encoding=json_encoding)
         query.drop()

@@ -21,6 +21,7 @@ from ..wire.keys import RunKeys
 from ..wire.membership import Admission, NodeReady, Registration, Welcome
 from ..wire.messages import HEADER, decode_json, encode_abort
 from ..wire.refusals import payload_of
+from ..wire.runtime import is_alive, is_stopped
 from ..wire.session import tokens, undeclare_all
 
 __all__ = ["Followers", "Members", "spoken"]
@@ -41,6 +42,7 @@ class Members:
 
     Attributes:
         shared: the nodes that use the shared memory, and the recorder.
+        doubted: nodes on this host whose token is gone, although their process runs.
 
     Call sequence: `register`, `ready` and `token_changed` for messages that arrive; `welcome` when `complete` is true;
     then `send`. `abort` may be called at any time, `close` at the end.
@@ -68,6 +70,7 @@ class Members:
         self._ready: dict[str, tuple[NodeReady, zenoh.Query]] = {}
         self._welcomed = False
         self.shared: tuple[str, ...] = ()
+        self.doubted: set[str] = set()
         self._grant_keys = keys.grants(self._nodes)
         self._grants = [
             session.declare_publisher(key, congestion_control=zenoh.CongestionControl.BLOCK, express=True)
@@ -124,11 +127,25 @@ class Members:
         self._ready[node] = (ready, query)
 
     def token_changed(self, sample: zenoh.Sample) -> None:
-        """Handle a liveliness token that seems to be gone, if it really is."""
+        """Handle a liveliness token that seems to be gone, if it really is. On this host its process tells."""
         node = RunKeys.node_in(str(sample.key_expr))
         gone = sample.kind == zenoh.SampleKind.DELETE and node in self._admitted
-        if gone and not tokens(self._session, self._keys.node(node)):
+        if gone and node in self.shared:
+            self.doubted.add(node)
+            self.look_at_doubted()
+        elif gone and not tokens(self._session, self._keys.node(node)):
             self._on_lost(node)
+
+    def look_at_doubted(self) -> None:
+        """Call it now and then: a node whose token is gone is lost when its process has ended."""
+        for node in [node for node in self.doubted if not is_alive(self._admitted[node].pid)]:
+            self.doubted.discard(node)
+            self._on_lost(node)
+
+    @property
+    def stopped(self) -> list[str]:
+        """The nodes on this host whose processes are stopped."""
+        return [node for node in self.shared if is_stopped(self._admitted[node].pid)]
 
     @property
     def complete(self) -> bool:

@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Mapping
 
+from ..awake import AwakeClock
 from ..errors import FmuMeshError, StepFailed
 from ..instances.call_guard import not_returned
 from ..system.plan import NodePlan
@@ -40,6 +41,7 @@ class Activity:
         self._plan = plan
         self._refusals = refusals
         self._started = 0.0
+        self._clock = AwakeClock()
         self._engine: Engine | None = None
         self._under_way: tuple[str, int, float] | None = None
 
@@ -78,14 +80,14 @@ class Activity:
             running_time=time.monotonic() - self._started if engine is not None else 0.0,
         )
 
-    def look_at_steps(self, now: float) -> StepFailed | None:
+    def look_at_steps(self) -> StepFailed | None:
         """Look at the running step; return an error if it has not returned within the time limit.
 
         The burst ends after this step. If the step takes longer than the time between two looks, the rows before it are
         sent: other nodes may wait for them, and they must not be lost if this process dies. Other calls of an FMU are
         watched by `fmu_mesh.instances.call_guard.CallWatch`.
         """
-        engine = self._engine
+        engine, now = self._engine, self._clock()
         if engine is None or self.state != "running" or (runner := engine.current) is None:
             self._under_way = None
             return None
@@ -115,7 +117,7 @@ class Activity:
             return f"waiting at point {runner.point} for {runner.waits_for}"
         if current is not runner:
             return f"waiting at point {runner.point} for its turn: '{current.name}' is in doStep"
-        now = time.monotonic()
+        now = self._clock()
         return f"in doStep at point {runner.point} for {now - self._since(runner, now):.1f} s"
 
     def _since(self, runner: Runner, now: float) -> float:

@@ -21,8 +21,8 @@ from collections.abc import Callable
 
 import zenoh
 
+from ..awake import AwakeClock
 from ..errors import (
-    DeadlineExceeded,
     FmuError,
     FmuMeshError,
     Interrupted,
@@ -39,7 +39,7 @@ from ..rings.host_memory import ONE_CORE, HostMemory
 from ..system.plan import RECORDER, Link, NodePlan
 from ..wire.frames import FrameReceiver, of_text
 from ..wire.inbox import Inbox, Message
-from ..wire.membership import Membership, Welcome
+from ..wire.membership import SILENCE_S, Membership, Welcome
 from ..wire.messages import (
     ABORT,
     FINISH,
@@ -116,7 +116,8 @@ class Node:
         self.finished = False
         self._token_went = False
         self.failure_is_known = False
-        self._heard = time.monotonic()
+        self._clock = AwakeClock()
+        self._heard = 0.0
         self._lazy_sent = 0.0
         self._progress_sent = -1
         self._progress_told_at = 0.0
@@ -203,7 +204,7 @@ class Node:
             if not self._membership.given_up:
                 raise
             raise self._membership.without_master() from error
-        self._heard = time.monotonic()
+        self._heard = self._clock()
         if welcome.profile:
             self._profiler = Profiler(self._plan.node, welcome.profile)
         return welcome
@@ -270,10 +271,9 @@ class Node:
             while (message := self._inbox.poll()) is not None:
                 self._sort_in(message)
             self._tell_progress(engine)
-            now = time.monotonic()
-            if now - self._heard > self._plan.timeouts.step:
-                text = f"the master has said nothing for {now - self._heard:.1f} s"
-                raise DeadlineExceeded(text, hint="Is its process stopped, or its host gone?")
+            if self._token_went and not self._membership.master_runs:
+                self._end_without_master()
+            self._membership.check_silence(self._clock() - self._heard)
 
     def _end_early(self, asked: TerminationRequested | NotFinite) -> None:
         """An FMU ends the simulation: its unit stops stepping, and the master ends the run at its point."""
@@ -290,10 +290,8 @@ class Node:
 
     def _send_rows(self, *, stepped: bool) -> bool:
         """Send rows that a step may wait for; those for the recorder every 50 ms, and before a wait. Are all sent?"""
-        now = time.monotonic()
-        lazy = not stepped or now - self._lazy_sent > _LAZY_S
-        if lazy:
-            self._lazy_sent = now
+        if lazy := not stepped or time.monotonic() - self._lazy_sent > _LAZY_S:
+            self._lazy_sent = time.monotonic()
         for runner in self._runners.values():
             runner.flush(lazy=lazy)
         return lazy
@@ -318,7 +316,7 @@ class Node:
     def _take_from_master(self, message: Message) -> None:
         _, kind, _, _, point, data = message
         if kind == GRANT:
-            self._heard = time.monotonic()
+            self._heard = self._clock()
             if self._memory is not self._own_memory:
                 return  # the grant itself is in the shared memory; this is a sign of life
             most = self._progress_sent + self._plan.window
@@ -366,8 +364,9 @@ class Node:
             FmuMeshError: why the master ended the run, or that the master is gone.
         """
         if not self._membership.master_is_gone:
+            self._token_went = self._membership.master_runs  # then it is asked again whether it runs
             return
-        error = self._membership.without_master()
+        error = self._membership.without_master(self._clock() - self._heard)
         deadline = time.monotonic() + _LAST_WORD_S
         while not self.finished and (left := deadline - time.monotonic()) > 0:
             if (message := self._inbox.wait(left)) is not None:
@@ -397,7 +396,7 @@ class Node:
         """Report the failure to the master, unless the master is gone; return whether it knows now."""
         self._activity.enter("failed")
         if self._membership.lost_master:
-            return True
+            return self._clock() - self._heard < SILENCE_S  # otherwise only the link is lost, and nobody else says it
         self.server.say_everything()
         try:
             self._tell_end(self._as_others_see(error), self._patience_s())

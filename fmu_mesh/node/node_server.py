@@ -159,7 +159,7 @@ class NodeServer:
         for name, publisher in self._status_publishers.items():
             if matches(publisher):
                 publisher.put(msgspec.json.encode(self._activity.status(name)))
-        if (hang := self._activity.look_at_steps(now)) is not None:
+        if (hang := self._activity.look_at_steps()) is not None:
             self._on_hang(hang)
 
     def report_hang(self, error: FmuError, deadline_s: float) -> bool:

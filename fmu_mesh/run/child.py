@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import IO, Protocol
 
 from ..errors import Interrupted
-from ..wire.runtime import process_state
+from ..wire.runtime import is_stopped
 from .threads import ONE_THREAD
 
 __all__ = [
@@ -161,7 +161,7 @@ class Child:
     def stopped(self) -> bool:
         """Whether it is stopped by SIGSTOP; being held by a debugger does not count."""
         pid = self._process.pid
-        return pid is not None and self.running and process_state(pid) == "T"
+        return pid is not None and self.running and is_stopped(pid)
 
     def signal(self, number: signal.Signals) -> None:
         """Send a signal if it still runs."""

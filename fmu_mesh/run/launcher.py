@@ -18,10 +18,12 @@ from functools import partial
 import msgspec
 from msgspec.structs import replace
 
+from ..awake import AwakeClock
 from ..errors import DeadlineExceeded, FmuError, FmuMeshError, Interrupted, MeshLost, from_report
 from ..files import remove_tree
 from ..system.plan import MASTER, RECORDER
 from ..wire.runtime import (
+    STOPPED,
     MeshNote,
     remove_stale_folders,
     run_folder,
@@ -29,7 +31,6 @@ from ..wire.runtime import (
     socket_endpoint,
     write_note,
 )
-from ..wire.session import LEASE_MS
 from ..wire.views import GOING_ON
 from .child import Child, Process, StopWatch, executed, how_it_ended, is_other_python
 from .events import Event, OutputLine, Reachable, Status, decode_event
@@ -51,7 +52,8 @@ _GATEWAY_S = 2.0
 """A gateway ends with its mesh. If it has ended so long before the mesh, it has lost its link."""
 
 _SILENCE_S = 10.0
-"""The master sends an event ten times per second. After this time without one, it counts as lost."""
+"""The master sends an event ten times per second. Without one for so long after the deadline of a step, it counts as
+lost: its nodes have ended before, and said why."""
 
 _TURN_S = 0.25
 _SILENT = "does not answer any more"
@@ -87,8 +89,9 @@ class Launcher:
         self._point: int | None = None
         self._starting = True
         self._stopping = False  # after that, the loss of a node is a warning of the master
-        self._stop_watch = StopWatch(LEASE_MS / 1000, _TURN_S)
-        self._heard = time.monotonic()
+        self._stop_watch = StopWatch(self._timeouts.link, _TURN_S)
+        self._clock = AwakeClock()
+        self._heard = 0.0
         self._quiet = False
         self._ending = False
         self._signalled = False
@@ -168,7 +171,7 @@ class Launcher:
         met = {_MASTER: self._point is not None, _GATEWAY: self._gateway_ready}
         stopped = [name for name, process in self._processes.items() if not met.get(name) and process.stopped]
         for name in self._stop_watch.look(now, stopped):
-            self._how[name] = "is stopped"
+            self._how[name] = STOPPED
             self._lost.append((name, -signal.SIGSTOP, now))
 
     def _take_event(self, line: bytes) -> None:
@@ -177,7 +180,7 @@ class Launcher:
         except msgspec.DecodeError:
             self._take_output(_MASTER, line)
             return
-        self._heard = time.monotonic()
+        self._heard = self._clock()
         match event:
             case Reachable(endpoints):
                 prefix, file = self._run.loaded.config.zenoh.key_prefix, str(self._run.config_file)
@@ -210,13 +213,14 @@ class Launcher:
 
     def _take_exit(self, name: str, code: int) -> None:
         if not self._signalled:  # afterwards the signal is the reason
-            self._how.setdefault(name, how_it_ended(code))
+            lost_link = code == MeshLost.exit_code and name in self._plan.nodes
+            self._how.setdefault(name, "lost its link to the master" if lost_link else how_it_ended(code))
         if self._ending:
             return
         if self._outcome is None and (name == _MASTER or (code != 0 and not self._stopping)):
             self._lost.append((name, code, time.monotonic()))
         elif name == _GATEWAY:
-            self._gateway_ended = time.monotonic()
+            self._gateway_ended = self._clock()
 
     def _take_exit_of_server(self, name: str, code: int) -> None:
         """The server ends after all others. Otherwise it is lost, whatever the master reports of what that means."""
@@ -234,8 +238,8 @@ class Launcher:
 
     def _over(self) -> bool:
         """Whether there is nothing left to wait for."""
-        now = time.monotonic()
-        silent_s = now - self._heard if self._quiet else 0.0
+        now, heard_s = time.monotonic(), self._clock() - self._heard
+        silent_s = heard_s if self._quiet else 0.0
         if self._outcome is not None:
             return not self._processes[_MASTER].running or silent_s > self._timeouts.stop
         if any(name == _MASTER or code == -signal.SIGSTOP for name, code, _ in self._lost):
@@ -249,13 +253,15 @@ class Launcher:
             return True
         if silent_s > _REPORT_S and not self._processes[_MASTER].running:
             return True  # a fork server that is stopped does not tell this
-        return silent_s > (_SILENCE_S if self._point is not None else self._timeouts.start)
+        patience_s = _SILENCE_S + self._timeouts.step if self._point is not None else self._timeouts.start
+        return silent_s > patience_s
 
     # --- the end
 
     def _end_all(self) -> None:
         """Wait for the processes that end by themselves, then send SIGTERM, then SIGKILL."""
         self._ending = True
+        self._how = {name: STOPPED for name, process in self._processes.items() if process.stopped} | self._how
         if self._server is not None:
             self._server.finish()
         patience = _KILL_S if self._outcome is not None else 0.1

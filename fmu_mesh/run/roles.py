@@ -31,7 +31,7 @@ from .outcome import Outcome
 from .process import RunProcess
 from .results import open_results
 from .run_plan import MANUAL, NodeRun, RunPlan
-from .wiring import is_socket, wiring
+from .wiring import is_socket, patient, wiring
 
 __all__ = ["prepare_node", "run_master", "run_node"]
 
@@ -70,7 +70,8 @@ class _NodeProcess:
         plan, run, process = self._plan, self._run, self._process
         process.cleans_up(self._remove_files)
         process.take_place(plan.node, f"node '{plan.node}' of mesh '{plan.mesh}'")
-        session = open_session(wiring(run.zenoh, run.config_file, process.folder, plan.node, plan.peers()))
+        own = wiring(run.zenoh, run.config_file, process.folder, plan.node, plan.peers())
+        session = open_session(patient(own, plan.timeouts, is_node=True))
         process.stack.callback(close_session, session)
         self._watch = process.stack.enter_context(closing(CallWatch(self._take_hang, survives=True)))
         process.stack.callback(self._close_instances)
@@ -161,7 +162,8 @@ def run_master(run: RunPlan, emit: Callable[[Event], None]) -> Outcome:
     with RunProcess(config.mesh, run.run) as process:
         process.take_place(MASTER, f"the master of mesh '{config.mesh}'")
         try:
-            session = open_session(wiring(zenoh, run.config_file, process.folder, MASTER, ()))
+            own = wiring(zenoh, run.config_file, process.folder, MASTER, ())
+            session = open_session(patient(own, config.timeouts, is_node=False))
             process.stack.callback(close_session, session)
             settings = _settings(run, process, own_endpoints(session) if zenoh.mode == "peer" else ())
             master = Master(plan, session, _Emitter(emit), settings, RouterLink(session, config.zenoh.connect))

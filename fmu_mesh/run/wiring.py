@@ -11,13 +11,19 @@ import ipaddress
 from collections.abc import Iterable
 from pathlib import Path
 
-from ..config.mesh import ZenohConfig
+from msgspec.structs import replace
+
+from ..config.mesh import TimeoutsConfig, ZenohConfig
 from ..files import beside
 from ..system.plan import MASTER
 from ..wire.runtime import socket_endpoint
 from ..wire.session import Wiring
 
-__all__ = ["is_socket", "leaves_host", "wiring"]
+__all__ = ["is_socket", "leaves_host", "patient", "wiring"]
+
+
+_STEPS = 4
+"""As many deadlines of a step pass before a link on one host counts as lost: they come first."""
 
 
 def wiring(config: ZenohConfig, config_file: Path, folder: Path, process: str, peers: Iterable[str]) -> Wiring:
@@ -51,6 +57,16 @@ def wiring(config: ZenohConfig, config_file: Path, folder: Path, process: str, p
         # others later: it registers, and says hello.
         waits=bool(config.connect),
     )
+
+
+def patient(made: Wiring, timeouts: TimeoutsConfig, *, is_node: bool) -> Wiring:
+    """The wiring of a process that waits for the others as long as the configuration says.
+
+    On one host the end of a process closes its sockets, so a link is never given up before a step is.
+    """
+    has_network = made.gossip or made.mode == "client"
+    lease_s = timeouts.link if has_network else max(timeouts.link, _STEPS * timeouts.step)
+    return replace(made, lease_s=lease_s, stuck_s=lease_s if is_node else made.stuck_s)
 
 
 def is_socket(endpoint: str) -> bool:

@@ -28,11 +28,15 @@ from .inbox import Inbox
 from .keys import RUN_ID_BYTES, Keys, RunKeys
 from .messages import NodeReport, decode_json
 from .refusals import payload_of
+from .runtime import STOPPED, is_alive, is_stopped
 from .session import Question, RouterLink, ask, tokens
 
-__all__ = ["Admission", "Membership", "NodeReady", "Registration", "Welcome"]
+__all__ = ["SILENCE_S", "Admission", "Membership", "NodeReady", "Registration", "Welcome"]
 
 T = TypeVar("T")
+
+SILENCE_S = 2.0
+"""Longer than a live master is silent: it says something twice a second."""
 
 _GRACE_S = 1.0
 
@@ -181,16 +185,47 @@ class Membership:
 
     @property
     def master_is_gone(self) -> bool:
-        """Whether the master's token is gone. This may send a query, so do not call it in a callback of Zenoh."""
-        return self._keys is not None and not tokens(self._session, self._keys.master)
+        """Whether the master is gone. This may send a query, so do not call it in a callback of Zenoh.
 
-    def without_master(self) -> MeshLost:
-        """The error for a lost master; also stores that the master is lost."""
+        On this host its process tells. Elsewhere its token does.
+        """
+        return not self.master_runs and self._keys is not None and not tokens(self._session, self._keys.master)
+
+    @property
+    def master_runs(self) -> bool:
+        """Whether the master is known to run, because it shares memory with this process."""
+        return (pid := self._master_pid) is not None and is_alive(pid)
+
+    @property
+    def _master_pid(self) -> int | None:
+        offer = self._admitted.result(0).offer if self.memory is not None and self.is_admitted else None
+        return offer.pid if offer is not None else None
+
+    def without_master(self, silent_s: float = 0.0) -> MeshLost:
+        """The error for a lost master, which has said nothing for ``silent_s`` seconds; also stores that it is lost."""
         self.lost_master = True
         loss = self._router.loss()
         if loss is not None:
             return MeshLost(f"{loss}, and the master with it")
+        if silent_s > SILENCE_S:
+            text = f"node '{self._plan.node}' lost its link to the master, which did not answer for {silent_s:.0f} s"
+            return MeshLost(text, hint="Is its process stopped, its host suspended, or the network cut?")
         return MeshLost("the master is gone", hint="See the messages of its process.")
+
+    def check_silence(self, silent_s: float) -> None:
+        """The master has said nothing for ``silent_s`` seconds.
+
+        Raises:
+            MeshLost: no link between hosts may be silent for so long.
+            DeadlineExceeded: a step may not take so long.
+        """
+        timeouts, pid = self._plan.timeouts, self._master_pid
+        if self._router.is_used and silent_s > timeouts.link:
+            raise self.without_master(silent_s)
+        if silent_s > timeouts.step:
+            state = f": its process {STOPPED}" if pid is not None and is_stopped(pid) else ""
+            text = f"the master has said nothing for {silent_s:.1f} s{state}"
+            raise DeadlineExceeded(text, hint=None if state else "Is its process stopped, or its host gone?")
 
     def report(
         self,

@@ -47,6 +47,9 @@ __all__ = [
 _SOCKET_PATH_LIMIT = 107
 """Of the system: 108 bytes with a zero at the end (unix(7))."""
 _PF_EXITING = 0x4
+STOPPED = "is stopped (state T)"
+"""What a message says of such a process; see `is_stopped`."""
+
 _KILLED = 1 << (signal.SIGKILL - 1)
 """Bits of a process in /proc."""
 _ENTRIES = 100
@@ -333,6 +336,11 @@ def process_state(pid: int) -> str | None:
         return _stat(pid)[0]
     except (OSError, IndexError):
         return None
+
+
+def is_stopped(pid: int) -> bool:
+    """Whether a process is stopped by a signal, such as SIGSTOP or Ctrl-Z."""
+    return process_state(pid) == "T"
 
 
 def _stat(pid: int) -> list[str]:

@@ -22,6 +22,7 @@ from ..errors import ConfigurationError, DeadlineExceeded, MeshLost
 from .values import json_encoding
 
 __all__ = [
+    "LEASE_S",
     "Question",
     "RouterLink",
     "Wiring",
@@ -37,15 +38,10 @@ __all__ = [
     "undeclare_all",
 ]
 
-LEASE_MS = 4_000
-"""A stopped process is detected after this time; a dead process within milliseconds."""
+LEASE_S = 30.0
+"""After so long in s without a sign of life a link counts as lost; a dead process is noticed within milliseconds."""
 
-STUCK_US = 1000 * LEASE_MS
-"""How long a sender may be blocked before the link is closed, and with it the peer's tokens.
-
-Grants limit the messages on the way, so the queue of a live peer never fills up, and only a stopped process blocks a
-sender. The lease does not expire while the sender is blocked, so this limit is needed in addition.
-"""
+_STUCK_S = 4.0
 
 _OWN_SOURCE = re.compile(r" at /\S+\.rs:\d+\.?")
 _CANNOT_LISTEN = (
@@ -78,6 +74,10 @@ class Wiring(msgspec.Struct, frozen=True):
         gossip: whether peers find each other through other peers (meshes over several hosts).
         config: a Zenoh configuration file to start from.
         patience_s: how long a client tries to connect, in s.
+        lease_s: how long a process at the other end waits for a sign of life of this one, in s.
+        stuck_s: how long a sender may be blocked before its link is closed, in s; the lease does not expire meanwhile.
+            Grants limit the messages on the way, so only a process that is stopped blocks. Nodes wait for each other;
+            the master closes the link of a tool that is stopped.
         waits: whether opening the session waits, half a second at most, for the processes that it connects to.
     """
 
@@ -88,6 +88,8 @@ class Wiring(msgspec.Struct, frozen=True):
     config: Path | None = None
     patience_s: float = 20.0
     waits: bool = True
+    lease_s: float = LEASE_S
+    stuck_s: float = _STUCK_S
 
 
 def open_session(wiring: Wiring) -> zenoh.Session:
@@ -137,8 +139,8 @@ def _configuration(wiring: Wiring) -> zenoh.Config:
         "connect/retry": {"period_init_ms": 20, "period_max_ms": 250, "period_increase_factor": 1.5},
         "listen/exit_on_failure": True,
         "open/return_conditions/connect_scouted": wiring.waits,
-        "transport/link/tx/lease": LEASE_MS,
-        "transport/link/tx/queue/congestion_control/block/wait_before_close": STUCK_US,
+        "transport/link/tx/lease": round(1e3 * wiring.lease_s),
+        "transport/link/tx/queue/congestion_control/block/wait_before_close": round(1e6 * wiring.stuck_s),
         # A slow subscriber must not delay other messages on its link: its samples are dropped at once (the default is
         # to wait a millisecond for each). To drop fewer samples, the queue for streams has the largest possible size.
         "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,
@@ -204,6 +206,11 @@ class RouterLink:
         self._session = session
         self._endpoints = tuple(endpoints)
         self._had_router = False
+
+    @property
+    def is_used(self) -> bool:
+        """Whether the master is reached through a network."""
+        return bool(self._endpoints)
 
     def wait(self) -> None:
         """Wait a moment for the link: a session in peer mode is open before the link is."""
@@ -346,7 +353,7 @@ def run_router(listen: Sequence[str]) -> Iterator[tuple[str, ...]]:
         ConfigurationError: an endpoint cannot be used.
     """
     # Peers that connect to it, such as ROS nodes, find each other here and connect directly; it does not route.
-    session = open_session(Wiring(mode="router", listen=tuple(listen), gossip=True))
+    session = open_session(Wiring(mode="router", listen=tuple(listen), gossip=True, stuck_s=LEASE_S))
     try:
         yield own_endpoints(session)
     finally:
