@@ -39,7 +39,7 @@ from ..rings.host_memory import ONE_CORE, HostMemory
 from ..system.plan import RECORDER, Link, NodePlan
 from ..wire.frames import FrameReceiver, of_text
 from ..wire.inbox import Inbox, Message
-from ..wire.membership import SILENCE_S, Membership, Welcome
+from ..wire.membership import Membership, Welcome
 from ..wire.messages import (
     ABORT,
     FINISH,
@@ -396,7 +396,7 @@ class Node:
         """Report the failure to the master, unless the master is gone; return whether it knows now."""
         self._activity.enter("failed")
         if self._membership.lost_master:
-            return self._clock() - self._heard < SILENCE_S  # otherwise only the link is lost, and nobody else says it
+            return not self._membership.lost_link
         self.server.say_everything()
         try:
             self._tell_end(self._as_others_see(error), self._patience_s())

@@ -1,4 +1,4 @@
-"""One child process of the launcher: its start and end, the threads that read its output, and how long it was stopped.
+"""One child process of the launcher: its start and end, and the threads that read its output.
 
 Does not know what a mesh is. What happens is posted to the launcher's thread.
 """
@@ -10,7 +10,7 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -23,7 +23,6 @@ from .threads import ONE_THREAD
 __all__ = [
     "Child",
     "Process",
-    "StopWatch",
     "executed",
     "how_it_ended",
     "is_other_python",
@@ -212,34 +211,6 @@ class Child:
         for reader in readers:
             reader.join(1.0)
         self._post(lambda: on_exit(self.name, code))
-
-
-class StopWatch:
-    """Measures how long children have been stopped.
-
-    The launcher itself may have been stopped (Ctrl-Z), so of the time between two looks at most two turns count.
-
-    Args:
-        patience_s: how long a child may be stopped, in s.
-        turn_s: about how often the launcher looks, in s.
-    """
-
-    def __init__(self, patience_s: float, turn_s: float) -> None:
-        self._patience_s = patience_s
-        self._turn_s = turn_s
-        self._looked: float | None = None
-        self._stopped_s: dict[str, float] = {}
-
-    def due(self, now: float) -> bool:
-        """Whether it is time for the next look."""
-        return self._looked is None or now - self._looked >= self._turn_s
-
-    def look(self, now: float, stopped: Iterable[str]) -> list[str]:
-        """Note which children are stopped now; returns those that have been stopped for too long."""
-        passed_s = min(now - self._looked, 2 * self._turn_s) if self._looked is not None else 0.0
-        self._looked = now
-        self._stopped_s = {name: self._stopped_s.get(name, 0.0) + passed_s for name in stopped}
-        return [name for name, seconds in self._stopped_s.items() if seconds > self._patience_s]
 
 
 def how_it_ended(code: int) -> str:

@@ -42,7 +42,8 @@ def run_gateway(run: RunPlan, emit: Callable[[Event], None]) -> None:
     ros_plan = _ros_plan(run)
     with RunProcess(config.mesh, run.run) as process:
         stack = process.stack
-        mesh = open_session(Wiring(mode="client", connect=_master_at(run, process), patience_s=patience_s))
+        at, lease_s = _master_at(run, process), config.timeouts.link
+        mesh = open_session(Wiring(mode="client", connect=at, patience_s=patience_s, lease_s=lease_s))
         stack.callback(close_session, mesh)
         # A peer that gossips, as the nodes of ROS are: a router does not forward between peers, it introduces them.
         # They have ports, and this process connects to them; a port of its own would be open to every user of the host.

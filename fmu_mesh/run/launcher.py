@@ -32,7 +32,7 @@ from ..wire.runtime import (
     write_note,
 )
 from ..wire.views import GOING_ON
-from .child import Child, Process, StopWatch, executed, how_it_ended, is_other_python
+from .child import Child, Process, executed, how_it_ended, is_other_python
 from .events import Event, OutputLine, Reachable, Status, decode_event
 from .fork_server import ForkServer, fork_server
 from .outcome import Outcome
@@ -89,8 +89,9 @@ class Launcher:
         self._point: int | None = None
         self._starting = True
         self._stopping = False  # after that, the loss of a node is a warning of the master
-        self._stop_watch = StopWatch(self._timeouts.link, _TURN_S)
         self._clock = AwakeClock()
+        self._looked = 0.0
+        self._stopped_since: dict[str, float] = {}
         self._heard = 0.0
         self._quiet = False
         self._ending = False
@@ -163,16 +164,19 @@ class Launcher:
             self._quiet = False
         except queue.Empty:
             self._quiet = True
-        if self._starting and self._stop_watch.due(now := time.monotonic()):
+        now = self._clock()
+        if self._starting and now - self._looked >= _TURN_S:
+            self._looked = now
             self._look_for_stopped(now)
 
     def _look_for_stopped(self, now: float) -> None:
         """Find processes that are stopped before the run begins: the others would only notice at the deadline."""
         met = {_MASTER: self._point is not None, _GATEWAY: self._gateway_ready}
         stopped = [name for name, process in self._processes.items() if not met.get(name) and process.stopped]
-        for name in self._stop_watch.look(now, stopped):
+        self._stopped_since = {name: self._stopped_since.get(name, now) for name in stopped}
+        for name in [name for name, since in self._stopped_since.items() if now - since > self._timeouts.link]:
             self._how[name] = STOPPED
-            self._lost.append((name, -signal.SIGSTOP, now))
+            self._lost.append((name, -signal.SIGSTOP, time.monotonic()))
 
     def _take_event(self, line: bytes) -> None:
         try:

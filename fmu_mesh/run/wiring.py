@@ -22,10 +22,6 @@ from ..wire.session import Wiring
 __all__ = ["is_socket", "leaves_host", "patient", "wiring"]
 
 
-_STEPS = 4
-"""As many deadlines of a step pass before a link on one host counts as lost: they come first."""
-
-
 def wiring(config: ZenohConfig, config_file: Path, folder: Path, process: str, peers: Iterable[str]) -> Wiring:
     """The endpoints of one process.
 
@@ -62,10 +58,11 @@ def wiring(config: ZenohConfig, config_file: Path, folder: Path, process: str, p
 def patient(made: Wiring, timeouts: TimeoutsConfig, *, is_node: bool) -> Wiring:
     """The wiring of a process that waits for the others as long as the configuration says.
 
-    On one host the end of a process closes its sockets, so a link is never given up before a step is.
+    On one host the end of a process closes its sockets, so no link is given up before a step is: its deadlines come
+    first. Of two hosts the one that connects decides.
     """
-    has_network = made.gossip or made.mode == "client"
-    lease_s = timeouts.link if has_network else max(timeouts.link, _STEPS * timeouts.step)
+    is_local = all(map(is_socket, made.connect))
+    lease_s = max(timeouts.link, 4 * timeouts.step) if is_local else timeouts.link
     return replace(made, lease_s=lease_s, stuck_s=lease_s if is_node else made.stuck_s)
 
 

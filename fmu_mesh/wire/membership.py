@@ -31,11 +31,11 @@ from .refusals import payload_of
 from .runtime import STOPPED, is_alive, is_stopped
 from .session import Question, RouterLink, ask, tokens
 
-__all__ = ["SILENCE_S", "Admission", "Membership", "NodeReady", "Registration", "Welcome"]
+__all__ = ["Admission", "Membership", "NodeReady", "Registration", "Welcome"]
 
 T = TypeVar("T")
 
-SILENCE_S = 2.0
+_SILENCE_S = 2.0
 """Longer than a live master is silent: it says something twice a second."""
 
 _GRACE_S = 1.0
@@ -112,7 +112,8 @@ class Membership:
     Attributes:
         given_up: whether `give_up` was called.
         memory: the shared memory, once `open_memory` has opened it; None if this process does not share any.
-        lost_master: whether the master was found to be gone.
+        lost_master: whether the master was found to be gone, or does not answer.
+        lost_link: whether only the link to it may be lost, so that nobody else can say it.
 
     Call sequence: `register`, then `join` once, then `sender` for each receiver, and `close` at the end.
     """
@@ -128,7 +129,8 @@ class Membership:
     ) -> None:
         self._plan = plan
         self._router = router or RouterLink(session)
-        self.lost_master = False
+        self.lost_master = self.lost_link = False
+        self._stopped_s = 0.0
         self._session = session
         self._inbox = inbox
         self._launch = launch
@@ -207,7 +209,8 @@ class Membership:
         loss = self._router.loss()
         if loss is not None:
             return MeshLost(f"{loss}, and the master with it")
-        if silent_s > SILENCE_S:
+        if silent_s > _SILENCE_S:
+            self.lost_link = True
             text = f"node '{self._plan.node}' lost its link to the master, which did not answer for {silent_s:.0f} s"
             return MeshLost(text, hint="Is its process stopped, its host suspended, or the network cut?")
         return MeshLost("the master is gone", hint="See the messages of its process.")
@@ -220,10 +223,17 @@ class Membership:
             DeadlineExceeded: a step may not take so long.
         """
         timeouts, pid = self._plan.timeouts, self._master_pid
-        if self._router.is_used and silent_s > timeouts.link:
+        if silent_s <= min(timeouts.link, timeouts.step):
+            self._stopped_s = 0.0
+            return
+        stopped = pid is not None and is_stopped(pid)
+        if stopped:  # on this host, so what is silent is not the link
+            self._stopped_s = silent_s
+        if self._router.endpoints and silent_s - self._stopped_s > timeouts.link:
             raise self.without_master(silent_s)
         if silent_s > timeouts.step:
-            state = f": its process {STOPPED}" if pid is not None and is_stopped(pid) else ""
+            self.lost_master = True
+            state = f": its process {STOPPED}" if stopped else ""
             text = f"the master has said nothing for {silent_s:.1f} s{state}"
             raise DeadlineExceeded(text, hint=None if state else "Is its process stopped, or its host gone?")
 
@@ -327,8 +337,8 @@ class Membership:
 
     def _has_nothing_to_join(self) -> bool:
         if self._master_went and not self.given_up:
-            self._master_went = False
             self.given_up = self.master_is_gone
+            self._master_went = self.master_runs and not self.given_up  # then it is asked again
         return self.given_up
 
 

@@ -199,27 +199,22 @@ class RouterLink:
     """Watches the link of a process to the router that connects it to the other processes.
 
     Args:
-        endpoints: where the process connects to; empty if everything that it needs is on this host.
+        endpoints: where the process connects to; empty if everything that it needs is on this host. Also an attribute.
     """
 
     def __init__(self, session: zenoh.Session, endpoints: Iterable[str] = ()) -> None:
         self._session = session
-        self._endpoints = tuple(endpoints)
+        self.endpoints = tuple(endpoints)
         self._had_router = False
-
-    @property
-    def is_used(self) -> bool:
-        """Whether the master is reached through a network."""
-        return bool(self._endpoints)
 
     def wait(self) -> None:
         """Wait a moment for the link: a session in peer mode is open before the link is."""
-        if self._endpoints:
+        if self.endpoints:
             self._waits_until(there=True, seconds=_LINK_S)
 
     def look(self) -> bool:
         """Whether there is a router. After it was found once, a missing router counts as lost."""
-        there = bool(self._endpoints) and any(True for _ in self._session.info.routers_zid())
+        there = bool(self.endpoints) and any(True for _ in self._session.info.routers_zid())
         self._had_router = self._had_router or there
         return there
 
@@ -230,7 +225,7 @@ class RouterLink:
         """
         if not self._had_router or not self._waits_until(there=False, seconds=_UNLINK_S):
             return None
-        return f"the link to the router at {', '.join(self._endpoints)} was lost"
+        return f"the link to the router at {', '.join(self.endpoints)} was lost"
 
     def _waits_until(self, *, there: bool, seconds: float) -> bool:
         """Wait until the router is there, or until it is not; return whether that happened in time."""

@@ -13,7 +13,6 @@ import pytest
 import yaml
 
 from fmu_mesh.cli.main import main
-from fmu_mesh.run.child import StopWatch
 from fmu_mesh.system.window import AUTO_WINDOW_POINTS
 from tests.helpers import (
     DEADLINE_S,
@@ -280,18 +279,6 @@ def test_a_gateway_that_somebody_else_ends_is_lost(place: Place) -> None:
     place.assert_nothing_left()
 
 
-def test_time_in_which_the_launcher_itself_was_stopped_is_not_that_of_a_child() -> None:
-    watch = StopWatch(patience_s=4.0, turn_s=0.25)
-
-    # It looks, is stopped for a minute, finds a child stopped by the same hand, and sees it go on.
-    assert watch.look(0.0, ["delay"]) == []
-    assert watch.look(60.0, ["delay"]) == []
-    assert watch.look(60.25, ["delay"]) == []
-    assert watch.look(60.5, []) == []
-    assert [watch.look(60.5 + 0.25 * turn, ["delay"]) for turn in range(1, 17)] == [[]] * 16
-    assert watch.look(64.75, ["delay"]) == ["delay"]
-
-
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT], ids=lambda number: number.name)
 def test_a_node_that_somebody_else_ends_is_lost_and_named(place: Place, number: signal.Signals) -> None:
     launched, result = started(place, {"real_time_factor": 1}, 100)
@@ -378,7 +365,7 @@ def test_a_process_that_stays_stopped_is_named_at_the_deadline_of_a_step(
 
     assert launched.wait(60.0) == 4
     place.assert_nothing_left()
-    who = "the master was lost" if victim == "master" else f"instance node '{victim}', point"
+    who = "the master was lost" if victim == "master" else f"node '{victim}', point"
     assert who in launched.message
     assert "its process is stopped (state T)" in launched.message
     assert_is_what_one_process_calculates(place, result)

@@ -40,7 +40,7 @@ def test_a_run_goes_on_after_its_processes_were_stopped(place: Place, *, shared_
         stop_time=4.0,
         simulation={"real_time_factor": 1},
         timeouts={"link": LINK_S, "step": STEP_S},
-        zenoh={"shared_memory": shared_memory},
+        zenoh={"shared_memory": shared_memory, "listen": ["tcp/127.0.0.1:0"]},
     )
     result, undisturbed = config.with_suffix(".csv"), place.folder / "undisturbed.csv"
     launched = place.start("launch", config, "--no-progress")
@@ -103,11 +103,14 @@ def relay(place: Place) -> Iterator[tuple[str, Relay]]:
     relay.close()
 
 
-def test_a_link_that_is_cut_is_named_by_both_ends(place: Place, relay: tuple[str, Relay]) -> None:
+@pytest.mark.parametrize("shared_memory", [True, False], ids=["shared memory", "frames"])
+def test_a_link_that_is_cut_is_named_by_both_ends(
+    place: Place, relay: tuple[str, Relay], *, shared_memory: bool
+) -> None:
     router, cable = relay
 
     def config(name: str, endpoint: str) -> Path:
-        zenoh = {"mode": "client", "connect": [endpoint]}
+        zenoh = {"mode": "client", "connect": [endpoint], "shared_memory": shared_memory}
         made = write_config(
             place.folder,
             stop_time=1e6,

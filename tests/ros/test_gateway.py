@@ -150,7 +150,7 @@ def test_a_gateway_that_had_no_processor_at_the_end_still_carries_every_sample(p
 def test_a_gateway_that_never_comes_back_ends_with_the_mesh_and_is_told(
     place: Place, ros: Ros, *, away: bool, says: str
 ) -> None:
-    config = configured(place, ros, factor=3, timeouts={"stop": 1.0})
+    config = configured(place, ros, factor=3, timeouts={"stop": 1.0, "link": 4.0})
     with resting(place, ros, config) as (mesh, gateway, session):
         gateway.suspend()
         if away:

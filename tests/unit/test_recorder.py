@@ -17,8 +17,9 @@ from fmu_mesh.errors import MeshLost
 from fmu_mesh.recorder import recorder as module
 from fmu_mesh.recorder.csv_file import CsvFile
 from fmu_mesh.recorder.recorder import Recorder
+from fmu_mesh.rings.host_memory import HostMemory
 from fmu_mesh.rings.ring import Ring
-from fmu_mesh.system.plan import RECORDER, NodePlan
+from fmu_mesh.system.plan import MASTER, RECORDER, NodePlan
 from fmu_mesh.wire.keys import Keys, RunKeys
 from fmu_mesh.wire.membership import Admission, Welcome
 from fmu_mesh.wire.messages import FINISH, FRAME, HEADER, LAST, encode_abort
@@ -45,6 +46,7 @@ class Mesh:
         self._folder = folder
         self.reported = threading.Event()
         self._welcomed = threading.Event()
+        self.shared: tuple[str, ...] = ()
         public = Keys(self.plan.key_prefix, self.plan.mesh)
         self._keys = RunKeys.new(public)
         self._reports: list[zenoh.Query] = []
@@ -86,7 +88,7 @@ class Mesh:
         )
 
     def _take_ready(self, query: zenoh.Query) -> None:
-        query.reply(query.key_expr, msgspec.json.encode(Welcome()))
+        query.reply(query.key_expr, msgspec.json.encode(Welcome(shared=self.shared)))
         self._welcomed.set()
 
     def _take_report(self, query: zenoh.Query) -> None:
@@ -163,3 +165,26 @@ def test_a_recorder_takes_rows_that_come_after_the_end_of_the_run(mesh: Mesh, mo
 
     rows.join(DEADLINE_S)
     assert_has_ended(recorder)
+
+
+def test_a_recorder_writes_before_its_window_is_full(mesh: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Otherwise the nodes, which may not be further ahead, wait until it looks."""
+    monkeypatch.setattr(module, "_LOOK_S", 2 * DEADLINE_S)
+    memory, mesh.shared = HostMemory.create(mesh.plan.memory, MASTER), ("n",)
+    plan = msgspec.structs.replace(mesh.plan, window=64)
+
+    def put(rows: int) -> None:
+        for place in plan.rings:
+            for step in range(rows):
+                memory.ring(place).stamp(step)
+            memory.counter(place.counter).raise_to(rows)
+
+    with (
+        suppress(MeshLost),
+        Recorder(plan, mesh.session, [mesh.file()], memory=memory.participant(RECORDER)) as recorder,
+    ):
+        put(1)
+        wait_until(lambda: recorder.files[0][1] == 1, "the first row")
+        put(64)
+        wait_until(lambda: recorder.files[0][1] == 64, "the rows of its window")
+        raise MeshLost("node 'n' was lost", instance="a, b")
