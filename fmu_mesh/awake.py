@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 
 __all__ = ["AwakeClock"]
 
@@ -16,13 +17,14 @@ class AwakeClock:
     the time to happen: of the time between two reads, at most a second counts.
     """
 
-    def __init__(self) -> None:
-        self._seen = time.monotonic()
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._seen = clock()
         self._awake_s = 0.0
 
     def __call__(self) -> float:
         """The time in s since this object was made, without the time in which this process could not run."""
-        now = time.monotonic()
+        now = self._clock()
         self._awake_s += min(now - self._seen, _MOST_S)
         self._seen = now
         return self._awake_s

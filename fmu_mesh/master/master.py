@@ -314,7 +314,8 @@ class Master:
         if granting.look(ended=self.ended_by is not None) or moved:  # the slowest node may wait for another slow one
             self._moved = self._awake()
         self._publish_status()
-        self._members.look_at_doubted()
+        if self._members.doubted:
+            self._members.look_at_doubted(router_is_lost=self._router.is_lost)
         if self._failure is not None:
             raise self._failure
 

@@ -132,13 +132,12 @@ class Members:
         gone = sample.kind == zenoh.SampleKind.DELETE and node in self._admitted
         if gone and node in self.shared:
             self.doubted.add(node)
-            self.look_at_doubted()
         elif gone and not tokens(self._session, self._keys.node(node)):
             self._on_lost(node)
 
-    def look_at_doubted(self) -> None:
-        """Call it now and then: a node whose token is gone is lost when its process has ended."""
-        for node in [node for node in self.doubted if not is_alive(self._admitted[node].pid)]:
+    def look_at_doubted(self, *, router_is_lost: bool) -> None:
+        """Call it now and then: a node whose token is gone is lost when its process has ended, or with the router."""
+        for node in [node for node in self.doubted if router_is_lost or not is_alive(self._admitted[node].pid)]:
             self.doubted.discard(node)
             self._on_lost(node)
 

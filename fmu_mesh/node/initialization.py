@@ -7,9 +7,9 @@ the values of the last one.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Collection, Sequence
 
+from ..awake import AwakeClock
 from ..errors import DeadlineExceeded, InitializationFailed
 from ..rings.array_elements import element_of, merged
 from ..rings.value_change import ValueChange
@@ -26,6 +26,7 @@ from .stepping import Runner
 
 __all__ = ["Initialization"]
 
+_LOOK_S = 0.5
 _SWEEP = 1 << 32
 """An INITIAL message has the number `level + sweep * this`."""
 
@@ -59,7 +60,7 @@ class Initialization:
         self._known: dict[tuple[str, str, int | None], Value] = {}
         self._settled: set[Key] = set()
         self._parameters: dict[Key, str] = {}
-        self._end = 0.0
+        self._clock, self._end = AwakeClock(), 0.0
 
     def take(self, link: Link, tag: int, data: bytes) -> None:
         """Store an INITIAL message of another node."""
@@ -80,7 +81,7 @@ class Initialization:
         for runner in runners:
             stop_time = grid.told_stop_time(runner.plan.step_points)
             runner.instance.enter_initialization(grid.start_time, stop_time, runner.plan.start_values)
-        self._end = time.monotonic() + self._plan.timeouts.initialize
+        self._end = self._clock() + self._plan.timeouts.initialize
         loops = {loop.first: loop for loop in self._plan.loops}
         iterated = {level for loop in self._plan.loops for level in range(loop.first, loop.last + 1)}
         plain = {level for runner in runners for level in runner.plan.initialization.values()} - iterated
@@ -180,11 +181,11 @@ class Initialization:
 
     def _value(self, instance: str, variable: str, sweep: int | None = None) -> Value:
         while (instance, variable, sweep) not in self._known:
-            left_s = self._end - time.monotonic()
+            left_s = self._end - self._clock()
             if left_s <= 0:
                 text = f"its initial value did not come within {self._plan.timeouts.initialize:g} s"
                 raise DeadlineExceeded(text, instance=instance, variable=variable)
-            self._wait(left_s)
+            self._wait(min(left_s, _LOOK_S))
         return self._known[instance, variable, sweep]
 
     def _get_outputs(self, runner: Runner, names: Sequence[str], sweep: int | None = None) -> dict[str, Value]:

@@ -196,7 +196,7 @@ class Membership:
     @property
     def master_runs(self) -> bool:
         """Whether the master is known to run, because it shares memory with this process."""
-        return (pid := self._master_pid) is not None and is_alive(pid)
+        return (pid := self._master_pid) is not None and is_alive(pid) and not self._router.is_lost
 
     @property
     def _master_pid(self) -> int | None:

@@ -218,6 +218,11 @@ class RouterLink:
         self._had_router = self._had_router or there
         return there
 
+    @property
+    def is_lost(self) -> bool:
+        """Whether the router was there, and is not there now."""
+        return self._had_router and not self.look()
+
     def loss(self) -> str | None:
         """A text that says that the router is lost; None if it is there, or if there was none.
 

@@ -98,7 +98,7 @@ def test_with_restarts_a_run_whose_fork_server_is_killed_starts_again(place: Pla
 
 
 def test_a_fork_server_that_is_stopped_before_it_forks_is_named(place: Place) -> None:
-    config = write_config(place.folder, stop_time=FAR_S, timeouts={"start": 10 * DEADLINE_S})
+    config = write_config(place.folder, stop_time=FAR_S, timeouts={"start": 10 * DEADLINE_S, "link": 4.0})
     launched = place.start("launch", config)
 
     launched.child("fork").suspend()

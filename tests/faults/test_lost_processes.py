@@ -35,11 +35,16 @@ FAR_S = 1_000_000.0
 
 
 def started(
-    place: Place, simulation: dict[str, float], rows: int, **sections: dict[str, float]
+    place: Place, simulation: dict[str, float], rows: int, timeouts: dict[str, float] | None = None
 ) -> tuple[Launched, Path]:
     """A pendulum and a delay that run, and their result file with ``rows`` rows or more."""
-    instances = braked(place.folder)
-    config = write_config(place.folder, instances=instances, stop_time=FAR_S, simulation=simulation, **sections)
+    config = write_config(
+        place.folder,
+        instances=braked(place.folder),
+        stop_time=FAR_S,
+        simulation=simulation,
+        timeouts=timeouts or {},
+    )
     launched = place.start("launch", config)
     result = config.with_suffix(".csv")
     wait_until(lambda: row_count(result) > rows, f"{rows} rows")

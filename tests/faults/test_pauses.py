@@ -13,7 +13,6 @@ from pathlib import Path
 import psutil
 import pytest
 
-from fmu_mesh import awake
 from fmu_mesh.awake import AwakeClock
 from fmu_mesh.cli.main import main
 from tests.helpers import Place, row_count, wait_until, write_config
@@ -133,9 +132,8 @@ def test_a_link_that_is_cut_is_named_by_both_ends(
     assert "node 'delay' was lost: its process does not answer any more" in master.message
 
 
-def test_a_clock_for_deadlines_stands_while_its_process_does(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_clock_for_deadlines_stands_while_its_process_does() -> None:
     times = iter([100.0, 100.5, 160.5, 161.0])
-    monkeypatch.setattr(awake.time, "monotonic", lambda: next(times))
-    clock = AwakeClock()
+    clock = AwakeClock(lambda: next(times))
 
     assert [clock() for _ in range(3)] == [0.5, 1.5, 2.0]
