@@ -1,8 +1,8 @@
 """fmu_mesh: `fmu-mesh launch` on a configuration written from the task; runs in the project's own environment.
 
 Options: `window`; `group` = `one` puts all instances into one node; `local` = `yes` is `launch --local`; `record` =
-`outputs` (the outputs that the system reads), `all` or `none`; `shared_memory` = `no` sends all rows in frames; `result`
-is the CSV file; `checkout` is the folder of another checkout with its `.venv`, whose fmu_mesh runs instead of this one.
+`outputs` (the outputs that the system reads), `all` or `none`; `shared_memory` = `no` sends all rows in frames;
+`result` is the CSV file; `checkout` is the folder of another checkout with its `.venv`, whose fmu_mesh runs instead.
 """
 
 from __future__ import annotations
